@@ -1,0 +1,74 @@
+"""Clusters to pedestrian candidates: ground snapping, height filter, STM, CPA (paper A)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from time import perf_counter
+
+import numpy as np
+
+from lidar_perception.candidates.boxes import height_matches
+from lidar_perception.candidates.seeds import Seed
+from lidar_perception.candidates.silhouette import cpa_scales, silhouettes, similarity
+from lidar_perception.params import PipelineParams
+from lidar_perception.types import PEDESTRIAN, Detections
+
+STAGES = ("stage1", "stage2", "final")
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Detections after the height filter (stage1), STM (stage2) and STM with CPA (final); scores
+    are the similarity with the seed (stage1: without CPA). ms: time of each step."""
+
+    stage1: Detections
+    stage2: Detections
+    final: Detections
+    ms: dict[str, float] = field(default_factory=dict)
+
+    @staticmethod
+    def none() -> Candidates:
+        return Candidates(Detections.none(), Detections.none(), Detections.none(),
+                          dict(height=0.0, stm=0.0, cpa=0.0))
+
+
+def refine(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, seed: Seed,
+           params: PipelineParams = PipelineParams()) -> Candidates:
+    """Candidates among clusters 1..K of points (N, 3), ids (N,), ground-snapped boxes (K, 7)."""
+    t0 = perf_counter()
+    kept = np.flatnonzero(height_matches(boxes, seed.height, params.height))
+    boxes = boxes[kept]
+    t1 = perf_counter()
+    points, start = group_points(xyz, labels, kept + 1)
+    plain = similarity(silhouettes(points, start, np.ones((len(kept), 1))), seed.silhouette)
+    t2 = perf_counter()
+    ranges = np.hypot(boxes[:, 0], boxes[:, 1])
+    scales = cpa_scales(ranges, params.cpa)
+    augmented = (scales < 1.0).any(axis=1)
+    final = plain.copy()
+    if augmented.any():
+        chosen = np.flatnonzero(augmented)
+        points, start = group_points(xyz, labels, kept[chosen] + 1)
+        final[chosen] = similarity(silhouettes(points, start, scales[chosen]), seed.silhouette)
+    t3 = perf_counter()
+
+    def detections(scores, accepted):
+        return Detections.of(boxes[accepted], PEDESTRIAN, scores[accepted])
+
+    return Candidates(detections(plain, np.ones(len(kept), bool)),
+                      detections(plain, plain >= params.stm.threshold),
+                      detections(final, final >= params.stm.threshold),
+                      dict(height=(t1 - t0) * 1e3, stm=(t2 - t1) * 1e3, cpa=(t3 - t2) * 1e3))
+
+
+def group_points(xyz: np.ndarray, labels: np.ndarray,
+                 wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """points (M, 3) of the clusters `wanted` (K,) of ids, one cluster after the other, and
+    start (K + 1,) where each begins."""
+    place = np.full(int(labels.max(initial=0)) + 1, -1)
+    place[wanted] = np.arange(len(wanted))
+    group = place[labels]
+    members = np.flatnonzero(group >= 0)
+    members = members[np.argsort(group[members], kind="stable")]
+    sizes = np.bincount(group[members], minlength=len(wanted))
+    return xyz[members], np.concatenate([[0], np.cumsum(sizes)])

@@ -1,0 +1,1 @@
+"""Recorded data: KITTI folders and rosbag2 bags."""

@@ -1,0 +1,142 @@
+"""KITTI labels <-> GroundTruth in the LiDAR frame, without loss.
+
+label_2 (object), label_02 (tracking) and tracklet_labels.xml (raw).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from lidar_perception.geometry import wrap_angle
+from lidar_perception.types import CLASSES, GroundTruth, InputError
+
+# The label file's own names and numbers, in its order; they travel in GroundTruth.extras.
+COLUMNS = ("truncated", "occluded", "alpha", "bbox", "dimensions", "location", "rotation_y")
+OTHER_NAMES = {"Person": "Person_sitting"}  # the tracking benchmark's name
+RAW_NAMES = {"Person (sitting)": "Person_sitting"}
+
+
+def read_object_labels(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
+    """The objects of one label_2 file; lidar_to_camera (4, 4)."""
+    return to_ground_truth([parse(line, path, i) for i, line in _lines(path)], lidar_to_camera)
+
+
+def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray) -> dict[int, GroundTruth]:
+    """Frame number -> objects, of one label_02 file. Frames without objects are left out."""
+    frames: dict[int, list[dict]] = {}
+    for i, line in _lines(path):
+        try:
+            frame, track, rest = line.split(maxsplit=2)
+            frames.setdefault(int(frame), []).append(
+                dict(parse(rest, path, i), track_id=int(track)))
+        except ValueError as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{path}:{i} is no tracking label: {line!r}") from None
+    return {k: to_ground_truth(v, lidar_to_camera) for k, v in frames.items()}
+
+
+def parse(line: str, path: Path | str = "label", number: int = 0) -> dict:
+    """One label line as a dict: class, the COLUMNS, and score where the line has one."""
+    words = line.split()
+    try:
+        numbers = [float(w) for w in words[1:]]
+        if len(numbers) not in (14, 15):
+            raise ValueError
+    except ValueError:
+        raise InputError(f"{path}:{number} is no KITTI label (a class and 14 or 15 numbers): "
+                         f"{line!r}") from None
+    name = OTHER_NAMES.get(words[0], words[0])
+    if name not in CLASSES:
+        raise InputError(f"{path}:{number} has the unknown class {words[0]!r}; known are "
+                         f"{', '.join(CLASSES)}")
+    label = {"class": name, "truncated": numbers[0], "occluded": int(numbers[1]),
+             "alpha": numbers[2], "bbox": numbers[3:7], "dimensions": numbers[7:10],
+             "location": numbers[10:13], "rotation_y": numbers[13]}
+    if len(numbers) == 15:
+        label["score"] = numbers[14]
+    return label
+
+
+def to_ground_truth(labels: list[dict], lidar_to_camera: np.ndarray) -> GroundTruth:
+    """Boxes in the LiDAR frame. Objects without a 3D box (DontCare) become notes."""
+    to_lidar = np.linalg.inv(lidar_to_camera)
+    boxes, class_ids, extras, notes = [], [], [], []
+    for label in labels:
+        extra = {k: v for k, v in label.items() if k != "class"}
+        h, w, length = label["dimensions"]
+        if min(h, w, length) <= 0:
+            notes.append((label["class"], extra))
+            continue
+        x, y, z = label["location"]  # centre of the bottom face; y points down
+        centre = to_lidar @ [x, y - h / 2, z, 1.0]
+        heading = to_lidar[:3, :3] @ [np.cos(label["rotation_y"]), 0, -np.sin(label["rotation_y"])]
+        boxes.append([*centre[:3], length, w, h, np.arctan2(heading[1], heading[0])])
+        class_ids.append(CLASSES.index(label["class"]))
+        extras.append(extra)
+    return GroundTruth.of(boxes, class_ids, extras, notes)
+
+
+def to_labels(truth: GroundTruth, lidar_to_camera: np.ndarray) -> list[dict]:
+    """The inverse of to_ground_truth up to order (notes come last). What extras do not hold is
+    computed from the box; the 2D box is then zero."""
+    labels = []
+    for box, name, extra in zip(truth.boxes, truth.labels, truth.extras):
+        labels.append({"class": name, **camera_box(box, lidar_to_camera), **extra})
+    return labels + [{"class": name, **extra} for name, extra in truth.notes]
+
+
+def camera_box(box: np.ndarray, lidar_to_camera: np.ndarray) -> dict:
+    """dimensions, location, rotation_y and alpha of a LiDAR box (7,); nothing truncated."""
+    x, y, z, length, w, h, yaw = (float(v) for v in box)
+    centre = lidar_to_camera @ [x, y, z, 1.0]
+    heading = lidar_to_camera[:3, :3] @ [np.cos(yaw), np.sin(yaw), 0.0]
+    rotation = float(np.arctan2(-heading[2], heading[0]))
+    location = [float(centre[0]), float(centre[1] + h / 2), float(centre[2])]
+    alpha = float(wrap_angle(rotation - np.arctan2(location[0], location[2])))
+    return {"truncated": 0.0, "occluded": 0, "alpha": alpha, "bbox": [0.0] * 4,
+            "dimensions": [h, w, length], "location": location, "rotation_y": rotation}
+
+
+def format_label(label: dict, decimals: int = 2) -> str:
+    """The label_2 line of a label."""
+    numbers = [label["alpha"], *label["bbox"], *label["dimensions"], *label["location"],
+               label["rotation_y"]] + ([label["score"]] if "score" in label else [])
+    words = [label["class"], label["truncated"], str(label["occluded"]), *numbers]
+    if label["class"] == "DontCare":  # KITTI writes its -1, -10 and -1000 as whole numbers
+        return " ".join(f"{w:g}" if w in (-1, -10, -1000) else f"{w:.{decimals}f}"
+                        if isinstance(w, float) else w for w in words)
+    return " ".join(f"{w:.{decimals}f}" if isinstance(w, float) else w for w in words)
+
+
+def read_tracklets(path: Path) -> dict[int, GroundTruth]:
+    """Frame number -> objects, of a raw recording's tracklet_labels.xml (LiDAR frame already)."""
+    try:
+        tracklets = ElementTree.parse(path).getroot().find("tracklets")
+        items = [t for t in tracklets if t.tag == "item"]
+        frames: dict[int, list] = {}
+        for track, item in enumerate(items):
+            name = RAW_NAMES.get(item.findtext("objectType"), item.findtext("objectType"))
+            h, w, length = (float(item.findtext(k)) for k in "hwl")
+            first = int(item.findtext("first_frame"))
+            poses = [p for p in item.find("poses") if p.tag == "item"]
+            for i, pose in enumerate(poses):
+                x, y, z, yaw = (float(pose.findtext(k)) for k in ("tx", "ty", "tz", "rz"))
+                extra = {"track_id": track, "occluded": int(float(pose.findtext("occlusion", "0"))),
+                         "truncated": float(pose.findtext("truncation", "0"))}
+                frames.setdefault(first + i, []).append(
+                    ([x, y, z + h / 2, length, w, h, yaw], CLASSES.index(name), extra))
+    except (OSError, ElementTree.ParseError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"cannot read the tracklets {path}: {error}") from None
+    return {k: GroundTruth.of(*map(list, zip(*objects))) for k, objects in frames.items()}
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    try:
+        text = path.read_text()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the labels {path}: {error}") from None
+    return [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]

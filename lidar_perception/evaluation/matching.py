@@ -1,0 +1,66 @@
+"""Detections to ground truth by centre distance (paper A, Section 3.8)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+RANGE_NAMES = ("0-15", "15-30", "30-45", "45-60", "60+")
+RANGE_LIMITS = np.array([15.0, 30.0, 45.0, 60.0])
+MAX_CENTRE_DISTANCE = 1.0  # metres, Section 3.8
+
+
+def match_centres(found: np.ndarray, truth: np.ndarray,
+                  max_distance: float = MAX_CENTRE_DISTANCE) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (P,), (P,) of row numbers of found (K, >=3) and truth (M, >=3) whose 3D centres are at
+    most max_distance apart, one to one: as many pairs as possible, then the least distance."""
+    if len(found) == 0 or len(truth) == 0:
+        return np.zeros(0, int), np.zeros(0, int)
+    distance = np.linalg.norm(found[:, None, :3].astype(float) - truth[None, :, :3], axis=2)
+    too_far = distance > max_distance
+    # One forbidden pair costs more than all allowed ones together.
+    rows, columns = linear_sum_assignment(np.where(too_far, max_distance * (distance.size + 1),
+                                                   distance))
+    keep = ~too_far[rows, columns]
+    return rows[keep], columns[keep]
+
+
+def range_bins(boxes: np.ndarray) -> np.ndarray:
+    """(K,) index into RANGE_NAMES of the horizontal range of box centres (K, >=2)."""
+    return np.searchsorted(RANGE_LIMITS, np.hypot(boxes[:, 0], boxes[:, 1]), side="right")
+
+
+class Score:
+    """Counts of one stage, by range: true and false positives, misses, centre errors.
+
+    A true positive and a miss belong to the range of the true object, a false positive to its own.
+    """
+
+    def __init__(self) -> None:
+        self.tp, self.fp, self.fn = (np.zeros(len(RANGE_NAMES), int) for _ in range(3))
+        self.error = np.zeros(len(RANGE_NAMES))
+
+    def add(self, found: np.ndarray, truth: np.ndarray) -> None:
+        """One frame: found boxes (K, 7), true boxes (M, 7)."""
+        i, j = match_centres(found, truth)
+        true_bin, found_bin = range_bins(truth), range_bins(found)
+        bins = len(RANGE_NAMES)
+        hits = np.bincount(true_bin[j], minlength=bins)
+        self.tp += hits
+        self.fn += np.bincount(true_bin, minlength=bins) - hits
+        self.fp += np.bincount(np.delete(found_bin, i), minlength=bins)
+        error = np.linalg.norm(found[i, :3].astype(float) - truth[j, :3], axis=1)
+        self.error += np.bincount(true_bin[j], weights=error, minlength=bins)
+
+    def table(self) -> dict[str, dict]:
+        """Range name (and 'all') to tp, fp, fn, precision, recall, f1, centre_error_m. A ratio
+        without cases is 0; centre_error_m is None without hits."""
+        rows = {name: self._row(i) for i, name in enumerate(RANGE_NAMES)}
+        return {**rows, "all": self._row(slice(None))}
+
+    def _row(self, index) -> dict:
+        tp, fp, fn = (int(np.sum(a[index])) for a in (self.tp, self.fp, self.fn))
+        return dict(tp=tp, fp=fp, fn=fn, precision=tp / (tp + fp) if tp + fp else 0.0,
+                    recall=tp / (tp + fn) if tp + fn else 0.0,
+                    f1=2 * tp / (2 * tp + fp + fn) if tp + fp + fn else 0.0,
+                    centre_error_m=float(np.sum(self.error[index])) / tp if tp else None)

@@ -1,0 +1,49 @@
+"""Tables for people."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.table import Table
+
+from lidar_perception.candidates.refine import STAGES
+from lidar_perception.evaluation.matching import RANGE_NAMES
+
+STAGE_TITLES = {"stage1": "stage 1 (clusters of the seed's height)", "stage2": "stage 2 (STM)",
+                "final": "final (STM + CPA)"}
+# Paper A, Table 6: recall, precision, F1 in percent, centre error in metres
+PAPER = {"stage1": (55.5, 27.6, 36.8, 0.15), "stage2": (44.7, 60.5, 51.4, 0.14),
+         "final": (46.7, 58.8, 52.1, 0.16)}
+
+
+def print_candidate_report(content: dict, console: Console, paper: bool = True) -> None:
+    """Scores by range and stage, beside the paper's overall figures, and times of the steps."""
+    table = Table(title=f"Pedestrian candidates: {content['ground_truth']} pedestrians in "
+                        f"{content['frames']} frames, 3D centre within 1.0 m")
+    for name in ("stage", "range [m]", "TP", "FP", "FN", "recall", "precision", "F1",
+                 "error [m]"):
+        table.add_column(name, justify="left" if name == "stage" else "right", no_wrap=True)
+    for stage in [s for s in STAGES if s in content]:
+        for name in (*RANGE_NAMES, "all"):
+            row = content[stage][name]
+            if row["tp"] + row["fp"] + row["fn"] == 0 and name != "all":
+                continue
+            table.add_row(STAGE_TITLES[stage] if name == "all" else "", name, str(row["tp"]),
+                          str(row["fp"]), str(row["fn"]),
+                          *(f"{100 * row[k]:.1f}" for k in ("recall", "precision", "f1")),
+                          "-" if row["centre_error_m"] is None else f"{row['centre_error_m']:.2f}",
+                          style="bold" if name == "all" else "")
+        if paper:
+            recall, precision, f1, error = PAPER[stage]
+            table.add_row("paper, 1779 KITTI frames", "all", "", "", "", f"{recall}",
+                          f"{precision}", f"{f1}", f"{error:.2f}", style="dim", end_section=True)
+    console.print(table)
+    if content["ms"]:
+        times = Table(title="Median time a frame")
+        for step in content["ms"]:
+            times.add_column(step, justify="right")
+        times.add_row(*(f"{ms:.2f} ms" for ms in content["ms"].values()))
+        console.print(times)
+    for line in content.get("skipped", [])[:5]:
+        console.print(f"[yellow]skipped[/]: {line}", highlight=False)
+    if len(content.get("skipped", [])) > 5:
+        console.print(f"[yellow]skipped[/]: {len(content['skipped']) - 5} more, see the JSON file")

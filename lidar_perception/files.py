@@ -1,0 +1,18 @@
+"""Writing files so that a crash never destroys what was there."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write, fsync, rename: path holds the old text or the whole new one, never a part."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with open(temporary, "w", encoding="utf-8") as stream:
+        stream.write(text if text.endswith("\n") else text + "\n")
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(path)

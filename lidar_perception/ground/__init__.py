@@ -1,0 +1,1 @@
+"""Ground segmentation: a frame to an (N,) bool mask, True = ground."""

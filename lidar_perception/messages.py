@@ -1,0 +1,109 @@
+"""ROS messages <-> the core's types, for nodes and bags alike (either kind of message class)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.camera import Camera
+from lidar_perception.datasets.kitti_calibration import KittiCalibration
+from lidar_perception.topics import CAMERA_FRAME
+from lidar_perception.types import (
+    CLASSES,
+    Detections,
+    GroundTruth,
+    InputError,
+    LidarFrame,
+    usable_returns,
+)
+from msg_utils.markers import MarkedObjects, to_marker_array
+from msg_utils.point_cloud2 import CloudError, to_array, xyz
+from msg_utils.stamps import to_ns
+
+
+def to_frame(msg: Any) -> tuple[LidarFrame, np.ndarray]:
+    """The usable points of a PointCloud2 and the mask (height * width,) bool that chose them;
+    per-point results go back to the whole cloud with spread(). InputError for a broken cloud."""
+    try:
+        points = xyz(to_array(msg))
+    except CloudError as error:
+        raise InputError(str(error)) from None
+    usable = usable_returns(points)
+    return LidarFrame(points if usable.all() else points[usable], None, to_ns(msg.header.stamp),
+                      msg.header.frame_id), usable
+
+
+def spread(values: np.ndarray, usable: np.ndarray, dtype: str) -> np.ndarray:
+    """Values (N,) of the usable points as a column of the whole cloud; 0 elsewhere."""
+    column = np.zeros(len(usable), dtype)
+    column[usable] = values
+    return column
+
+
+def camera_of(info: Any, transform: Any) -> Camera:
+    """Camera from CameraInfo and the TransformStamped between the LiDAR frame and the camera's,
+    in either direction. InputError when P is empty or the frames do not fit."""
+    intrinsics = np.asarray(info.p, float).reshape(3, 4)
+    if intrinsics[0, 0] <= 0 or info.width == 0 or info.height == 0:
+        raise InputError("CameraInfo has no projection matrix P or no image size; calibrate the "
+                         "camera or set view.enabled to false")
+    t, q = transform.transform.translation, transform.transform.rotation
+    rotation, translation = np.array([q.x, q.y, q.z, q.w]), np.array([t.x, t.y, t.z])
+    if not abs(np.linalg.norm(rotation) - 1) < 1e-3:
+        raise InputError("the LiDAR-to-camera transform has no unit quaternion")
+    parent, child = transform.header.frame_id, transform.child_frame_id
+    if info.header.frame_id == parent:  # the LiDAR's pose in the camera frame: turn it round
+        return Camera.of_lidar_pose(intrinsics, rotation, translation, info.width, info.height)
+    if info.header.frame_id != child:
+        raise InputError(f"CameraInfo is in frame '{info.header.frame_id}' but the transform links "
+                         f"'{parent}' and '{child}'")
+    return Camera.of(intrinsics, rotation, translation, info.width, info.height)
+
+
+def camera_info(calibration: KittiCalibration, header: Any, make: Any) -> Any:
+    p = calibration.intrinsics
+    return make("sensor_msgs/msg/CameraInfo", header=header, height=calibration.height,
+                width=calibration.width, distortion_model="plumb_bob", d=np.zeros(5),
+                k=p[:, :3].ravel().copy(), r=np.eye(3).ravel(), p=p.ravel().copy())
+
+
+def extrinsics(calibration: KittiCalibration, header: Any, make: Any) -> Any:
+    """TransformStamped: the camera frame in the LiDAR frame of header."""
+    rotation, translation = calibration.pose
+    x, y, z = map(float, translation)
+    qx, qy, qz, qw = map(float, rotation)
+    return make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=CAMERA_FRAME,
+                transform=make("geometry_msgs/msg/Transform",
+                               translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+                               rotation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz,
+                                             w=qw)))
+
+
+def truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()) -> Any:
+    """MarkerArray of the labels. Objects keep the marker id of their track."""
+    ids = [extra.get("track_id") for extra in truth.extras]
+    if None in ids or len(set(zip(truth.labels, ids))) < len(ids):
+        ids = None
+    return to_marker_array(truth.boxes, truth.labels, header=header, make=make, ids=ids,
+                           extras=truth.extras, notes=truth.notes, previous=previous)
+
+
+def to_truth(objects: MarkedObjects) -> GroundTruth:
+    """Labels from markers; objects of unknown class are Misc."""
+    return GroundTruth.of(objects.boxes, _class_ids(objects.labels), objects.extras, objects.notes)
+
+
+def to_detections(objects: MarkedObjects) -> Detections:
+    return Detections.of(objects.boxes, np.array(_class_ids(objects.labels), np.int32),
+                         objects.scores)
+
+
+def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = ()) -> Any:
+    labels = [CLASSES[i] for i in detections.class_ids]
+    return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
+                           previous=previous)
+
+
+def _class_ids(labels: list[str]) -> list[int]:
+    return [CLASSES.index(x if x in CLASSES else "Misc") for x in labels]

@@ -1,0 +1,199 @@
+"""Replays a rosbag2 bag: CDR bytes from the file to DDS, never decoded."""
+
+from __future__ import annotations
+
+import importlib.util
+from time import monotonic
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import Trigger
+
+from lidar_perception.datasets.bag import Bag
+from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
+from lidar_perception.params import PlayerParams
+from lidar_perception.types import InputError
+from msg_utils.messages import message_class, ros_message
+from msg_utils.stamps import SECOND, time_message
+
+
+class BagPlayer(LidarNode):
+    """Ends with exit code 0 when the bag is played, unless it loops.
+
+    Services (std_srvs/Trigger): ~/pause, ~/resume, ~/step (one message of the busiest topic and
+    what comes before it). The speed is the parameter `rate`; ~/set_rate exists too where
+    rosbag2_interfaces is installed.
+    """
+
+    def __init__(self, **options: Any):
+        super().__init__("bag_player", PlayerParams(), **options)
+        if not self.params.bag:
+            raise InputError("parameter 'bag' is empty; give the folder of a rosbag2 bag")
+        self.bag = Bag(self.params.bag)
+        self.names = self._chosen_topics()
+        self.publishers_by_topic = {t: p for t in self.names if (p := self._publisher(t))}
+        if not self.publishers_by_topic:
+            raise InputError(f"{self.params.bag}: nothing to play; no topic is left of "
+                             f"{', '.join(self.bag.topics) or 'an empty bag'}")
+        self.start_ns = self.bag.start_ns + int(self.params.start_offset * SECOND)
+        self.stop_ns = (self.start_ns + int(self.params.duration * SECOND)
+                        if self.params.duration else None)
+        self.paused = self.params.start_paused
+        self.steps = 0
+        self.step_topic = max(self.publishers_by_topic, key=lambda t: (
+            "PointCloud2" in self.bag.topics[t], self.bag.counts[t]))
+        self.now_ns, self.anchor = self.start_ns, monotonic()
+        self.clock = self.params.clock_hz and self.create_publisher(Clock, "/clock", RELIABLE)
+        self.next_clock = 0.0
+        for name, action in (("pause", self._pause), ("resume", self._resume),
+                             ("step", self._step)):
+            self.create_service(Trigger, f"~/{name}", action)
+        if importlib.util.find_spec("rosbag2_interfaces"):
+            from rosbag2_interfaces.srv import SetRate
+            self.create_service(SetRate, "~/set_rate", self._set_rate)
+
+    def _chosen_topics(self) -> dict[str, str]:
+        """Topic in the bag -> topic as played."""
+        for topic in self.params.topics:
+            self.bag.require(topic)
+        names = {t: t for t in (self.params.topics or self.bag.topics)}
+        for rule in self.params.remap:
+            old, separator, new = rule.partition(":=")
+            if not separator or old not in names:
+                raise InputError(f"remap '{rule}' must be OLD:=NEW with one of the topics "
+                                 f"{', '.join(names)}")
+            names[old] = new
+        return names
+
+    def _publisher(self, topic: str) -> Any:
+        kind = self.bag.topics[topic]
+        try:
+            return self.output(self.names[topic], message_class(kind), _qos(self.bag.qos(topic)))
+        except (ModuleNotFoundError, AttributeError):
+            self.get_logger().warning(f"{topic} is not played: {kind} is not installed here")
+            return None
+
+    def _latched(self, topic: str) -> bool:
+        return any(q.durability.name == "TRANSIENT_LOCAL" for q in self.bag.qos(topic))
+
+    def spin(self, executor: SingleThreadedExecutor) -> None:
+        """Play; services and parameters are served between messages."""
+        self.serve = executor.spin_once
+        self._wait_for_subscribers()
+        self.report(OK, f"playing {self.params.bag}")
+        while rclpy.ok():
+            self._play_once()
+            if not self.params.loop:
+                break
+        self.report(OK, "the bag is played")
+        self._wait_until_delivered()
+
+    def _wait_for_subscribers(self) -> None:
+        wanted = [p for t, p in self.publishers_by_topic.items()
+                  if self.names[t] in self.params.wait_for]
+        give_up = monotonic() + self.params.wait_timeout
+        while rclpy.ok() and any(p.get_subscription_count() == 0 for p in wanted):
+            if monotonic() > give_up:
+                missing = [p.topic_name for p in wanted if p.get_subscription_count() == 0]
+                self.report(WARN, f"nobody subscribes to {', '.join(missing)}; playing anyway")
+                return
+            self.serve(timeout_sec=0.02)
+
+    def _wait_until_delivered(self) -> None:
+        from rclpy.duration import Duration
+        for publisher in self.publishers_by_topic.values():
+            if rclpy.ok():
+                publisher.wait_for_all_acked(Duration(seconds=2))
+
+    def _play_once(self) -> None:
+        self._publish_latched()
+        self.now_ns, self.anchor = self.start_ns, monotonic()
+        for topic, stamp, data in self.bag.raw(self.publishers_by_topic, self.start_ns,
+                                               self.stop_ns):
+            if not self._wait_until(stamp, topic):
+                return
+            self.publishers_by_topic[topic].publish(data)
+            self.counts["frames"] += topic == self.step_topic
+            self.last_stamp_ns = stamp
+
+    def _publish_latched(self) -> None:
+        """The last message of each latched topic before the start, so that none is missed."""
+        before = {}
+        latched = {t for t in self.publishers_by_topic if self._latched(t)}
+        if self.start_ns > self.bag.start_ns and latched:
+            for topic, _, data in self.bag.raw(latched, None, self.start_ns):
+                before[topic] = data
+        for topic, data in before.items():
+            self.publishers_by_topic[topic].publish(data)
+
+    def _wait_until(self, stamp: int, topic: str) -> bool:
+        """Serve until it is time for stamp; False when the node shall end."""
+        while rclpy.ok():
+            self._advance()
+            if self.steps and self.paused:
+                self.now_ns = stamp
+                self.steps -= topic == self.step_topic
+                return True
+            behind = (stamp - self.now_ns) / SECOND / self.params.rate
+            if behind <= 0 and not self.paused:
+                return True
+            wait = 0.05 if self.paused else min(behind, 0.05)
+            self.serve(timeout_sec=wait)
+        return False
+
+    def _advance(self) -> None:
+        """Move the bag's time by the time that went by, at the present rate."""
+        now = monotonic()
+        if not self.paused:
+            self.now_ns += int((now - self.anchor) * self.params.rate * SECOND)
+        self.anchor = now
+        if self.clock and now >= self.next_clock:
+            self.next_clock = now + 1 / self.params.clock_hz
+            self.clock.publish(Clock(clock=time_message(self.now_ns, ros_message)))
+
+    def _pause(self, _: Any, response: Any) -> Any:
+        self._advance()
+        self.paused = True
+        return _done(response, "paused")
+
+    def _resume(self, _: Any, response: Any) -> Any:
+        self._advance()
+        self.paused = False
+        return _done(response, "playing")
+
+    def _step(self, _: Any, response: Any) -> Any:
+        if not self.paused:
+            return _done(response, "pause first", success=False)
+        self.steps += 1
+        return _done(response, f"next message of {self.step_topic}")
+
+    def _set_rate(self, request: Any, response: Any) -> Any:
+        from rclpy.parameter import Parameter
+        self._advance()
+        result = self.set_parameters([Parameter("rate", value=float(request.rate))])[0]
+        response.success = result.successful
+        return response
+
+    def close(self) -> None:
+        self.bag.reader.close()
+
+
+def _done(response: Any, message: str, success: bool = True) -> Any:
+    response.success, response.message = success, message
+    return response
+
+
+def _qos(profiles: list) -> QoSProfile:
+    """The recorded profile; what it leaves open is reliable and volatile."""
+    if not profiles:
+        return RELIABLE
+    recorded = profiles[0]
+    return QoSProfile(
+        depth=max(recorded.depth, 10),
+        reliability=ReliabilityPolicy.BEST_EFFORT if recorded.reliability.name == "BEST_EFFORT"
+        else ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL
+        if recorded.durability.name == "TRANSIENT_LOCAL" else DurabilityPolicy.VOLATILE)

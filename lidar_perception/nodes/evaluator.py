@@ -1,0 +1,72 @@
+"""Scores detections against ground truth as they come; paper A's protocol."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from std_msgs.msg import Float64
+from visualization_msgs.msg import MarkerArray
+
+from lidar_perception.evaluation.candidates import CandidateReport
+from lidar_perception.files import write_text
+from lidar_perception.messages import to_truth
+from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
+from lidar_perception.params import EvaluatorParams
+from lidar_perception.types import PEDESTRIAN, InputError
+from msg_utils.markers import from_marker_array
+
+WRITE_PERIOD = 5.0  # seconds
+WAITING_FRAMES = 100
+
+
+class Evaluator(LidarNode):
+    """A frame is scored when its ground truth and every stage's detections have come, matched by
+    header.stamp. Frames that stay incomplete are counted as lost, never as misses."""
+
+    def __init__(self, **options: Any):
+        super().__init__("evaluator", EvaluatorParams(), **options)
+        self.result = CandidateReport()
+        self.waiting: dict[int, dict[str, Any]] = {}
+        self.input("ground_truth", MarkerArray, lambda m: self._add("truth", m), RELIABLE)
+        for stage in self.params.stages:
+            self.input(stage, MarkerArray, lambda m, s=stage: self._add(s, m), RELIABLE)
+        for topic in self.params.timing:
+            name = topic.split("/")[1]
+            self.input(topic, Float64, lambda m, n=name: self.result.add_times({n: m.data}),
+                       RELIABLE)
+        self.create_timer(WRITE_PERIOD, self.write)
+
+    def _add(self, kind: str, msg: Any) -> None:
+        objects = from_marker_array(msg)
+        if not msg.markers:
+            raise InputError("an empty MarkerArray has no stamp, so it cannot be matched; send a "
+                             "DELETE marker with the header of the frame")
+        frame = self.waiting.setdefault(objects.stamp_ns, {})
+        frame[kind] = objects
+        if len(frame) == 1 + len(self.params.stages):
+            del self.waiting[objects.stamp_ns]
+            self._score(frame)
+        while len(self.waiting) > WAITING_FRAMES:
+            self.waiting.pop(next(iter(self.waiting)))
+            self.counts["lost"] += 1
+            self.report(WARN, "frames without ground truth or detections of the same header.stamp")
+
+    def _score(self, frame: dict[str, Any]) -> None:
+        self.counts["frames"] += 1
+        truth = to_truth(frame["truth"]).of_class(PEDESTRIAN)
+        if len(truth) or not self.params.only_with_pedestrians:
+            self.result.add(truth, {s: frame[s].boxes for s in self.params.stages})
+        rows = [f"{s} F1 {score.table()['all']['f1']:.3f}"
+                for s, score in self.result.scores.items()]
+        self.counts.update(scored=self.result.frames)
+        self.report(OK, ", ".join(rows) or "no frame with a Pedestrian yet")
+
+    def write(self) -> None:
+        if self.params.file:
+            content = self.result.content()
+            content["lost_frames"] = self.counts["lost"] + len(self.waiting)
+            write_text(self.params.file, json.dumps(content, indent=1))
+
+    def close(self) -> None:
+        self.write()

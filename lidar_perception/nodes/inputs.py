@@ -1,0 +1,166 @@
+"""Inputs that several nodes share: the camera, and messages that belong to one cloud."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any
+
+from geometry_msgs.msg import PointStamped, TransformStamped
+from sensor_msgs.msg import CameraInfo
+from visualization_msgs.msg import MarkerArray
+
+from lidar_perception.camera import Camera
+from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.messages import camera_of, to_truth
+from lidar_perception.nodes.runtime import LATCHED, RELIABLE, LidarNode
+from lidar_perception.params import SeedParams
+from lidar_perception.pipeline import SeedSource, clicked_seed, fixed_seed, truth_seed
+from lidar_perception.topics import CLICK, TF_STATIC
+from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
+from msg_utils.markers import from_marker_array
+from msg_utils.stamps import to_ns
+
+
+class CameraInput:
+    """The camera from ~/input/camera_info and ~/input/extrinsics, or from /tf_static."""
+
+    def __init__(self, node: LidarNode):
+        self.node = node
+        self.info: Any = None
+        self.transforms: dict[tuple[str, str], Any] = {}
+        self.camera: Camera | None = None
+        node.input("camera_info", CameraInfo, self._on_info, LATCHED)
+        node.input("extrinsics", TransformStamped, self._on_transform, LATCHED)
+        if importlib.util.find_spec("tf2_msgs"):
+            from tf2_msgs.msg import TFMessage
+            node.input(TF_STATIC, TFMessage, lambda m: [*map(self._on_transform, m.transforms)],
+                       LATCHED)
+
+    def _on_info(self, msg: Any) -> None:
+        self.info, self.camera = msg, None
+
+    def _on_transform(self, msg: Any) -> None:
+        self.transforms[msg.header.frame_id, msg.child_frame_id] = msg
+        self.camera = None
+
+    def get(self, lidar_frame: str) -> Camera | None:
+        """The camera as seen from lidar_frame; None until both messages are there."""
+        if self.camera is None and self.info is not None:
+            camera_frame = self.info.header.frame_id
+            transform = (self.transforms.get((lidar_frame, camera_frame))
+                         or self.transforms.get((camera_frame, lidar_frame)))
+            if transform is not None:
+                self.camera = camera_of(self.info, transform)
+        return self.camera
+
+
+class Paired:
+    """Clouds that wait for the message with the same stamp from another topic.
+
+    A cloud is given out with its partner; without one when a later partner or too many clouds
+    have come, as then its own is lost.
+    """
+
+    def __init__(self, deliver: Callable[[Any, Any], None], capacity: int = 5):
+        self.deliver, self.capacity = deliver, capacity
+        self.clouds: OrderedDict[int, Any] = OrderedDict()
+        self.partners: OrderedDict[int, Any] = OrderedDict()
+
+    def add_cloud(self, stamp_ns: int, msg: Any) -> None:
+        self.clouds[stamp_ns] = msg
+        self._flush()
+
+    def add_partner(self, stamp_ns: int, msg: Any) -> None:
+        self.partners[stamp_ns] = msg
+        while len(self.partners) > 20 * self.capacity:
+            self.partners.popitem(last=False)
+        self._flush()
+
+    def clear(self) -> None:
+        self.clouds.clear()
+        self.partners.clear()
+
+    def _flush(self) -> None:
+        while self.clouds:
+            stamp, cloud = next(iter(self.clouds.items()))
+            newest = next(reversed(self.partners), None)
+            partner = self.partners.get(stamp)
+            late = newest is not None and newest > stamp
+            if partner is None and not late and len(self.clouds) <= self.capacity:
+                return
+            del self.clouds[stamp]
+            self.deliver(cloud, partner)
+
+
+class SeedInput:
+    """The seed pedestrian of each cloud, from the source that the parameters name.
+
+    deliver(cloud message, seed source) is called for each cloud, in order. The source raises
+    InputError where there is no seed yet.
+    """
+
+    def __init__(self, node: LidarNode, deliver: Callable[[Any, SeedSource], None]):
+        self.node, self.deliver = node, deliver
+        self.click: PointStamped | None = None
+        self.template = None
+        self.template_file: str | None = None
+        self.paired = Paired(self._deliver_with_truth)
+        node.input("ground_truth", MarkerArray, self._on_truth, RELIABLE)
+        node.input(CLICK, PointStamped, self._on_click, RELIABLE)
+
+    @property
+    def params(self) -> SeedParams:
+        return self.node.params.seed
+
+    def add_cloud(self, msg: Any) -> None:
+        if self.params.source == "ground_truth":
+            self.paired.add_cloud(to_ns(msg.header.stamp), msg)
+        elif self.params.source == "click":
+            self.deliver(msg, self._from_click)
+        else:
+            if self.template_file != self.params.file:
+                self.template, self.template_file = load_seed(self.params.file), self.params.file
+            self.deliver(msg, fixed_seed(self.template))
+
+    def clear(self) -> None:
+        self.paired.clear()
+        self.click = self.template = self.template_file = None
+
+    def _on_truth(self, msg: Any) -> None:
+        objects = from_marker_array(msg)
+        self.paired.add_partner(objects.stamp_ns, to_truth(objects))
+
+    def _deliver_with_truth(self, cloud: Any, truth: Any) -> None:
+        if truth is None:
+            self.deliver(cloud, _missing("no ground truth with the stamp of this cloud; is it "
+                                         "published, with the same header.stamp?"))
+        else:
+            self.deliver(cloud, truth_seed(truth.of_class(PEDESTRIAN)))
+
+    def _on_click(self, msg: Any) -> None:
+        self.click, self.template = msg, None
+
+    def _from_click(self, frame: LidarFrame, segmented: Any):
+        if self.click is None:
+            raise InputError(f"no seed yet: click a pedestrian (a PointStamped on {CLICK}, as RViz "
+                             "and Foxglove publish it)")
+        if self.template is None:
+            if self.click.header.frame_id not in ("", frame.frame_id):
+                raise InputError(f"the clicked point is in frame '{self.click.header.frame_id}' "
+                                 f"but the cloud in '{frame.frame_id}'; set that as the fixed "
+                                 "frame and click again")
+            p = self.click.point
+            self.template = clicked_seed([p.x, p.y, p.z], self.params)(frame, segmented)
+            self.node.get_logger().info(f"seed taken at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), height "
+                                        f"{self.template.height:.2f} m")
+        return self.template
+
+
+def _missing(reason: str) -> SeedSource:
+    def source(frame: LidarFrame, segmented: Any):
+        raise InputError(reason)
+    return source
+
+

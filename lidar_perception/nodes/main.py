@@ -1,0 +1,100 @@
+"""Starts a node: signals first, then compiled code, then ROS. Every executable enters here."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import sys
+from pathlib import Path
+from time import perf_counter
+
+NODES = {  # executable -> class; the module has the executable's name
+    "bag_player": "BagPlayer",
+    "bag_recorder": "BagRecorder",
+    "ground_segmentation": "GroundSegmentation",
+    "clustering": "Clustering",
+    "candidate_refinement": "CandidateRefinement",
+    "evaluator": "Evaluator",
+    "perception": "Perception",
+}
+
+
+def main() -> int:
+    """Entry point of all executables: the node is named by the program's own name."""
+    return run(Path(sys.argv[0]).name.removesuffix(".exe"), sys.argv)
+
+
+PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+SHARED_MEMORY_NEEDED = 256 * 2**20
+
+
+def use_large_shared_memory() -> None:
+    """Let Fast DDS pass whole clouds through shared memory, see fastdds.xml. A profile of the
+    user's own stays; so does the default where /dev/shm is small, as in a container."""
+    if any(os.environ.get(name) for name in PROFILE_VARIABLES):
+        return
+    try:
+        memory = os.statvfs("/dev/shm")
+    except OSError:
+        return
+    if memory.f_bavail * memory.f_frsize < SHARED_MEMORY_NEEDED:
+        print("/dev/shm is small, so large clouds may get lost between processes; start the "
+              "container with --shm-size=1g", file=sys.stderr)
+        return
+    for name in PROFILE_VARIABLES:
+        os.environ[name] = str(Path(__file__).with_name("fastdds.xml"))
+
+
+def run(name: str, arguments: list[str]) -> int:
+    """Run a node until SIGINT or SIGTERM (exit code 0), or until it is done. 2: it cannot start."""
+    # From here on a signal ends the process cleanly, also while imports and compilation run.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: os._exit(0))
+    begin = perf_counter()
+    use_large_shared_memory()
+    try:
+        import rclpy
+    except ImportError:
+        print("rclpy is missing: install ROS 2 Jazzy, or pip install 'lidar_perception[ros]'",
+              file=sys.stderr)
+        return 2
+    module = importlib.import_module(f"lidar_perception.nodes.{name}")
+    if hasattr(module, "warm_up"):
+        module.warm_up()
+    return _spin(getattr(module, NODES[name]), rclpy, arguments, perf_counter() - begin)
+
+
+def _spin(node_class: type, rclpy, arguments: list[str], seconds: float) -> int:
+    from rclpy.exceptions import ParameterException
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+    from lidar_perception.types import InputError
+
+    # rclpy hands on to these: SIGINT raises KeyboardInterrupt, both shut the context down.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    rclpy.init(args=arguments)
+    node = None
+    try:
+        node = node_class()
+        node.get_logger().info(f"ready: code loaded and warmed up in {seconds:.1f} s")
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        node.spin(executor) if hasattr(node, "spin") else executor.spin()
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except (InputError, ValueError, ParameterException) as error:
+        rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
+        return 2
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not cut the clean-up
+        if node is not None:
+            node.close()
+            node.destroy_node()
+        rclpy.try_shutdown()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run(sys.argv[1], sys.argv[1:]))

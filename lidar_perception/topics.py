@@ -1,0 +1,12 @@
+"""Topic names shared by bags, nodes and launch files."""
+
+POINTS = "/points"
+TRUTH = "/ground_truth/detections"
+CAMERA_INFO = "/camera/camera_info"
+EXTRINSICS = "/camera/extrinsics"  # geometry_msgs/TransformStamped, camera in the LiDAR frame
+IMAGE = "/camera/image/compressed"
+TF_STATIC = "/tf_static"
+CLICK = "/clicked_point"           # what RViz and Foxglove publish
+
+LIDAR_FRAME = "velodyne"
+CAMERA_FRAME = "camera"

@@ -1,0 +1,108 @@
+"""The shared types: one LiDAR frame in, detections out.
+
+Frames follow REP-103 (x forward, y left, z up; metres, radians); boxes are
+[x y z l w h yaw] with the centre in x y z.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc",
+           "DontCare")
+PEDESTRIAN = CLASSES.index("Pedestrian")
+
+# Beyond this a coordinate is a broken return, not a point; keeps squares exact enough in float32.
+MAX_COORDINATE = 1e5
+
+
+class InputError(ValueError):
+    """Input that cannot be used. The message is one line: what is wrong, and the remedy."""
+
+
+@dataclass(frozen=True)
+class LidarFrame:
+    """One cloud, with only the returns that can be used.
+
+    xyz (N, 3) float32 metres in frame_id, C-contiguous; intensity (N,) float32 0..1 or None;
+    stamp_ns int. All columns went through one mask, see usable_returns.
+    """
+
+    xyz: np.ndarray
+    intensity: np.ndarray | None = None
+    stamp_ns: int = 0
+    frame_id: str = ""
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+
+def usable_returns(xyz: np.ndarray) -> np.ndarray:
+    """(N,) bool: finite, within 100 km, and not the origin, where drivers put missing returns."""
+    with np.errstate(invalid="ignore"):
+        largest = np.abs(xyz).max(axis=1, initial=0.0)  # NaN and inf survive the maximum
+        return (largest > 0.0) & (largest <= MAX_COORDINATE)
+
+
+@dataclass(frozen=True)
+class Detections:
+    """K boxes: boxes (K, 7) float32 [x y z l w h yaw], class_ids (K,) int32 into CLASSES,
+    scores (K,) float32. No detections is K = 0, never None."""
+
+    boxes: np.ndarray
+    class_ids: np.ndarray
+    scores: np.ndarray
+
+    @staticmethod
+    def of(boxes, class_ids=PEDESTRIAN, scores=1.0) -> Detections:
+        """Detections with dtypes and shapes put right; class_ids and scores may be scalars."""
+        boxes = np.ascontiguousarray(boxes, np.float32).reshape(-1, 7)
+        count = len(boxes)
+        return Detections(boxes, np.broadcast_to(np.asarray(class_ids, np.int32), count).copy(),
+                          np.broadcast_to(np.asarray(scores, np.float32), count).copy())
+
+    @staticmethod
+    def none() -> Detections:
+        return Detections.of(np.zeros((0, 7)))
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    def __getitem__(self, index) -> Detections:
+        """The detections under a mask, slice or index array."""
+        return Detections(self.boxes[index], self.class_ids[index], self.scores[index])
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """The labelled objects of one frame, in the LiDAR frame.
+
+    boxes (K, 7) float64 [x y z l w h yaw], class_ids (K,) int into CLASSES, extras K dicts with
+    what else is known: track_id, truncated, occluded, alpha, bbox [left top right bottom] pixels.
+    notes: (class, extras) of objects without a 3D box, such as KITTI's DontCare regions.
+    """
+
+    boxes: np.ndarray
+    class_ids: np.ndarray
+    extras: tuple[dict, ...]
+    notes: tuple[tuple[str, dict], ...] = ()
+
+    @staticmethod
+    def of(boxes, class_ids, extras=None, notes=()) -> GroundTruth:
+        boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
+        extras = tuple({} for _ in boxes) if extras is None else tuple(extras)
+        return GroundTruth(boxes, np.asarray(class_ids, np.int32).reshape(len(boxes)), extras,
+                           tuple(notes))
+
+    def __len__(self) -> int:
+        return len(self.boxes)
+
+    @property
+    def labels(self) -> list[str]:
+        return [CLASSES[i] for i in self.class_ids]
+
+    def of_class(self, class_id: int) -> np.ndarray:
+        """(M, 7) boxes of one class."""
+        return self.boxes[self.class_ids == class_id]

@@ -1,0 +1,42 @@
+"""Labelled boxes <-> vision_msgs/Detection3DArray, for stacks that have vision_msgs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from msg_utils.markers import MarkedObjects, box_pose, pose_yaw
+from msg_utils.stamps import to_ns
+
+
+def to_detection_array(boxes: np.ndarray, labels: Sequence[str], scores: Sequence[float], *,
+                       header: Any, make: Any) -> Any:
+    """Detection3DArray of boxes (K, 7) [x y z l w h yaw], one hypothesis each."""
+    detections = []
+    for i, (box, label, score) in enumerate(zip(np.asarray(boxes, float).reshape(-1, 7), labels,
+                                                scores, strict=True)):
+        pose, (length, width, height) = box_pose(box, make), map(float, box[3:6])
+        hypothesis = make("vision_msgs/msg/ObjectHypothesis", class_id=label, score=float(score))
+        detections.append(make(
+            "vision_msgs/msg/Detection3D", header=header, id=str(i),
+            results=[make("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis,
+                          pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose))],
+            bbox=make("vision_msgs/msg/BoundingBox3D", center=pose,
+                      size=make("geometry_msgs/msg/Vector3", x=length, y=width, z=height))))
+    return make("vision_msgs/msg/Detection3DArray", header=header, detections=detections)
+
+
+def from_detection_array(msg: Any) -> MarkedObjects:
+    """The objects of a Detection3DArray, each with its most likely class."""
+    boxes, labels, scores = [], [], []
+    for d in msg.detections:
+        p, s = d.bbox.center.position, d.bbox.size
+        boxes.append([p.x, p.y, p.z, s.x, s.y, s.z, pose_yaw(d.bbox.center)])
+        best = max(d.results, key=lambda r: r.hypothesis.score, default=None)
+        labels.append(best.hypothesis.class_id if best else "")
+        scores.append(best.hypothesis.score if best else 1.0)
+    return MarkedObjects(np.array(boxes, float).reshape(-1, 7), labels, np.array(scores, float),
+                         np.arange(len(boxes)), [{} for _ in boxes], [],
+                         to_ns(msg.header.stamp), msg.header.frame_id)

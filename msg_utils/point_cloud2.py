@@ -1,0 +1,167 @@
+"""sensor_msgs/PointCloud2 <-> NumPy structured arrays: any field order, padding, datatype,
+count, endianness and row padding."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+# sensor_msgs/PointField datatypes
+DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+CODES = {kind: code for code, kind in DATATYPES.items()}
+
+
+class CloudError(ValueError):
+    """A cloud that cannot be read. The message is one line: what is wrong, and the remedy."""
+
+
+def dtype_of(msg: Any) -> np.dtype:
+    """The structured dtype of a cloud's points, itemsize = point_step, in the cloud's byte order.
+
+    Fields without a name are padding. CloudError for an unknown datatype, a field that reaches
+    past point_step, or a name that comes twice.
+    """
+    order = ">" if msg.is_bigendian else "<"
+    names, formats, offsets = [], [], []
+    for f in msg.fields:
+        if not f.name:
+            continue
+        if f.datatype not in DATATYPES:
+            raise CloudError(f"field '{f.name}' has datatype {f.datatype}; "
+                             "sensor_msgs/PointField knows 1 to 8")
+        if f.name in names:
+            raise CloudError(f"field '{f.name}' comes twice; give each field its own name")
+        base = np.dtype(order + DATATYPES[f.datatype])
+        names.append(f.name)
+        formats.append((base, (f.count,)) if f.count > 1 else base)
+        offsets.append(f.offset)
+        if f.offset + base.itemsize * max(f.count, 1) > msg.point_step:
+            raise CloudError(f"field '{f.name}' at offset {f.offset} reaches past point_step = "
+                             f"{msg.point_step}; the driver's field offsets are wrong")
+    return np.dtype(dict(names=names, formats=formats, offsets=offsets, itemsize=msg.point_step))
+
+
+def to_array(msg: Any) -> np.ndarray:
+    """The points of a cloud, (height * width,) structured, row by row.
+
+    A read-only view of the message's buffer; copied only where rows are padded. CloudError when
+    the buffer is shorter than height, width and the steps say.
+    """
+    count = msg.height * msg.width
+    if count == 0:
+        return np.zeros(0, dtype_of(msg) if msg.point_step else np.dtype([]))
+    if msg.point_step == 0:
+        raise CloudError(f"point_step is 0 for {count} points; the message is broken")
+    dtype = dtype_of(msg)
+    data = np.frombuffer(msg.data, np.uint8)
+    row = msg.width * msg.point_step
+    if msg.height > 1 and msg.row_step < row:
+        raise CloudError(f"row_step = {msg.row_step} is less than width x point_step = {row}")
+    step = msg.row_step if msg.height > 1 else row
+    needed = (msg.height - 1) * step + row
+    if len(data) < needed:
+        raise CloudError(f"data has {len(data)} bytes where height {msg.height} x width "
+                         f"{msg.width} x point_step {msg.point_step} needs {needed}; "
+                         "the message was cut")
+    rows = np.ndarray((msg.height, msg.width), dtype, data, strides=(step, msg.point_step))
+    rows.flags.writeable = False
+    return rows.reshape(count)
+
+
+def columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
+    """(N, len(names)) float32 of the named fields. CloudError names fields that are missing or
+    hold more than one number."""
+    for name in names:
+        if name not in (points.dtype.names or ()):
+            raise CloudError(f"the cloud has no field '{name}'; it has "
+                             f"{', '.join(points.dtype.names or ()) or 'none'}")
+        if points.dtype[name].shape:
+            raise CloudError(f"field '{name}' has count > 1; a single number is needed")
+    out = np.empty((len(points), len(names)), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # float64 beyond float32 becomes inf
+        for i, name in enumerate(names):
+            out[:, i] = points[name]
+    return out
+
+
+def xyz(points: np.ndarray) -> np.ndarray:
+    """(N, 3) float32 coordinates; invalid returns stay in. CloudError when x, y or z is missing
+    or is no floating-point field."""
+    out = columns(points, ("x", "y", "z"))
+    for name in "xyz":
+        if points.dtype[name].kind != "f":
+            raise CloudError(f"field '{name}' is of type {points.dtype[name]}; metres as float32 "
+                             "or float64 are needed")
+    return out
+
+
+def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1,
+               is_dense: bool = True) -> Any:
+    """PointCloud2 of a structured array (N,), whatever its layout; N must divide by height."""
+    width = len(points) // height
+    if width * height != len(points):
+        raise ValueError(f"{len(points)} points do not make {height} rows")
+    data = np.ascontiguousarray(points).view(np.uint8).reshape(-1)
+    big = any(points.dtype[n].base.byteorder == ">" for n in points.dtype.names)
+    return _cloud(header, make, point_fields(points.dtype, make), data, height=height, width=width,
+                  point_step=points.dtype.itemsize, is_bigendian=big, is_dense=is_dense)
+
+
+def point_fields(dtype: np.dtype, make: Any) -> list:
+    """PointField messages of a structured dtype."""
+    fields = []
+    for name in dtype.names:
+        kind, offset = dtype.fields[name][:2]
+        code = CODES.get(f"{kind.base.kind}{kind.base.itemsize}")
+        if code is None:
+            raise ValueError(f"field '{name}' of type {kind} has no PointField datatype")
+        fields.append(make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code,
+                           count=int(np.prod(kind.shape, dtype=int))))
+    return fields
+
+
+def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
+    """The same cloud with further fields, each (height * width,) of a PointField datatype.
+
+    Every old field keeps its bytes; a field that exists already with the same datatype is
+    overwritten. Shape, density and byte order stay as they are.
+    """
+    old = to_array(msg)
+    order = ">" if msg.is_bigendian else "<"
+    fields, offset = list(msg.fields), msg.point_step
+    names = {f.name: f for f in fields}
+    places = {}
+    for name, values in new.items():
+        kind = np.dtype(values.dtype).newbyteorder(order)
+        code = CODES[f"{kind.kind}{kind.itemsize}"]
+        known = names.get(name)
+        if known is not None and known.datatype == code:
+            places[name] = (known.offset, kind)
+            continue
+        fields = [f for f in fields if f.name != name]
+        fields.append(make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code,
+                           count=1))
+        places[name] = (offset, kind)
+        offset += kind.itemsize
+    # 4-byte steps keep float fields aligned in every point
+    step = offset if offset == msg.point_step else -(-offset // 4) * 4
+    data = np.zeros((len(old), step), np.uint8)
+    if len(old):
+        raw = np.frombuffer(msg.data, np.uint8)
+        if msg.height > 1 and msg.row_step != msg.width * msg.point_step:
+            raw = np.ascontiguousarray(old).view(np.uint8)
+        data[:, :msg.point_step] = raw[:len(old) * msg.point_step].reshape(-1, msg.point_step)
+    for name, (at, kind) in places.items():
+        target = np.ndarray(len(old), kind, data, offset=at, strides=(step,)) if len(old) else []
+        if len(old):
+            target[:] = new[name]
+    return _cloud(msg.header, make, fields, data.reshape(-1), height=msg.height, width=msg.width,
+                  point_step=step, is_bigendian=msg.is_bigendian, is_dense=msg.is_dense)
+
+
+def _cloud(header: Any, make: Any, fields: list, data: np.ndarray, *, height: int, width: int,
+           point_step: int, is_bigendian: bool, is_dense: bool) -> Any:
+    return make("sensor_msgs/msg/PointCloud2", header=header, height=height, width=width,
+                fields=fields, is_bigendian=is_bigendian, point_step=point_step,
+                row_step=width * point_step, data=data, is_dense=is_dense)
