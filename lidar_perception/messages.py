@@ -23,22 +23,37 @@ from msg_utils.stamps import to_ns
 
 
 def to_frame(msg: Any) -> tuple[LidarFrame, np.ndarray]:
-    """The usable points of a PointCloud2 and the mask (height * width,) bool that chose them;
-    per-point results go back to the whole cloud with spread(). InputError for a broken cloud."""
+    """The usable points of a PointCloud2 and their places (N,) in the cloud; if the cloud has a
+    column in_view, only the points where it is not 0. InputError for a broken cloud."""
     try:
-        points = xyz(to_array(msg))
+        points = to_array(msg)
+        places = None
+        if "in_view" in (points.dtype.names or ()):
+            places = np.flatnonzero(points["in_view"])
+            points = points.take(places)
+        coordinates = xyz(points)
     except CloudError as error:
         raise InputError(str(error)) from None
-    usable = usable_returns(points)
-    return LidarFrame(points if usable.all() else points[usable], None, to_ns(msg.header.stamp),
-                      msg.header.frame_id), usable
+    usable = usable_returns(coordinates)
+    if not usable.all():
+        kept = np.flatnonzero(usable)
+        places = kept if places is None else places.take(kept)
+        coordinates = coordinates.take(kept, axis=0)
+    frame = LidarFrame(coordinates, None, to_ns(msg.header.stamp), msg.header.frame_id)
+    return frame, np.arange(len(points)) if places is None else places
 
 
-def spread(values: np.ndarray, usable: np.ndarray, dtype: str) -> np.ndarray:
-    """Values (N,) of the usable points as a column of the whole cloud; 0 elsewhere."""
-    column = np.zeros(len(usable), dtype)
-    column[usable] = values
+def spread(values: np.ndarray | int, places: np.ndarray, msg: Any, dtype: str) -> np.ndarray:
+    """Values (N,) at places (N,) as a column of the whole cloud msg; 0 elsewhere."""
+    column = np.zeros(msg.height * msg.width, dtype)
+    column[places] = values
     return column
+
+
+def column(msg: Any, name: str, places: np.ndarray) -> np.ndarray | None:
+    """(N,) values of a field at places (N,); None where the cloud has no such field."""
+    points = to_array(msg)
+    return points[name].take(places) if name in (points.dtype.names or ()) else None
 
 
 def camera_of(info: Any, transform: Any) -> Camera:

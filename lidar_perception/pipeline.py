@@ -9,7 +9,7 @@ the same candidates.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 import numpy as np
@@ -26,7 +26,7 @@ from lidar_perception.candidates.seeds import (
 )
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
 from lidar_perception.ground.threshold import fit_plane, segment_ground
-from lidar_perception.params import DbscanParams, GroundParams, PipelineParams, SeedParams
+from lidar_perception.params import DbscanParams, PipelineParams, SeedParams, ViewParams
 from lidar_perception.types import InputError, LidarFrame
 
 STEPS = ("view", "ground", "clustering", "boxes", "height", "stm", "cpa")
@@ -34,68 +34,67 @@ STEPS = ("view", "ground", "clustering", "boxes", "height", "stm", "cpa")
 
 @dataclass(frozen=True)
 class Segmented:
-    """Ground, cluster ids and boxes of N points: in_view and ground (N,) bool, cluster_ids (N,)
-    int32 with 0 = none, boxes (K, 7) float32 of clusters 1..K on the ground plane; ms per step."""
+    """Ground, clusters and boxes of the M points of a frame that are in view.
 
-    in_view: np.ndarray
+    places (M,) int64 their rows in the frame, xyz (M, 3) float32, ground (M,) bool, cluster_ids
+    (M,) int32 with 0 = none, boxes (K, 7) float32 of clusters 1..K down to the ground plane;
+    ms per step.
+    """
+
+    places: np.ndarray
+    xyz: np.ndarray
     ground: np.ndarray
     cluster_ids: np.ndarray
     boxes: np.ndarray
-    ms: dict[str, float]
+    ms: dict[str, float] = field(default_factory=dict)
 
 
 # Where the seed comes from, given the frame's clusters.
-SeedSource = Callable[[LidarFrame, Segmented], Seed]
+SeedSource = Callable[[Segmented], Seed]
 
 
-def ground_in_view(xyz: np.ndarray, in_view: np.ndarray, params: GroundParams) -> np.ndarray:
-    """(N,) bool ground among the points in view; False for all others."""
-    if in_view.all():
-        return segment_ground(xyz, params)
-    seen = np.flatnonzero(in_view)
-    ground = np.zeros(len(xyz), bool)
-    ground[seen] = segment_ground(xyz[seen], params)
-    return ground
+def points_in_view(xyz: np.ndarray, camera: Camera | None,
+                   params: ViewParams) -> tuple[np.ndarray, np.ndarray]:
+    """places (M,) int64 and points (M, 3) of those of (N, 3) in the camera's view; all of them
+    while the crop is off. InputError if it is on and there is no camera."""
+    if not params.enabled:
+        return np.arange(len(xyz)), xyz
+    if camera is None:
+        raise InputError("view.enabled is on but there is no camera calibration; give CameraInfo "
+                         "and the LiDAR-to-camera transform, or set view.enabled to false")
+    places = np.flatnonzero(camera.in_view(xyz))
+    return places, xyz.take(places, axis=0)
 
 
-def cluster_obstacles(xyz: np.ndarray, obstacle: np.ndarray, params: DbscanParams) -> np.ndarray:
-    """(N,) int32 cluster ids of the points under mask obstacle; 0 for all others."""
+def cluster_obstacles(xyz: np.ndarray, ground: np.ndarray, params: DbscanParams) -> np.ndarray:
+    """(M,) int32 cluster ids of the points (M, 3) that are not ground; ground has 0."""
     labels = np.zeros(len(xyz), np.int32)
-    members = np.flatnonzero(obstacle)
-    labels[members] = distance_aware_dbscan(xyz[members], params)
+    obstacles = np.flatnonzero(~ground)
+    labels[obstacles] = distance_aware_dbscan(xyz.take(obstacles, axis=0), params)
     return labels
 
 
 def grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray) -> np.ndarray:
     """(K, 7) boxes of clusters 1..K, down to the plane through the ground points."""
-    return snap_to_ground(cluster_boxes(xyz, cluster_ids), fit_plane(xyz[ground]))
+    return snap_to_ground(cluster_boxes(xyz, cluster_ids),
+                          fit_plane(xyz.compress(ground, axis=0)))
 
 
 def segment(frame: LidarFrame, camera: Camera | None = None,
             params: PipelineParams = PipelineParams()) -> Segmented:
     """Stages up to the boxes. InputError if the crop is on and there is no camera."""
-    xyz = frame.xyz
     t0 = perf_counter()
-    in_view = view_mask(xyz, camera, params)
+    places, xyz = points_in_view(frame.xyz, camera, params.view)
     t1 = perf_counter()
-    ground = ground_in_view(xyz, in_view, params.ground)
+    ground = segment_ground(xyz, params.ground)
     t2 = perf_counter()
-    cluster_ids = cluster_obstacles(xyz, in_view & ~ground, params.dbscan)
+    cluster_ids = cluster_obstacles(xyz, ground, params.dbscan)
     t3 = perf_counter()
     boxes = grounded_boxes(xyz, ground, cluster_ids)
     t4 = perf_counter()
     ms = dict(view=t1 - t0, ground=t2 - t1, clustering=t3 - t2, boxes=t4 - t3)
-    return Segmented(in_view, ground, cluster_ids, boxes, {k: v * 1e3 for k, v in ms.items()})
-
-
-def view_mask(xyz: np.ndarray, camera: Camera | None, params: PipelineParams) -> np.ndarray:
-    """(N,) bool: in the camera's view, or all True while the crop is off."""
-    if not params.view.enabled:
-        return np.ones(len(xyz), bool)
-    if camera is None:
-        raise InputError("view.enabled is on but there is no camera calibration; give CameraInfo "
-                         "and the LiDAR-to-camera transform, or set view.enabled to false")
-    return camera.in_view(xyz)
+    return Segmented(places, xyz, ground, cluster_ids, boxes,
+                     {k: v * 1e3 for k, v in ms.items()})
 
 
 def find_candidates(frame: LidarFrame, seed: SeedSource, camera: Camera | None = None,
@@ -105,30 +104,28 @@ def find_candidates(frame: LidarFrame, seed: SeedSource, camera: Camera | None =
     InputError where the seed source has no seed for this frame.
     """
     segmented = segment(frame, camera, params)
-    return segmented, refined(frame, segmented, seed, params)
+    return segmented, refined(segmented, seed, params)
 
 
-def refined(frame: LidarFrame, segmented: Segmented, seed: SeedSource,
+def refined(segmented: Segmented, seed: SeedSource,
             params: PipelineParams = PipelineParams()) -> Candidates:
     """The candidates among a frame's clusters. InputError where there is no seed."""
-    found = refine(frame.xyz, segmented.cluster_ids, segmented.boxes, seed(frame, segmented),
-                   params)
+    found = refine(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed(segmented), params)
     return replace(found, ms={**segmented.ms, **found.ms})
 
 
 def truth_seed(pedestrians: np.ndarray) -> SeedSource:
     """Nearest pedestrian of boxes (M, 7), the paper's protocol."""
-    return lambda frame, s: seed_from_truth(frame.xyz, s.ground, pedestrians)
+    return lambda s: seed_from_truth(s.xyz, s.ground, pedestrians)
 
 
 def clicked_seed(click: np.ndarray, params: SeedParams = SeedParams()) -> SeedSource:
     """The cluster at a point (3,) in the LiDAR frame."""
-    return lambda frame, s: seed_from_click(click, frame.xyz, s.cluster_ids, s.boxes,
-                                            params.click_radius)
+    return lambda s: seed_from_click(click, s.xyz, s.cluster_ids, s.boxes, params.click_radius)
 
 
 def fixed_seed(seed: Seed) -> SeedSource:
-    return lambda frame, s: seed
+    return lambda s: seed
 
 
 def warm_up() -> None:
@@ -142,6 +139,18 @@ def warm_up() -> None:
     find_candidates(LidarFrame(xyz), fixed_seed(seed))
 
 
-__all__ = ["STEPS", "Segmented", "clicked_seed", "cluster_obstacles", "find_candidates",
-           "fixed_seed", "ground_in_view", "grounded_boxes", "load_seed", "refined",
-           "segment", "truth_seed", "view_mask", "warm_up"]
+__all__ = [
+    "STEPS",
+    "Segmented",
+    "clicked_seed",
+    "cluster_obstacles",
+    "find_candidates",
+    "fixed_seed",
+    "grounded_boxes",
+    "load_seed",
+    "points_in_view",
+    "refined",
+    "segment",
+    "truth_seed",
+    "warm_up",
+]

@@ -14,8 +14,7 @@ CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tr
            "DontCare")
 PEDESTRIAN = CLASSES.index("Pedestrian")
 
-# Beyond this a coordinate is a broken return, not a point; keeps squares exact enough in float32.
-MAX_COORDINATE = 1e5
+MAX_RANGE = 1e5  # metres; what is farther is a broken return, not a point
 
 
 class InputError(ValueError):
@@ -41,9 +40,9 @@ class LidarFrame:
 
 def usable_returns(xyz: np.ndarray) -> np.ndarray:
     """(N,) bool: finite, within 100 km, and not the origin, where drivers put missing returns."""
-    with np.errstate(invalid="ignore"):
-        largest = np.abs(xyz).max(axis=1, initial=0.0)  # NaN and inf survive the maximum
-        return (largest > 0.0) & (largest <= MAX_COORDINATE)
+    with np.errstate(invalid="ignore", over="ignore"):
+        square = np.einsum("ij,ij->i", xyz, xyz)  # NaN and inf survive
+        return (square > 0.0) & (square <= MAX_RANGE * MAX_RANGE)
 
 
 @dataclass(frozen=True)

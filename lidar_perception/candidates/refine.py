@@ -71,4 +71,4 @@ def group_points(xyz: np.ndarray, labels: np.ndarray,
     members = np.flatnonzero(group >= 0)
     members = members[np.argsort(group[members], kind="stable")]
     sizes = np.bincount(group[members], minlength=len(wanted))
-    return xyz[members], np.concatenate([[0], np.cumsum(sizes)])
+    return xyz.take(members, axis=0), np.concatenate([[0], np.cumsum(sizes)])

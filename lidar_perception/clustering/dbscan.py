@@ -28,7 +28,7 @@ def distance_aware_dbscan(xyz: np.ndarray, params: DbscanParams = DbscanParams()
         members = np.flatnonzero(band == i)
         if len(members) < params.min_samples:
             continue
-        found = dbscan(xyz[members], eps, params.min_samples)
+        found = dbscan(xyz.take(members, axis=0), eps, params.min_samples)
         labels[members] = np.where(found > 0, found + last, 0)
         last += int(found.max(initial=0))
     return labels

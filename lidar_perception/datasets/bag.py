@@ -42,6 +42,19 @@ def bag_message(type_name: str, /, **fields: Any) -> Any:
     return typestore().types[type_name](**names)
 
 
+def encode(message: Any) -> bytes:
+    """CDR of a message of rosbags' class."""
+    return bytes(typestore().serialize_cdr(message, message.__msgtype__))
+
+
+def decode(data: bytes, type_name: str) -> Any:
+    """Message of rosbags' class from CDR; arrays are views of data. InputError if it is broken."""
+    try:
+        return typestore().deserialize_cdr(data, type_name)
+    except Exception as error:  # rosbags raises whatever struct, numpy or its own code raise
+        raise InputError(f"{len(data)} bytes are no {type_name} ({error})") from None
+
+
 def _zero(kind: tuple) -> Any:
     node, detail = kind
     if node == Nodetype.BASE:
@@ -79,7 +92,7 @@ class BagWriter:
         if self.path.exists() and not force:
             raise InputError(f"{self.path} exists already; give another name or --force")
         self.partial = self.path.with_name(self.path.name + ".incomplete")
-        self.channels: dict[str, tuple[int, str]] = {}
+        self.channels: dict[str, int] = {}
         self.topics: list[dict] = []
         self.times: list[int] = []
 
@@ -102,7 +115,7 @@ class BagWriter:
         metadata = {"offered_qos_profiles": _yaml(profile),
                     "topic_type_hash": typestore().hash_rihs01(type_name)}
         channel = self.mcap.register_channel(topic, "cdr", schema, metadata)
-        self.channels[topic] = (channel, type_name)
+        self.channels[topic] = channel
         self.topics.append({"topic_metadata": {
             "name": topic, "type": type_name, "serialization_format": "cdr",
             "offered_qos_profiles": profile,
@@ -110,9 +123,8 @@ class BagWriter:
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Append a message: an object of bag_message, or CDR bytes as they are."""
-        channel, type_name = self.channels[topic]
-        raw = message if isinstance(message, bytes) else bytes(
-            typestore().serialize_cdr(message, type_name))
+        channel = self.channels[topic]
+        raw = message if isinstance(message, bytes) else encode(message)
         self.mcap.add_message(channel, stamp_ns, raw, stamp_ns)
         self.topics[list(self.channels).index(topic)]["message_count"] += 1
         self.times.append(stamp_ns)
@@ -204,10 +216,9 @@ class Bag:
         """(topic, time, message) of rosbags' classes."""
         for topic, stamp, data in self.raw(topics):
             try:
-                yield topic, stamp, typestore().deserialize_cdr(data, self.topics[topic])
-            except Exception as error:
-                raise InputError(f"{self.path}: a message of {topic} at {stamp} ns cannot be "
-                                 f"decoded as {self.topics[topic]}: {error}") from None
+                yield topic, stamp, decode(data, self.topics[topic])
+            except InputError as error:
+                raise InputError(f"{self.path}, topic {topic} at {stamp} ns: {error}") from None
 
 
 def _storage(path: Path) -> Path:

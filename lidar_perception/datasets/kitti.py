@@ -45,7 +45,7 @@ class KittiFrame:
 
     def load(self) -> LidarFrame:
         cloud = self.cloud()
-        cloud = cloud[usable_returns(cloud[:, :3])]
+        cloud = cloud.compress(usable_returns(cloud[:, :3]), axis=0)
         return LidarFrame(np.ascontiguousarray(cloud[:, :3]), cloud[:, 3].copy(), self.stamp_ns,
                           LIDAR_FRAME)
 

@@ -8,8 +8,7 @@ from rich.table import Table
 from lidar_perception.candidates.refine import STAGES
 from lidar_perception.evaluation.matching import RANGE_NAMES
 
-STAGE_TITLES = {"stage1": "stage 1 (clusters of the seed's height)", "stage2": "stage 2 (STM)",
-                "final": "final (STM + CPA)"}
+STAGE_TITLES = {"stage1": "clusters", "stage2": "STM", "final": "STM + CPA"}
 # Paper A, Table 6: recall, precision, F1 in percent, centre error in metres
 PAPER = {"stage1": (55.5, 27.6, 36.8, 0.15), "stage2": (44.7, 60.5, 51.4, 0.14),
          "final": (46.7, 58.8, 52.1, 0.16)}
@@ -17,10 +16,9 @@ PAPER = {"stage1": (55.5, 27.6, 36.8, 0.15), "stage2": (44.7, 60.5, 51.4, 0.14),
 
 def print_candidate_report(content: dict, console: Console, paper: bool = True) -> None:
     """Scores by range and stage, beside the paper's overall figures, and times of the steps."""
-    table = Table(title=f"Pedestrian candidates: {content['ground_truth']} pedestrians in "
-                        f"{content['frames']} frames, 3D centre within 1.0 m")
-    for name in ("stage", "range [m]", "TP", "FP", "FN", "recall", "precision", "F1",
-                 "error [m]"):
+    table = Table(title=f"{content['ground_truth']} pedestrians in {content['frames']} frames, "
+                        "hit = 3D centre within 1.0 m")
+    for name in ("stage", "range [m]", "TP", "FP", "FN", "recall", "prec.", "F1", "error [m]"):
         table.add_column(name, justify="left" if name == "stage" else "right", no_wrap=True)
     for stage in [s for s in STAGES if s in content]:
         for name in (*RANGE_NAMES, "all"):
@@ -34,14 +32,15 @@ def print_candidate_report(content: dict, console: Console, paper: bool = True) 
                           style="bold" if name == "all" else "")
         if paper:
             recall, precision, f1, error = PAPER[stage]
-            table.add_row("paper, 1779 KITTI frames", "all", "", "", "", f"{recall}",
+            table.add_row("  the paper", "all", "", "", "", f"{recall}",
                           f"{precision}", f"{f1}", f"{error:.2f}", style="dim", end_section=True)
     console.print(table)
     if content["ms"]:
         times = Table(title="Median time a frame")
-        for step in content["ms"]:
-            times.add_column(step, justify="right")
-        times.add_row(*(f"{ms:.2f} ms" for ms in content["ms"].values()))
+        times.add_column("step")
+        times.add_column("ms", justify="right")
+        for step, ms in content["ms"].items():
+            times.add_row(step, f"{ms:.2f}", style="bold" if step == "total" else "")
         console.print(times)
     for line in content.get("skipped", [])[:5]:
         console.print(f"[yellow]skipped[/]: {line}", highlight=False)

@@ -20,7 +20,7 @@ def segment_ground(xyz: np.ndarray, params: GroundParams = GroundParams()) -> np
     """(N,) bool, True = ground: points (N, 3) below z_max within inlier_distance of the plane
     through most of them. All False where no plane can be found (too few points, all steep)."""
     candidate = xyz[:, 2] < params.z_max
-    plane = ransac_plane(xyz[candidate], params)
+    plane = ransac_plane(xyz.compress(candidate, axis=0), params)
     if plane is None:
         return np.zeros(len(xyz), bool)
     return candidate & (np.abs(height_above(xyz, plane)) <= params.inlier_distance)

@@ -16,7 +16,7 @@ from lidar_perception.datasets.bag import Bag
 from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
 from lidar_perception.params import PlayerParams
 from lidar_perception.types import InputError
-from msg_utils.messages import message_class, ros_message
+from msg_utils.messages import ros_message
 from msg_utils.stamps import SECOND, time_message
 
 
@@ -71,7 +71,7 @@ class BagPlayer(LidarNode):
     def _publisher(self, topic: str) -> Any:
         kind = self.bag.topics[topic]
         try:
-            return self.output(self.names[topic], message_class(kind), _qos(self.bag.qos(topic)))
+            return self.output(self.names[topic], kind, _qos(self.bag.qos(topic)))
         except (ModuleNotFoundError, AttributeError):
             self.get_logger().warning(f"{topic} is not played: {kind} is not installed here")
             return None
@@ -92,13 +92,17 @@ class BagPlayer(LidarNode):
         self._wait_until_delivered()
 
     def _wait_for_subscribers(self) -> None:
-        wanted = [p for t, p in self.publishers_by_topic.items()
-                  if self.names[t] in self.params.wait_for]
+        rules = [rule.partition(":=") for rule in self.params.wait_for]
+        wanted = {name: int(count or 1) for name, _, count in rules}
         give_up = monotonic() + self.params.wait_timeout
-        while rclpy.ok() and any(p.get_subscription_count() == 0 for p in wanted):
+        while rclpy.ok():
+            missing = [p.topic_name for t, p in self.publishers_by_topic.items()
+                       if p.get_subscription_count() < wanted.get(self.names[t], 0)]
+            if not missing:
+                return
             if monotonic() > give_up:
-                missing = [p.topic_name for p in wanted if p.get_subscription_count() == 0]
-                self.report(WARN, f"nobody subscribes to {', '.join(missing)}; playing anyway")
+                self.report(WARN, f"too few subscribers of {', '.join(missing)} after "
+                            f"{self.params.wait_timeout:g} s; playing anyway")
                 return
             self.serve(timeout_sec=0.02)
 

@@ -5,13 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from std_msgs.msg import Float64
-from visualization_msgs.msg import MarkerArray
-
 from lidar_perception.evaluation.candidates import CandidateReport
 from lidar_perception.files import write_text
 from lidar_perception.messages import to_truth
-from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
+from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
 from lidar_perception.params import EvaluatorParams
 from lidar_perception.types import PEDESTRIAN, InputError
 from msg_utils.markers import from_marker_array
@@ -28,13 +25,13 @@ class Evaluator(LidarNode):
         super().__init__("evaluator", EvaluatorParams(), **options)
         self.result = CandidateReport()
         self.waiting: dict[int, dict[str, Any]] = {}
-        self.input("ground_truth", MarkerArray, lambda m: self._add("truth", m), RELIABLE)
+        self.input("ground_truth", MARKERS, lambda m: self._add("truth", m), RELIABLE)
         for stage in self.params.stages:
-            self.input(stage, MarkerArray, lambda m, s=stage: self._add(s, m), RELIABLE)
+            self.input(stage, MARKERS, lambda m, s=stage: self._add(s, m), RELIABLE)
         for topic in self.params.timing:
             name = topic.split("/")[1]
-            self.input(topic, Float64, lambda m, n=name: self.result.add_times({n: m.data}),
-                       RELIABLE)
+            self.input(topic, "std_msgs/msg/Float64",
+                       lambda m, n=name: self.result.add_times({n: m.data}), RELIABLE)
         self.create_timer(WRITE_PERIOD, self.write)
 
     def _add(self, kind: str, msg: Any) -> None:

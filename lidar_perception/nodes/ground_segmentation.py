@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import PointCloud2
 
-from lidar_perception.ground.threshold import fit_plane
+from lidar_perception.datasets.bag import bag_message, encode
+from lidar_perception.ground.threshold import fit_plane, segment_ground
 from lidar_perception.messages import spread, to_frame
 from lidar_perception.nodes.inputs import CameraInput
-from lidar_perception.nodes.runtime import OK, WARN, LidarNode
+from lidar_perception.nodes.runtime import CLOUD, OK, WARN, LidarNode
 from lidar_perception.params import GroundNodeParams
-from lidar_perception.pipeline import ground_in_view, view_mask, warm_up
-from msg_utils.messages import ros_message
+from lidar_perception.pipeline import points_in_view, warm_up
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
 from msg_utils.stamps import to_ns
 
@@ -27,30 +26,32 @@ class GroundSegmentation(LidarNode):
     def __init__(self, **options: Any):
         super().__init__("ground_segmentation", GroundNodeParams(), **options)
         self.camera = CameraInput(self)
-        self.points = self.output("points", PointCloud2)
-        self.ground = self.output("ground", PointCloud2)
-        self.nonground = self.output("nonground", PointCloud2)
-        self.input("points", PointCloud2, self.on_points)
+        self.points = self.output("points", CLOUD)
+        self.ground = self.output("ground", CLOUD)
+        self.nonground = self.output("nonground", CLOUD)
+        self.input("points", CLOUD, self.on_points)
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable = to_frame(msg)
-            in_view = view_mask(frame.xyz, self.camera.get(frame.frame_id), self.params)
-            ground = ground_in_view(frame.xyz, in_view, self.params.ground)
-            column = spread(ground, usable, "u1")
-            self.points.publish(add_columns(msg, ros_message, ground=column,
-                                            in_view=spread(in_view, usable, "u1")))
-        for publisher, wanted in ((self.ground, 1), (self.nonground, 0)):
+            places, xyz = points_in_view(frame.xyz, self.camera.get(frame.frame_id),
+                                         self.params.view)
+            ground = segment_ground(xyz, self.params.ground)
+            places = usable.take(places)
+            self.points.publish(encode(add_columns(
+                msg, bag_message, ground=spread(ground, places, msg, "u1"),
+                in_view=spread(1, places, msg, "u1"))))
+        for publisher, chosen in ((self.ground, ground), (self.nonground, ~ground)):
             if publisher.get_subscription_count():
-                chosen = to_array(msg)[(column == wanted) & usable]
-                publisher.publish(from_array(chosen, msg.header, ros_message))
-        self._diagnose(frame, ground, in_view)
+                publisher.publish(encode(from_array(to_array(msg).take(places[chosen]), msg.header,
+                                                    bag_message)))
+        self._diagnose(len(frame), xyz, ground)
 
-    def _diagnose(self, frame, ground: np.ndarray, in_view: np.ndarray) -> None:
-        plane = fit_plane(frame.xyz[ground])
-        if len(frame) == 0:
+    def _diagnose(self, usable: int, xyz: np.ndarray, ground: np.ndarray) -> None:
+        plane = fit_plane(xyz.compress(ground, axis=0))
+        if usable == 0:
             self.report(WARN, "the cloud is empty or has no finite point")
-        elif not in_view.any():
+        elif len(xyz) == 0:
             self.report(WARN, "no point is in the camera's view; check the LiDAR-to-camera "
                         "transform")
         elif plane is None:
@@ -58,5 +59,5 @@ class GroundSegmentation(LidarNode):
                         "sensor's height different? set ground.z_max")
         else:
             self.counts.update(plane=" ".join(f"{v:.4f}" for v in plane),
-                               ground_share=f"{ground.sum() / max(in_view.sum(), 1):.3f}")
+                               ground_share=f"{ground.mean():.3f}")
             self.report(OK, "segmenting")

@@ -5,20 +5,17 @@ from __future__ import annotations
 import importlib.util
 from collections import OrderedDict
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
-from geometry_msgs.msg import PointStamped, TransformStamped
-from sensor_msgs.msg import CameraInfo
-from visualization_msgs.msg import MarkerArray
-
 from lidar_perception.camera import Camera
-from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.messages import camera_of, to_truth
-from lidar_perception.nodes.runtime import LATCHED, RELIABLE, LidarNode
+from lidar_perception.nodes.runtime import LATCHED, MARKERS, RELIABLE, LidarNode
 from lidar_perception.params import SeedParams
-from lidar_perception.pipeline import SeedSource, clicked_seed, fixed_seed, truth_seed
+from lidar_perception.pipeline import SeedSource, Segmented, clicked_seed, fixed_seed, truth_seed
 from lidar_perception.topics import CLICK, TF_STATIC
-from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
+from lidar_perception.types import PEDESTRIAN, InputError
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import to_ns
 
@@ -31,12 +28,12 @@ class CameraInput:
         self.info: Any = None
         self.transforms: dict[tuple[str, str], Any] = {}
         self.camera: Camera | None = None
-        node.input("camera_info", CameraInfo, self._on_info, LATCHED)
-        node.input("extrinsics", TransformStamped, self._on_transform, LATCHED)
+        node.input("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED)
+        node.input("extrinsics", "geometry_msgs/msg/TransformStamped", self._on_transform,
+                   LATCHED)
         if importlib.util.find_spec("tf2_msgs"):
-            from tf2_msgs.msg import TFMessage
-            node.input(TF_STATIC, TFMessage, lambda m: [*map(self._on_transform, m.transforms)],
-                       LATCHED)
+            node.input(TF_STATIC, "tf2_msgs/msg/TFMessage",
+                       lambda m: [*map(self._on_transform, m.transforms)], LATCHED)
 
     def _on_info(self, msg: Any) -> None:
         self.info, self.camera = msg, None
@@ -103,12 +100,12 @@ class SeedInput:
 
     def __init__(self, node: LidarNode, deliver: Callable[[Any, SeedSource], None]):
         self.node, self.deliver = node, deliver
-        self.click: PointStamped | None = None
+        self.click: Any = None
         self.template = None
         self.template_file: str | None = None
         self.paired = Paired(self._deliver_with_truth)
-        node.input("ground_truth", MarkerArray, self._on_truth, RELIABLE)
-        node.input(CLICK, PointStamped, self._on_click, RELIABLE)
+        node.input("ground_truth", MARKERS, self._on_truth, RELIABLE)
+        node.input(CLICK, "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE)
 
     @property
     def params(self) -> SeedParams:
@@ -118,7 +115,7 @@ class SeedInput:
         if self.params.source == "ground_truth":
             self.paired.add_cloud(to_ns(msg.header.stamp), msg)
         elif self.params.source == "click":
-            self.deliver(msg, self._from_click)
+            self.deliver(msg, partial(self._from_click, msg.header.frame_id))
         else:
             if self.template_file != self.params.file:
                 self.template, self.template_file = load_seed(self.params.file), self.params.file
@@ -142,24 +139,24 @@ class SeedInput:
     def _on_click(self, msg: Any) -> None:
         self.click, self.template = msg, None
 
-    def _from_click(self, frame: LidarFrame, segmented: Any):
+    def _from_click(self, frame_id: str, segmented: Segmented) -> Seed:
         if self.click is None:
             raise InputError(f"no seed yet: click a pedestrian (a PointStamped on {CLICK}, as RViz "
                              "and Foxglove publish it)")
         if self.template is None:
-            if self.click.header.frame_id not in ("", frame.frame_id):
+            if self.click.header.frame_id not in ("", frame_id):
                 raise InputError(f"the clicked point is in frame '{self.click.header.frame_id}' "
-                                 f"but the cloud in '{frame.frame_id}'; set that as the fixed "
+                                 f"but the cloud in '{frame_id}'; set that as the fixed "
                                  "frame and click again")
             p = self.click.point
-            self.template = clicked_seed([p.x, p.y, p.z], self.params)(frame, segmented)
+            self.template = clicked_seed([p.x, p.y, p.z], self.params)(segmented)
             self.node.get_logger().info(f"seed taken at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), height "
                                         f"{self.template.height:.2f} m")
         return self.template
 
 
 def _missing(reason: str) -> SeedSource:
-    def source(frame: LidarFrame, segmented: Any):
+    def source(segmented: Segmented) -> Seed:
         raise InputError(reason)
     return source
 

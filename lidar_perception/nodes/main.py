@@ -52,6 +52,10 @@ def run(name: str, arguments: list[str]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))
     begin = perf_counter()
+    # Threads of a linear algebra library wait actively; nodes that share few cores stand in each
+    # other's way.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
     use_large_shared_memory()
     try:
         import rclpy

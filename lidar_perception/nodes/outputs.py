@@ -6,16 +6,34 @@ import importlib.util
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from std_msgs.msg import Float64
-from visualization_msgs.msg import MarkerArray
 
 from lidar_perception.candidates.refine import Candidates
+from lidar_perception.datasets.bag import bag_message, encode
 from lidar_perception.messages import detection_markers
-from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
+from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
 from lidar_perception.types import CLASSES, InputError
 from msg_utils.detections import to_detection_array
-from msg_utils.markers import marker_keys
-from msg_utils.messages import ros_message
+from msg_utils.markers import marker_keys, to_marker_array
+from msg_utils.messages import message_class, ros_message
+from msg_utils.stamps import header_message, to_ns
+
+
+class ClusterBoxes:
+    """~/output/boxes, made only while somebody subscribes."""
+
+    def __init__(self, node: LidarNode):
+        self.publisher = node.output("boxes", MARKERS)
+        self.shown: Any = ()
+
+    def publish(self, header: Any, boxes: Callable[[], np.ndarray]) -> None:
+        if self.publisher.get_subscription_count():
+            found = boxes()
+            markers = to_marker_array(found, ["cluster"] * len(found), header=header,
+                                      make=bag_message, previous=self.shown)
+            self.shown = marker_keys(markers)
+            self.publisher.publish(encode(markers))
 
 
 class CandidateOutputs:
@@ -24,14 +42,15 @@ class CandidateOutputs:
 
     def __init__(self, node: LidarNode):
         self.node = node
-        self.markers = {"stage1": node.output("~/debug/stage1", MarkerArray, RELIABLE),
-                        "stage2": node.output("~/debug/stage2", MarkerArray, RELIABLE),
-                        "final": node.output("detections", MarkerArray, RELIABLE)}
+        self.markers = {"stage1": node.output("~/debug/stage1", MARKERS),
+                        "stage2": node.output("~/debug/stage2", MARKERS),
+                        "final": node.output("detections", MARKERS)}
         self.shown: dict[str, Any] = dict.fromkeys(self.markers, ())
         self.detections_3d = None
         if importlib.util.find_spec("vision_msgs"):
-            from vision_msgs.msg import Detection3DArray
-            self.detections_3d = node.output("detections_3d", Detection3DArray, RELIABLE)
+            self.detections_3d = node.create_publisher(
+                message_class("vision_msgs/msg/Detection3DArray"), "~/output/detections_3d",
+                RELIABLE)
         self.step_times: dict[str, Any] = {}
 
     def publish(self, header: Any, find: Callable[[], Candidates]) -> Candidates:
@@ -42,15 +61,15 @@ class CandidateOutputs:
             candidates, problem = Candidates.none(), str(error)
         for stage, publisher in self.markers.items():
             if stage == "final" or publisher.get_subscription_count():
-                message = detection_markers(getattr(candidates, stage), header, ros_message,
+                message = detection_markers(getattr(candidates, stage), header, bag_message,
                                             self.shown[stage])
                 self.shown[stage] = marker_keys(message)
-                publisher.publish(message)
+                publisher.publish(encode(message))
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             final = candidates.final
             self.detections_3d.publish(to_detection_array(
-                final.boxes, [CLASSES[i] for i in final.class_ids], final.scores, header=header,
-                make=ros_message))
+                final.boxes, [CLASSES[i] for i in final.class_ids], final.scores, make=ros_message,
+                header=header_message(to_ns(header.stamp), header.frame_id, ros_message)))
         for step, ms in candidates.ms.items():
             if step not in self.step_times:
                 self.step_times[step] = self.node.create_publisher(

@@ -4,18 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from sensor_msgs.msg import PointCloud2
-from visualization_msgs.msg import MarkerArray
-
-from lidar_perception.candidates.refine import Candidates
+from lidar_perception.datasets.bag import bag_message, encode
 from lidar_perception.messages import spread, to_frame
 from lidar_perception.nodes.inputs import CameraInput, SeedInput
-from lidar_perception.nodes.outputs import CandidateOutputs
-from lidar_perception.nodes.runtime import RELIABLE, LidarNode
+from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes
+from lidar_perception.nodes.runtime import CLOUD, LidarNode
 from lidar_perception.params import PipelineParams
-from lidar_perception.pipeline import SeedSource, Segmented, refined, segment, warm_up
-from msg_utils.markers import marker_keys, to_marker_array
-from msg_utils.messages import ros_message
+from lidar_perception.pipeline import SeedSource, refined, segment, warm_up
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
 
@@ -30,34 +25,23 @@ class Perception(LidarNode):
         super().__init__("perception", PipelineParams(), **options)
         self.camera = CameraInput(self)
         self.outputs = CandidateOutputs(self)
-        self.points = self.output("points", PointCloud2)
-        self.boxes = self.output("boxes", MarkerArray, RELIABLE)
-        self.shown: Any = ()
+        self.points = self.output("points", CLOUD)
+        self.boxes = ClusterBoxes(self)
         self.seed = SeedInput(self, self.on_cloud)
-        self.input("points", PointCloud2, self.seed.add_cloud)
+        self.input("points", CLOUD, self.seed.add_cloud)
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable = to_frame(msg)
             segmented = segment(frame, self.camera.get(frame.frame_id), self.params)
-
-            def find() -> Candidates:
-                return refined(frame, segmented, source, self.params)
-
-            self.outputs.publish(msg.header, find)
-        self._publish_clusters(msg, segmented, usable)
-
-    def _publish_clusters(self, msg: Any, segmented: Segmented, usable: Any) -> None:
+            self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params))
         if self.points.get_subscription_count():
-            self.points.publish(add_columns(
-                msg, ros_message, ground=spread(segmented.ground, usable, "u1"),
-                in_view=spread(segmented.in_view, usable, "u1"),
-                cluster_id=spread(segmented.cluster_ids, usable, "u4")))
-        if self.boxes.get_subscription_count():
-            markers = to_marker_array(segmented.boxes, ["cluster"] * len(segmented.boxes),
-                                      header=msg.header, make=ros_message, previous=self.shown)
-            self.shown = marker_keys(markers)
-            self.boxes.publish(markers)
+            places = usable.take(segmented.places)
+            self.points.publish(encode(add_columns(
+                msg, bag_message, ground=spread(segmented.ground, places, msg, "u1"),
+                in_view=spread(1, places, msg, "u1"),
+                cluster_id=spread(segmented.cluster_ids, places, msg, "u4"))))
+        self.boxes.publish(msg.header, lambda: segmented.boxes)
 
     def time_went_back(self) -> None:
         self.seed.clear()

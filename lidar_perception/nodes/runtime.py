@@ -25,8 +25,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from std_msgs.msg import Float64
 
+from lidar_perception.datasets.bag import bag_message, decode, encode, typestore
 from lidar_perception.params import flatten, parameter_fields, with_values
 from lidar_perception.types import InputError
+from msg_utils.messages import message_class
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+MARKERS = "visualization_msgs/msg/MarkerArray"
 
 SENSOR_DATA = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 RELIABLE = QoSProfile(depth=10)
@@ -82,13 +87,16 @@ class LidarNode(Node):
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
-    def input(self, topic: str, kind: type, callback: Callable, qos: QoSProfile = SENSOR_DATA):
-        """Subscribe to ~/input/TOPIC (or an absolute name)."""
+    def input(self, topic: str, type_name: str, callback: Callable, qos: QoSProfile = SENSOR_DATA):
+        """Subscribe to ~/input/TOPIC (or an absolute name). callback gets rosbags' class of the
+        message, the one that offline code reads from bags: it views the received bytes, where
+        rclpy's own class copies them several times."""
         name = topic if topic.startswith("/") else f"~/input/{topic}"
+        _warm_up_type(type_name)
 
-        def guarded(msg: Any) -> None:
+        def guarded(data: bytes) -> None:
             try:
-                callback(msg)
+                callback(decode(data, type_name))
             except InputError as error:
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {error}")
             except Exception as error:
@@ -100,14 +108,18 @@ class LidarNode(Node):
             self.counts["lost"] += event.total_count_change
 
         return self.create_subscription(
-            kind, name, guarded, qos, event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
+            message_class(type_name), name, guarded, qos, raw=True,
+            event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
 
-    def output(self, topic: str, kind: type, qos: QoSProfile = RELIABLE):
-        """Publisher of ~/output/TOPIC, or of any name that starts with ~ or /."""
+    def output(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE):
+        """Publisher of ~/output/TOPIC, or of any name that starts with ~ or /; it takes encode()d
+        messages."""
         name = topic if topic[0] in "~/" else f"~/output/{topic}"
+        _warm_up_type(type_name)
         publisher = self.create_publisher(
-            kind, name, qos, qos_overriding_options=QoSOverridingOptions.with_default_policies())
+            message_class(type_name), name, qos,
+            qos_overriding_options=QoSOverridingOptions.with_default_policies())
         self._outputs.append(publisher)
         return publisher
 
@@ -157,6 +169,12 @@ class LidarNode(Node):
 
     def close(self) -> None:
         """Called once before the node is destroyed."""
+
+
+def _warm_up_type(type_name: str) -> None:
+    """rosbags writes its code for a type on first use: do that before the first message."""
+    if type_name in typestore().fielddefs:
+        decode(encode(bag_message(type_name)), type_name)
 
 
 def _descriptor(f: Any, kind: Parameter.Type) -> ParameterDescriptor:

@@ -1,0 +1,192 @@
+"""demo: the main job, from a bag through the nodes to a score."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+from statistics import median
+
+import click
+import numpy as np
+
+from lidar_perception.cli.evaluate import PROTOCOL
+from lidar_perception.cli.options import console, errors, parameter_options, progress, track
+from lidar_perception.datasets.bag import Bag
+from lidar_perception.evaluation.matching import match_centres
+from lidar_perception.evaluation.report import print_candidate_report
+from lidar_perception.files import write_text
+from lidar_perception.messages import column, to_detections, to_frame
+from lidar_perception.nodes.graph import (
+    SINGLE,
+    STAGES,
+    Processes,
+    cloud_topic,
+    evaluation,
+    outputs_in_use,
+    result_topics,
+)
+from lidar_perception.params import PipelineParams, flatten, with_values
+from lidar_perception.pipeline import warm_up
+from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
+from lidar_perception.types import InputError
+from msg_utils.markers import from_marker_array
+
+START_TIMEOUT = 60.0   # seconds for all nodes to come up and find each other
+SILENCE_TIMEOUT = 10.0  # seconds without a result after the last cloud
+
+
+@click.command()
+@click.option("--kitti", type=click.Path(path_type=Path), metavar="ROOT",
+              help="Replay a KITTI folder instead of the simulated drive.")
+@click.option("--bag", type=click.Path(path_type=Path),
+              help="Replay a bag with /points and /ground_truth/detections.")
+@click.option("--out", type=click.Path(path_type=Path), default=Path("out/demo"),
+              show_default=True, help="Folder for the results.")
+@click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
+              help="Length of the simulated drive, 10 frames a second.")
+@click.option("--drive-seed", type=click.IntRange(0), default=1, show_default=True,
+              help="Seed of the simulated drive.")
+@click.option("--rate", type=click.FloatRange(0.01, 100), default=1.0, show_default=True,
+              help="Speed of the replay.")
+@click.option("--single", is_flag=True, help="All stages in one process instead of three.")
+@parameter_options(PROTOCOL)
+def demo(kitti: Path | None, bag: Path | None, out: Path, frames: int, drive_seed: int,
+         rate: float, single: bool, params: PipelineParams) -> None:
+    """Replay a drive through the real nodes over DDS and score the pedestrian candidates.
+
+    Without options: makes a simulated drive with walking pedestrians, writes it as a rosbag2 bag,
+    replays it into the nodes, each a process of its own on a private ROS domain, and prints the
+    scores. Leaves in --out: the bag, the result bag, scores.json, birdseye.png and the logs.
+
+    \b
+    Examples:
+      lidar-perception demo
+      lidar-perception demo --kitti /data/kitti/tracking
+      lidar-perception demo --bag drive.bag --rate 0.5 --single
+    """
+    if kitti is not None and bag is not None:
+        raise click.UsageError("give --kitti or --bag, not both")
+    for old in ("drive", "result", "logs"):
+        shutil.rmtree(out / old, ignore_errors=True)
+    drive = bag or _make_bag(out / "drive", kitti, frames, drive_seed)
+    with Bag(drive) as opened:
+        opened.require(POINTS)
+        opened.require(TRUTH)
+        clouds = opened.counts[POINTS]
+        if params.view.enabled and not {CAMERA_INFO, EXTRINSICS} <= set(opened.topics):
+            errors.print(f"{drive} has no camera calibration: the whole scan is processed")
+            params = with_values(params, {"view.enabled": False})
+    with errors.status("loading compiled code (the first time: compiling, about a minute)"):
+        warm_up()
+    content = _replay(drive, clouds, out, rate, single, params)
+    write_text(out / "scores.json", json.dumps(content, indent=1))
+    print_candidate_report(content, console)
+    latency = content["latency_ms"]
+    console.print(f"{clouds} clouds replayed at {rate:g}x, {content['results']} results; latency "
+                  f"cloud to candidates median {latency['median']:.0f} ms, 95 % under "
+                  f"{latency['p95']:.0f} ms; memory of the graph {content['memory_mb']:.0f} MB")
+    picture = _draw_best(out / "result", out / "birdseye.png", single)
+    console.print(f"results in {out}: result (bag), scores.json, logs"
+                  + (", birdseye.png" if picture else ""), highlight=False)
+    if content["results"] < clouds:
+        errors.print(f"[red]{clouds - content['results']} clouds gave no result[/]; see {out}/logs")
+        raise SystemExit(1)
+
+
+def _make_bag(path: Path, kitti: Path | None, frames: int, drive_seed: int) -> Path:
+    from lidar_perception.datasets.kitti import open_kitti
+    from lidar_perception.datasets.to_bag import kitti_scan, write_bag
+    if kitti is not None:
+        found = open_kitti(kitti)
+        scans = track(map(kitti_scan, found), f"converting {kitti}", len(found))
+    else:
+        from lidar_perception.simulation.to_bag import simulated_scans
+        scans = track(simulated_scans(drive_seed, frames), "simulating a drive", frames)
+    write_bag(path, scans, force=True)
+    return path
+
+
+def _replay(drive: Path, clouds: int, out: Path, rate: float, single: bool,
+            params: PipelineParams) -> dict:
+    """Run the graph on a bag; the scores, and how the run went."""
+    from lidar_perception.nodes.main import use_large_shared_memory
+    use_large_shared_memory()
+    from lidar_perception.nodes.watch import Watch
+
+    graph, topics = dict(SINGLE if single else STAGES), result_topics(single)
+    domain = 1 + os.getpid() % 100
+    scores = out / "logs" / "scores.json"
+    evaluator_remap, evaluator_params = evaluation(scores, single)
+    recorded = [cloud_topic(single), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
+    with Processes(out / "logs", domain) as processes, Watch(domain, topics["final"]) as watch:
+        for node, remap in graph.items():
+            processes.start(node, remap, flatten(params))
+        processes.start("evaluator", evaluator_remap, evaluator_params)
+        processes.start("bag_recorder", {}, {"bag": str((out / "result").resolve()),
+                                             "topics": recorded})
+        outputs = outputs_in_use({**graph, "evaluator": evaluator_remap})
+        with errors.status("starting the nodes"):
+            ready = watch.until(lambda: watch.connected({**outputs, "bag_recorder": set()}),
+                                START_TIMEOUT, processes.check)
+        if not ready:
+            raise InputError(f"the nodes did not find each other in {START_TIMEOUT:.0f} s: "
+                             f"{watch.messages or 'none has reported'}; see {out}/logs")
+        # The first stage and the watch hear the clouds; seeds, evaluator and recorder the truth.
+        processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
+                                           "wait_for": [f"{POINTS}:=2", f"{TRUTH}:=3"]})
+        with progress() as bar:
+            task = bar.add_task("replaying", total=clouds)
+            last = {"frames": -1, "at": 0.0}
+
+            def finished() -> bool:
+                bar.update(task, completed=watch.frames)
+                return watch.frames >= clouds
+
+            while not finished() and (watch.frames != last["frames"]
+                                      or not processes.ended("bag_player")):
+                last["frames"] = watch.frames
+                watch.until(finished, SILENCE_TIMEOUT, lambda: processes.check("bag_player"))
+        # The evaluator is behind the results by as much as its own work takes.
+        watch.until(lambda: int(watch.status.get("evaluator", {}).get("frames", 0)) >= watch.frames,
+                    SILENCE_TIMEOUT)
+        memory = processes.memory_mb()
+        codes = processes.stop(timeout=30)
+    if failed := {node: code for node, code in codes.items() if code}:
+        errors.print(f"[red]exit codes {failed}[/]; see {out}/logs")
+    latencies = sorted(watch.latencies_ms) or [float("nan")]
+    return {**json.loads(scores.read_text()), "clouds": clouds, "results": watch.frames,
+            "latency_ms": {"median": median(latencies),
+                           "p95": latencies[int(0.95 * (len(latencies) - 1))]},
+            "memory_mb": sum(memory.values()), "memory_mb_by_node": memory}
+
+
+def _draw_best(result: Path, picture: Path, single: bool) -> bool:
+    """Draw the recorded frame with most hits; False if none has a labelled pedestrian."""
+    from lidar_perception.evaluation.pictures import draw_frame
+    final = result_topics(single)["final"]
+    frames: dict[int, dict] = {}
+    with Bag(result) as bag:
+        for topic, _, msg in bag.messages({TRUTH, final} & set(bag.topics)):
+            objects = from_marker_array(msg)
+            boxes = (to_detections(objects).boxes if topic == final
+                     else objects.boxes[[x == "Pedestrian" for x in objects.labels]])
+            frames.setdefault(objects.stamp_ns, {})[topic] = boxes
+        hits = {stamp: (len(match_centres(f[final], f[TRUTH])[0]), len(f[TRUTH]))
+                for stamp, f in frames.items() if len(f) == 2 and len(f[TRUTH])}
+        if not hits:
+            return False
+        best = max(hits, key=lambda s: hits[s])
+        for _, _, msg in bag.messages({cloud_topic(single)}):
+            frame, places = to_frame(msg)
+            if frame.stamp_ns == best:
+                ids = column(msg, "cluster_id", places).astype(np.int32)
+                draw_frame(picture, frame.xyz, column(msg, "ground", places) > 0, ids,
+                           frames[best][TRUTH],
+                           frames[best][final], title=f"{hits[best][0]} of {hits[best][1]} "
+                           f"pedestrians found, stamp {best / 1e9:.1f} s")
+                return True
+    return False
+
+

@@ -1,0 +1,71 @@
+"""lidar-perception VERB: the commands are imported only when they are called."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+
+import click
+
+from lidar_perception import __version__
+
+COMMANDS = {  # verb -> module.function, and its line in the overview
+    "demo": ("demo.demo", "Replay a drive through the real nodes and score the result."),
+    "convert": ("convert.convert", "Turn a data set into a rosbag2 bag."),
+    "evaluate": ("evaluate.evaluate", "Score the algorithms without ROS."),
+    "seed": ("seed.seed", "Make a template of a seed pedestrian."),
+    "simulate": ("simulate.simulate", "Write a simulated drive as a bag."),
+    "info": ("info.info", "Say what is in a bag."),
+    "run": ("run.run_node", "Start one ROS node."),
+    "benchmark": ("checkout.benchmark", "Time the algorithms beside their peers."),
+    "test": ("checkout.test", "Run the tests of this checkout."),
+}
+
+
+class LazyGroup(click.Group):
+    """A group that imports a command's module on first use."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(COMMANDS)
+
+    def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
+        if name not in COMMANDS:
+            return None
+        module, function = COMMANDS[name][0].split(".")
+        return getattr(importlib.import_module(f"lidar_perception.cli.{module}"), function)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
+
+
+@click.group(cls=LazyGroup, context_settings=dict(help_option_names=["-h", "--help"]))
+@click.version_option(__version__, prog_name="lidar-perception")
+def cli() -> None:
+    """LiDAR perception for ROS 2: ground, clusters, pedestrian candidates.
+
+    \b
+    Examples:
+      lidar-perception demo
+      lidar-perception demo --kitti /data/kitti/tracking
+      lidar-perception convert kitti /data/kitti/object --out kitti.bag
+      lidar-perception evaluate candidates --kitti /data/kitti/object --json scores.json
+      lidar-perception run perception --ros-args -r '~/input/points:=/points'
+
+    Exit codes: 0 done, 1 ran but something failed, 2 the command or its input cannot be used.
+    """
+
+
+def main() -> None:
+    from lidar_perception.types import InputError
+    try:
+        cli(prog_name="lidar-perception")
+    except InputError as error:
+        click.echo(f"Error: {error}", err=True)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

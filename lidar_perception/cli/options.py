@@ -1,0 +1,122 @@
+"""Flags from the parameter dataclasses, a parameter file, and progress bars."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import click
+import yaml
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from lidar_perception.params import parameter_fields, with_values
+from lidar_perception.types import InputError
+
+console = Console()
+errors = Console(stderr=True)
+
+
+class NumberList(click.ParamType):
+    """Comma-separated numbers."""
+
+    name = "numbers"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple:
+        if isinstance(value, tuple):
+            return value
+        try:
+            return tuple(float(v) for v in str(value).split(","))
+        except ValueError:
+            self.fail(f"{value!r} is not a list of numbers like 0.15,0.3", param, ctx)
+
+
+def parameter_options(defaults: Any) -> Callable:
+    """Decorator: one flag for each field, and --config. The function gets params=..."""
+
+    def decorate(function: Callable) -> Callable:
+        def wrapper(*args: Any, **kwargs: Any) -> Any:
+            given = {name: value for name in parameter_fields(defaults)
+                     if (value := kwargs.pop(_variable(name))) is not None}
+            config = kwargs.pop("config")
+            try:
+                params = with_values(defaults, {**(read_config(config, defaults) if config else {}),
+                                                **given})
+            except ValueError as error:
+                raise InputError(str(error)) from None
+            return function(*args, params=params, **kwargs)
+
+        wrapper.__name__, wrapper.__doc__ = function.__name__, function.__doc__
+        wrapper.__click_params__ = getattr(function, "__click_params__", [])
+        for name, f in reversed(parameter_fields(defaults).items()):
+            wrapper = _option(name, f, defaults)(wrapper)
+        return click.option("--config", type=click.Path(path_type=Path), metavar="YAML",
+                            help="ROS parameter file, as in config/.")(wrapper)
+
+    return decorate
+
+
+def _variable(name: str) -> str:
+    return name.replace(".", "_")
+
+
+def _option(name: str, f: dataclasses.Field, defaults: Any) -> Callable:
+    flag = "--" + name.replace(".", "-").replace("_", "-")
+    meta, default = f.metadata, f.default
+    unit = f" [{meta['unit']}]" if meta["unit"] else ""
+    shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
+    kind: Any = NumberList() if isinstance(default, tuple) else type(default)
+    if meta["choices"]:
+        kind = click.Choice(meta["choices"])
+    if isinstance(default, bool):
+        return click.option(f"{flag}/--no-{flag[2:]}", _variable(name), default=None,
+                            help=meta["doc"])
+    return click.option(flag, _variable(name), type=kind, default=None,
+                        help=f"{meta['doc']}{unit} Default: {shown or 'none'}.")
+
+
+def read_config(path: Path, params: Any) -> dict[str, Any]:
+    """Values of a ROS parameter file for params; other nodes' parameters are left out."""
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise InputError(f"cannot read the parameter file {path}: "
+                         f"{str(error).splitlines()[0]}") from None
+    known, values = parameter_fields(params), {}
+    for node, section in (content or {}).items():
+        if not isinstance(section, dict) or "ros__parameters" not in section:
+            raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for the form")
+        for name, value in _dotted(section["ros__parameters"] or {}):
+            if name in known:
+                values[name] = value
+    return values
+
+
+def _dotted(section: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in section.items():
+        if isinstance(value, dict):
+            yield from _dotted(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def progress() -> Progress:
+    """A progress bar on standard error: text, bar, count, elapsed and remaining time."""
+    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+                    TimeElapsedColumn(), TimeRemainingColumn(), console=errors, transient=True)
+
+
+def track(items: Iterable, description: str, total: int) -> Iterator:
+    with progress() as bar:
+        yield from bar.track(items, total=total, description=description)
+
+

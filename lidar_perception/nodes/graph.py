@@ -1,0 +1,127 @@
+"""The graph of nodes: who listens to whom. Launch files and the demo start it from here."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import yaml
+
+from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
+from lidar_perception.types import InputError
+
+CAMERA = {"~/input/camera_info": CAMERA_INFO, "~/input/extrinsics": EXTRINSICS}
+
+# Node -> remapping of its topics. One process a stage ...
+STAGES = {
+    "ground_segmentation": {"~/input/points": POINTS, **CAMERA},
+    "clustering": {"~/input/points": "/ground_segmentation/output/points"},
+    "candidate_refinement": {"~/input/points": "/clustering/output/points",
+                             "~/input/ground_truth": TRUTH},
+}
+# ... or all stages in one process.
+SINGLE = {"perception": {"~/input/points": POINTS, "~/input/ground_truth": TRUTH, **CAMERA}}
+
+
+def result_topics(single: bool = False) -> dict[str, str]:
+    """Stage -> topic of its detections."""
+    node = "perception" if single else "candidate_refinement"
+    return {"stage1": f"/{node}/debug/stage1", "stage2": f"/{node}/debug/stage2",
+            "final": f"/{node}/output/detections"}
+
+
+def cloud_topic(single: bool = False) -> str:
+    """The cloud with all columns."""
+    return "/perception/output/points" if single else "/clustering/output/points"
+
+
+def timing_topics(single: bool = False) -> list[str]:
+    return [f"/{node}/debug/processing_time_ms" for node in (SINGLE if single else STAGES)]
+
+
+def evaluation(file: Path | str, single: bool = False) -> tuple[dict[str, str], dict[str, Any]]:
+    """Remapping and parameters of an evaluator of all stages."""
+    topics = result_topics(single)
+    remap = {"~/input/ground_truth": TRUTH, **{f"~/input/{k}": v for k, v in topics.items()}}
+    return remap, {"stages": list(topics), "timing": timing_topics(single), "file": str(file)}
+
+
+def outputs_in_use(graph: Mapping[str, Mapping[str, str]]) -> dict[str, set[str]]:
+    """Node -> those of its topics that another node of the graph listens to."""
+    heard = {topic for remap in graph.values() for topic in remap.values()}
+    return {node: {t for t in heard if t.startswith(f"/{node}/")} for node in graph}
+
+
+class Processes:
+    """Node processes with logs in a folder; a context manager that ends them with SIGINT."""
+
+    def __init__(self, logs: Path, domain: int | None = None):
+        self.logs = logs
+        self.environment = dict(os.environ)
+        if domain is not None:
+            self.environment.update(ROS_DOMAIN_ID=str(domain),
+                                    ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
+        self.running: dict[str, subprocess.Popen] = {}
+
+    def __enter__(self) -> Processes:
+        self.logs.mkdir(parents=True, exist_ok=True)
+        return self
+
+    def start(self, node: str, remap: Mapping[str, str], params: Mapping[str, Any]) -> None:
+        values = {k: list(v) if isinstance(v, tuple) else v for k, v in params.items()}
+        values = {k: v for k, v in values.items() if v != []}  # an empty list has no type in YAML
+        file = self.logs / f"{node}.param.yaml"
+        file.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}))
+        remapping = [word for rule in remap.items() for word in ("-r", ":=".join(rule))]
+        with open(self.logs / f"{node}.log", "w") as log:
+            self.running[node] = subprocess.Popen(
+                [sys.executable, "-m", "lidar_perception.nodes.main", node, "--ros-args",
+                 "--params-file", str(file), *remapping],
+                env=self.environment, stdin=subprocess.DEVNULL, stdout=log,
+                stderr=subprocess.STDOUT)
+
+    def check(self, *finished: str) -> None:
+        """InputError with the last line of its log, if a node other than `finished` has ended."""
+        for node, process in self.running.items():
+            code = process.poll()
+            if code is not None and (node not in finished or code):
+                lines = (self.logs / f"{node}.log").read_text().strip().splitlines() or ["no log"]
+                raise InputError(f"{node} ended with code {code}: {lines[-1]} "
+                                 f"(log: {self.logs / node}.log)")
+
+    def ended(self, node: str) -> bool:
+        return self.running[node].poll() is not None
+
+    def memory_mb(self) -> dict[str, float]:
+        """Proportional set size of each running node, in megabytes; empty where /proc is not."""
+        sizes = {}
+        for node, process in self.running.items():
+            try:
+                lines = Path(f"/proc/{process.pid}/smaps_rollup").read_text().splitlines()
+                sizes[node] = next(int(x.split()[1]) for x in lines if x.startswith("Pss:")) / 1024
+            except (OSError, StopIteration):
+                continue
+        return sizes
+
+    def stop(self, timeout: float = 5.0) -> dict[str, int]:
+        """SIGINT to all, SIGKILL after timeout seconds; returns the exit codes."""
+        for process in self.running.values():
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        end = monotonic() + timeout
+        for process in self.running.values():
+            try:
+                process.wait(max(0.1, end - monotonic()))
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        return {node: p.returncode for node, p in self.running.items()}
+
+    def __exit__(self, *_: Any) -> None:
+        self.stop()
