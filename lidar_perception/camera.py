@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from scipy.spatial.transform import Rotation
 
 
@@ -39,8 +40,17 @@ class Camera:
 
     def in_view(self, xyz: np.ndarray) -> np.ndarray:
         """(N,) bool: points (N, 3) in front of the camera that fall into the image."""
-        # float32 keeps this to one pass over the cloud; it is good to 0.01 pixel.
-        u, v, depth = (self.projection[:, :3].astype(np.float32) @ xyz.T
-                       + self.projection[:, 3:].astype(np.float32))
-        return ((depth > 0) & (u >= 0) & (u < self.width * depth)
-                & (v >= 0) & (v < self.height * depth))
+        return _in_view(xyz, self.projection, self.width, self.height)
+
+
+@njit(cache=True)
+def _in_view(xyz, projection, width, height):
+    p = projection
+    seen = np.empty(len(xyz), np.bool_)
+    for i in range(len(xyz)):
+        x, y, z = np.float64(xyz[i, 0]), np.float64(xyz[i, 1]), np.float64(xyz[i, 2])
+        depth = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
+        u = p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]
+        v = p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]
+        seen[i] = depth > 0 and 0 <= u < width * depth and 0 <= v < height * depth
+    return seen

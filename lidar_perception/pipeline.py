@@ -136,7 +136,9 @@ def warm_up() -> None:
     person = rng.uniform(-0.5, 0.5, (400, 3)) * [0.5, 0.5, 1.7] + [8, 0, -0.8]
     xyz = np.concatenate([flat, person, person + [12, 0, 0]]).astype(np.float32)
     seed = seed_from_points(person.astype(np.float32), 1.7)
-    find_candidates(LidarFrame(xyz), fixed_seed(seed))
+    forward = Camera(np.array([[50, -100, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]], float), 100, 100)
+    find_candidates(LidarFrame(xyz), fixed_seed(seed), forward,
+                    PipelineParams(view=ViewParams(enabled=True)))
 
 
 __all__ = [

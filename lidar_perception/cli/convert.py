@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from lidar_perception.cli.options import console, track
 from lidar_perception.datasets.kitti import open_kitti
 from lidar_perception.datasets.to_bag import kitti_scan, write_bag
+from lidar_perception.terminal import console, track
 from lidar_perception.types import InputError
 
 
@@ -47,7 +47,7 @@ def kitti(root: Path, out: Path, images: bool, frames: int | None, force: bool) 
             yield scan
 
     count = write_bag(out, scans(), force=force)
-    console.print(f"{out}: {count} scans of {len(wanted)}", highlight=False)
+    console.print(f"{out}: {count} scans of {len(wanted)}")
     for line in skipped:
-        console.print(f"[yellow]left out[/]: {line}", highlight=False)
+        console.print(f"[yellow]left out[/]: {line}")
     raise SystemExit(1 if skipped else 0)

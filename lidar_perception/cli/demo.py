@@ -3,38 +3,25 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from pathlib import Path
-from statistics import median
 
 import click
 import numpy as np
 
 from lidar_perception.cli.evaluate import PROTOCOL
-from lidar_perception.cli.options import console, errors, parameter_options, progress, track
+from lidar_perception.cli.options import parameter_options
 from lidar_perception.datasets.bag import Bag
 from lidar_perception.evaluation.matching import match_centres
 from lidar_perception.evaluation.report import print_candidate_report
 from lidar_perception.files import write_text
 from lidar_perception.messages import column, to_detections, to_frame
-from lidar_perception.nodes.graph import (
-    SINGLE,
-    STAGES,
-    Processes,
-    cloud_topic,
-    evaluation,
-    outputs_in_use,
-    result_topics,
-)
-from lidar_perception.params import PipelineParams, flatten, with_values
+from lidar_perception.nodes.graph import cloud_topic, result_topics
+from lidar_perception.params import PipelineParams, with_values
 from lidar_perception.pipeline import warm_up
+from lidar_perception.terminal import console, errors, track
 from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
-from lidar_perception.types import InputError
 from msg_utils.markers import from_marker_array
-
-START_TIMEOUT = 60.0   # seconds for all nodes to come up and find each other
-SILENCE_TIMEOUT = 10.0  # seconds without a result after the last cloud
 
 
 @click.command()
@@ -78,9 +65,10 @@ def demo(kitti: Path | None, bag: Path | None, out: Path, frames: int, drive_see
         if params.view.enabled and not {CAMERA_INFO, EXTRINSICS} <= set(opened.topics):
             errors.print(f"{drive} has no camera calibration: the whole scan is processed")
             params = with_values(params, {"view.enabled": False})
+    from lidar_perception.nodes.replay import replay
     with errors.status("loading compiled code (the first time: compiling, about a minute)"):
         warm_up()
-    content = _replay(drive, clouds, out, rate, single, params)
+    content = replay(drive, clouds, out, params, rate=rate, single=single)
     write_text(out / "scores.json", json.dumps(content, indent=1))
     print_candidate_report(content, console)
     latency = content["latency_ms"]
@@ -89,7 +77,7 @@ def demo(kitti: Path | None, bag: Path | None, out: Path, frames: int, drive_see
                   f"{latency['p95']:.0f} ms; memory of the graph {content['memory_mb']:.0f} MB")
     picture = _draw_best(out / "result", out / "birdseye.png", single)
     console.print(f"results in {out}: result (bag), scores.json, logs"
-                  + (", birdseye.png" if picture else ""), highlight=False)
+                  + (", birdseye.png" if picture else ""))
     if content["results"] < clouds:
         errors.print(f"[red]{clouds - content['results']} clouds gave no result[/]; see {out}/logs")
         raise SystemExit(1)
@@ -106,60 +94,6 @@ def _make_bag(path: Path, kitti: Path | None, frames: int, drive_seed: int) -> P
         scans = track(simulated_scans(drive_seed, frames), "simulating a drive", frames)
     write_bag(path, scans, force=True)
     return path
-
-
-def _replay(drive: Path, clouds: int, out: Path, rate: float, single: bool,
-            params: PipelineParams) -> dict:
-    """Run the graph on a bag; the scores, and how the run went."""
-    from lidar_perception.nodes.main import use_large_shared_memory
-    use_large_shared_memory()
-    from lidar_perception.nodes.watch import Watch
-
-    graph, topics = dict(SINGLE if single else STAGES), result_topics(single)
-    domain = 1 + os.getpid() % 100
-    scores = out / "logs" / "scores.json"
-    evaluator_remap, evaluator_params = evaluation(scores, single)
-    recorded = [cloud_topic(single), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
-    with Processes(out / "logs", domain) as processes, Watch(domain, topics["final"]) as watch:
-        for node, remap in graph.items():
-            processes.start(node, remap, flatten(params))
-        processes.start("evaluator", evaluator_remap, evaluator_params)
-        processes.start("bag_recorder", {}, {"bag": str((out / "result").resolve()),
-                                             "topics": recorded})
-        outputs = outputs_in_use({**graph, "evaluator": evaluator_remap})
-        with errors.status("starting the nodes"):
-            ready = watch.until(lambda: watch.connected({**outputs, "bag_recorder": set()}),
-                                START_TIMEOUT, processes.check)
-        if not ready:
-            raise InputError(f"the nodes did not find each other in {START_TIMEOUT:.0f} s: "
-                             f"{watch.messages or 'none has reported'}; see {out}/logs")
-        # The first stage and the watch hear the clouds; seeds, evaluator and recorder the truth.
-        processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
-                                           "wait_for": [f"{POINTS}:=2", f"{TRUTH}:=3"]})
-        with progress() as bar:
-            task = bar.add_task("replaying", total=clouds)
-            last = {"frames": -1, "at": 0.0}
-
-            def finished() -> bool:
-                bar.update(task, completed=watch.frames)
-                return watch.frames >= clouds
-
-            while not finished() and (watch.frames != last["frames"]
-                                      or not processes.ended("bag_player")):
-                last["frames"] = watch.frames
-                watch.until(finished, SILENCE_TIMEOUT, lambda: processes.check("bag_player"))
-        # The evaluator is behind the results by as much as its own work takes.
-        watch.until(lambda: int(watch.status.get("evaluator", {}).get("frames", 0)) >= watch.frames,
-                    SILENCE_TIMEOUT)
-        memory = processes.memory_mb()
-        codes = processes.stop(timeout=30)
-    if failed := {node: code for node, code in codes.items() if code}:
-        errors.print(f"[red]exit codes {failed}[/]; see {out}/logs")
-    latencies = sorted(watch.latencies_ms) or [float("nan")]
-    return {**json.loads(scores.read_text()), "clouds": clouds, "results": watch.frames,
-            "latency_ms": {"median": median(latencies),
-                           "p95": latencies[int(0.95 * (len(latencies) - 1))]},
-            "memory_mb": sum(memory.values()), "memory_mb_by_node": memory}
 
 
 def _draw_best(result: Path, picture: Path, single: bool) -> bool:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from lidar_perception.cli.options import console, parameter_options, track
+from lidar_perception.cli.options import parameter_options
 from lidar_perception.datasets.recording import open_recording
 from lidar_perception.evaluation.candidates import CandidateReport, pedestrians
 from lidar_perception.evaluation.candidates import evaluate as evaluate_frames
@@ -15,6 +15,7 @@ from lidar_perception.evaluation.report import print_candidate_report
 from lidar_perception.files import write_text
 from lidar_perception.params import PipelineParams, SeedParams, ViewParams
 from lidar_perception.pipeline import warm_up
+from lidar_perception.terminal import console, track
 from lidar_perception.types import InputError
 
 # Paper A's protocol: points in the camera's view, the nearest labelled pedestrian as seed.
@@ -70,6 +71,6 @@ def candidates(kitti: Path | None, bag: Path | None, json_file: Path | None, png
         _, recorded, segmented, found = best
         draw_frame(png, segmented.xyz, segmented.ground, segmented.cluster_ids,
                    pedestrians(recorded), found.final.boxes, title=f"frame {recorded.name}")
-        console.print(f"picture: {png}", highlight=False)
+        console.print(f"picture: {png}")
 
 

@@ -1,29 +1,17 @@
-"""Flags from the parameter dataclasses, a parameter file, and progress bars."""
+"""Flags from the parameter dataclasses, and parameter files."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import click
 import yaml
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from lidar_perception.params import parameter_fields, with_values
 from lidar_perception.types import InputError
-
-console = Console()
-errors = Console(stderr=True)
 
 
 class NumberList(click.ParamType):
@@ -107,16 +95,3 @@ def _dotted(section: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
             yield from _dotted(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
-
-
-def progress() -> Progress:
-    """A progress bar on standard error: text, bar, count, elapsed and remaining time."""
-    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-                    TimeElapsedColumn(), TimeRemainingColumn(), console=errors, transient=True)
-
-
-def track(items: Iterable, description: str, total: int) -> Iterator:
-    with progress() as bar:
-        yield from bar.track(items, total=total, description=description)
-
-

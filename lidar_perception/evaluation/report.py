@@ -43,6 +43,6 @@ def print_candidate_report(content: dict, console: Console, paper: bool = True) 
             times.add_row(step, f"{ms:.2f}", style="bold" if step == "total" else "")
         console.print(times)
     for line in content.get("skipped", [])[:5]:
-        console.print(f"[yellow]skipped[/]: {line}", highlight=False)
+        console.print(f"[yellow]skipped[/]: {line}")
     if len(content.get("skipped", [])) > 5:
         console.print(f"[yellow]skipped[/]: {len(content['skipped']) - 5} more, see the JSON file")

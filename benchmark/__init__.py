@@ -1,0 +1,1 @@
+"""Our algorithms timed beside others in one run: python -m benchmark, or ./lidar benchmark."""

@@ -1,0 +1,85 @@
+"""Replays a bag through the graph of nodes, each a process of its own, and scores the result."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from statistics import median
+
+from lidar_perception.nodes.graph import (
+    SINGLE,
+    STAGES,
+    Processes,
+    cloud_topic,
+    evaluation,
+    outputs_in_use,
+    result_topics,
+)
+from lidar_perception.nodes.main import use_large_shared_memory
+from lidar_perception.params import PipelineParams, flatten
+from lidar_perception.terminal import errors, progress
+from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
+from lidar_perception.types import InputError
+
+START_TIMEOUT = 60.0    # seconds for all nodes to come up and find each other
+SILENCE_TIMEOUT = 10.0  # seconds without a result after the last cloud
+
+
+def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate: float = 1.0,
+           single: bool = False, record: bool = True) -> dict:
+    """Scores of a bag with `clouds` clouds, and how the run went: results, latency_ms (from the
+    cloud's arrival in this process to its candidates'), memory_mb (proportional set size).
+
+    Leaves logs and, with record, the result bag in out. The nodes run on a private domain.
+    """
+    use_large_shared_memory()
+    from lidar_perception.nodes.watch import Watch
+
+    graph, topics = dict(SINGLE if single else STAGES), result_topics(single)
+    domain = 1 + os.getpid() % 100
+    scores = out / "logs" / "scores.json"
+    evaluator_remap, evaluator_params = evaluation(scores.resolve(), single)
+    recorded = [cloud_topic(single), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
+    with Processes(out / "logs", domain) as processes, Watch(domain, topics["final"]) as watch:
+        for node, remap in graph.items():
+            processes.start(node, remap, flatten(params))
+        processes.start("evaluator", evaluator_remap, evaluator_params)
+        if record:
+            processes.start("bag_recorder", {}, {"bag": str((out / "result").resolve()),
+                                                 "topics": recorded})
+        others = {"bag_recorder": set()} if record else {}
+        outputs = outputs_in_use({**graph, "evaluator": evaluator_remap})
+        with errors.status("starting the nodes"):
+            ready = watch.until(lambda: watch.connected(outputs | others),
+                                START_TIMEOUT, processes.check)
+        if not ready:
+            raise InputError(f"the nodes did not find each other in {START_TIMEOUT:.0f} s: "
+                             f"{watch.messages or 'none has reported'}; see {out}/logs")
+        # The first stage and the watch hear the clouds; seeds, evaluator and recorder the truth.
+        processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
+                                           "wait_for": [f"{POINTS}:=2", f"{TRUTH}:={2 + record}"]})
+        with progress() as bar:
+            task = bar.add_task("replaying", total=clouds)
+            before = -1
+
+            def finished() -> bool:
+                bar.update(task, completed=watch.frames)
+                return watch.frames >= clouds
+
+            while not finished() and (watch.frames != before
+                                      or not processes.ended("bag_player")):
+                before = watch.frames
+                watch.until(finished, SILENCE_TIMEOUT, lambda: processes.check("bag_player"))
+        # The evaluator is behind the results by as much as its own work takes.
+        watch.until(lambda: int(watch.status.get("evaluator", {}).get("frames", 0)) >= watch.frames,
+                    SILENCE_TIMEOUT)
+        memory = processes.memory_mb()
+        codes = processes.stop(timeout=30)
+    if failed := {node: code for node, code in codes.items() if code}:
+        errors.print(f"[red]exit codes {failed}[/]; see {out}/logs")
+    latencies = sorted(watch.latencies_ms) or [float("nan")]
+    return {**json.loads(scores.read_text()), "clouds": clouds, "results": watch.frames,
+            "latency_ms": {"median": median(latencies),
+                           "p95": latencies[int(0.95 * (len(latencies) - 1))]},
+            "memory_mb": sum(memory.values()), "memory_mb_by_node": memory}
