@@ -1,0 +1,71 @@
+"""Replay a bag through the pipeline and score it; everything ends with the bag.
+
+    ros2 launch lidar_perception replay.launch.py bag:=drive scores:=scores.json
+"""
+
+from pathlib import Path
+
+from launch import LaunchDescription
+from launch.actions import (
+    DeclareLaunchArgument,
+    EmitEvent,
+    IncludeLaunchDescription,
+    OpaqueFunction,
+    RegisterEventHandler,
+    TimerAction,
+)
+from launch.event_handlers import OnProcessExit
+from launch.events import Shutdown
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from lidar_perception.nodes.graph import evaluation
+
+HERE = Path(__file__).resolve().parent
+CONFIG = HERE.parent / "config" / "replay.param.yaml"
+SECONDS_FOR_THE_LAST_FRAME = 1.0
+
+
+def replay(context):
+    value = {k: context.perform_substitution(LaunchConfiguration(k))
+             for k in ("bag", "rate", "loop", "scores", "config", "single", "use_sim_time",
+                       "log_level")}
+    sim_time = {"use_sim_time": value["use_sim_time"] == "true"}
+    log_level = ["--log-level", value["log_level"]]
+    remap, scoring = evaluation(value["scores"], value["single"] == "true")
+    player = Node(
+        package="lidar_perception", executable="bag_player", name="bag_player", output="screen",
+        parameters=[value["config"], {"bag": value["bag"], "rate": float(value["rate"]),
+                                      "loop": value["loop"] == "true"}],
+        ros_arguments=log_level)
+    evaluator = Node(
+        package="lidar_perception", executable="evaluator", name="evaluator", output="screen",
+        parameters=[value["config"], scoring, sim_time], remappings=list(remap.items()),
+        ros_arguments=log_level)
+    end = TimerAction(period=SECONDS_FOR_THE_LAST_FRAME,
+                      actions=[EmitEvent(event=Shutdown(reason="the bag is played"))])
+    return [player, evaluator,
+            RegisterEventHandler(OnProcessExit(target_action=player, on_exit=[end]))]
+
+
+def generate_launch_description():
+    pipeline = IncludeLaunchDescription(
+        PythonLaunchDescriptionSource(str(HERE / "perception.launch.py")),
+        launch_arguments={k: LaunchConfiguration(k) for k in (
+            "config", "single", "use_sim_time", "log_level")}.items())
+    return LaunchDescription([
+        DeclareLaunchArgument("bag", description="Folder of the bag."),
+        DeclareLaunchArgument("rate", default_value="1.0", description="Speed of the replay."),
+        DeclareLaunchArgument("loop", default_value="false", choices=["true", "false"],
+                              description="Start again at the end."),
+        DeclareLaunchArgument("scores", default_value="", description="JSON file for the scores."),
+        DeclareLaunchArgument("config", default_value=str(CONFIG), description="Parameter file."),
+        DeclareLaunchArgument("single", default_value="false", choices=["true", "false"],
+                              description="All stages in one process."),
+        DeclareLaunchArgument("use_sim_time", default_value="true", choices=["true", "false"],
+                              description="Take the time from /clock."),
+        DeclareLaunchArgument("log_level", default_value="info", description="debug, info, ..."),
+        pipeline,
+        OpaqueFunction(function=replay),
+    ])

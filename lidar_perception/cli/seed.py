@@ -1,0 +1,68 @@
+"""seed: a template of a seed pedestrian."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import click
+import numpy as np
+
+from lidar_perception.candidates.seeds import save_seed
+from lidar_perception.candidates.silhouette import to_pixels
+from lidar_perception.cli.options import parameter_options
+from lidar_perception.datasets.recording import Recorded, open_recording
+from lidar_perception.evaluation.candidates import pedestrians
+from lidar_perception.params import PipelineParams, ViewParams
+from lidar_perception.pipeline import clicked_seed, segment, truth_seed
+from lidar_perception.terminal import console
+from lidar_perception.types import InputError
+
+
+@click.command()
+@click.option("--kitti", type=click.Path(path_type=Path), metavar="ROOT", help="KITTI folder.")
+@click.option("--bag", type=click.Path(path_type=Path), help="Bag with /points.")
+@click.option("--frame", "number", type=click.IntRange(0), metavar="N",
+              help="Number of the frame; default: the first with a Pedestrian label.")
+@click.option("--at", nargs=3, type=float, metavar="X Y Z",
+              help="A point on the pedestrian, in the LiDAR frame; default: the nearest label.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, help="Template to write.")
+@parameter_options(PipelineParams(view=ViewParams(enabled=True)))
+def seed(kitti: Path | None, bag: Path | None, number: int | None,
+         at: tuple[float, float, float] | None, out: Path, params: PipelineParams) -> None:
+    """Take the silhouette and height of one pedestrian as a template for later runs.
+
+    Use it with --seed-source file --seed-file OUT, or with the parameters seed.source and
+    seed.file of the nodes.
+
+    \b
+    Examples:
+      lidar-perception seed --kitti /data/kitti/object --out pedestrian.json
+      lidar-perception seed --bag drive --frame 12 --at 8.2 -1.5 -0.8 --out pedestrian.json
+    """
+    if (kitti is None) == (bag is None):
+        raise click.UsageError("give either --kitti ROOT or --bag FILE")
+    recorded = _pick(open_recording(kitti=kitti, bag=bag), number, labelled=at is None)
+    if recorded.camera is None:
+        params = replace(params, view=ViewParams(enabled=False))
+    segmented = segment(recorded.frame, recorded.camera, params)
+    source = (clicked_seed(np.array(at), params.seed) if at is not None
+              else truth_seed(pedestrians(recorded)))
+    template = source(segmented)
+    save_seed(template, out)
+    for row in to_pixels(template.silhouette)[::2]:
+        console.print("".join(".#"[bit] for bit in row.astype(int)), markup=False)
+    console.print(f"{out}: frame {recorded.name}, height {template.height:.2f} m")
+
+
+def _pick(recording, number: int | None, labelled: bool) -> Recorded:
+    for i, recorded in enumerate(recording):
+        if isinstance(recorded, InputError):
+            if i == number:
+                raise recorded
+            continue
+        if i == number or (number is None and (not labelled or len(pedestrians(recorded)))):
+            return recorded
+    raise InputError(f"{recording.path} has no frame {number}; it has {recording.count}"
+                     if number is not None else
+                     f"{recording.path} has no Pedestrian label; give --frame and --at")
