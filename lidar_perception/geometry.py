@@ -7,7 +7,8 @@ import numpy as np
 
 def wrap_angle(angle):
     """The same angle in [-pi, pi)."""
-    return (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
+    wrapped = (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
+    return np.where(wrapped >= np.pi, -np.pi, wrapped)[()]  # a hair below -pi rounds to pi
 
 
 def horizontal_range(xyz: np.ndarray) -> np.ndarray:

@@ -77,6 +77,7 @@ def camera_of(info: Any, transform: Any) -> Camera:
 
 
 def camera_info(calibration: KittiCalibration, header: Any, make: Any) -> Any:
+    """CameraInfo of the calibration's rectified image, without distortion."""
     p = calibration.intrinsics
     return make("sensor_msgs/msg/CameraInfo", header=header, height=calibration.height,
                 width=calibration.width, distortion_model="plumb_bob", d=np.zeros(5),
@@ -110,11 +111,13 @@ def to_truth(objects: MarkedObjects) -> GroundTruth:
 
 
 def to_detections(objects: MarkedObjects) -> Detections:
+    """Detections from markers; objects of unknown class are Misc."""
     return Detections.of(objects.boxes, np.array(_class_ids(objects.labels), np.int32),
                          objects.scores)
 
 
 def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = ()) -> Any:
+    """MarkerArray of detections; previous as in to_marker_array."""
     labels = [CLASSES[i] for i in detections.class_ids]
     return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
                            previous=previous)

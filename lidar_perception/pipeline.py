@@ -19,7 +19,6 @@ from lidar_perception.candidates.boxes import cluster_boxes, snap_to_ground
 from lidar_perception.candidates.refine import Candidates, refine
 from lidar_perception.candidates.seeds import (
     Seed,
-    load_seed,
     seed_from_click,
     seed_from_points,
     seed_from_truth,
@@ -97,6 +96,24 @@ def segment(frame: LidarFrame, camera: Camera | None = None,
                      {k: v * 1e3 for k, v in ms.items()})
 
 
+def explain_nothing(usable: int, xyz: np.ndarray, ground: np.ndarray, z_max: float,
+                    cluster_ids: np.ndarray | None = None) -> str | None:
+    """Why a frame can have no candidates, with the remedy; None if nothing is wrong so far.
+
+    usable is the number of finite points, xyz (M, 3) those in view; ground (M,), cluster_ids (M,).
+    """
+    if usable == 0:
+        return "the cloud is empty or has no finite point"
+    if len(xyz) == 0:
+        return "no point is in the camera's view; check the LiDAR-to-camera transform"
+    if not ground.any():
+        return (f"no ground found below z = {z_max:g} m; is the sensor mounted at another height? "
+                "set ground.z_max")
+    if cluster_ids is not None and not cluster_ids.any():
+        return "no clusters; are dbscan.eps and dbscan.min_samples right for this sensor?"
+    return None
+
+
 def find_candidates(frame: LidarFrame, seed: SeedSource, camera: Camera | None = None,
                     params: PipelineParams = PipelineParams()) -> tuple[Segmented, Candidates]:
     """The whole pipeline on one frame; ms of the result covers every step of STEPS.
@@ -125,6 +142,7 @@ def clicked_seed(click: np.ndarray, params: SeedParams = SeedParams()) -> SeedSo
 
 
 def fixed_seed(seed: Seed) -> SeedSource:
+    """The same seed in every frame."""
     return lambda s: seed
 
 
@@ -140,19 +158,3 @@ def warm_up() -> None:
     find_candidates(LidarFrame(xyz), fixed_seed(seed), forward,
                     PipelineParams(view=ViewParams(enabled=True)))
 
-
-__all__ = [
-    "STEPS",
-    "Segmented",
-    "clicked_seed",
-    "cluster_obstacles",
-    "find_candidates",
-    "fixed_seed",
-    "grounded_boxes",
-    "load_seed",
-    "points_in_view",
-    "refined",
-    "segment",
-    "truth_seed",
-    "warm_up",
-]

@@ -25,5 +25,6 @@ def progress() -> Progress:
 
 
 def track(items: Iterable, description: str, total: int) -> Iterator:
+    """The items, under a progress bar of `total` steps."""
     with progress() as bar:
         yield from bar.track(items, total=total, description=description)

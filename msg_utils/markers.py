@@ -90,7 +90,8 @@ def from_marker_array(msg: Any) -> MarkedObjects:
     """The objects of a MarkerArray, from this module or any other node that sends CUBEs."""
     cubes = [m for m in msg.markers if m.action == ADD and m.type == CUBE]
     extras = [_content(m.text) for m in cubes]
-    scores = [float(e.pop("score", 1.0)) for e in extras]
+    scores = [float(e.pop("score")) if isinstance(e.get("score"), int | float) else 1.0
+              for e in extras]
     boxes = np.array([_box(m) for m in cubes], np.float64).reshape(-1, 7)
     notes = [(m.ns, _content(m.text)) for m in msg.markers if m.action == DELETE and m.text]
     header = msg.markers[0].header if msg.markers else None

@@ -103,9 +103,11 @@ def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1,
     if width * height != len(points):
         raise ValueError(f"{len(points)} points do not make {height} rows")
     data = np.ascontiguousarray(points).view(np.uint8).reshape(-1)
-    big = any(points.dtype[n].base.byteorder == ">" for n in points.dtype.names)
+    orders = {points.dtype[n].base.byteorder for n in points.dtype.names} - {"|"}
+    if len(orders) > 1:
+        raise ValueError("fields of both byte orders do not fit into one cloud")
     return _cloud(header, make, point_fields(points.dtype, make), data, height=height, width=width,
-                  point_step=points.dtype.itemsize, is_bigendian=big, is_dense=is_dense)
+                  point_step=points.dtype.itemsize, is_bigendian=">" in orders, is_dense=is_dense)
 
 
 def point_fields(dtype: np.dtype, make: Any) -> list:
@@ -136,7 +138,7 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
         kind = np.dtype(values.dtype).newbyteorder(order)
         code = CODES[f"{kind.kind}{kind.itemsize}"]
         known = names.get(name)
-        if known is not None and known.datatype == code:
+        if known is not None and known.datatype == code and known.count <= 1:
             places[name] = (known.offset, kind)
             continue
         fields = [f for f in fields if f.name != name]
@@ -150,7 +152,8 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
     if len(old):
         raw = np.frombuffer(msg.data, np.uint8)
         if msg.height > 1 and msg.row_step != msg.width * msg.point_step:
-            raw = np.ascontiguousarray(old).view(np.uint8)
+            raw = np.ndarray((msg.height, msg.width * msg.point_step), np.uint8, raw,
+                             strides=(msg.row_step, 1)).reshape(-1)
         data[:, :msg.point_step] = raw[:len(old) * msg.point_step].reshape(-1, msg.point_step)
     for name, (at, kind) in places.items():
         target = np.ndarray(len(old), kind, data, offset=at, strides=(step,)) if len(old) else []

@@ -13,12 +13,15 @@ def to_ns(stamp: Any) -> int:
 
 
 def time_message(ns: int, make: Any) -> Any:
+    """builtin_interfaces/Time of nanoseconds."""
     return make("builtin_interfaces/msg/Time", sec=ns // SECOND, nanosec=ns % SECOND)
 
 
 def duration_message(ns: int, make: Any) -> Any:
+    """builtin_interfaces/Duration of nanoseconds."""
     return make("builtin_interfaces/msg/Duration", sec=ns // SECOND, nanosec=ns % SECOND)
 
 
 def header_message(ns: int, frame_id: str, make: Any) -> Any:
+    """std_msgs/Header with the stamp of nanoseconds."""
     return make("std_msgs/msg/Header", stamp=time_message(ns, make), frame_id=frame_id)

@@ -14,7 +14,12 @@ from lidar_perception.terminal import console
 @click.command()
 @click.argument("bag", type=click.Path(path_type=Path))
 def info(bag: Path) -> None:
-    """Topics, types, counts and length of a BAG."""
+    """Topics, types, counts and length of a BAG.
+
+    \b
+    Example:
+      lidar-perception info drive.bag
+    """
     with Bag(bag) as opened:
         seconds = max(0, opened.end_ns - opened.start_ns) / 1e9
         table = Table(title=f"{bag}: {seconds:.1f} s", title_justify="left")

@@ -10,7 +10,7 @@ from typing import Any
 import click
 import yaml
 
-from lidar_perception.params import parameter_fields, with_values
+from lidar_perception.params import flatten, parameter_fields, with_values
 from lidar_perception.types import InputError
 
 
@@ -59,7 +59,7 @@ def _variable(name: str) -> str:
 
 def _option(name: str, f: dataclasses.Field, defaults: Any) -> Callable:
     flag = "--" + name.replace(".", "-").replace("_", "-")
-    meta, default = f.metadata, f.default
+    meta, default = f.metadata, flatten(defaults)[name]
     unit = f" [{meta['unit']}]" if meta["unit"] else ""
     shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
     kind: Any = NumberList() if isinstance(default, tuple) else type(default)
@@ -67,9 +67,9 @@ def _option(name: str, f: dataclasses.Field, defaults: Any) -> Callable:
         kind = click.Choice(meta["choices"])
     if isinstance(default, bool):
         return click.option(f"{flag}/--no-{flag[2:]}", _variable(name), default=None,
-                            help=meta["doc"])
+                            help=f"{meta['doc']} Default: {'on' if default else 'off'}.")
     return click.option(flag, _variable(name), type=kind, default=None,
-                        help=f"{meta['doc']}{unit} Default: {shown or 'none'}.")
+                        help=f"{meta['doc']}{unit} Default: {'none' if shown == '' else shown}.")
 
 
 def read_config(path: Path, params: Any) -> dict[str, Any]:
@@ -79,9 +79,12 @@ def read_config(path: Path, params: Any) -> dict[str, Any]:
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise InputError(f"cannot read the parameter file {path}: "
                          f"{str(error).splitlines()[0]}") from None
+    if not isinstance(content, dict | None):
+        raise InputError(f"{path} is no parameter file; see config/ for the form")
     known, values = parameter_fields(params), {}
     for node, section in (content or {}).items():
-        if not isinstance(section, dict) or "ros__parameters" not in section:
+        if not (isinstance(section, dict)
+                and isinstance(section.get("ros__parameters", ()), dict | None)):
             raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for the form")
         for name, value in _dotted(section["ros__parameters"] or {}):
             if name in known:

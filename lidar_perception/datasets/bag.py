@@ -29,6 +29,7 @@ LATCHED_QOS = dict(history="keep_last", depth=1, reliability="reliable",
 
 @functools.cache
 def typestore():
+    """ROS 2 Jazzy's message types, as rosbags knows them."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 
@@ -91,6 +92,8 @@ class BagWriter:
         self.path = Path(path)
         if self.path.exists() and not force:
             raise InputError(f"{self.path} exists already; give another name or --force")
+        if self.path.exists() and not (self.path / "metadata.yaml").is_file():
+            raise InputError(f"{self.path} is no bag, so it is not replaced; give another name")
         self.partial = self.path.with_name(self.path.name + ".incomplete")
         self.channels: dict[str, int] = {}
         self.topics: list[dict] = []
@@ -209,7 +212,7 @@ class Bag:
         try:
             for connection, stamp, data in self.reader.messages(wanted, start_ns, stop_ns):
                 yield connection.topic, stamp, data
-        except (ReaderError, OSError, ValueError, EOFError) as error:
+        except Exception as error:  # rosbags lets through what zstd, struct and SQLite raise
             raise InputError(_unreadable(self.path, error)) from None
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
@@ -237,5 +240,6 @@ def _storage(path: Path) -> Path:
 
 
 def _unreadable(path: Path, error: Exception) -> str:
-    return (f"the bag {path} is truncated or damaged ({str(error).splitlines()[0].rstrip('.')}); "
+    reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+    return (f"the bag {path} is truncated or damaged ({reason}); "
             "'mcap recover' may save what it holds")

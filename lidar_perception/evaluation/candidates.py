@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lidar_perception.candidates.refine import STAGES, Candidates
+from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.datasets.recording import Recorded, Recording
 from lidar_perception.evaluation.matching import RANGE_NAMES, Score, range_bins
 from lidar_perception.params import PipelineParams
@@ -16,7 +17,6 @@ from lidar_perception.pipeline import (
     Segmented,
     find_candidates,
     fixed_seed,
-    load_seed,
     truth_seed,
 )
 from lidar_perception.types import PEDESTRIAN, InputError
@@ -63,6 +63,7 @@ def pedestrians(recorded: Recorded) -> np.ndarray:
 
 
 def boxes_by_stage(candidates: Candidates) -> dict[str, np.ndarray]:
+    """Name of each stage to its boxes (K, 7)."""
     return {stage: getattr(candidates, stage).boxes for stage in STAGES}
 
 

@@ -11,7 +11,7 @@ from lidar_perception.messages import column, spread, to_frame
 from lidar_perception.nodes.outputs import ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN, LidarNode
 from lidar_perception.params import ClusteringNodeParams
-from lidar_perception.pipeline import cluster_obstacles, grounded_boxes, warm_up
+from lidar_perception.pipeline import cluster_obstacles, explain_nothing, grounded_boxes, warm_up
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
 
@@ -41,7 +41,6 @@ class Clustering(LidarNode):
         if marked is None:
             self.report(WARN, "the cloud has no column 'ground', so all of it is clustered; "
                         "remap ~/input/points to the ground segmentation's output")
-        elif not ids.any():
-            self.report(WARN, "no clusters; are dbscan.eps and min_samples right for this sensor?")
         else:
-            self.report(OK, "clustering")
+            problem = explain_nothing(len(frame), frame.xyz, ground, np.inf, ids)
+            self.report(WARN if problem else OK, problem or "clustering")

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from lidar_perception.datasets.bag import bag_message, encode
 from lidar_perception.ground.threshold import fit_plane, segment_ground
 from lidar_perception.messages import spread, to_frame
 from lidar_perception.nodes.inputs import CameraInput
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN, LidarNode
 from lidar_perception.params import GroundNodeParams
-from lidar_perception.pipeline import points_in_view, warm_up
+from lidar_perception.pipeline import explain_nothing, points_in_view, warm_up
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
 from msg_utils.stamps import to_ns
 
@@ -45,19 +43,9 @@ class GroundSegmentation(LidarNode):
             if publisher.get_subscription_count():
                 publisher.publish(encode(from_array(to_array(msg).take(places[chosen]), msg.header,
                                                     bag_message)))
-        self._diagnose(len(frame), xyz, ground)
-
-    def _diagnose(self, usable: int, xyz: np.ndarray, ground: np.ndarray) -> None:
         plane = fit_plane(xyz.compress(ground, axis=0))
-        if usable == 0:
-            self.report(WARN, "the cloud is empty or has no finite point")
-        elif len(xyz) == 0:
-            self.report(WARN, "no point is in the camera's view; check the LiDAR-to-camera "
-                        "transform")
-        elif plane is None:
-            self.report(WARN, f"no ground found below z = {self.params.ground.z_max} m; is the "
-                        "sensor's height different? set ground.z_max")
-        else:
+        if plane is not None:
             self.counts.update(plane=" ".join(f"{v:.4f}" for v in plane),
                                ground_share=f"{ground.mean():.3f}")
-            self.report(OK, "segmenting")
+        problem = explain_nothing(len(frame), xyz, ground, self.params.ground.z_max)
+        self.report(WARN if problem else OK, problem or "segmenting")

@@ -53,12 +53,14 @@ class CandidateOutputs:
                 RELIABLE)
         self.step_times: dict[str, Any] = {}
 
-    def publish(self, header: Any, find: Callable[[], Candidates]) -> Candidates:
-        """Publish what find() gives; where it raises InputError, no candidates and the reason."""
+    def publish(self, header: Any, find: Callable[[], Candidates],
+                problem: str | None = None) -> None:
+        """Publish what find() gives; where it raises InputError, no candidates and the reason.
+        problem is what is known to be wrong with the frame already."""
         try:
-            candidates, problem = find(), None
+            candidates = find()
         except InputError as error:
-            candidates, problem = Candidates.none(), str(error)
+            candidates, problem = Candidates.none(), problem or str(error)
         for stage, publisher in self.markers.items():
             if stage == "final" or publisher.get_subscription_count():
                 message = detection_markers(getattr(candidates, stage), header, bag_message,
@@ -76,7 +78,6 @@ class CandidateOutputs:
                     Float64, f"~/debug/{step}_ms", RELIABLE)
             self.step_times[step].publish(Float64(data=ms))
         self._diagnose(candidates, problem)
-        return candidates
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:
         self.node.counts["candidates"] = len(candidates.final)

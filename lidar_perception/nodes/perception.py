@@ -10,7 +10,7 @@ from lidar_perception.nodes.inputs import CameraInput, SeedInput
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, LidarNode
 from lidar_perception.params import PipelineParams
-from lidar_perception.pipeline import SeedSource, refined, segment, warm_up
+from lidar_perception.pipeline import SeedSource, explain_nothing, refined, segment, warm_up
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
 
@@ -34,7 +34,10 @@ class Perception(LidarNode):
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable = to_frame(msg)
             segmented = segment(frame, self.camera.get(frame.frame_id), self.params)
-            self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params))
+            problem = explain_nothing(len(frame), segmented.xyz, segmented.ground,
+                                      self.params.ground.z_max, segmented.cluster_ids)
+            self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params),
+                                 problem)
         if self.points.get_subscription_count():
             places = usable.take(segmented.places)
             self.points.publish(encode(add_columns(

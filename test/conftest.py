@@ -1,0 +1,55 @@
+"""Fixtures of more than one file: a simulated bag, and a peer on a private ROS domain."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+FRAMES = 8
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """Real scans that lie beside the checkout, never in it."""
+    if not DATA.is_dir():
+        pytest.skip("real data is not beside the checkout (../shared/data)")
+    return DATA
+
+
+@pytest.fixture(scope="session")
+def drive_bag(tmp_path_factory) -> Path:
+    """A bag of a simulated drive: clouds, labels, camera."""
+    from lidar_perception.datasets.to_bag import write_bag
+    from lidar_perception.simulation.to_bag import simulated_scans
+    path = tmp_path_factory.mktemp("drive") / "drive"
+    write_bag(path, simulated_scans(seed=1, frames=FRAMES))
+    return path
+
+
+@pytest.fixture(scope="session")
+def domain() -> int:
+    """A ROS domain of this test session's own, reached by this machine only."""
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    number = 101 + os.getpid() % 100
+    os.environ["ROS_DOMAIN_ID"] = str(number)
+    return number
+
+
+@pytest.fixture
+def peer(domain):
+    pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+    from ros_peer import Peer
+    with Peer(domain) as peer:
+        yield peer
+
+
+@pytest.fixture
+def processes(domain, tmp_path):
+    """Starts node processes; what still runs at the end of the test is ended."""
+    pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+    from lidar_perception.nodes.graph import Processes
+    with Processes(tmp_path / "logs", domain) as running:
+        yield running

@@ -1,0 +1,102 @@
+"""A node in the test's own process, to talk to the nodes under test over DDS."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import monotonic
+from typing import Any
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.qos import QoSProfile
+from rclpy.signals import SignalHandlerOptions
+
+from lidar_perception.datasets.bag import decode, encode
+from lidar_perception.nodes.main import use_large_shared_memory
+from lidar_perception.nodes.runtime import RELIABLE
+from msg_utils.messages import message_class
+
+use_large_shared_memory()
+TIMEOUT = 60.0  # seconds; the first start on a machine compiles
+
+
+class Peer:
+    def __init__(self, domain: int):
+        self.context = Context()
+        rclpy.init(context=self.context, domain_id=domain,
+                   signal_handler_options=SignalHandlerOptions.NO)
+        self.node = rclpy.create_node("peer", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.diagnostics: dict[str, Any] = {}
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_status, RELIABLE)
+
+    def __enter__(self) -> Peer:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        rclpy.try_shutdown(context=self.context)
+
+    def _on_status(self, msg: Any) -> None:
+        for status in msg.status:
+            self.diagnostics[status.name] = status
+
+    def message_of(self, node: str) -> str:
+        """The node's last diagnostic message, '' before the first."""
+        return self.diagnostics[node].message if node in self.diagnostics else ""
+
+    def value_of(self, node: str, key: str) -> str | None:
+        status = self.diagnostics.get(node)
+        return next((v.value for v in status.values if v.key == key), None) if status else None
+
+    def listen(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE) -> list:
+        """A list that grows with the messages of a topic."""
+        received: list = []
+        self.node.create_subscription(message_class(type_name), topic,
+                                      lambda data: received.append(decode(data, type_name)), qos,
+                                      raw=True)
+        return received
+
+    def listen_raw(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE) -> list[bytes]:
+        received: list[bytes] = []
+        self.node.create_subscription(message_class(type_name), topic, received.append, qos,
+                                      raw=True)
+        return received
+
+    def talker(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE) -> Any:
+        return self.node.create_publisher(message_class(type_name), topic, qos)
+
+    def send(self, publisher: Any, message: Any, until: Callable[[], Any], what: str) -> None:
+        """Publish, and again every half second, until a condition holds: a best-effort subscriber
+        may not know the publisher yet when the publisher knows it."""
+        data, again = encode(message), 0.0
+
+        def condition() -> Any:
+            nonlocal again
+            if monotonic() >= again and publisher.get_subscription_count():
+                publisher.publish(data)
+                again = monotonic() + 0.5
+                return False
+            return until()
+
+        self.wait(condition, what)
+
+    def wait(self, condition: Callable[[], Any], what: str, timeout: float = TIMEOUT) -> None:
+        """Spin until condition() holds; fail naming what was waited for."""
+        end = monotonic() + timeout
+        while not condition():
+            assert monotonic() < end, f"waited {timeout:.0f} s in vain for {what}; diagnostics: " \
+                + str({k: v.message for k, v in self.diagnostics.items()})
+            self.executor.spin_once(timeout_sec=0.02)
+
+    def call(self, service: str, kind: type, request: Any) -> Any:
+        client = self.node.create_client(kind, service)
+        self.wait(client.service_is_ready, f"service {service}")
+        future = client.call_async(request)
+        self.wait(future.done, f"answer of {service}")
+        self.node.destroy_client(client)
+        return future.result()

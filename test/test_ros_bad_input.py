@@ -1,0 +1,145 @@
+"""No message ends a node: each bad cloud becomes a diagnostic, and the next good one is served."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from lidar_perception.datasets.bag import Bag, bag_message
+from lidar_perception.topics import POINTS
+from msg_utils.markers import from_marker_array
+from msg_utils.point_cloud2 import from_array
+from msg_utils.stamps import header_message, to_ns
+
+CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
+XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+
+
+def cloud(xyz, stamp=1, **changes):
+    points = np.asarray(xyz, np.float32).reshape(-1, 3).view(XYZ).reshape(-1)
+    msg = from_array(points, header_message(stamp, "lidar", bag_message), bag_message)
+    for name, value in changes.items():
+        setattr(msg, name, value)
+    return msg
+
+
+def without_x():
+    msg = cloud(np.ones((5, 3)))
+    msg.fields[0].name = "a"
+    return msg
+
+
+def integer_z():
+    msg = cloud(np.ones((5, 3)))
+    msg.fields[2].datatype = 5
+    return msg
+
+
+def big_endian(xyz, stamp):
+    points = np.asarray(xyz, np.float32).view(XYZ).reshape(-1).astype(XYZ.newbyteorder(">"))
+    return from_array(points, header_message(stamp, "lidar", bag_message), bag_message)
+
+
+BAD = {  # what is wrong -> message, words that the diagnostic must hold
+    "empty": (cloud(np.zeros((0, 3))), "no finite point"),
+    "missing x": (without_x(), "no field 'x'"),
+    "no fields at all": (bag_message(CLOUD), "no field 'x'"),
+    "all NaN": (cloud(np.full((9, 3), np.nan)), "no finite point"),
+    "cut": (cloud(np.ones((5, 3)), data=np.zeros(7, np.uint8)), "7 bytes"),
+    "all infinite": (cloud(np.full((9, 3), np.inf)), "no finite point"),
+    "integer z": (integer_z(), "'z'"),
+    "more points than bytes": (cloud(np.ones((5, 3)), width=2**31), "bytes"),
+    "point_step 0": (cloud(np.ones((5, 3)), point_step=0), "point_step"),
+    "one point": (cloud([[5, 0, -1]]), "no ground"),
+}
+
+
+@pytest.fixture(scope="module")
+def good_cloud(drive_bag):
+    with Bag(drive_bag) as bag:
+        return next(m for _, _, m in bag.messages({POINTS}))
+
+
+@pytest.mark.parametrize("node", ["ground_segmentation", "perception"])
+def test_bad_clouds_become_diagnostics_and_the_node_lives_on(node, processes, peer, good_cloud):
+    processes.start(node, {"~/input/points": "/in", "~/output/points": "/out"},
+                    {"seed.source": "file"} if node == "perception" else {})
+    talker = peer.talker("/in", CLOUD)
+    received = peer.listen("/out", CLOUD)
+    for name, (msg, words) in BAD.items():
+        peer.diagnostics.clear()
+        peer.send(talker, msg, lambda w=words: w in peer.message_of(node), f"'{words}': {name}")
+        processes.check()
+    peer.send(talker, good_cloud, lambda: received and received[-1].width == good_cloud.width,
+              "the result of a good cloud")
+    names = [f.name for f in received[-1].fields]
+    assert names[:4] == ["x", "y", "z", "intensity"] and "ground" in names
+
+
+def test_layout_does_not_change_the_result(processes, peer, good_cloud):
+    """Big-endian, organised and NaN-padded clouds give the ground of the plain cloud."""
+    from lidar_perception.messages import to_frame
+    from msg_utils.point_cloud2 import to_array
+    processes.start("ground_segmentation", {"~/input/points": "/in", "~/output/points": "/out"}, {})
+    xyz = to_frame(good_cloud)[0].xyz[:40_000]
+    holes = np.full((20_000, 3), np.nan, np.float32)
+    organised = cloud(np.concatenate([xyz, holes, np.zeros_like(holes)]), 3, is_dense=False)
+    organised.height, organised.width = 8, 10_000
+    organised.row_step = organised.width * organised.point_step
+    talker, received = peer.talker("/in", CLOUD), peer.listen("/out", CLOUD)
+    for i, msg in enumerate((cloud(xyz, 1), big_endian(xyz, 2), organised)):
+        peer.send(talker, msg, lambda n=i: to_ns(received[-1].header.stamp) == n + 1
+                  if received else False, "a result")
+    results = {to_ns(m.header.stamp): to_array(m)["ground"] for m in received}
+    plain, big, grid = results[1], results[2], results[3]
+    assert plain.sum() > 1000
+    np.testing.assert_array_equal(plain, big)
+    np.testing.assert_array_equal(plain, grid[:len(plain)])
+    assert not grid[len(plain):].any() and received[-1].height == 8
+
+
+def test_clustering_and_refinement_name_the_missing_column(processes, peer, good_cloud):
+    processes.start("clustering", {"~/input/points": "/in"}, {})
+    processes.start("candidate_refinement", {"~/input/points": "/in"}, {})
+    talker = peer.talker("/in", CLOUD)
+    peer.send(talker, good_cloud, lambda: (
+        "no column 'ground'" in peer.message_of("clustering")
+        and "no column 'cluster_id'" in peer.message_of("candidate_refinement")), "diagnostics")
+    processes.check()
+
+
+def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
+        processes, peer, good_cloud, drive_bag):
+    """view.enabled without CameraInfo; then without a seed; then with a clicked pedestrian."""
+    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+    from rcl_interfaces.srv import SetParameters
+
+    from lidar_perception.datasets.recording import open_recording
+    from lidar_perception.evaluation.candidates import pedestrians
+    processes.start("perception", {"~/input/points": "/in", "~/output/detections": "/found"},
+                    {"view.enabled": True, "seed.source": "click"})
+    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
+    peer.send(talker, good_cloud, lambda: "camera calibration" in peer.message_of("perception"),
+              "no camera yet")
+    off = Parameter(name="view.enabled",
+                    value=ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=False))
+    assert peer.call("/perception/set_parameters", SetParameters,
+                     SetParameters.Request(parameters=[off])).results[0].successful
+    peer.send(talker, good_cloud, lambda: found and "no seed yet" in peer.message_of("perception"),
+              "no seed yet")
+    assert len(from_marker_array(found[-1])) == 0
+
+    people = pedestrians(next(iter(open_recording(bag=drive_bag))))
+    nearest = people[np.argmin(np.hypot(people[:, 0], people[:, 1]))]
+    click = peer.talker("/clicked_point", "geometry_msgs/msg/PointStamped")
+    point = bag_message("geometry_msgs/msg/Point", x=nearest[0], y=nearest[1], z=nearest[2])
+    for frame_id, words in (("map", "frame 'map'"), ("velodyne", "detecting")):
+        clicked = bag_message("geometry_msgs/msg/PointStamped", point=point,
+                              header=header_message(0, frame_id, bag_message))
+        peer.send(click, clicked, click.get_subscription_count, "a subscriber of the click")
+        peer.send(talker, good_cloud, lambda w=words: w in peer.message_of("perception"), words)
+    objects = from_marker_array(found[-1])
+    assert np.linalg.norm(objects.boxes[:, :2] - nearest[:2], axis=1).min() < 1.0
+    assert set(objects.labels) == {"Pedestrian"} and objects.frame_id == "velodyne"
