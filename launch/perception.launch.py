@@ -5,11 +5,11 @@
 
 from pathlib import Path
 
-from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from launch import LaunchDescription
 from lidar_perception.nodes.graph import SINGLE, STAGES
 from lidar_perception.topics import POINTS
 

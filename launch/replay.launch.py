@@ -5,7 +5,6 @@
 
 from pathlib import Path
 
-from launch import LaunchDescription
 from launch.actions import (
     DeclareLaunchArgument,
     EmitEvent,
@@ -20,7 +19,8 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from lidar_perception.nodes.graph import evaluation
+from launch import LaunchDescription
+from lidar_perception.nodes.graph import evaluation, wait_for
 
 HERE = Path(__file__).resolve().parent
 CONFIG = HERE.parent / "config" / "replay.param.yaml"
@@ -37,7 +37,8 @@ def replay(context):
     player = Node(
         package="lidar_perception", executable="bag_player", name="bag_player", output="screen",
         parameters=[value["config"], {"bag": value["bag"], "rate": float(value["rate"]),
-                                      "loop": value["loop"] == "true"}],
+                                      "loop": value["loop"] == "true",
+                                      "wait_for": wait_for(value["single"] == "true")}],
         ros_arguments=log_level)
     evaluator = Node(
         package="lidar_perception", executable="evaluator", name="evaluator", output="screen",

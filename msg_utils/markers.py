@@ -58,7 +58,7 @@ def to_marker_array(boxes: np.ndarray, labels: Sequence[str], scores: Sequence[f
     boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
     ids = range(len(boxes)) if ids is None else ids
     lifetime = duration_message(lifetime_ns, make)
-    empty = make("geometry_msgs/msg/Pose")
+    empty = box_pose(np.zeros(7), make)  # with a unit quaternion
 
     def marker(ns, index, action, text, pose=empty, scale=(0, 0, 0), rgb=OTHER_COLOR):
         x, y, z = map(float, scale)

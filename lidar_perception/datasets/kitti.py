@@ -120,9 +120,10 @@ def _tracking(folder: Path) -> list[KittiFrame]:
             return all_labels().get(frame, _NO_OBJECTS) if labels.exists() else None
 
         for points in scans:
-            stamp = start + (int(points.stem) - int(scans[0].stem)) * PERIOD_NS
+            frame = _number(points)
+            stamp = start + (frame - _number(scans[0])) * PERIOD_NS
             frames.append(KittiFrame(f"{sequence.name}/{points.stem}", points, stamp, calibration,
-                                     functools.partial(truth, int(points.stem)),
+                                     functools.partial(truth, frame),
                                      images / f"{points.stem}.png"))
         start = frames[-1].stamp_ns + GAP_NS if frames else start
     return frames
@@ -146,7 +147,7 @@ def _raw(root: Path) -> list[KittiFrame]:
 
         stamps = _raw_stamps(drive / "velodyne_points" / "timestamps.txt")
         for points in sorted((drive / "velodyne_points/data").glob("*.bin")):
-            frame = int(points.stem)
+            frame = _number(points)
             if frame >= len(stamps):
                 raise InputError(f"{drive}/velodyne_points/timestamps.txt has {len(stamps)} lines "
                                  f"but there is a scan {points.name}; download the drive again")
@@ -154,6 +155,13 @@ def _raw(root: Path) -> list[KittiFrame]:
                                      calibration, functools.partial(truth, frame),
                                      drive / f"image_02/data/{points.stem}.png"))
     return sorted(frames, key=lambda f: f.stamp_ns)
+
+
+def _number(scan: Path) -> int:
+    try:
+        return int(scan.stem)
+    except ValueError:
+        raise InputError(f"{scan} is no KITTI scan: its name is no number; move it away") from None
 
 
 def _raw_stamps(path: Path) -> list[int]:

@@ -96,8 +96,7 @@ class BagPlayer(LidarNode):
         wanted = {name: int(count or 1) for name, _, count in rules}
         give_up = monotonic() + self.params.wait_timeout
         while rclpy.ok():
-            missing = [p.topic_name for t, p in self.publishers_by_topic.items()
-                       if p.get_subscription_count() < wanted.get(self.names[t], 0)]
+            missing = [t for t, count in wanted.items() if self._subscribers(t) < count]
             if not missing:
                 return
             if monotonic() > give_up:
@@ -105,6 +104,12 @@ class BagPlayer(LidarNode):
                             f"{self.params.wait_timeout:g} s; playing anyway")
                 return
             self.serve(timeout_sec=0.02)
+
+    def _subscribers(self, topic: str) -> int:
+        """Of a topic that is played, those that are matched; else those that are known of."""
+        played = [p for t, p in self.publishers_by_topic.items() if self.names[t] == topic]
+        return (played[0].get_subscription_count() if played
+                else self.count_subscribers(topic))
 
     def _wait_until_delivered(self) -> None:
         from rclpy.duration import Duration

@@ -54,10 +54,10 @@ class Evaluator(LidarNode):
         truth = to_truth(frame["truth"]).of_class(PEDESTRIAN)
         if len(truth) or not self.params.only_with_pedestrians:
             self.result.add(truth, {s: frame[s].boxes for s in self.params.stages})
-        rows = [f"{s} F1 {score.table()['all']['f1']:.3f}"
-                for s, score in self.result.scores.items()]
-        self.counts.update(scored=self.result.frames)
-        self.report(OK, ", ".join(rows) or "no frame with a Pedestrian yet")
+        self.counts.update(scored=self.result.frames, **{
+            f"F1 of {s}": f"{score.table()['all']['f1']:.3f}"
+            for s, score in self.result.scores.items()})
+        self.report(OK, "scoring" if self.result.frames else "no frame with a Pedestrian yet")
 
     def write(self) -> None:
         if self.params.file:

@@ -58,6 +58,14 @@ def outputs_in_use(graph: Mapping[str, Mapping[str, str]]) -> dict[str, set[str]
     return {node: {t for t in heard if t.startswith(f"/{node}/")} for node in graph}
 
 
+def wait_for(single: bool = False, points: int = 1, truth: int = 2) -> list[str]:
+    """bag_player's wait_for: subscribers of the clouds, of the labels (the seed input and an
+    evaluator), and one of each topic between the nodes."""
+    graph = SINGLE if single else STAGES
+    between = sorted(set().union(*outputs_in_use(graph).values()))
+    return [f"{POINTS}:={points}", f"{TRUTH}:={truth}", *between, result_topics(single)["final"]]
+
+
 class Processes:
     """Node processes with logs in a folder; a context manager that ends them with SIGINT."""
 

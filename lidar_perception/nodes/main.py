@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import importlib
 import os
 import signal
 import sys
+import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
 
@@ -46,6 +49,15 @@ def use_large_shared_memory() -> None:
         os.environ[name] = str(Path(__file__).with_name("fastdds.xml"))
 
 
+@contextmanager
+def one_at_a_time():
+    """The first node compiles, the others wait and load what it has cached: when all compile the
+    same at once on few cores, each takes as many times longer."""
+    with open(Path(tempfile.gettempdir()) / f"lidar_perception-{os.getuid()}.lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield
+
+
 def run(name: str, arguments: list[str]) -> int:
     """Run a node until SIGINT or SIGTERM (exit code 0), or until it is done. 2: it cannot start."""
     # From here on a signal ends the process cleanly, also while imports and compilation run.
@@ -65,7 +77,8 @@ def run(name: str, arguments: list[str]) -> int:
         return 2
     module = importlib.import_module(f"lidar_perception.nodes.{name}")
     if hasattr(module, "warm_up"):
-        module.warm_up()
+        with one_at_a_time():
+            module.warm_up()
     return _spin(getattr(module, NODES[name]), rclpy, arguments, perf_counter() - begin)
 
 
@@ -91,6 +104,9 @@ def _spin(node_class: type, rclpy, arguments: list[str], seconds: float) -> int:
     except (InputError, ValueError, ParameterException) as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
         return 2
+    except Exception:
+        if rclpy.ok():  # after a signal has shut the context down, any call of rclpy may fail
+            raise
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not cut the clean-up
         if node is not None:

@@ -15,11 +15,12 @@ from lidar_perception.nodes.graph import (
     evaluation,
     outputs_in_use,
     result_topics,
+    wait_for,
 )
 from lidar_perception.nodes.main import use_large_shared_memory
 from lidar_perception.params import PipelineParams, flatten
 from lidar_perception.terminal import errors, progress
-from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
+from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, TRUTH
 from lidar_perception.types import InputError
 
 START_TIMEOUT = 60.0    # seconds for all nodes to come up and find each other
@@ -56,9 +57,10 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
         if not ready:
             raise InputError(f"the nodes did not find each other in {START_TIMEOUT:.0f} s: "
                              f"{watch.messages or 'none has reported'}; see {out}/logs")
-        # The first stage and the watch hear the clouds; seeds, evaluator and recorder the truth.
+        # The watch hears the clouds too, and the recorder the labels.
+        rules = wait_for(single, points=2, truth=2 + record)
         processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
-                                           "wait_for": [f"{POINTS}:=2", f"{TRUTH}:={2 + record}"]})
+                                           "wait_for": rules})
         with progress() as bar:
             task = bar.add_task("replaying", total=clouds)
             before = -1

@@ -1,0 +1,93 @@
+"""Small made-up inputs that several test files share."""
+
+from __future__ import annotations
+
+import importlib.util
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lidar_perception.datasets.bag import bag_message
+from lidar_perception.datasets.kitti_calibration import KittiCalibration
+from lidar_perception.datasets.kitti_labels import format_label, to_labels
+from lidar_perception.types import PEDESTRIAN, GroundTruth
+from msg_utils.messages import ros_message
+from msg_utils.stamps import header_message
+
+# Both kinds of message classes: rosbags' own, and ROS's.
+each_make = pytest.mark.parametrize("make", [
+    pytest.param(bag_message, id="rosbags"),
+    pytest.param(ros_message, id="ros", marks=pytest.mark.skipif(
+        importlib.util.find_spec("rclpy") is None, reason="needs ROS 2, or the extra [ros]")),
+])
+
+STAMP = 1_700_000_000_123_456_789
+
+# A forward-looking camera, almost level, a little before the LiDAR.
+AXES = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])  # x forward, z up -> x right, y down
+RECTIFY = Rotation.from_euler("xyz", [0.004, -0.007, 0.003]).as_matrix()
+VELODYNE = np.column_stack([Rotation.from_euler("xyz", [0.002, 0.006, -0.009]).as_matrix() @ AXES,
+                            [0.01, -0.08, -0.27]])
+INTRINSICS = np.array([[721.5377, 0, 609.6, 45.0], [0, 721.5377, 172.9, 0.2], [0, 0, 1, 0.003]])
+LIDAR_TO_CAMERA = np.eye(4)
+LIDAR_TO_CAMERA[:3] = RECTIFY @ VELODYNE
+CALIBRATION = KittiCalibration(INTRINSICS, LIDAR_TO_CAMERA, 1242, 375)
+
+WALKER = np.array([8.0, 0.5, -0.85, 0.5, 0.5, 1.7, 0.3])  # [x y z l w h yaw]
+LABELS = """\
+Pedestrian 0.00 0 -0.21 700.00 150.00 800.00 300.00 1.80 0.50 0.90 1.50 1.60 8.00 0.02
+Car 0.35 2 1.57 10.25 180.50 220.75 374.00 1.52 1.63 3.88 -5.10 1.71 9.43 1.05
+DontCare -1 -1 -10 503.89 169.71 590.61 190.13 -1 -1 -1 -1000 -1000 -1000 -10
+"""
+
+
+def header(make, ns: int = STAMP, frame_id: str = "velodyne"):
+    return header_message(ns, frame_id, make)
+
+
+def scene(seed: int = 0) -> np.ndarray:
+    """(N, 4) float32: flat ground 1.7 m below, and a person inside the box WALKER."""
+    rng = np.random.default_rng(seed)
+    flat = rng.uniform(-20, 20, (3000, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
+    person = rng.uniform(-0.15, 0.15, (400, 3)) * [1, 1, 5.5] + WALKER[:3]
+    xyz = np.concatenate([flat, person])
+    return np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32)
+
+
+def walker_truth() -> GroundTruth:
+    return GroundTruth.of([WALKER], [PEDESTRIAN])
+
+
+def walker_label() -> str:
+    return format_label(to_labels(walker_truth(), LIDAR_TO_CAMERA)[0])
+
+
+def numbers(matrix: np.ndarray) -> str:
+    return " ".join(f"{v!r}" for v in np.asarray(matrix).ravel().tolist())
+
+
+def calibration_text(rectify: str = "R0_rect:", velodyne: str = "Tr_velo_to_cam:") -> str:
+    return (f"P2: {numbers(INTRINSICS)}\n{rectify} {numbers(RECTIFY)}\n"
+            f"{velodyne} {numbers(VELODYNE)}\n")
+
+
+def write(path: Path, content: str | bytes | np.ndarray) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(content.encode() if isinstance(content, str) else bytes(content))
+    return path
+
+
+def png_header(width: int, height: int) -> bytes:
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", width, height)
+
+
+def object_folder(root: Path, labels: str = LABELS, count: int = 2) -> Path:
+    """KITTI 3D object: training/{velodyne,calib,label_2}, frames 000000..."""
+    for i in range(count):
+        write(root / f"training/velodyne/{i:06}.bin", scene(i).tobytes())
+        write(root / f"training/calib/{i:06}.txt", calibration_text())
+        write(root / f"training/label_2/{i:06}.txt", labels)
+    return root

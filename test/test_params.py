@@ -1,0 +1,277 @@
+"""Parameters: what is in range goes in and comes out; what is not is named."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import pytest
+
+from lidar_perception import params as module
+from lidar_perception.cli.options import read_config
+from lidar_perception.params import (
+    ClusteringNodeParams,
+    DbscanParams,
+    GroundNodeParams,
+    GroundParams,
+    Params,
+    PipelineParams,
+    PlayerParams,
+    RefinementNodeParams,
+    flatten,
+    parameter_fields,
+    with_values,
+)
+from lidar_perception.types import InputError
+
+GROUPS = Params.__subclasses__()
+COMPOSITES = [PipelineParams, GroundNodeParams, ClusteringNodeParams, RefinementNodeParams]
+FIELDS = [pytest.param(group, f, id=f"{group.__name__}.{f.name}")
+          for group in GROUPS for f in dataclasses.fields(group)]
+
+each_field = pytest.mark.parametrize("group, f", FIELDS)
+each_params = pytest.mark.parametrize("kind", [*GROUPS, *COMPOSITES])
+
+
+def kind_of(f: dataclasses.Field) -> type:
+    return f.metadata["item"] or type(f.default)
+
+
+def as_field(f: dataclasses.Field, value):
+    """value where the field is a scalar; a list as long as the default, with value first."""
+    return (value, *f.default[1:]) if f.metadata["item"] else value
+
+
+def bounded(limit: str) -> list:
+    return [p for p in FIELDS if p.values[1].metadata[limit] is not None]
+
+
+def step_of(f: dataclasses.Field) -> float:
+    return 1 if kind_of(f) is int else 0.5
+
+
+def other_value(f: dataclasses.Field):
+    """A value in range that is not the default."""
+    if f.metadata["choices"]:
+        return next(c for c in f.metadata["choices"] if c != f.default)
+    if f.metadata["item"]:
+        return (*f.default, "/more") if kind_of(f) is str else tuple(v + 1.0 for v in f.default)
+    if isinstance(f.default, bool):
+        return not f.default
+    if isinstance(f.default, str):
+        return f.default + "other"
+    high = f.metadata["high"]
+    return f.default + 1 if high is None or f.default + 1 <= high else f.default / 2
+
+
+def config(tmp_path, text: str, params=None):
+    path = tmp_path / "params.yaml"
+    path.write_text(text)
+    return read_config(path, params or PipelineParams())
+
+
+def test_every_group_of_the_module_is_tested():
+    public = [v for v in vars(module).values() if dataclasses.is_dataclass(v)]
+    assert {*public} == {*GROUPS, *COMPOSITES}
+
+
+@each_params
+def test_defaults_pass_their_own_checks_unchanged(kind):
+    made = kind()
+    assert flatten(made) == {n: f.default for n, f in parameter_fields(made).items()}
+
+
+@each_field
+def test_each_field_says_what_it_is(group, f):
+    assert f.metadata["doc"].endswith(".")
+    assert kind_of(f) in (bool, int, float, str)
+    assert f.metadata["choices"] == () or f.default in f.metadata["choices"]
+
+
+@each_params
+def test_with_values_inverts_flatten(kind):
+    changed = with_values(kind(), {n: other_value(f)
+                                   for n, f in parameter_fields(kind()).items()})
+    assert changed != kind()
+    assert with_values(kind(), flatten(changed)) == changed
+    assert flatten(with_values(kind(), flatten(changed))) == flatten(changed)
+
+
+@each_params
+def test_with_values_changes_nothing_else(kind):
+    for name, f in parameter_fields(kind()).items():
+        if name.endswith(("eps", "range_limits")):
+            continue  # two lengths that depend on each other
+        assert flatten(with_values(kind(), {name: other_value(f)})) == {
+            **flatten(kind()), name: other_value(f)}
+
+
+@pytest.mark.parametrize("group, f", bounded("low"))
+def test_below_the_range_names_field_value_and_range(group, f):
+    value = f.metadata["low"] - step_of(f)
+    with pytest.raises(ValueError) as error:
+        group(**{f.name: as_field(f, value)})
+    for word in (f.name, str(value), f"{f.metadata['low']} .. "):
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize("group, f", bounded("high"))
+def test_above_the_range_names_field_value_and_range(group, f):
+    value = f.metadata["high"] + step_of(f)
+    with pytest.raises(ValueError) as error:
+        group(**{f.name: as_field(f, value)})
+    for word in (f.name, str(value), f" .. {f.metadata['high']}"):
+        assert word in str(error.value)
+
+
+@pytest.mark.parametrize("group, f", [p for p in bounded("low") + bounded("high")
+                                      if not p.values[1].metadata["item"]])
+def test_the_ends_of_the_range_belong_to_it(group, f):
+    for limit in (f.metadata["low"], f.metadata["high"]):
+        if limit is not None:
+            assert getattr(group(**{f.name: kind_of(f)(limit)}), f.name) == limit
+
+
+@each_field
+def test_wrong_types_name_field_value_and_type(group, f):
+    wrong = {bool: [1, 0.0, "true"], int: [1.0, "1", True], float: ["1.0", True, 1j],
+             str: [1, 2.0, True]}[kind_of(f)]
+    for value in [None, *wrong]:
+        with pytest.raises(ValueError, match=f"^{f.name} = ") as error:
+            group(**{f.name: as_field(f, value)})
+        assert repr(value) in str(error.value)
+        assert kind_of(f).__name__ in str(error.value)
+
+
+@pytest.mark.parametrize("group, f", [p for p in FIELDS if p.values[1].metadata["item"]])
+def test_a_scalar_is_no_list(group, f):
+    for value in ("text", 1.0, None):
+        with pytest.raises(ValueError, match=f"^{f.name} = .*must be a list"):
+            group(**{f.name: value})
+
+
+@pytest.mark.parametrize("group, f", [p for p in FIELDS if kind_of(p.values[1]) is float])
+def test_nan_is_no_number(group, f):
+    with pytest.raises(ValueError, match=f"^{f.name} is not a number"):
+        group(**{f.name: as_field(f, math.nan)})
+
+
+@pytest.mark.parametrize("group, f", [p for p in FIELDS if p.values[1].metadata["choices"]])
+def test_what_is_not_a_choice_is_answered_with_the_choices(group, f):
+    with pytest.raises(ValueError, match=f"^{f.name} = 'nothing'") as error:
+        group(**{f.name: "nothing"})
+    assert all(choice in str(error.value) for choice in f.metadata["choices"])
+
+
+def test_whole_numbers_become_floats():
+    made = GroundParams(z_max=-2)
+    assert made.z_max == -2.0 and isinstance(made.z_max, float)
+    eps = DbscanParams(eps=[1, 2, 3]).eps
+    assert eps == (1.0, 2.0, 3.0) and all(isinstance(v, float) for v in eps)
+
+
+@each_field
+def test_parameters_cannot_be_changed_in_place(group, f):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        setattr(group(), f.name, f.default)
+
+
+@pytest.mark.parametrize("limits, eps", [((), (0.2,)), ((10.0,), (0.1, 0.2))])
+def test_dbscan_takes_any_number_of_bands(limits, eps):
+    made = DbscanParams(range_limits=list(limits), eps=list(eps))
+    assert (made.range_limits, made.eps) == (limits, eps)
+
+
+def test_one_more_eps_than_range_limits():
+    for eps in [(), (0.1, 0.2), (0.1, 0.2, 0.3, 0.4)]:
+        with pytest.raises(ValueError, match=f"eps has {len(eps)} values for 2 range_limits"):
+            DbscanParams(eps=eps)
+
+
+@pytest.mark.parametrize("limits", [(30.0, 15.0), (15.0, 15.0)])
+def test_range_limits_ascend(limits):
+    with pytest.raises(ValueError, match=r"range_limits = \[.*must ascend"):
+        DbscanParams(range_limits=limits)
+
+
+@each_params
+def test_an_unknown_name_is_answered_with_the_known_ones(kind):
+    with pytest.raises(ValueError, match="unknown parameter 'nonsense'") as error:
+        with_values(kind(), {"nonsense": 1})
+    assert all(name in str(error.value) for name in parameter_fields(kind()))
+
+
+def test_with_values_names_the_group():
+    with pytest.raises(ValueError, match=r"^dbscan\.min_samples = 0 is outside 1 \.\. "):
+        with_values(PipelineParams(), {"dbscan.min_samples": 0})
+
+
+def test_a_node_declares_the_parameters_of_the_pipeline():
+    whole = parameter_fields(PipelineParams())
+    parts = [parameter_fields(kind()) for kind in COMPOSITES[1:]]
+    assert {k: v for part in parts for k, v in part.items()} == whole
+
+
+def test_a_config_may_be_nested_or_dotted(tmp_path):
+    nested = config(tmp_path, """
+/**:
+  ros__parameters:
+    dbscan:
+      min_samples: 5
+      eps: [0.1, 0.2, 0.3]
+    seed: {source: file}
+""")
+    dotted = config(tmp_path, """
+perception:
+  ros__parameters:
+    dbscan.min_samples: 5
+    dbscan.eps: [0.1, 0.2, 0.3]
+    seed.source: file
+""")
+    assert nested == dotted
+    assert with_values(PipelineParams(), nested).dbscan == DbscanParams(eps=(0.1, 0.2, 0.3),
+                                                                        min_samples=5)
+
+
+def test_every_parameter_can_come_from_a_config(tmp_path):
+    text = "node:\n  ros__parameters:\n" + "".join(
+        f"    {name}: {list(value) if isinstance(value, tuple) else repr(value)}\n"
+        for name, value in flatten(PlayerParams()).items())
+    assert with_values(PlayerParams(), config(tmp_path, text, PlayerParams())) == PlayerParams()
+
+
+def test_a_config_may_hold_what_other_nodes_need(tmp_path):
+    values = config(tmp_path, """
+player: {ros__parameters: {rate: 2.0}}
+clustering: {ros__parameters: {dbscan: {min_samples: 7}, use_sim_time: true}}
+silent: {ros__parameters: }
+""")
+    assert values == {"dbscan.min_samples": 7}
+
+
+def test_an_empty_config_sets_nothing(tmp_path):
+    assert config(tmp_path, "# nothing yet\n") == {}
+
+
+@pytest.mark.parametrize("text, words", [
+    ("node: [1, 2\n", ("cannot read",)),
+    ("\tnode: 1\n", ("cannot read",)),
+    ("perception: {dbscan: {eps: 1}}", ("'perception'", "ros__parameters")),
+    ("perception: 5", ("'perception'", "ros__parameters")),
+    ("perception: {ros__parameters: [1]}", ("'perception'", "ros__parameters")),
+    ("- perception\n", ("no parameter file",)),
+    ("perception", ("no parameter file",)),
+])
+def test_a_config_that_is_none_is_named_in_one_line(tmp_path, text, words):
+    with pytest.raises(InputError) as error:
+        config(tmp_path, text)
+    message = str(error.value)
+    assert str(tmp_path / "params.yaml") in message and "\n" not in message
+    assert all(word in message for word in words)
+
+
+def test_a_config_that_cannot_be_read_is_named(tmp_path):
+    (tmp_path / "binary.yaml").write_bytes(b"\xff\xfe\x00a")
+    for name in ("missing.yaml", "binary.yaml", "."):
+        with pytest.raises(InputError, match="cannot read the parameter file"):
+            read_config(tmp_path / name, PipelineParams())

@@ -1,0 +1,274 @@
+"""PointCloud2 <-> structured arrays, byte by byte."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from samples import each_make, header
+
+from msg_utils.point_cloud2 import (
+    DATATYPES,
+    CloudError,
+    add_columns,
+    columns,
+    dtype_of,
+    from_array,
+    point_fields,
+    to_array,
+    xyz,
+)
+
+XYZ = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+
+
+@st.composite
+def layouts(draw) -> np.dtype:
+    """Any dtype a cloud can have: every datatype, gaps, counts, byte orders, field orders."""
+    names = draw(st.lists(st.sampled_from(["x", "y", "z", "intensity", "ring", "t"]), min_size=1,
+                          unique=True))
+    order = draw(st.sampled_from("<>"))
+    gaps = st.integers(0, 5)
+    formats, offsets, end = [], [], 0
+    for _ in names:
+        base = np.dtype(order + draw(st.sampled_from(sorted(DATATYPES.values()))))
+        count = draw(st.sampled_from([1, 1, 1, 2, 5]))
+        offsets.append(end + draw(gaps))
+        formats.append(base if count == 1 else (base, (count,)))
+        end = offsets[-1] + base.itemsize * count
+    listed = draw(st.permutations(range(len(names))))
+    return np.dtype(dict(names=names, formats=[formats[i] for i in listed],
+                         offsets=[offsets[i] for i in listed], itemsize=end + draw(gaps)))
+
+
+@st.composite
+def points(draw, count=st.integers(0, 12)) -> np.ndarray:
+    """Points of any layout, all bits random, NaN and padding too."""
+    dtype, n = draw(layouts()), draw(count)
+    seed = draw(st.integers(0, 2**16))
+    raw = np.random.default_rng(seed).integers(0, 256, n * dtype.itemsize, dtype=np.uint8)
+    return raw.view(dtype) if n else np.zeros(0, dtype)
+
+
+def field(make, name, offset, datatype=7, count=1):
+    return make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=datatype,
+                count=count)
+
+
+def message(make, fields, data, *, height=1, width=1, point_step, row_step=None, big=False):
+    return make("sensor_msgs/msg/PointCloud2", header=header(make), height=height, width=width,
+                fields=fields, point_step=point_step, data=data, is_bigendian=big,
+                row_step=width * point_step if row_step is None else row_step)
+
+
+def two_fields(make, *, names="ab", datatypes=(7, 7), count=1, **shape):
+    """Three points of two float32, or what is said otherwise."""
+    fields = [field(make, names[0], 0, datatypes[0]), field(make, names[1], 4, datatypes[1], count)]
+    return message(make, fields, np.zeros(24, np.uint8), **dict(width=3, point_step=8) | shape)
+
+
+def is_big(dtype: np.dtype) -> bool:
+    return any(dtype[n].base.byteorder == ">" for n in dtype.names)
+
+
+def padded(make, cloud: np.ndarray, height: int, pad: int, unnamed=()):
+    """An organised cloud with pad bytes of 0xAA after each row."""
+    rows = np.frombuffer(cloud.tobytes(), np.uint8).reshape(height, -1)
+    data = np.pad(rows, [(0, 0), (0, pad)], constant_values=0xAA)
+    fields = [*point_fields(cloud.dtype, make), *(field(make, "", at, 2) for at in unnamed)]
+    return message(make, fields, data.reshape(-1), height=height, width=len(cloud) // height,
+                   point_step=cloud.dtype.itemsize, row_step=data.shape[1],
+                   big=is_big(cloud.dtype))
+
+
+def stacked(cloud: np.ndarray, times: int) -> np.ndarray:
+    """The cloud several times; np.concatenate would lose the bytes between fields."""
+    return np.ndarray(len(cloud) * times, cloud.dtype, cloud.tobytes() * times)
+
+
+def same(a: np.ndarray, b: np.ndarray) -> bool:
+    """Equal bit by bit in every field; what lies between fields does not count."""
+    return len(a) == len(b) and a.dtype.names == b.dtype.names and all(
+        a[n].dtype == b[n].dtype and a[n].tobytes() == b[n].tobytes() for n in a.dtype.names)
+
+
+@each_make
+@given(cloud=points())
+def test_to_array_inverts_from_array(make, cloud):
+    got = to_array(from_array(cloud, header(make), make))
+    assert got.dtype == cloud.dtype
+    assert got.tobytes() == cloud.tobytes()
+
+
+@each_make
+@given(cloud=points(), height=st.integers(1, 3))
+def test_from_array_fills_in_the_message(make, cloud, height):
+    cloud = stacked(cloud, height)
+    msg = from_array(cloud, header(make), make, height=height, is_dense=False)
+    assert (msg.height, msg.height * msg.width) == (height, len(cloud))
+    assert msg.point_step == cloud.dtype.itemsize
+    assert msg.row_step == msg.width * msg.point_step
+    assert len(msg.data) == msg.height * msg.row_step
+    assert msg.header.frame_id == "velodyne" and not msg.is_dense
+
+
+@each_make
+@given(cloud=points(st.integers(1, 6)))
+def test_a_view_of_some_rows_makes_the_same_cloud_as_its_copy(make, cloud):
+    wide = np.repeat(cloud, 2)
+    assert same(to_array(from_array(wide[::2], header(make), make)), cloud)
+
+
+@each_make
+@given(cloud=points(st.integers(1, 6)), height=st.integers(1, 3), pad=st.integers(0, 9))
+def test_the_end_of_a_row_is_not_read(make, cloud, height, pad):
+    cloud = stacked(cloud, height)
+    assert same(to_array(padded(make, cloud, height, pad)), cloud)
+
+
+@each_make
+def test_the_last_row_needs_no_padding(make):
+    cloud = np.arange(12, dtype="<f4").view(XYZ)
+    msg = padded(make, cloud, 2, 8)
+    msg.data = msg.data[:-8]
+    assert same(to_array(msg), cloud)
+
+
+@each_make
+def test_fields_without_a_name_are_padding(make):
+    fields = [field(make, "", 0, 2, 4), field(make, "x", 4), field(make, "", 8, 2, 4)]
+    data = np.array([9.0, 1.5, 9.0, 9.0, 2.5, 9.0], "<f4").view(np.uint8)
+    got = to_array(message(make, fields, data, width=2, point_step=12))
+    assert got.dtype.names == ("x",) and got["x"].tolist() == [1.5, 2.5]
+
+
+@each_make
+def test_a_count_of_zero_is_one_number(make):
+    msg = message(make, [field(make, "x", 0, count=0)], np.zeros(4, np.uint8), point_step=4)
+    assert dtype_of(msg)["x"] == np.dtype("<f4")
+
+
+@each_make
+def test_arrays_of_a_cloud_cannot_be_written(make):
+    cloud = to_array(from_array(np.zeros(3, XYZ), header(make), make))
+    with pytest.raises(ValueError):
+        cloud["x"] = 1
+
+
+@each_make
+@given(cloud=points(), height=st.integers(1, 3), pad=st.integers(0, 9))
+def test_add_columns_keeps_every_old_byte_and_field(make, cloud, height, pad):
+    cloud = stacked(cloud, height)
+    step = cloud.dtype.itemsize
+    old = padded(make, cloud, height, pad, unnamed=[0])
+    new = add_columns(old, make, label=np.arange(len(cloud), dtype=np.uint16),
+                      score=np.linspace(0, 1, len(cloud), dtype=np.float32))
+    got = to_array(new)
+    assert got.dtype.names == (*cloud.dtype.names, "label", "score")
+    assert same(got[list(cloud.dtype.names)], cloud)
+    assert got["label"].tolist() == list(range(len(cloud)))
+    assert got["score"].tolist() == np.linspace(0, 1, len(cloud), dtype=np.float32).tolist()
+    raw = np.frombuffer(new.data, np.uint8).reshape(len(cloud), new.point_step)
+    assert raw[:, :step].tobytes() == cloud.tobytes()
+    assert list(new.fields[:len(old.fields)]) == list(old.fields)
+    assert (new.height, new.width) == (old.height, old.width)
+    assert (new.is_bigendian, new.is_dense) == (old.is_bigendian, old.is_dense)
+    assert new.header == old.header
+
+
+@each_make
+@given(cloud=points())
+def test_a_column_twice_is_the_last_one(make, cloud):
+    first = np.arange(len(cloud), dtype=np.int32)
+    once = add_columns(from_array(cloud, header(make), make), make, label=first)
+    twice = add_columns(once, make, label=first[::-1])
+    assert twice.point_step == once.point_step and list(twice.fields) == list(once.fields)
+    assert to_array(twice)["label"].tolist() == first[::-1].tolist()
+    assert same(to_array(twice)[list(cloud.dtype.names)], cloud)
+
+
+@each_make
+@pytest.mark.parametrize("old", [("i", "<f4"), ("i", "<i4", (2,)), ("i", "<u4")])
+@pytest.mark.parametrize("order", "<>")
+def test_a_column_of_another_shape_or_type_is_replaced(make, old, order):
+    dtype = np.dtype([("x", "<f4"), old, ("y", "<f8")]).newbyteorder(order)
+    cloud = np.zeros(3, dtype)
+    cloud["x"], cloud["y"] = [1, 2, 3], [4, 5, 6]
+    got = to_array(add_columns(from_array(cloud, header(make), make), make,
+                               i=np.array([7, 8, 9], np.int32)))
+    assert got.dtype["i"] == np.dtype(f"{order}i4") and got["i"].tolist() == [7, 8, 9]
+    assert sorted(got.dtype.names) == ["i", "x", "y"]
+    assert same(got[["x", "y"]], cloud[["x", "y"]])
+
+
+@each_make
+def test_an_empty_cloud_stays_empty(make):
+    empty = message(make, [], np.zeros(0, np.uint8), width=0, point_step=0)
+    assert len(to_array(empty)) == 0
+    got = to_array(add_columns(empty, make, label=np.zeros(0, np.uint8)))
+    assert len(got) == 0 and got.dtype.names == ("label",)
+    assert xyz(to_array(from_array(np.zeros(0, XYZ), header(make), make))).shape == (0, 3)
+
+
+@each_make
+@pytest.mark.parametrize("kind", ["<f4", ">f4", "<f8", ">f8"])
+def test_xyz_reads_any_floating_point_cloud(make, kind):
+    cloud = np.zeros(2, [("z", kind), ("ring", kind[0] + "u2"), ("y", kind), ("x", kind)])
+    cloud["x"], cloud["y"], cloud["z"] = [1, np.nan], [3, np.inf], [5, 6]
+    got = xyz(to_array(from_array(cloud, header(make), make)))
+    assert got.dtype == np.float32 and got.flags.c_contiguous
+    np.testing.assert_array_equal(got, [[1, 3, 5], [np.nan, np.inf, 6]])
+
+
+def test_columns_come_in_the_order_they_are_asked_for():
+    cloud = np.arange(6, dtype="<f4").view(XYZ)
+    assert columns(cloud, ("z", "x")).tolist() == [[2, 0], [5, 3]]
+
+
+def test_xyz_beyond_float32_is_infinite_and_not_a_warning():
+    assert np.isinf(xyz(np.array([(1e300, 0, 0)], [(n, "<f8") for n in "xyz"]))[0, 0])
+
+
+@pytest.mark.parametrize("dtype, words", [
+    ([("y", "f4"), ("z", "f4")], "no field 'x'; it has y, z"),
+    ([("x", "f4", (2,)), ("y", "f4"), ("z", "f4")], "field 'x' has count > 1"),
+    ([("x", "i4"), ("y", "f4"), ("z", "f4")], "field 'x' is of type int32"),
+    ([("x", "f4"), ("y", "f4"), ("z", "u1")], "field 'z' is of type uint8"),
+])
+def test_a_cloud_without_metres_names_the_field(dtype, words):
+    with pytest.raises(CloudError, match=words):
+        xyz(np.zeros(2, dtype))
+
+
+@each_make
+@pytest.mark.parametrize("change, words", [
+    (dict(width=4), "data has 24 bytes where height 1 x width 4 x point_step 8 needs 32"),
+    (dict(height=2, width=2), "data has 24 bytes where height 2 .* needs 32"),
+    (dict(height=2, width=1, row_step=20), "data has 24 bytes .* needs 28"),
+    (dict(height=3, width=1, row_step=7), "row_step = 7 is less than width x point_step = 8"),
+    (dict(point_step=0), "point_step is 0 for 3 points"),
+    (dict(point_step=6), "field 'b' at offset 4 reaches past point_step = 6"),
+    (dict(names="aa"), "field 'a' comes twice"),
+    (dict(datatypes=(7, 9)), "field 'b' has datatype 9"),
+    (dict(datatypes=(0, 7)), "field 'a' has datatype 0"),
+    (dict(count=2), "field 'b' at offset 4 reaches past point_step = 8"),
+])
+def test_a_broken_cloud_names_what_is_broken(make, change, words):
+    with pytest.raises(CloudError, match=words) as error:
+        to_array(two_fields(make, **change))
+    assert "\n" not in str(error.value)
+
+
+@each_make
+@pytest.mark.parametrize("dtype", [[("x", "<f4"), ("y", ">f4")], [("x", "f2")], [("x", "i8")],
+                                   [("x", "?")], [("x", "S4")]])
+def test_what_point_cloud2_cannot_say_is_refused(make, dtype):
+    with pytest.raises(ValueError):
+        from_array(np.zeros(2, dtype), header(make), make)
+
+
+@each_make
+def test_rows_of_different_length_are_refused(make):
+    with pytest.raises(ValueError, match="5 points do not make 2 rows"):
+        from_array(np.zeros(5, XYZ), header(make), make, height=2)
