@@ -54,7 +54,7 @@ setup(
     ],
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
-        "test": ["pytest>=7.4", "hypothesis>=6.90", "shapely>=2"],
+        "test": ["pytest>=7.4", "hypothesis>=6.90", "opencv-python-headless>=4.8", "setuptools>=68"],
         "benchmark": ["opencv-python-headless>=4.8", "psutil>=5.9"],
     },
     entry_points={"console_scripts": [

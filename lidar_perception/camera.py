@@ -52,5 +52,5 @@ def _in_view(xyz, projection, width, height):
         depth = p[2, 0] * x + p[2, 1] * y + p[2, 2] * z + p[2, 3]
         u = p[0, 0] * x + p[0, 1] * y + p[0, 2] * z + p[0, 3]
         v = p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]
-        seen[i] = depth > 0 and 0 <= u < width * depth and 0 <= v < height * depth
+        seen[i] = 0 <= u < width * depth and 0 <= v < height * depth  # so depth > 0
     return seen

@@ -31,8 +31,8 @@ OTHER_COLOR = (0.6, 0.6, 0.6)
 
 @dataclass(frozen=True)
 class MarkedObjects:
-    """boxes (K, 7) float64 [x y z l w h yaw], labels and extras (JSON objects) K each, ids (K,)
-    the markers' ids, scores (K,) float64; notes are (label, JSON object) without a 3D box."""
+    """boxes (K, 7) float64 [x y z l w h yaw], labels and extras (JSON objects, the score among
+    them where there is one) K each, ids (K,) the markers' ids, scores (K,) float64; notes are (label, JSON object) without a 3D box."""
 
     boxes: np.ndarray
     labels: list[str]
@@ -90,7 +90,7 @@ def from_marker_array(msg: Any) -> MarkedObjects:
     """The objects of a MarkerArray, from this module or any other node that sends CUBEs."""
     cubes = [m for m in msg.markers if m.action == ADD and m.type == CUBE]
     extras = [_content(m.text) for m in cubes]
-    scores = [float(e.pop("score")) if isinstance(e.get("score"), int | float) else 1.0
+    scores = [float(e["score"]) if isinstance(e.get("score"), int | float) else 1.0
               for e in extras]
     boxes = np.array([_box(m) for m in cubes], np.float64).reshape(-1, 7)
     notes = [(m.ns, _content(m.text)) for m in msg.markers if m.action == DELETE and m.text]

@@ -74,7 +74,7 @@ def test_from_marker_array_inverts_to_marker_array(make, rows, remarks):
     assert same_boxes(got.boxes, [r[0] for r in rows])
     assert got.labels == [r[1] for r in rows]
     assert got.scores.tolist() == [r[2] for r in rows]
-    assert got.extras == [r[3] for r in rows]
+    assert got.extras == [{**r[3], "score": r[2]} for r in rows]
     assert got.notes == remarks
     assert got.ids.tolist() == list(range(7, 7 + len(rows)))
     assert (got.stamp_ns, got.frame_id) == (STAMP, "velodyne")
@@ -140,8 +140,8 @@ def test_a_message_without_markers_is_empty(make):
     ("{broken", 1.0, {"text": "{broken"}),
     ("12", 1.0, {"text": "12"}),
     ("[1, 2]", 1.0, {"text": "[1, 2]"}),
-    ('{"score": 0.25, "id": 3}', 0.25, {"id": 3}),
-    ('{"score": 1}', 1.0, {}),
+    ('{"score": 0.25, "id": 3}', 0.25, {"score": 0.25, "id": 3}),
+    ('{"score": 1}', 1.0, {"score": 1}),
     ('{"score": "high"}', 1.0, {"score": "high"}),
     ('{"score": null}', 1.0, {"score": None}),
 ])

@@ -83,7 +83,7 @@ def load_seed(path: str | Path = "") -> Seed:
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{source} is not a template ({error!r}); make one with "
                          "'lidar-perception seed'") from None
-    if pixels.shape != (ROWS, COLUMNS) or not pixels.any() or not height > 0:
+    if pixels.shape != (ROWS, COLUMNS) or not pixels.any() or not 0 < height < np.inf:
         raise InputError(f"{source}: a template has {ROWS} rows of {COLUMNS} characters with some "
                          "'#', and height_m above 0; make one with 'lidar-perception seed'")
     return Seed(from_pixels(pixels), height)

@@ -238,10 +238,29 @@ def _root(parent, c):
 
 
 @njit(cache=True)
-def _touch(x, y, z, core, start, a, b, eps2):
+def _core_extents(x, y, z, start, core):
+    """(C, 6): low and high corner of each cell's core points; inf and -inf where it has none."""
+    extents = np.empty((len(start) - 1, 6))
+    extents[:, :3], extents[:, 3:] = np.inf, -np.inf
+    for c in range(len(start) - 1):
+        for i in range(start[c], start[c + 1]):
+            if core[i]:
+                extents[c, 0], extents[c, 3] = min(extents[c, 0], x[i]), max(extents[c, 3], x[i])
+                extents[c, 1], extents[c, 4] = min(extents[c, 1], y[i]), max(extents[c, 4], y[i])
+                extents[c, 2], extents[c, 5] = min(extents[c, 2], z[i]), max(extents[c, 5], z[i])
+    return extents
+
+
+@njit(cache=True)
+def _touch(x, y, z, core, extents, start, a, b, eps2):
     """True if a core point of cell a lies within eps of a core point of cell b."""
+    box = extents[b]
     for i in range(start[a], start[a + 1]):
-        if core[i]:
+        # Far from all of cell b at once: keeps two dense cells that do not touch linear.
+        dx = max(box[0] - x[i], 0.0, x[i] - box[3])
+        dy = max(box[1] - y[i], 0.0, y[i] - box[4])
+        dz = max(box[2] - z[i], 0.0, z[i] - box[5])
+        if core[i] and dx * dx + dy * dy + dz * dz <= eps2:
             for j in range(start[b], start[b + 1]):
                 if core[j] and _near(x, y, z, i, j, eps2):
                     return True
@@ -261,11 +280,12 @@ def _labels(x, y, z, order, start, first, second, core, eps2):
             grid_place[order[k]] = k
 
     parent = np.arange(cells).astype(np.int32)
+    extents = _core_extents(x, y, z, start, core)
     for p in range(len(first)):
         a, b = first[p], second[p]
         if cores[a] and cores[b]:
             root_a, root_b = _root(parent, a), _root(parent, b)
-            if root_a != root_b and _touch(x, y, z, core, start, a, b, eps2):
+            if root_a != root_b and _touch(x, y, z, core, extents, start, a, b, eps2):
                 parent[max(root_a, root_b)] = min(root_a, root_b)
 
     # Clusters are numbered by their first core point in the order of the input.

@@ -104,7 +104,7 @@ def _object(folder: Path) -> list[KittiFrame]:
 
 def _tracking(folder: Path) -> list[KittiFrame]:
     frames, start = [], START_NS
-    for sequence in sorted(p for p in (folder / "velodyne").iterdir() if p.is_dir()):
+    for sequence in sorted(folder.glob("velodyne/*/")):
         scans = sorted(sequence.glob("*.bin"))
         images = folder / "image_02" / sequence.name
         calibration = functools.cache(functools.partial(

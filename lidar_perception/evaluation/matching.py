@@ -19,7 +19,7 @@ def match_centres(found: np.ndarray, truth: np.ndarray,
     distance = np.linalg.norm(found[:, None, :3].astype(float) - truth[None, :, :3], axis=2)
     too_far = ~(distance <= max_distance)  # a centre that is NaN is far from all
     # One forbidden pair costs more than all allowed ones together.
-    rows, columns = linear_sum_assignment(np.where(too_far, max_distance * (distance.size + 1),
+    rows, columns = linear_sum_assignment(np.where(too_far, max_distance * distance.size + 1.0,
                                                    distance))
     keep = ~too_far[rows, columns]
     return rows[keep], columns[keep]

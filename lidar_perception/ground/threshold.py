@@ -13,6 +13,7 @@ from lidar_perception.params import GroundParams
 MIN_POINTS = 3
 SAMPLE = 2048        # candidates on which trial planes are compared; the fit uses all of them
 CONFIDENCE = 0.9999  # of having drawn one triple without outliers
+MIN_SINE = 1e-3      # of the angle in a trial's triangle; a thinner one says nothing of the plane
 REFINEMENTS = 50     # the inliers settle after a few; this bounds the rare case that they cycle
 
 
@@ -42,8 +43,9 @@ def ransac_plane(xyz: np.ndarray, params: GroundParams) -> np.ndarray | None:
         return None
     for _ in range(REFINEMENTS):
         fitted = _plane_of(_moments(xyz, plane, params.inlier_distance))
-        if (fitted is None or np.array_equal(fitted, plane)
-                or np.hypot(fitted[0], fitted[1]) > max_gradient):
+        if fitted is None:
+            return None  # the inliers lie on one line
+        if np.array_equal(fitted, plane) or np.hypot(fitted[0], fitted[1]) > max_gradient:
             break
         plane = fitted
     return plane
@@ -57,7 +59,8 @@ def fit_plane(xyz: np.ndarray) -> np.ndarray | None:
 
 def height_above(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:
     """(N,) metres of points (N, 3) above the plane, along z."""
-    return xyz[:, 2] - (plane[0] * xyz[:, 0] + plane[1] * xyz[:, 1] + plane[2])
+    x, y, z = xyz.T.astype(np.float64)  # NumPy 1 would compute in float32
+    return z - (plane[0] * x + plane[1] * y + plane[2])
 
 
 @njit(cache=True)
@@ -71,10 +74,12 @@ def _best_trial(sample, triples, distance, max_gradient, confidence):
         p, q, r = sample[triples[trial, 0]], sample[triples[trial, 1]], sample[triples[trial, 2]]
         ux, uy, uz = q[0] - p[0], q[1] - p[1], q[2] - p[2]
         vx, vy, vz = r[0] - p[0], r[1] - p[1], r[2] - p[2]
-        normal_z = ux * vy - uy * vx
-        if abs(normal_z) < 1e-9:  # the same point twice, or a vertical plane
-            continue
-        a, b = (uz * vy - uy * vz) / normal_z, (ux * vz - uz * vx) / normal_z
+        normal_x, normal_y, normal_z = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        area = normal_x * normal_x + normal_y * normal_y + normal_z * normal_z
+        sides = (ux * ux + uy * uy + uz * uz) * (vx * vx + vy * vy + vz * vz)
+        if area <= MIN_SINE * MIN_SINE * sides or normal_z == 0.0:
+            continue  # three points on a line, or a vertical plane
+        a, b = -normal_x / normal_z, -normal_y / normal_z
         if a * a + b * b > max_gradient * max_gradient:
             continue
         c = p[2] - a * p[0] - b * p[1]
@@ -123,7 +128,7 @@ def _plane_of(m: np.ndarray) -> np.ndarray | None:
     xx, xy, yy = m[4] / n - mx * mx, m[5] / n - mx * my, m[6] / n - my * my
     xz, yz = m[7] / n - mx * mz, m[8] / n - my * mz
     determinant = xx * yy - xy * xy
-    if determinant <= 1e-12 * (xx + yy) ** 2:
+    if determinant <= 1e-9 * (xx + yy) ** 2:
         return None
     a, b = (xz * yy - yz * xy) / determinant, (yz * xx - xz * xy) / determinant
     return np.array([a, b, mz + m[11] - a * (mx + m[9]) - b * (my + m[10])])
