@@ -54,8 +54,9 @@ setup(
     ],
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
-        "test": ["pytest>=7.4", "hypothesis>=6.90", "opencv-python-headless>=4.8", "setuptools>=68"],
-        "benchmark": ["opencv-python-headless>=4.8", "psutil>=5.9"],
+        "test": ["pytest>=7.4", "hypothesis>=6.90", "opencv-python-headless>=4.8",
+                 "setuptools>=68"],
+        "benchmark": ["opencv-python-headless>=4.8"],
     },
     entry_points={"console_scripts": [
         "lidar-perception = lidar_perception.cli.main:main",

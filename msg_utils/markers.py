@@ -31,8 +31,9 @@ OTHER_COLOR = (0.6, 0.6, 0.6)
 
 @dataclass(frozen=True)
 class MarkedObjects:
-    """boxes (K, 7) float64 [x y z l w h yaw], labels and extras (JSON objects, the score among
-    them where there is one) K each, ids (K,) the markers' ids, scores (K,) float64; notes are (label, JSON object) without a 3D box."""
+    """boxes (K, 7) float64 [x y z l w h yaw], scores (K,) float64, ids (K,) the markers' ids,
+    labels K strings, extras K JSON objects (the score among them where there is one); notes are
+    (label, JSON object) without a 3D box."""
 
     boxes: np.ndarray
     labels: list[str]

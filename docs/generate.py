@@ -1,0 +1,140 @@
+"""Makes docs/nodes/*.md from the parameter dataclasses: python docs/generate.py
+
+test/test_docs.py holds that the pages are up to date and the topics those of the running nodes.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from lidar_perception import params
+
+FOLDER = Path(__file__).parent / "nodes"
+CLOUD, MARKERS = "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray"
+STRING_TIMES = "std_msgs/Float64"
+
+CAMERA_IN = [
+    ("~/input/camera_info", "sensor_msgs/CameraInfo", "P and the image size; latched. Only needed "
+     "with `view.enabled`."),
+    ("~/input/extrinsics", "geometry_msgs/TransformStamped", "The camera in the LiDAR frame or the "
+     "other way round; latched. /tf_static is read too where tf2_msgs is installed."),
+]
+SEED_IN = [
+    ("~/input/ground_truth", MARKERS, "Labels, for `seed.source` ground_truth; matched to the "
+     "cloud by header.stamp."),
+    ("/clicked_point", "geometry_msgs/PointStamped", "A point on a pedestrian, for `seed.source` "
+     "click, in the frame of the cloud."),
+]
+CANDIDATES_OUT = [
+    ("~/output/detections", MARKERS, "The candidates (STM + CPA); an empty array still carries the "
+     "stamp."),
+    ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, where vision_msgs is "
+     "installed."),
+    ("~/debug/stage1", MARKERS, "Clusters of the seed's height; made only while subscribed."),
+    ("~/debug/stage2", MARKERS, "After STM without CPA; made only while subscribed."),
+    ("~/debug/height_ms, stm_ms, cpa_ms", STRING_TIMES, "Time of each step."),
+]
+ALWAYS_OUT = [
+    ("~/debug/processing_time_ms", STRING_TIMES, "Time of the work on one cloud."),
+    ("/diagnostics", "diagnostic_msgs/DiagnosticArray", "Once a second and at every change: state, "
+     "reason, counts, lost messages, subscribers of the outputs."),
+]
+COLUMNS = "columns `ground` (uint8, 1 = ground) and `in_view` (uint8, 1 = processed)"
+
+NODES: dict[str, dict[str, Any]] = {
+    "ground_segmentation": dict(
+        params=params.GroundNodeParams(),
+        what="Marks the ground points of a cloud by a height threshold and a RANSAC plane.",
+        inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN],
+        outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS}."),
+                 ("~/output/ground", CLOUD, "Ground points only; made only while subscribed."),
+                 ("~/output/nonground", CLOUD, "The other points in view; likewise.")]),
+    "clustering": dict(
+        params=params.ClusteringNodeParams(),
+        what="Clusters the points that are not ground: distance-aware DBSCAN, exact.",
+        inputs=[("~/input/points", CLOUD, "With column `ground`; without it everything is "
+                 "clustered and a diagnostic says so.")],
+        outputs=[("~/output/points", CLOUD, "The same cloud with the column `cluster_id` (uint32, "
+                  "0 = none)."),
+                 ("~/output/boxes", MARKERS, "Cluster boxes, down to the ground; made only while "
+                  "subscribed.")]),
+    "candidate_refinement": dict(
+        params=params.RefinementNodeParams(),
+        what="Finds pedestrian candidates among clusters: ground snapping, height filter, single "
+             "template matching, centralized point augmentation.",
+        inputs=[("~/input/points", CLOUD, "With columns `ground` and `cluster_id`."), *SEED_IN],
+        outputs=CANDIDATES_OUT),
+    "perception": dict(
+        params=params.PipelineParams(),
+        what="The three stages in one process, with the same parameters and results and without "
+             "the copies between them.",
+        inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN,
+                *SEED_IN],
+        outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS} and `cluster_id`; "
+                  "made only while subscribed."),
+                 ("~/output/boxes", MARKERS, "Cluster boxes; made only while subscribed."),
+                 *CANDIDATES_OUT]),
+    "evaluator": dict(
+        params=params.EvaluatorParams(),
+        what="Scores detections against ground truth by the protocol of the STM-CPA paper.",
+        inputs=[("~/input/ground_truth", MARKERS, "Labels; matched by header.stamp."),
+                ("~/input/STAGE", MARKERS, "One topic for each name in `stages`.")],
+        outputs=[]),
+    "bag_player": dict(
+        params=params.PlayerParams(),
+        what="Replays a rosbag2 bag (MCAP or SQLite3). Messages go from the file to DDS as they "
+             "are. Ends with exit code 0 when the bag is played.",
+        inputs=[],
+        outputs=[("the topics of the bag", "as recorded", "With the recorded QoS."),
+                 ("/clock", "rosgraph_msgs/Clock", "The bag's time, with `clock_hz`.")],
+        services=[("~/pause, ~/resume", "std_srvs/Trigger", ""),
+                  ("~/step", "std_srvs/Trigger", "While paused: one more cloud and what comes "
+                   "before it."),
+                  ("~/set_rate", "rosbag2_interfaces/SetRate", "Where rosbag2_interfaces is "
+                   "installed; the parameter `rate` does the same everywhere.")]),
+    "bag_recorder": dict(
+        params=params.RecorderParams(),
+        what="Records topics to an MCAP bag. The bag appears under its name when the node ends.",
+        inputs=[("the topics of `topics`", "any", "With the QoS of their publishers.")],
+        outputs=[]),
+}
+
+
+def page(name: str) -> str:
+    node = NODES[name]
+    lines = [f"# {name}", "", node["what"], "",
+             f"    ros2 run lidar_perception {name}      # or: lidar-perception run {name}", ""]
+    for title, rows in (("Subscribes", node["inputs"]), ("Publishes", node["outputs"] + ALWAYS_OUT),
+                        ("Services", node.get("services", []))):
+        if rows:
+            lines += [f"## {title}", "", "| name | type | |", "|---|---|---|",
+                      *(f"| `{a}` | {b} | {c} |" for a, b, c in rows), ""]
+    lines += ["## Parameters", "", "| name | default | range | |", "|---|---|---|---|"]
+    for key, f in params.parameter_fields(node["params"]).items():
+        lines.append(f"| `{key}` | {_default(f)} | {_range(f)} | {f.metadata['doc']}"
+                     + (" Fixed at start." if f.metadata["fixed"] else "") + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _default(f: Any) -> str:
+    unit = f" {f.metadata['unit']}" if f.metadata["unit"] else ""
+    if isinstance(f.default, tuple):
+        return ", ".join(map(str, f.default)) + unit if f.default else "empty"
+    return (str(f.default).lower() if isinstance(f.default, bool) else str(f.default) or "empty"
+            ) + unit
+
+
+def _range(f: Any) -> str:
+    low, high, choices = (f.metadata[k] for k in ("low", "high", "choices"))
+    if choices:
+        return ", ".join(choices)
+    if low is None and high is None:
+        return ""
+    return f"{'' if low is None else f'{low:g}'} .. {'' if high is None else f'{high:g}'}"
+
+
+if __name__ == "__main__":
+    FOLDER.mkdir(exist_ok=True)
+    for name in NODES:
+        (FOLDER / f"{name}.md").write_text(page(name))

@@ -1,0 +1,68 @@
+"""The pages of the nodes say what the nodes do."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+from lidar_perception.datasets.bag import bag_message  # noqa: F401  (the nodes' message classes)
+from lidar_perception.nodes.main import NODES
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture(scope="module")
+def generate():
+    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_node_has_a_page_and_a_place_in_setup(generate):
+    assert set(generate.NODES) == set(NODES)
+    text = (ROOT / "setup.py").read_text()
+    listed = re.search(r"NODES = \[(.*?)\]", text, re.S).group(1)
+    assert set(re.findall(r'"(\w+)"', listed)) == set(NODES)
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_pages_are_made_from_the_code(generate, name):
+    assert (ROOT / "docs" / "nodes" / f"{name}.md").read_text() == generate.page(name), \
+        "run: python docs/generate.py"
+
+
+@pytest.mark.parametrize("name", ["ground_segmentation", "clustering", "candidate_refinement",
+                                  "perception", "evaluator"])
+def test_documented_topics_are_the_nodes_own(generate, name, domain):
+    rclpy = pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+    from rclpy.context import Context
+    from rclpy.signals import SignalHandlerOptions
+    context = Context()
+    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    module = importlib.import_module(f"lidar_perception.nodes.{name}")
+    node = getattr(module, NODES[name])(context=context)
+    listed = {t for t, _ in [*node.get_publisher_names_and_types_by_node(name, "/"),
+                             *node.get_subscriber_names_and_types_by_node(name, "/")]}
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)
+    documented = set()
+    entry = generate.NODES[name]
+    for topics, kind, _ in entry["inputs"] + entry["outputs"] + generate.ALWAYS_OUT:
+        first, *others = topics.split(", ")
+        names = [first, *(f"{first.rsplit('/', 1)[0]}/{o}" for o in others)]
+        if not (kind.startswith("vision_msgs") or ("_ms" in topics and "processing" not in topics)):
+            documented |= {n.replace("~", f"/{name}").replace("STAGE", "final") for n in names}
+    standard = {"/parameter_events", "/rosout", "/clock", "/tf_static"}
+    assert listed - standard == documented
+
+
+@pytest.mark.parametrize("page", [*ROOT.glob("docs/**/*.md"), ROOT / "README.md"],
+                         ids=lambda p: str(p.relative_to(ROOT)))
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)", page.read_text()):
+        if "://" not in target:
+            assert (page.parent / target).exists(), target
