@@ -23,7 +23,7 @@ from lidar_perception.candidates.seeds import (
     seed_from_points,
     seed_from_truth,
 )
-from lidar_perception.clustering.dbscan import distance_aware_dbscan
+from lidar_perception.clustering.dbscan import dbscan, distance_aware_dbscan
 from lidar_perception.ground.threshold import fit_plane, segment_ground
 from lidar_perception.params import DbscanParams, PipelineParams, SeedParams, ViewParams
 from lidar_perception.types import InputError, LidarFrame
@@ -155,6 +155,7 @@ def warm_up() -> None:
     xyz = np.concatenate([flat, person, person + [12, 0, 0]]).astype(np.float32)
     seed = seed_from_points(person.astype(np.float32), 1.7)
     forward = Camera(np.array([[50, -100, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]], float), 100, 100)
+    dbscan(np.zeros((2000, 3), np.float32), 0.1, 5)  # the way that dense points take
     find_candidates(LidarFrame(xyz), fixed_seed(seed), forward,
                     PipelineParams(view=ViewParams(enabled=True)))
 

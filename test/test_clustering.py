@@ -12,6 +12,8 @@ from scipy.spatial import cKDTree
 from sklearn.cluster import DBSCAN
 
 from lidar_perception.clustering.dbscan import dbscan, distance_aware_dbscan
+from lidar_perception.clustering.dense import dbscan_by_cells
+from lidar_perception.clustering.sparse import dbscan_by_pairs
 from lidar_perception.ground.threshold import segment_ground
 from lidar_perception.params import DbscanParams
 
@@ -279,3 +281,20 @@ def test_two_dense_places_within_eps_are_one_cluster_however_many_points():
     xyz = np.zeros((400_000, 3), np.float32)
     xyz[::2, 1] = 0.14
     assert (dbscan(xyz, 0.15, 10) == 1).all()
+
+
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 300), scale=st.sampled_from([0.3, 1.0, 4.0]),
+       eps=st.sampled_from([0.1, 0.25, 0.5]), min_samples=st.integers(1, 12))
+@settings(max_examples=100, deadline=None)
+def test_by_cells_and_by_pairs_the_labels_are_scikit_learns(seed, n, scale, eps, min_samples):
+    rng = np.random.default_rng(seed)
+    xyz = (rng.random((n, 3)) * scale).astype(np.float32)
+    if seed % 2:
+        xyz = np.round(xyz * 20) / np.float32(20)  # many ties at exactly eps
+    expected = DBSCAN(eps=eps, min_samples=min_samples).fit(xyz).labels_ + 1
+    np.testing.assert_array_equal(dbscan_by_cells(xyz, eps, min_samples), expected)
+    np.testing.assert_array_equal(dbscan_by_pairs(xyz, eps, min_samples), expected)
+
+
+def test_dense_points_are_refused_by_pairs_before_they_cost_much():
+    assert dbscan_by_pairs(np.zeros((100_000, 3), np.float32), 0.5, 10) is None
