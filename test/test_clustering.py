@@ -283,8 +283,9 @@ def test_two_dense_places_within_eps_are_one_cluster_however_many_points():
     assert (dbscan(xyz, 0.15, 10) == 1).all()
 
 
-@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 300), scale=st.sampled_from([0.3, 1.0, 4.0]),
-       eps=st.sampled_from([0.1, 0.25, 0.5]), min_samples=st.integers(1, 12))
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 300),
+       scale=st.sampled_from([0.3, 1.0, 4.0]), eps=st.sampled_from([0.1, 0.25, 0.5]),
+       min_samples=st.integers(1, 12))
 @settings(max_examples=100, deadline=None)
 def test_by_cells_and_by_pairs_the_labels_are_scikit_learns(seed, n, scale, eps, min_samples):
     rng = np.random.default_rng(seed)

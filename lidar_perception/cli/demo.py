@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 import numpy as np
 
-from lidar_perception.cli.evaluate import PROTOCOL
+from lidar_perception.cli.evaluate import PROTOCOL, view_as_recorded
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.datasets.bag import Bag
 from lidar_perception.evaluation.matching import match_centres
@@ -17,10 +17,10 @@ from lidar_perception.evaluation.report import print_candidate_report
 from lidar_perception.files import write_text
 from lidar_perception.messages import column, to_detections, to_frame
 from lidar_perception.nodes.graph import cloud_topic, result_topics
-from lidar_perception.params import PipelineParams, with_values
+from lidar_perception.params import PipelineParams
 from lidar_perception.pipeline import warm_up
 from lidar_perception.terminal import console, errors, track
-from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
+from lidar_perception.topics import POINTS, TRUTH
 from msg_utils.markers import from_marker_array
 
 
@@ -62,9 +62,7 @@ def demo(kitti: Path | None, bag: Path | None, out: Path, frames: int, drive_see
         opened.require(POINTS)
         opened.require(TRUTH)
         clouds = opened.counts[POINTS]
-        if params.view.enabled and not {CAMERA_INFO, EXTRINSICS} <= set(opened.topics):
-            errors.print(f"{drive} has no camera calibration: the whole scan is processed")
-            params = with_values(params, {"view.enabled": False})
+    params = view_as_recorded(drive, params)
     from lidar_perception.nodes.replay import replay
     with errors.status("loading compiled code (the first time: compiling, about a minute)"):
         warm_up()

@@ -8,18 +8,29 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.options import parameter_options
+from lidar_perception.datasets.bag import Bag
 from lidar_perception.datasets.recording import open_recording
 from lidar_perception.evaluation.candidates import CandidateReport, pedestrians
 from lidar_perception.evaluation.candidates import evaluate as evaluate_frames
 from lidar_perception.evaluation.report import print_candidate_report
 from lidar_perception.files import write_text
-from lidar_perception.params import PipelineParams, SeedParams, ViewParams
+from lidar_perception.params import PipelineParams, SeedParams, ViewParams, with_values
 from lidar_perception.pipeline import warm_up
-from lidar_perception.terminal import console, track
+from lidar_perception.terminal import console, errors, track
+from lidar_perception.topics import CAMERA_INFO, EXTRINSICS
 from lidar_perception.types import InputError
 
 # Paper A's protocol: points in the camera's view, the nearest labelled pedestrian as seed.
 PROTOCOL = PipelineParams(view=ViewParams(enabled=True), seed=SeedParams(source="ground_truth"))
+
+
+def view_as_recorded(bag: Path, params: PipelineParams) -> PipelineParams:
+    """params with the crop to the camera off, and a note, if the bag has no camera calibration."""
+    with Bag(bag) as opened:
+        if params.view.enabled and not {CAMERA_INFO, EXTRINSICS} <= set(opened.topics):
+            errors.print(f"{bag} has no camera calibration: the whole scan is processed")
+            return with_values(params, {"view.enabled": False})
+    return params
 
 
 @click.group()
@@ -51,6 +62,8 @@ def candidates(kitti: Path | None, bag: Path | None, json_file: Path | None, png
     if (kitti is None) == (bag is None):
         raise click.UsageError("give either --kitti ROOT or --bag FILE")
     recording = open_recording(kitti=kitti, bag=bag)
+    if bag is not None:
+        params = view_as_recorded(bag, params)
     if params.seed.source == "click":
         raise click.UsageError("there is nobody to click here; use --seed-source file")
     warm_up()
