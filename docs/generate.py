@@ -33,7 +33,8 @@ CANDIDATES_OUT = [
      "installed."),
     ("~/debug/stage1", MARKERS, "Clusters of the seed's height; made only while subscribed."),
     ("~/debug/stage2", MARKERS, "After STM without CPA; made only while subscribed."),
-    ("~/debug/height_ms, stm_ms, cpa_ms", STRING_TIMES, "Time of each step."),
+    ("~/debug/height_ms, stm_ms, cpa_ms", STRING_TIMES, "Time of each step; perception has "
+     "view_ms, ground_ms, clustering_ms and boxes_ms too."),
 ]
 ALWAYS_OUT = [
     ("~/debug/processing_time_ms", STRING_TIMES, "Time of the work on one cloud."),

@@ -162,6 +162,10 @@ class SeedParams(Params):
                                 unit="m", low=0.01, high=100.0)
 
 
+# The steps of the candidate pipeline whose times are taken, in order.
+STEPS = ("view", "ground", "clustering", "boxes", "height", "stm", "cpa")
+
+
 @dataclass(frozen=True)
 class PipelineParams:
     """All groups of the candidate pipeline, in the order of the stages."""

@@ -28,8 +28,6 @@ from lidar_perception.ground.threshold import fit_plane, segment_ground
 from lidar_perception.params import DbscanParams, PipelineParams, SeedParams, ViewParams
 from lidar_perception.types import InputError, LidarFrame
 
-STEPS = ("view", "ground", "clustering", "boxes", "height", "stm", "cpa")
-
 
 @dataclass(frozen=True)
 class Segmented:
@@ -116,7 +114,7 @@ def explain_nothing(usable: int, xyz: np.ndarray, ground: np.ndarray, z_max: flo
 
 def find_candidates(frame: LidarFrame, seed: SeedSource, camera: Camera | None = None,
                     params: PipelineParams = PipelineParams()) -> tuple[Segmented, Candidates]:
-    """The whole pipeline on one frame; ms of the result covers every step of STEPS.
+    """The whole pipeline on one frame; ms of the result covers every step of params.STEPS.
 
     InputError where the seed source has no seed for this frame.
     """

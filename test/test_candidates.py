@@ -25,9 +25,15 @@ from lidar_perception.candidates.seeds import (
 from lidar_perception.candidates.silhouette import COLUMNS, ROWS, from_pixels, to_pixels
 from lidar_perception.datasets.kitti import open_kitti
 from lidar_perception.geometry import points_in_box
-from lidar_perception.params import HeightParams, PipelineParams, SeedParams, StmParams, ViewParams
-from lidar_perception.pipeline import (
+from lidar_perception.params import (
     STEPS,
+    HeightParams,
+    PipelineParams,
+    SeedParams,
+    StmParams,
+    ViewParams,
+)
+from lidar_perception.pipeline import (
     Segmented,
     clicked_seed,
     find_candidates,

@@ -28,8 +28,7 @@ class Candidates:
 
     @staticmethod
     def none() -> Candidates:
-        return Candidates(Detections.none(), Detections.none(), Detections.none(),
-                          dict(height=0.0, stm=0.0, cpa=0.0))
+        return Candidates(Detections.none(), Detections.none(), Detections.none())
 
 
 def refine(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, seed: Seed,

@@ -13,6 +13,7 @@ from typing import Any
 
 import yaml
 
+from lidar_perception.params import STEPS
 from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
 from lidar_perception.types import InputError
 
@@ -42,7 +43,10 @@ def cloud_topic(single: bool = False) -> str:
 
 
 def timing_topics(single: bool = False) -> list[str]:
-    return [f"/{node}/debug/processing_time_ms" for node in (SINGLE if single else STAGES)]
+    """Times of the nodes, and of the steps that they take apart."""
+    steps, last = (STEPS, "perception") if single else (STEPS[-3:], "candidate_refinement")
+    return [*(f"/{node}/debug/processing_time_ms" for node in (SINGLE if single else STAGES)),
+            *(f"/{last}/debug/{step}_ms" for step in steps)]
 
 
 def evaluation(file: Path | str, single: bool = False) -> tuple[dict[str, str], dict[str, Any]]:

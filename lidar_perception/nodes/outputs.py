@@ -40,7 +40,7 @@ class CandidateOutputs:
     """~/output/detections (and ~/output/detections_3d where vision_msgs is installed), the earlier
     stages under ~/debug/stage1 and ~/debug/stage2, and the time of each step."""
 
-    def __init__(self, node: LidarNode):
+    def __init__(self, node: LidarNode, steps: tuple[str, ...] = ("height", "stm", "cpa")):
         self.node = node
         self.markers = {"stage1": node.output("~/debug/stage1", MARKERS),
                         "stage2": node.output("~/debug/stage2", MARKERS),
@@ -51,7 +51,8 @@ class CandidateOutputs:
             self.detections_3d = node.create_publisher(
                 message_class("vision_msgs/msg/Detection3DArray"), "~/output/detections_3d",
                 RELIABLE)
-        self.step_times: dict[str, Any] = {}
+        self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE)
+                           for step in steps}
 
     def publish(self, header: Any, find: Callable[[], Candidates],
                 problem: str | None = None) -> None:
@@ -72,11 +73,9 @@ class CandidateOutputs:
             self.detections_3d.publish(to_detection_array(
                 final.boxes, [CLASSES[i] for i in final.class_ids], final.scores, make=ros_message,
                 header=header_message(to_ns(header.stamp), header.frame_id, ros_message)))
-        for step, ms in candidates.ms.items():
-            if step not in self.step_times:
-                self.step_times[step] = self.node.create_publisher(
-                    Float64, f"~/debug/{step}_ms", RELIABLE)
-            self.step_times[step].publish(Float64(data=ms))
+        for step, publisher in self.step_times.items():
+            if step in candidates.ms:
+                publisher.publish(Float64(data=candidates.ms[step]))
         self._diagnose(candidates, problem)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:

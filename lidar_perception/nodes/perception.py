@@ -9,7 +9,7 @@ from lidar_perception.messages import spread, to_frame
 from lidar_perception.nodes.inputs import CameraInput, SeedInput
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, LidarNode
-from lidar_perception.params import PipelineParams
+from lidar_perception.params import STEPS, PipelineParams
 from lidar_perception.pipeline import SeedSource, explain_nothing, refined, segment, warm_up
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
@@ -24,7 +24,7 @@ class Perception(LidarNode):
     def __init__(self, **options: Any):
         super().__init__("perception", PipelineParams(), **options)
         self.camera = CameraInput(self)
-        self.outputs = CandidateOutputs(self)
+        self.outputs = CandidateOutputs(self, STEPS)
         self.points = self.output("points", CLOUD)
         self.boxes = ClusterBoxes(self)
         self.seed = SeedInput(self, self.on_cloud)
