@@ -50,12 +50,12 @@ setup(
     install_requires=[
         "click>=8.1", "cloth-simulation-filter>=1.1.5", "matplotlib>=3.6", "mcap>=1.2",
         "numba>=0.59", "numpy>=1.26", "pypatchworkpp>=1.0", "pyyaml>=6", "rich>=13",
-        "rosbags>=0.10.4", "scikit-learn>=1.3", "scipy>=1.11", "torch>=2.2", "zstandard>=0.21",
+        "rosbags>=0.11.6", "scikit-learn>=1.3", "scipy>=1.11", "torch>=2.2", "zstandard>=0.21",
     ],
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "test": ["pytest>=7.4", "hypothesis>=6.90", "opencv-python-headless>=4.8",
-                 "setuptools>=68"],
+                 "setuptools>=70.1"],
         "benchmark": ["opencv-python-headless>=4.8"],
     },
     entry_points={"console_scripts": [

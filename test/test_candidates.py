@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.boxes import cluster_boxes, height_matches, snap_to_ground
-from lidar_perception.candidates.refine import Candidates, group_points, refine
+from lidar_perception.candidates.refine import group_points, refine
 from lidar_perception.candidates.seeds import (
     Seed,
     load_seed,
@@ -347,7 +347,7 @@ def test_refining_without_clusters_finds_none():
     found = refine(xyz, np.zeros(5, np.int32), np.zeros((0, 7), np.float32), seed)
     for stage in (found.stage1, found.stage2, found.final):
         assert stage.boxes.shape == (0, 7) and stage.scores.shape == (0,)
-    assert set(Candidates.none().ms) == set(found.ms)
+    assert set(found.ms) == {"height", "stm", "cpa"}
 
 
 @needs_data

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from lidar_perception.datasets.bag import bag_message  # noqa: F401  (the nodes' message classes)
-from lidar_perception.nodes.main import NODES
+from lidar_perception.nodes.main import NODES, help_text
+from lidar_perception.params import parameter_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -20,6 +20,12 @@ def generate():
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_help_of_a_node_names_every_parameter(generate, name):
+    text = help_text(name)
+    assert all(f"  {key} (" in text for key in parameter_fields(generate.NODES[name]["params"]))
 
 
 def test_every_node_has_a_page_and_a_place_in_setup(generate):

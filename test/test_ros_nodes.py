@@ -16,6 +16,7 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 from lidar_perception.datasets.bag import Bag, bag_message
 from lidar_perception.nodes.inputs import Paired
 from lidar_perception.nodes.main import NODES
+from lidar_perception.nodes.runtime import LATCHED
 from lidar_perception.params import PipelineParams, flatten, parameter_fields
 from lidar_perception.topics import POINTS
 from msg_utils.markers import from_marker_array
@@ -128,6 +129,41 @@ def test_markers_that_go_away_are_deleted_and_time_that_jumps_back_is_noticed(
     assert {m.id for m in deleted} >= set(full.ids.tolist())
     peer.wait(lambda: "time went back" in (processes.logs / "perception.log").read_text(),
               "the log line")
+
+
+def test_inputs_that_are_not_asked_for_change_nothing(processes, peer, drive_bag):
+    """A click while the seed is a file, and a CameraInfo without P while the crop is off."""
+    with Bag(drive_bag) as bag:
+        msg = next(m for _, _, m in bag.messages({POINTS}))
+    processes.start("perception", {"~/input/points": "/in", "~/output/detections": "/found",
+                                   "~/input/camera_info": "/info", "~/input/extrinsics": "/pose"},
+                    {"seed.source": "file"})
+    found, talker = peer.listen("/found", MARKERS), peer.talker("/in", CLOUD)
+    peer.send(talker, msg, lambda: found, "candidates")
+    first = from_marker_array(found[-1])
+    for topic, kind in (("/clicked_point", "geometry_msgs/msg/PointStamped"),
+                        ("/info", "sensor_msgs/msg/CameraInfo"),
+                        ("/pose", "geometry_msgs/msg/TransformStamped")):
+        other = peer.talker(topic, kind, LATCHED)
+        peer.send(other, bag_message(kind), other.get_subscription_count, "a subscriber")
+    before = len(found)
+    peer.send(talker, msg, lambda: len(found) > before + 2, "more candidates")
+    np.testing.assert_array_equal(from_marker_array(found[-1]).boxes, first.boxes)
+    assert "Error" not in (processes.logs / "perception.log").read_text()
+
+
+def test_a_bag_that_starts_again_pairs_its_clouds_with_the_new_round():
+    """Whichever comes first after the jump, nothing of the round before is given out."""
+    for first in ("cloud", "partner"):
+        delivered = []
+        paired = Paired(lambda c, p, d=delivered: d.append((c, p)))
+        for round_ in range(3):
+            for i in range(30):
+                stamp = i * 10**9
+                for kind in (first, "partner" if first == "cloud" else "cloud"):
+                    (paired.add_cloud if kind == "cloud" else paired.add_partner)(
+                        stamp, (round_, i))
+        assert delivered == [((r, i), (r, i)) for r in range(3) for i in range(30)]
 
 
 def test_clouds_wait_for_the_partner_with_their_stamp():

@@ -56,7 +56,6 @@ def write_bag(path: str | Path, scans: Iterable[Scan], *, force: bool = False) -
         bag.add_topic(EXTRINSICS, "geometry_msgs/msg/TransformStamped", LATCHED_QOS)
         bag.add_topic(TF_STATIC, "tf2_msgs/msg/TFMessage", LATCHED_QOS)
         bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")
-        bag.add_topic(IMAGE, "sensor_msgs/msg/CompressedImage")
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         count, shown, calibration = 0, frozenset(), None
         for scan in scans:
@@ -69,6 +68,8 @@ def write_bag(path: str | Path, scans: Iterable[Scan], *, force: bool = False) -
                 shown = marker_keys(markers)
                 bag.write(TRUTH, scan.stamp_ns, markers)
             if scan.image is not None:
+                if IMAGE not in bag.channels:
+                    bag.add_topic(IMAGE, "sensor_msgs/msg/CompressedImage")
                 camera_header = header_message(scan.stamp_ns, CAMERA_FRAME, bag_message)
                 pixels = np.fromfile(scan.image, np.uint8)
                 bag.write(IMAGE, scan.stamp_ns, bag_message(

@@ -8,7 +8,7 @@ from typing import Any
 
 from rclpy.qos import QoSProfile
 
-from lidar_perception.datasets.bag import LATCHED_QOS, SENSOR_QOS, BagWriter
+from lidar_perception.datasets.bag import LATCHED_QOS, SENSOR_QOS, BagWriter, typestore
 from lidar_perception.nodes.runtime import LATCHED, OK, RELIABLE, SENSOR_DATA, WARN, LidarNode
 from lidar_perception.params import RecorderParams
 from lidar_perception.types import InputError
@@ -29,18 +29,25 @@ class BagRecorder(LidarNode):
         self.writer.__enter__()
         self.waiting = list(self.params.topics)
         self.queue: queue.Queue = queue.Queue()
+        self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._write)
         self.thread.start()
         self.create_timer(DISCOVERY_PERIOD, self._discover)
         self._discover()
 
     def _discover(self) -> None:
+        if self.failure:
+            raise InputError(f"cannot write the bag {self.params.bag}: {self.failure}; what is "
+                             f"written is in {self.writer.partial}")
         types = dict(self.get_topic_names_and_types())
         for topic in [t for t in self.waiting if t in types]:
             offered = [i.qos_profile for i in self.get_publishers_info_by_topic(topic)]
             if not offered:
                 continue
             self.waiting.remove(topic)
+            if types[topic][0] not in typestore().fielddefs:
+                self.get_logger().warning(f"{topic} is not recorded: {types[topic][0]} is unknown")
+                continue
             latched = all(q.durability == LATCHED.durability for q in offered)
             reliable = all(q.reliability == RELIABLE.reliability for q in offered)
             self.queue.put(("topic", topic, types[topic][0],
@@ -58,14 +65,20 @@ class BagRecorder(LidarNode):
         self.create_subscription(kind, topic, received, qos, raw=True)
 
     def _write(self) -> None:
-        while (item := self.queue.get()) is not None:
-            what, topic, *rest = item
-            if what == "topic":
-                self.writer.add_topic(topic, *rest)
-            else:
-                self.writer.write(topic, *rest)
+        try:
+            while (item := self.queue.get()) is not None:
+                what, topic, *rest = item
+                if what == "topic":
+                    self.writer.add_topic(topic, *rest)
+                else:
+                    self.writer.write(topic, *rest)
+        except Exception as error:  # a full disk; the timer ends the node
+            self.failure = error
 
     def close(self) -> None:
         self.queue.put(None)
         self.thread.join()
-        self.writer.__exit__(None, None, None)
+        try:
+            self.writer.__exit__(type(self.failure) if self.failure else None, self.failure, None)
+        except OSError as error:  # still full: the part stays as it is, for 'mcap recover'
+            self.get_logger().error(f"{self.writer.partial} is not complete: {error}")

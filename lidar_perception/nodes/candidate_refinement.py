@@ -39,6 +39,3 @@ class CandidateRefinement(LidarNode):
             segmented = Segmented(places, frame.xyz, ground, ids,
                                   grounded_boxes(frame.xyz, ground, ids))
             self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params))
-
-    def time_went_back(self) -> None:
-        self.seed.clear()

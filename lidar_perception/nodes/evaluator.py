@@ -7,7 +7,7 @@ from typing import Any
 
 from lidar_perception.evaluation.candidates import CandidateReport
 from lidar_perception.files import write_text
-from lidar_perception.messages import to_truth
+from lidar_perception.messages import to_detections, to_truth
 from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
 from lidar_perception.params import EvaluatorParams
 from lidar_perception.types import PEDESTRIAN, InputError
@@ -19,12 +19,15 @@ WAITING_FRAMES = 100
 
 class Evaluator(LidarNode):
     """A frame is scored when its ground truth and every stage's detections have come, matched by
-    header.stamp. Frames that stay incomplete are counted as lost, never as misses."""
+    header.stamp, once: a bag in a loop does not count twice. Frames that stay incomplete are
+    counted as lost, never as misses."""
 
     def __init__(self, **options: Any):
         super().__init__("evaluator", EvaluatorParams(), **options)
         self.result = CandidateReport()
         self.waiting: dict[int, dict[str, Any]] = {}
+        self.scored: set[int] = set()
+        self.counts["incomplete"] = 0
         self.input("ground_truth", MARKERS, lambda m: self._add("truth", m), RELIABLE)
         for stage in self.params.stages:
             self.input(stage, MARKERS, lambda m, s=stage: self._add(s, m), RELIABLE)
@@ -40,21 +43,26 @@ class Evaluator(LidarNode):
         if not msg.markers:
             raise InputError("an empty MarkerArray has no stamp, so it cannot be matched; send a "
                              "DELETE marker with the header of the frame")
+        if objects.stamp_ns in self.scored:  # a bag that is played again
+            return
         frame = self.waiting.setdefault(objects.stamp_ns, {})
         frame[kind] = objects
         if len(frame) == 1 + len(self.params.stages):
             del self.waiting[objects.stamp_ns]
+            self.scored.add(objects.stamp_ns)
             self._score(frame)
         while len(self.waiting) > WAITING_FRAMES:
             self.waiting.pop(next(iter(self.waiting)))
-            self.counts["lost"] += 1
+            self.counts["incomplete"] += 1
             self.report(WARN, "frames without ground truth or detections of the same header.stamp")
 
     def _score(self, frame: dict[str, Any]) -> None:
         self.counts["frames"] += 1
         truth = to_truth(frame["truth"]).of_class(PEDESTRIAN)
         if len(truth) or not self.params.only_with_pedestrians:
-            self.result.add(truth, {s: frame[s].boxes for s in self.params.stages})
+            found = {s: to_detections(frame[s]) for s in self.params.stages}
+            self.result.add(truth, {s: d.boxes[d.class_ids == PEDESTRIAN]
+                                    for s, d in found.items()})
         self.counts.update(scored=self.result.frames, **{
             f"F1 of {s}": f"{score.table()['all']['f1']:.3f}"
             for s, score in self.result.scores.items()})
@@ -63,7 +71,7 @@ class Evaluator(LidarNode):
     def write(self) -> None:
         if self.params.file:
             content = self.result.content()
-            content["lost_frames"] = self.counts["lost"] + len(self.waiting)
+            content["lost_frames"] = self.counts["incomplete"] + len(self.waiting)
             write_text(self.params.file, json.dumps(content, indent=1))
 
     def close(self) -> None:

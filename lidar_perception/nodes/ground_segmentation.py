@@ -32,8 +32,8 @@ class GroundSegmentation(LidarNode):
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable = to_frame(msg)
-            places, xyz = points_in_view(frame.xyz, self.camera.get(frame.frame_id),
-                                         self.params.view)
+            camera = self.camera.get(frame.frame_id, self.params.view)
+            places, xyz = points_in_view(frame.xyz, camera, self.params.view)
             ground = segment_ground(xyz, self.params.ground)
             places = usable.take(places)
             self.points.publish(encode(add_columns(

@@ -11,8 +11,8 @@ from typing import Any
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.messages import camera_of, to_truth
-from lidar_perception.nodes.runtime import LATCHED, MARKERS, RELIABLE, LidarNode
-from lidar_perception.params import SeedParams
+from lidar_perception.nodes.runtime import JUMP_NS, LATCHED, MARKERS, RELIABLE, LidarNode
+from lidar_perception.params import SeedParams, ViewParams
 from lidar_perception.pipeline import SeedSource, Segmented, clicked_seed, fixed_seed, truth_seed
 from lidar_perception.topics import CLICK, TF_STATIC
 from lidar_perception.types import PEDESTRIAN, InputError
@@ -27,7 +27,7 @@ class CameraInput:
         self.node = node
         self.info: Any = None
         self.transforms: dict[tuple[str, str], Any] = {}
-        self.camera: Camera | None = None
+        self.cameras: dict[str, Camera] = {}  # by LiDAR frame
         node.input("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED)
         node.input("extrinsics", "geometry_msgs/msg/TransformStamped", self._on_transform,
                    LATCHED)
@@ -36,28 +36,32 @@ class CameraInput:
                        lambda m: [*map(self._on_transform, m.transforms)], LATCHED)
 
     def _on_info(self, msg: Any) -> None:
-        self.info, self.camera = msg, None
+        self.info = msg
+        self.cameras.clear()
 
     def _on_transform(self, msg: Any) -> None:
         self.transforms[msg.header.frame_id, msg.child_frame_id] = msg
-        self.camera = None
+        self.cameras.clear()
 
-    def get(self, lidar_frame: str) -> Camera | None:
-        """The camera as seen from lidar_frame; None until both messages are there."""
-        if self.camera is None and self.info is not None:
+    def get(self, lidar_frame: str, params: ViewParams) -> Camera | None:
+        """The camera as seen from lidar_frame; None until both messages are there, and while the
+        crop is off."""
+        if not params.enabled:
+            return None
+        if lidar_frame not in self.cameras and self.info is not None:
             camera_frame = self.info.header.frame_id
             transform = (self.transforms.get((lidar_frame, camera_frame))
                          or self.transforms.get((camera_frame, lidar_frame)))
             if transform is not None:
-                self.camera = camera_of(self.info, transform)
-        return self.camera
+                self.cameras[lidar_frame] = camera_of(self.info, transform)
+        return self.cameras.get(lidar_frame)
 
 
 class Paired:
     """Clouds that wait for the message with the same stamp from another topic.
 
     A cloud is given out with its partner; without one when a later partner or too many clouds
-    have come, as then its own is lost.
+    have come, as then its own is lost. When time goes back, what is from before is dropped.
     """
 
     def __init__(self, deliver: Callable[[Any, Any], None], capacity: int = 5):
@@ -66,18 +70,18 @@ class Paired:
         self.partners: OrderedDict[int, Any] = OrderedDict()
 
     def add_cloud(self, stamp_ns: int, msg: Any) -> None:
+        for waiting in (self.clouds, self.partners):
+            _drop_if_later(waiting, stamp_ns)
         self.clouds[stamp_ns] = msg
         self._flush()
 
     def add_partner(self, stamp_ns: int, msg: Any) -> None:
+        for waiting in (self.clouds, self.partners):
+            _drop_if_later(waiting, stamp_ns)
         self.partners[stamp_ns] = msg
         while len(self.partners) > 20 * self.capacity:
             self.partners.popitem(last=False)
         self._flush()
-
-    def clear(self) -> None:
-        self.clouds.clear()
-        self.partners.clear()
 
     def _flush(self) -> None:
         while self.clouds:
@@ -91,6 +95,12 @@ class Paired:
             self.deliver(cloud, partner)
 
 
+def _drop_if_later(waiting: OrderedDict[int, Any], stamp_ns: int) -> None:
+    """Forget all if the last of them is from before a jump back to stamp_ns."""
+    if waiting and next(reversed(waiting)) > stamp_ns + JUMP_NS:
+        waiting.clear()
+
+
 class SeedInput:
     """The seed pedestrian of each cloud, from the source that the parameters name.
 
@@ -101,8 +111,8 @@ class SeedInput:
     def __init__(self, node: LidarNode, deliver: Callable[[Any, SeedSource], None]):
         self.node, self.deliver = node, deliver
         self.click: Any = None
-        self.template = None
-        self.template_file: str | None = None
+        self.clicked: Seed | None = None
+        self.loaded: tuple[str, Seed] | None = None
         self.paired = Paired(self._deliver_with_truth)
         node.input("ground_truth", MARKERS, self._on_truth, RELIABLE)
         node.input(CLICK, "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE)
@@ -117,13 +127,9 @@ class SeedInput:
         elif self.params.source == "click":
             self.deliver(msg, partial(self._from_click, msg.header.frame_id))
         else:
-            if self.template_file != self.params.file:
-                self.template, self.template_file = load_seed(self.params.file), self.params.file
-            self.deliver(msg, fixed_seed(self.template))
-
-    def clear(self) -> None:
-        self.paired.clear()
-        self.click = self.template = self.template_file = None
+            if self.loaded is None or self.loaded[0] != self.params.file:
+                self.loaded = (self.params.file, load_seed(self.params.file))
+            self.deliver(msg, fixed_seed(self.loaded[1]))
 
     def _on_truth(self, msg: Any) -> None:
         objects = from_marker_array(msg)
@@ -137,22 +143,22 @@ class SeedInput:
             self.deliver(cloud, truth_seed(truth.of_class(PEDESTRIAN)))
 
     def _on_click(self, msg: Any) -> None:
-        self.click, self.template = msg, None
+        self.click, self.clicked = msg, None
 
     def _from_click(self, frame_id: str, segmented: Segmented) -> Seed:
         if self.click is None:
             raise InputError(f"no seed yet: click a pedestrian (a PointStamped on {CLICK}, as RViz "
                              "and Foxglove publish it)")
-        if self.template is None:
+        if self.clicked is None:
             if self.click.header.frame_id not in ("", frame_id):
                 raise InputError(f"the clicked point is in frame '{self.click.header.frame_id}' "
                                  f"but the cloud in '{frame_id}'; set that as the fixed "
                                  "frame and click again")
             p = self.click.point
-            self.template = clicked_seed([p.x, p.y, p.z], self.params)(segmented)
+            self.clicked = clicked_seed([p.x, p.y, p.z], self.params)(segmented)
             self.node.get_logger().info(f"seed taken at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), height "
-                                        f"{self.template.height:.2f} m")
-        return self.template
+                                        f"{self.clicked.height:.2f} m")
+        return self.clicked
 
 
 def _missing(reason: str) -> SeedSource:

@@ -23,6 +23,29 @@ NODES = {  # executable -> class; the module has the executable's name
 }
 
 
+PARAMS = {  # executable -> its parameters, in params.py
+    "bag_player": "PlayerParams",
+    "bag_recorder": "RecorderParams",
+    "ground_segmentation": "GroundNodeParams",
+    "clustering": "ClusteringNodeParams",
+    "candidate_refinement": "RefinementNodeParams",
+    "evaluator": "EvaluatorParams",
+    "perception": "PipelineParams",
+}
+
+
+def help_text(name: str) -> str:
+    """What --help prints: how to start the node, and its parameters."""
+    from lidar_perception import params
+    lines = [f"Usage: {name} --ros-args [-p PARAMETER:=VALUE] [-r FROM:=TO] [--params-file YAML]",
+             "", "Parameters:"]
+    for key, f in params.parameter_fields(getattr(params, PARAMS[name])()).items():
+        default = list(f.default) if isinstance(f.default, tuple) else f.default
+        unit = f" {f.metadata['unit']}" if f.metadata["unit"] else ""
+        lines += [f"  {key} (default {default!r}{unit})", f"      {f.metadata['doc']}"]
+    return "\n".join(lines)
+
+
 def main() -> int:
     """Entry point of all executables: the node is named by the program's own name."""
     return run(Path(sys.argv[0]).name.removesuffix(".exe"), sys.argv)
@@ -60,6 +83,9 @@ def one_at_a_time():
 
 def run(name: str, arguments: list[str]) -> int:
     """Run a node until SIGINT or SIGTERM (exit code 0), or until it is done. 2: it cannot start."""
+    if {"-h", "--help"} & set(arguments[1:]):
+        print(help_text(name))
+        return 0
     # From here on a signal ends the process cleanly, also while imports and compilation run.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: os._exit(0))

@@ -33,7 +33,8 @@ class Perception(LidarNode):
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable = to_frame(msg)
-            segmented = segment(frame, self.camera.get(frame.frame_id), self.params)
+            segmented = segment(frame, self.camera.get(frame.frame_id, self.params.view),
+                                self.params)
             problem = explain_nothing(len(frame), segmented.xyz, segmented.ground,
                                       self.params.ground.z_max, segmented.cluster_ids)
             self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params),
@@ -45,6 +46,3 @@ class Perception(LidarNode):
                 in_view=spread(1, places, msg, "u1"),
                 cluster_id=spread(segmented.cluster_ids, places, msg, "u4"))))
         self.boxes.publish(msg.header, lambda: segmented.boxes)
-
-    def time_went_back(self) -> None:
-        self.seed.clear()

@@ -139,8 +139,7 @@ class LidarNode(Node):
     def frame(self, stamp_ns: int):
         """Around the work on one cloud: counts it, times it, notices that time went back."""
         if stamp_ns < self.last_stamp_ns - JUMP_NS:
-            self.get_logger().info("time went back; state from before is dropped")
-            self.time_went_back()
+            self.get_logger().info("time went back; what waited from before is dropped")
         self.last_stamp_ns = stamp_ns
         begin = perf_counter()
         yield
@@ -148,9 +147,6 @@ class LidarNode(Node):
         self._processing_time.publish(Float64(data=elapsed))
         self.times = [*self.times[-99:], elapsed]
         self.counts["frames"] += 1
-
-    def time_went_back(self) -> None:
-        """Forget what belongs to earlier stamps."""
 
     def publish_diagnostics(self) -> None:
         level, message = self.state
