@@ -9,7 +9,7 @@ import click
 from lidar_perception.nodes.main import NODES, run
 
 
-@click.command(context_settings=dict(ignore_unknown_options=True))
+@click.command(context_settings=dict(ignore_unknown_options=True, allow_interspersed_args=False))
 @click.argument("node", type=click.Choice(list(NODES)))
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def run_node(node: str, arguments: tuple[str, ...]) -> None:
