@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pytest
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 FRAMES = 8
 
 
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Real scans that lie beside the checkout, never in it."""
+    from samples import DATA
     if not DATA.is_dir():
         pytest.skip("real data is not beside the checkout (../shared/data)")
     return DATA

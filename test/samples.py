@@ -24,6 +24,11 @@ each_make = pytest.mark.parametrize("make", [
         importlib.util.find_spec("rclpy") is None, reason="needs ROS 2, or the extra [ros]")),
 ])
 
+# Real scans that lie beside the checkout, never in it.
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="real data is not beside the checkout "
+                                "(../shared/data)")
+
 STAMP = 1_700_000_000_123_456_789
 
 # A forward-looking camera, almost level, a little before the LiDAR.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 from importlib.resources import files
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from samples import DATA, needs_data
 
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.boxes import cluster_boxes, height_matches, snap_to_ground
@@ -44,9 +44,6 @@ from lidar_perception.pipeline import (
 )
 from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
-needs_data = pytest.mark.skipif(not (DATA / "kitti_object").is_dir(),
-                                reason=f"no KITTI scans in {DATA}")
 few = settings(deadline=None, max_examples=40, database=None)
 seeds = st.integers(0, 2**32 - 1)
 GROUND_Z = -1.7

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from samples import DATA, needs_data
 from scipy.spatial import cKDTree
 from sklearn.cluster import DBSCAN
 
@@ -17,9 +16,7 @@ from lidar_perception.clustering.sparse import dbscan_by_pairs
 from lidar_perception.ground.threshold import segment_ground
 from lidar_perception.params import DbscanParams
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SCANS = DATA / "kitti_object/training/velodyne_reduced"
-needs_data = pytest.mark.skipif(not SCANS.is_dir(), reason=f"no KITTI scans in {SCANS}")
 few = settings(deadline=None, max_examples=40, database=None)
 
 

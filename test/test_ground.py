@@ -3,12 +3,11 @@ none."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from samples import DATA, needs_data
 from sklearn.linear_model import LinearRegression, RANSACRegressor
 
 from lidar_perception.ground.threshold import (
@@ -19,9 +18,7 @@ from lidar_perception.ground.threshold import (
 )
 from lidar_perception.params import GroundParams
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SCANS = DATA / "kitti_object/training/velodyne"
-needs_data = pytest.mark.skipif(not SCANS.is_dir(), reason=f"no KITTI scans in {SCANS}")
 few = settings(deadline=None, max_examples=30, database=None)
 slopes = st.floats(-0.15, 0.15)
 

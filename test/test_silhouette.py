@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from samples import DATA, needs_data
 
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
@@ -22,9 +21,7 @@ from lidar_perception.params import CpaParams
 from lidar_perception.pipeline import segment
 from lidar_perception.types import LidarFrame
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 SCANS = DATA / "kitti_object/training/velodyne_reduced"
-needs_data = pytest.mark.skipif(not SCANS.is_dir(), reason=f"no KITTI scans in {SCANS}")
 few = settings(deadline=None, max_examples=40, database=None)
 seeds = st.integers(0, 2**32 - 1)
 PLAIN = np.ones((1, 1))

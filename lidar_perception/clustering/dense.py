@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.clustering.grid import grid, grown, near, root
+from lidar_perception.clustering.grid import grid, grown, near, number_clusters, root
 
 
 def dbscan_by_cells(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray:
@@ -139,12 +139,10 @@ def _labels(x, y, z, order, start, first, second, core, eps2):
     n, cells = len(x), len(start) - 1
     cores = np.zeros(cells, np.int32)
     cell_of = np.empty(n, np.int32)
-    grid_place = np.empty(n, np.int32)
     for c in range(cells):
         for k in range(start[c], start[c + 1]):
             cores[c] += core[k]
             cell_of[k] = c
-            grid_place[order[k]] = k
 
     parent = np.arange(cells).astype(np.int32)
     extents = _core_extents(x, y, z, start, core)
@@ -155,19 +153,7 @@ def _labels(x, y, z, order, start, first, second, core, eps2):
             if root_a != root_b and _touch(x, y, z, core, extents, start, a, b, eps2):
                 parent[max(root_a, root_b)] = min(root_a, root_b)
 
-    # Clusters are numbered by their first core point in the order of the input.
-    cluster = np.zeros(cells, np.int32)
-    count = 0
-    for i in range(n):
-        k = grid_place[i]
-        if core[k]:
-            top = root(parent, cell_of[k])
-            if cluster[top] == 0:
-                count += 1
-                cluster[top] = count
-    for c in range(cells):
-        cluster[c] = cluster[root(parent, c)] if cores[c] else 0
-
+    cluster = number_clusters(order, core, cell_of, parent)
     # A point of a cell with core points belongs to their cluster, unless it is a border point
     # that a lower cluster touches too; points of other cells are noise until one touches them.
     labels = np.empty(n, np.int32)

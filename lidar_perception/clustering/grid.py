@@ -127,3 +127,25 @@ def grown(values, count, capacity):
     new = np.empty(capacity, values.dtype)
     new[:count] = values[:count]
     return new
+
+
+@njit(cache=True)
+def number_clusters(order, core, owner, parent):
+    """(S,) int32 cluster of each set of the union-find forest parent (S,), 0 for sets without a
+    core point. Clusters are numbered 1..K by their first core point in the order of the input;
+    order, core and owner (N,) are the input row, the core flag and the set of each grid point."""
+    place = np.empty(len(order), np.int32)
+    for k in range(len(order)):
+        place[order[k]] = k
+    cluster = np.zeros(len(parent), np.int32)
+    count = 0
+    for i in range(len(order)):
+        k = place[i]
+        if core[k]:
+            top = root(parent, owner[k])
+            if cluster[top] == 0:
+                count += 1
+                cluster[top] = count
+    for s in range(len(parent)):
+        cluster[s] = cluster[root(parent, s)]
+    return cluster

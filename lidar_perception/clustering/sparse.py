@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.clustering.grid import grid, grown, near, root
+from lidar_perception.clustering.grid import grid, grown, near, number_clusters, root
 
 # Distances to compute a point, at most: beyond this, going by cells is faster and takes less
 # memory.
@@ -74,21 +74,7 @@ def _labels(order, core, first, second):
             if a != b:
                 parent[max(a, b)] = min(a, b)
 
-    place = np.empty(n, np.int32)
-    for k in range(n):
-        place[order[k]] = k
-    # Clusters are numbered by their first core point in the order of the input.
-    cluster = np.zeros(n, np.int32)
-    count = 0
-    for i in range(n):
-        k = place[i]
-        if core[k]:
-            top = root(parent, k)
-            if cluster[top] == 0:
-                count += 1
-                cluster[top] = count
-            cluster[k] = cluster[top]
-
+    cluster = number_clusters(order, core, np.arange(n), parent)
     # A border point goes to the first of the clusters that it touches.
     for p in range(len(first)):
         i, j = first[p], second[p]
