@@ -32,8 +32,9 @@ def drive_bag(tmp_path_factory) -> Path:
 @pytest.fixture(scope="session")
 def domain() -> int:
     """A ROS domain of this test session's own, reached by this machine only."""
+    from lidar_perception.nodes.graph import private_domain
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    number = 101 + os.getpid() % 100
+    number = private_domain()
     os.environ["ROS_DOMAIN_ID"] = str(number)
     return number
 

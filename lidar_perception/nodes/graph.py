@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Mapping
@@ -68,6 +70,20 @@ def wait_for(single: bool = False, points: int = 1, truth: int = 2) -> list[str]
     graph = SINGLE if single else STAGES
     between = sorted(set().union(*outputs_in_use(graph).values()))
     return [f"{POINTS}:={points}", f"{TRUTH}:={truth}", *between, result_topics(single)["final"]]
+
+
+def private_domain() -> int:
+    """A ROS domain that nobody on this machine uses: 1..100, as the ports of higher ones are also
+    handed out to other programs."""
+    for domain in random.SystemRandom().sample(range(1, 101), 100):
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            try:
+                # Where the domain's first participant listens (RTPS 2.5, Section 9.6.2.3).
+                probe.bind(("", 7410 + 250 * domain))
+            except OSError:
+                continue
+        return domain
+    raise InputError("all ROS domains 1..100 are in use on this machine")
 
 
 class Processes:

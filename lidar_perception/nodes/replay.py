@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from statistics import median
 
@@ -14,6 +13,7 @@ from lidar_perception.nodes.graph import (
     cloud_topic,
     evaluation,
     outputs_in_use,
+    private_domain,
     result_topics,
     wait_for,
 )
@@ -38,7 +38,7 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
     from lidar_perception.nodes.watch import Watch
 
     graph, topics = dict(SINGLE if single else STAGES), result_topics(single)
-    domain = 1 + os.getpid() % 100
+    domain = private_domain()
     scores = out / "logs" / "scores.json"
     evaluator_remap, evaluator_params = evaluation(scores.resolve(), single)
     recorded = [cloud_topic(single), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
