@@ -23,7 +23,7 @@ from lidar_perception.terminal import errors, progress
 from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, TRUTH
 from lidar_perception.types import InputError
 
-START_TIMEOUT = 60.0    # seconds for all nodes to come up and find each other
+START_TIMEOUT = 180.0   # seconds for all nodes to compile, come up and find each other
 SILENCE_TIMEOUT = 10.0  # seconds without a result after the last cloud
 
 
@@ -80,7 +80,9 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
         codes = processes.stop(timeout=30)
     if failed := {node: code for node, code in codes.items() if code}:
         errors.print(f"[red]exit codes {failed}[/]; see {out}/logs")
-    latencies = sorted(watch.latencies_ms) or [float("nan")]
+    if watch.frames == 0:
+        raise InputError(f"no cloud of {drive} gave a result; see {out}/logs")
+    latencies = sorted(watch.latencies_ms) or [0.0]
     return {**json.loads(scores.read_text()), "clouds": clouds, "results": watch.frames,
             "latency_ms": {"median": median(latencies),
                            "p95": latencies[int(0.95 * (len(latencies) - 1))]},
