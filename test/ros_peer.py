@@ -6,52 +6,21 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
-import rclpy
-from diagnostic_msgs.msg import DiagnosticArray
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
-from rclpy.signals import SignalHandlerOptions
 
 from lidar_perception.datasets.bag import decode, encode
 from lidar_perception.nodes.main import use_large_shared_memory
 from lidar_perception.nodes.runtime import RELIABLE
+from lidar_perception.nodes.watch import Outside
 from msg_utils.messages import message_class
 
 use_large_shared_memory()
 TIMEOUT = 60.0  # seconds; the first start on a machine compiles
 
 
-class Peer:
+class Peer(Outside):
     def __init__(self, domain: int):
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=domain,
-                   signal_handler_options=SignalHandlerOptions.NO)
-        self.node = rclpy.create_node("peer", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.diagnostics: dict[str, Any] = {}
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_status, RELIABLE)
-
-    def __enter__(self) -> Peer:
-        return self
-
-    def __exit__(self, *_: Any) -> None:
-        self.executor.shutdown()
-        self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
-
-    def _on_status(self, msg: Any) -> None:
-        for status in msg.status:
-            self.diagnostics[status.name] = status
-
-    def message_of(self, node: str) -> str:
-        """The node's last diagnostic message, '' before the first."""
-        return self.diagnostics[node].message if node in self.diagnostics else ""
-
-    def value_of(self, node: str, key: str) -> str | None:
-        status = self.diagnostics.get(node)
-        return next((v.value for v in status.values if v.key == key), None) if status else None
+        super().__init__(domain, "peer")
 
     def listen(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE) -> list:
         """A list that grows with the messages of a topic."""
@@ -87,11 +56,9 @@ class Peer:
 
     def wait(self, condition: Callable[[], Any], what: str, timeout: float = TIMEOUT) -> None:
         """Spin until condition() holds; fail naming what was waited for."""
-        end = monotonic() + timeout
-        while not condition():
-            assert monotonic() < end, f"waited {timeout:.0f} s in vain for {what}; diagnostics: " \
-                + str({k: v.message for k, v in self.diagnostics.items()})
-            self.executor.spin_once(timeout_sec=0.02)
+        assert self.until(condition, timeout), \
+            f"waited {timeout:.0f} s in vain for {what}; diagnostics: " \
+            + str({k: v.message for k, v in self.diagnostics.items()})
 
     def call(self, service: str, kind: type, request: Any) -> Any:
         client = self.node.create_client(kind, service)

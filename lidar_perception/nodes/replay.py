@@ -56,7 +56,7 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
                                 START_TIMEOUT, processes.check)
         if not ready:
             raise InputError(f"the nodes did not find each other in {START_TIMEOUT:.0f} s: "
-                             f"{watch.messages or 'none has reported'}; see {out}/logs")
+                             f"{list(watch.diagnostics) or 'none'} reported; see {out}/logs")
         # The watch hears the clouds too, and the recorder the labels.
         rules = wait_for(single, points=2, truth=2 + record)
         processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
@@ -74,7 +74,7 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
                 before = watch.frames
                 watch.until(finished, SILENCE_TIMEOUT, lambda: processes.check("bag_player"))
         # The evaluator is behind the results by as much as its own work takes.
-        watch.until(lambda: int(watch.status.get("evaluator", {}).get("frames", 0)) >= watch.frames,
+        watch.until(lambda: int(watch.value_of("evaluator", "frames") or 0) >= watch.frames,
                     SILENCE_TIMEOUT)
         memory = processes.memory_mb()
         codes = processes.stop(timeout=30)

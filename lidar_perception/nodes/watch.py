@@ -5,8 +5,9 @@ from __future__ import annotations
 import os
 import struct
 from collections.abc import Callable, Mapping
+from contextlib import contextmanager
 from time import monotonic
-from typing import Any
+from typing import Any, Self
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -19,33 +20,24 @@ from visualization_msgs.msg import MarkerArray
 from lidar_perception.nodes.runtime import RELIABLE, SENSOR_DATA
 from lidar_perception.topics import POINTS
 
+DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
-class Watch:
-    """A node of its own context on a private domain; a context manager."""
 
-    def __init__(self, domain: int, detections: str):
+class Outside:
+    """A node of a program that starts other nodes: a ROS context of its own, spun by hand, no
+    signal handlers. A context manager. diagnostics holds the last status of every node."""
+
+    def __init__(self, domain: int, name: str):
         self.context = Context()
-        previous = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE")
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         rclpy.init(context=self.context, domain_id=domain,
                    signal_handler_options=SignalHandlerOptions.NO)
-        self.node = rclpy.create_node("watch", context=self.context)
-        if previous is None:
-            del os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"]
-        else:
-            os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = previous
+        self.node = rclpy.create_node(name, context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
-        self.status: dict[str, dict[str, str]] = {}
-        self.messages: dict[str, str] = {}
-        self.sent: dict[bytes, float] = {}
-        self.latencies_ms: list[float] = []
-        self.frames = 0
+        self.diagnostics: dict[str, Any] = {}
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_status, RELIABLE)
-        self.node.create_subscription(PointCloud2, POINTS, self._on_cloud, SENSOR_DATA, raw=True)
-        self.node.create_subscription(MarkerArray, detections, self._on_detections, RELIABLE)
 
-    def __enter__(self) -> Watch:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: Any) -> None:
@@ -55,8 +47,41 @@ class Watch:
 
     def _on_status(self, msg: Any) -> None:
         for status in msg.status:
-            self.status[status.name] = {v.key: v.value for v in status.values}
-            self.messages[status.name] = status.message
+            self.diagnostics[status.name] = status
+
+    def message_of(self, node: str) -> str:
+        """The node's last diagnostic message, '' before the first."""
+        return self.diagnostics[node].message if node in self.diagnostics else ""
+
+    def value_of(self, node: str, key: str) -> str | None:
+        """A value of the node's last diagnostic; None where there is none."""
+        status = self.diagnostics.get(node)
+        return next((v.value for v in status.values if v.key == key), None) if status else None
+
+    def until(self, condition: Callable[[], Any], timeout: float,
+              each: Callable[[], None] = lambda: None) -> bool:
+        """Spin until condition() holds (True) or timeout seconds have gone by (False); each() is
+        called again and again."""
+        end = monotonic() + timeout
+        while not condition():
+            if monotonic() > end:
+                return False
+            each()
+            self.executor.spin_once(timeout_sec=0.02)
+        return True
+
+
+class Watch(Outside):
+    """How far a running graph is: results, and their latency."""
+
+    def __init__(self, domain: int, detections: str):
+        with _localhost():
+            super().__init__(domain, "watch")
+        self.sent: dict[bytes, float] = {}
+        self.latencies_ms: list[float] = []
+        self.frames = 0
+        self.node.create_subscription(PointCloud2, POINTS, self._on_cloud, SENSOR_DATA, raw=True)
+        self.node.create_subscription(MarkerArray, detections, self._on_detections, RELIABLE)
 
     def _on_cloud(self, data: bytes) -> None:
         self.sent[data[4:12]] = monotonic()  # CDR: 4 bytes of encapsulation, then header.stamp
@@ -68,21 +93,21 @@ class Watch:
         if sent:
             self.latencies_ms.append((monotonic() - sent) * 1e3)
 
-    def until(self, condition: Callable[[], bool], timeout: float,
-              each: Callable[[], None] = lambda: None) -> bool:
-        """Spin until condition() holds (True) or timeout seconds have gone by (False); each() is
-        called again and again."""
-        end = monotonic() + timeout
-        while not condition():
-            if monotonic() > end:
-                return False
-            each()
-            self.executor.spin_once(timeout_sec=0.05)
-        return True
-
     def connected(self, outputs: Mapping[str, set[str]]) -> bool:
         """True once every node has said by its diagnostics that somebody listens to each of its
         outputs in use."""
-        return all(node in self.status and all(
-            int(self.status[node].get(f"subscribers of {topic}", 0)) for topic in topics)
+        return all(node in self.diagnostics and all(
+            int(self.value_of(node, f"subscribers of {topic}") or 0) for topic in topics)
             for node, topics in outputs.items())
+
+
+@contextmanager
+def _localhost():
+    """ROS reads the range of discovery from the environment when a context is made."""
+    before = os.environ.get(DISCOVERY_RANGE)
+    os.environ[DISCOVERY_RANGE] = "LOCALHOST"
+    yield
+    if before is None:
+        del os.environ[DISCOVERY_RANGE]
+    else:
+        os.environ[DISCOVERY_RANGE] = before
