@@ -155,10 +155,8 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
             raw = np.ndarray((msg.height, msg.width * msg.point_step), np.uint8, raw,
                              strides=(msg.row_step, 1)).reshape(-1)
         data[:, :msg.point_step] = raw[:len(old) * msg.point_step].reshape(-1, msg.point_step)
-    for name, (at, kind) in places.items():
-        target = np.ndarray(len(old), kind, data, offset=at, strides=(step,)) if len(old) else []
-        if len(old):
-            target[:] = new[name]
+        for name, (at, kind) in places.items():
+            np.ndarray(len(old), kind, data, offset=at, strides=(step,))[:] = new[name]
     return _cloud(msg.header, make, fields, data.reshape(-1), height=msg.height, width=msg.width,
                   point_step=step, is_bigendian=msg.is_bigendian, is_dense=msg.is_dense)
 

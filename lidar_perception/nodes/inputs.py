@@ -24,7 +24,6 @@ class CameraInput:
     """The camera from ~/input/camera_info and ~/input/extrinsics, or from /tf_static."""
 
     def __init__(self, node: LidarNode):
-        self.node = node
         self.info: Any = None
         self.transforms: dict[tuple[str, str], Any] = {}
         self.cameras: dict[str, Camera] = {}  # by LiDAR frame
