@@ -86,9 +86,9 @@ def compare(frames: list[Recorded], repeat: int) -> dict:
         _median_of_steps(ours, [found.ms for _, found in mine])
         result = theirs[0]
         # The same ground for both: then clusters must be identical, and so the candidates.
-        ids = cluster_obstacles(result["points"], result["ground"], PROTOCOL.dbscan)
+        ids = cluster_obstacles(result["points"], result["ground"], PROTOCOL.clustering)
         agree["labels_identical"] += np.array_equal(ids, result["labels"])
-        boxes = grounded_boxes(result["points"], result["ground"], ids)
+        boxes = grounded_boxes(result["points"], result["ground"], ids, "axis_aligned")
         segmented = Segmented(np.arange(len(ids)), result["points"], result["ground"], ids, boxes)
         found = refined(segmented, truth_seed(truth), PROTOCOL)
         agree["candidates_same_given_ground"] += all(

@@ -46,20 +46,23 @@ COLUMNS = "columns `ground` (uint8, 1 = ground) and `in_view` (uint8, 1 = proces
 NODES: dict[str, dict[str, Any]] = {
     "ground_segmentation": dict(
         params=params.GroundNodeParams(),
-        what="Marks the ground points of a cloud by a height threshold and a RANSAC plane.",
+        what="Marks the ground points of a cloud, by one plane, by Patchwork++ or by a cloth "
+             "simulation (`ground.method`). Warns if the sensor hangs at another height than "
+             "`sensor_pose` says, and if the scale of the intensity does not fit.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN],
         outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS}."),
                  ("~/output/ground", CLOUD, "Ground points only; made only while subscribed."),
                  ("~/output/nonground", CLOUD, "The other points in view; likewise.")]),
     "clustering": dict(
         params=params.ClusteringNodeParams(),
-        what="Clusters the points that are not ground: distance-aware DBSCAN, exact.",
+        what="Clusters the points that are not ground: distance-aware DBSCAN, exact, or adaptive "
+             "Euclidean clustering (`clustering.method`).",
         inputs=[("~/input/points", CLOUD, "With column `ground`; without it everything is "
                  "clustered and a diagnostic says so.")],
         outputs=[("~/output/points", CLOUD, "The same cloud with the column `cluster_id` (uint32, "
                   "0 = none)."),
-                 ("~/output/boxes", MARKERS, "Cluster boxes, down to the ground; made only while "
-                  "subscribed.")]),
+                 ("~/output/boxes", MARKERS, "Cluster boxes, down to the ground; the text has "
+                  "`size_class` by the diagonal. Made only while subscribed.")]),
     "candidate_refinement": dict(
         params=params.RefinementNodeParams(),
         what="Finds pedestrian candidates among clusters: ground snapping, height filter, single "

@@ -18,13 +18,19 @@ from lidar_perception.types import (
     usable_returns,
 )
 from msg_utils.markers import MarkedObjects, to_marker_array
-from msg_utils.point_cloud2 import CloudError, to_array, xyz
+from msg_utils.point_cloud2 import CloudError, columns, to_array, xyz
 from msg_utils.stamps import to_ns
 
+INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # the first that the cloud has
 
-def to_frame(msg: Any) -> tuple[LidarFrame, np.ndarray]:
+
+def to_frame(msg: Any, intensity_max: float | None = None) -> tuple[LidarFrame, np.ndarray]:
     """The usable points of a PointCloud2 and their places (N,) in the cloud; if the cloud has a
-    column in_view, only the points where it is not 0. InputError for a broken cloud."""
+    column in_view, only the points where it is not 0. InputError for a broken cloud.
+
+    intensity_max: the value that means 1; 0 takes the largest value of an integer field, and 1
+    for a float field; None does not read intensity.
+    """
     try:
         points = to_array(msg)
         places = None
@@ -32,6 +38,7 @@ def to_frame(msg: Any) -> tuple[LidarFrame, np.ndarray]:
             places = np.flatnonzero(points["in_view"])
             points = points.take(places)
         coordinates = xyz(points)
+        intensity = None if intensity_max is None else _intensity(points, intensity_max)
     except CloudError as error:
         raise InputError(str(error)) from None
     usable = usable_returns(coordinates)
@@ -39,8 +46,29 @@ def to_frame(msg: Any) -> tuple[LidarFrame, np.ndarray]:
         kept = np.flatnonzero(usable)
         places = kept if places is None else places.take(kept)
         coordinates = coordinates.take(kept, axis=0)
-    frame = LidarFrame(coordinates, None, to_ns(msg.header.stamp), msg.header.frame_id)
+        intensity = None if intensity is None else intensity.take(kept)
+    frame = LidarFrame(coordinates, intensity, to_ns(msg.header.stamp), msg.header.frame_id)
     return frame, np.arange(len(points)) if places is None else places
+
+
+def _intensity(points: np.ndarray, full: float) -> np.ndarray | None:
+    """(N,) float32, 1 where the field has the value `full`; None without such a field."""
+    name = next((n for n in INTENSITY_FIELDS if n in (points.dtype.names or ())), None)
+    if name is None:
+        return None
+    if full == 0.0:
+        kind = points.dtype[name]
+        full = np.iinfo(kind).max if kind.kind in "iu" else 1.0
+    return columns(points, (name,))[:, 0] / np.float32(full)
+
+
+def intensity_problem(frame: LidarFrame) -> str | None:
+    """What is wrong with the scale of the intensity, with the remedy; None if nothing is."""
+    largest = 0.0 if frame.intensity is None else float(frame.intensity.max(initial=0.0))
+    if largest <= 1.5:
+        return None
+    return (f"intensity goes up to {largest:g} where 1 is expected; set input.intensity_max "
+            "(255 for most drivers)")
 
 
 def spread(values: np.ndarray | int, places: np.ndarray, msg: Any, dtype: str) -> np.ndarray:

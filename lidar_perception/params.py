@@ -8,67 +8,28 @@ and the range in the message.
 
 from __future__ import annotations
 
-import dataclasses
-import math
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass
 
-MAX_INT = 2**31 - 1
+from lidar_perception.param_fields import (
+    MAX_INT,
+    Params,
+    flatten,
+    param,
+    parameter_fields,
+    with_values,
+)
 
-
-def param(default: Any, doc: str, *, unit: str = "", low: float | None = None,
-          high: float | None = None, choices: tuple[str, ...] = (), fixed: bool = False) -> Any:
-    """A dataclass field with what ROS, YAML, the command line and the docs need to know.
-
-    low and high are inclusive; fixed parameters cannot change while a node runs. A default of
-    type `type` stands for an empty list of it.
-    """
-    item = default if isinstance(default, type) else type(default[0]) if isinstance(
-        default, tuple) else None
-    default = () if isinstance(default, type) else default
-    metadata = dict(doc=doc, unit=unit, low=low, high=high, choices=choices, fixed=fixed,
-                    item=item)
-    return field(default=default, metadata=metadata)
+__all__ = ["Params", "flatten", "parameter_fields", "with_values"]
 
 
-class Params:
-    """Base of all parameter groups: checks types and ranges on construction."""
+@dataclass(frozen=True)
+class InputParams(Params):
+    """How to read the fields of a cloud."""
 
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            object.__setattr__(self, f.name, _checked(f, getattr(self, f.name)))
-        self.check()
-
-    def check(self) -> None:
-        """Conditions between fields; raise ValueError."""
-
-
-def _checked(f: dataclasses.Field, value: Any) -> Any:
-    """value with the type of the field's default, or ValueError naming field, value and range."""
-    default, limits = f.default, f.metadata
-    if isinstance(default, tuple):
-        if isinstance(value, str) or not hasattr(value, "__iter__"):
-            raise ValueError(f"{f.name} = {value!r} must be a list of {limits['item'].__name__}")
-        return tuple(_scalar(f, limits["item"], item) for item in value)
-    value = _scalar(f, type(default), value)
-    if limits["choices"] and value not in limits["choices"]:
-        raise ValueError(f"{f.name} = {value!r} must be one of {', '.join(limits['choices'])}")
-    return value
-
-
-def _scalar(f: dataclasses.Field, kind: type, value: Any) -> Any:
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value) if abs(value) < 2**63 else math.copysign(math.inf, value)
-    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise ValueError(f"{f.name} = {value!r} must be of type {kind.__name__}")
-    low, high = f.metadata["low"], f.metadata["high"]
-    if kind is float and math.isnan(value):
-        raise ValueError(f"{f.name} is not a number (NaN)")
-    if (low is not None and value < low) or (high is not None and value > high):
-        bounds = f"{'-inf' if low is None else low} .. {'inf' if high is None else high}"
-        unit = f" {f.metadata['unit']}" if f.metadata["unit"] else ""
-        raise ValueError(f"{f.name} = {value} is outside {bounds}{unit}")
-    return value
+    intensity_max: float = param(
+        0.0, "The intensity of a full reflection: 1 for KITTI, 255 for Velodyne and nuScenes. 0 "
+        "takes the largest value of an integer field, and 1 for a float field.",
+        low=0.0, high=1e9)
 
 
 @dataclass(frozen=True)
@@ -81,11 +42,26 @@ class ViewParams(Params):
 
 
 @dataclass(frozen=True)
-class GroundParams(Params):
-    """z threshold and RANSAC plane (paper A, Sections 3.2 and 3.4, Table 2)."""
+class SensorPoseParams(Params):
+    """How the sensor is mounted. The algorithms see the levelled cloud; nothing that is published
+    moves."""
 
-    z_max: float = param(-1.3, "Only points below this height can be ground.", unit="m",
-                         low=-100.0, high=100.0)
+    height: float = param(1.73, "Height of the sensor above the ground. Checked against the first "
+                          "clouds; a warning gives the measured one.", unit="m",
+                          low=0.05, high=50.0)
+    roll: float = param(0.0, "Rotation of the sensor about its x axis, as in a URDF's rpy; pi is "
+                        "upside down.", unit="rad", low=-3.1416, high=3.1416)
+    pitch: float = param(0.0, "Rotation of the sensor about its y axis, as in a URDF's rpy; "
+                         "positive looks down.", unit="rad", low=-1.58, high=1.58)
+
+
+@dataclass(frozen=True)
+class ThresholdParams(Params):
+    """Height threshold and RANSAC plane (paper A, Sections 3.2 and 3.4, Table 2)."""
+
+    max_height: float = param(0.43, "The plane is looked for among points lower than this above "
+                              "the ground at the sensor. 0.43 m under a sensor 1.73 m high is the "
+                              "paper's z < -1.3.", unit="m", low=-10.0, high=100.0)
     inlier_distance: float = param(0.1, "A point this near the plane, vertically, is ground.",
                                    unit="m", low=0.001, high=2.0)
     max_iterations: int = param(2000, "RANSAC trials at most; it stops as soon as another trial "
@@ -93,6 +69,64 @@ class GroundParams(Params):
     max_slope: float = param(30.0, "Planes steeper than this are not ground.", unit="deg",
                              low=0.0, high=89.0)
     seed: int = param(0, "Seed of the random trials.", low=0, high=MAX_INT)
+
+
+@dataclass(frozen=True)
+class PatchworkParams(Params):
+    """Patchwork++: a plane in each sector of concentric zones (Lee et al., IROS 2022)."""
+
+    min_range: float = param(2.7, "Points nearer than this are not ground.", unit="m",
+                             low=0.0, high=50.0)
+    max_range: float = param(80.0, "Points farther than this are not ground.", unit="m",
+                             low=5.0, high=1000.0)
+    inlier_distance: float = param(0.125, "A point this near its sector's plane is ground.",
+                                   unit="m", low=0.001, high=2.0)
+    seed_distance: float = param(0.125, "Points this far above the lowest ones start the plane of "
+                                 "a sector.", unit="m", low=0.001, high=2.0)
+    uprightness: float = param(0.707, "Least z of the normal of a ground plane; 0.707 is 45 "
+                               "degrees.", low=0.0, high=1.0)
+    remove_reflections: bool = param(True, "Leave out points below the ground that come from "
+                                     "reflections (RNR). Needs intensity.")
+
+    def check(self) -> None:
+        if self.max_range <= self.min_range:
+            raise ValueError(f"max_range = {self.max_range} must be above min_range = "
+                             f"{self.min_range}")
+
+
+@dataclass(frozen=True)
+class ClothParams(Params):
+    """Cloth simulation (paper C, Eq. 2 and 3; Zhang et al., Remote Sensing 2016)."""
+
+    resolution: float = param(0.5, "Distance of the cloth's particles.", unit="m",
+                              low=0.1, high=10.0)
+    max_range: float = param(100.0, "Half the side of the cloth; points beyond it are not ground.",
+                             unit="m", low=1.0, high=500.0)
+    class_threshold: float = param(0.2, "A point this near the cloth, vertically, is ground.",
+                                   unit="m", low=0.001, high=5.0)
+    curvature: float = param(0.1, "How sharply gravity bends the cloth where nothing holds it; "
+                             "less is stiffer.", unit="1/m", low=0.0001, high=10.0)
+
+    def check(self) -> None:
+        if (cells := (2 * self.max_range / self.resolution) ** 2) > 4_000_000:
+            raise ValueError(f"resolution = {self.resolution} m over max_range = {self.max_range} "
+                             f"m makes {cells:.0f} particles, more than 4 million; raise the one "
+                             "or lower the other")
+
+
+GROUND_METHODS = ("threshold", "patchwork", "cloth")
+
+
+@dataclass(frozen=True)
+class GroundParams(Params):
+    """Which points are ground."""
+
+    method: str = param("threshold", "threshold: one plane (paper A). patchwork: Patchwork++ "
+                        "(paper B). cloth: cloth simulation (paper C).", choices=GROUND_METHODS)
+    sensor_pose: SensorPoseParams = SensorPoseParams()
+    threshold: ThresholdParams = ThresholdParams()
+    patchwork: PatchworkParams = PatchworkParams()
+    cloth: ClothParams = ClothParams()
 
 
 @dataclass(frozen=True)
@@ -107,6 +141,8 @@ class DbscanParams(Params):
         unit="m", low=0.001, high=100.0)
     min_samples: int = param(10, "Points within eps, itself included, that make a core point.",
                              low=1, high=MAX_INT)
+    join_bands: bool = param(False, "Join clusters across a range limit where core points of both "
+                             "lie within the smaller eps; the paper cuts them there.")
 
     def check(self) -> None:
         if len(self.eps) != len(self.range_limits) + 1:
@@ -114,6 +150,49 @@ class DbscanParams(Params):
                              "range_limits; give one more eps than range_limits")
         if any(b <= a for a, b in zip(self.range_limits, self.range_limits[1:])):
             raise ValueError(f"range_limits = {list(self.range_limits)} must ascend")
+
+
+@dataclass(frozen=True)
+class EuclideanParams(Params):
+    """Adaptive Euclidean clustering (paper C, Eq. 6 to 11)."""
+
+    threshold: str = param("local", "global: one distance for the whole cloud (Eq. 6). local: one "
+                           "for each point, from its neighbours (Eq. 11).",
+                           choices=("global", "local"))
+    alpha: float = param(1.2, "Factor of the distance threshold (Eq. 6 and 11).",
+                         low=0.01, high=100.0)
+    beta: float = param(0.5, "MinPts = beta ln N: points within the threshold, itself included, "
+                        "from which a point makes others follow (Eq. 7).", low=0.0, high=1000.0)
+    gamma: float = param(0.8, "Clusters are merged when their centres are nearer than gamma times "
+                         "the mean of their diameters (Eq. 9); 0 merges none.", low=0.0, high=10.0)
+    radius: float = param(0.5, "Neighbours for the local threshold lie within this radius.",
+                          unit="m", low=0.001, high=10.0)
+    min_size: int = param(10, "Smaller clusters are dropped.", low=1, high=MAX_INT)
+
+
+CLUSTERING_METHODS = ("dbscan", "euclidean")
+
+
+@dataclass(frozen=True)
+class ClusteringParams(Params):
+    """Which points that are not ground belong together."""
+
+    method: str = param("dbscan", "dbscan: distance-aware DBSCAN (paper A). euclidean: adaptive "
+                        "Euclidean clustering (paper C).", choices=CLUSTERING_METHODS)
+    dbscan: DbscanParams = DbscanParams()
+    euclidean: EuclideanParams = EuclideanParams()
+
+
+BOX_SHAPES = ("axis_aligned", "min_area", "l_shape")
+
+
+@dataclass(frozen=True)
+class BoxParams(Params):
+    """Boxes of clusters."""
+
+    shape: str = param("axis_aligned", "axis_aligned: along x and y (paper A). min_area: the "
+                       "smallest rectangle. l_shape: along the two visible sides.",
+                       choices=BOX_SHAPES)
 
 
 @dataclass(frozen=True)
@@ -170,9 +249,11 @@ STEPS = ("view", "ground", "clustering", "boxes", "height", "stm", "cpa")
 class PipelineParams:
     """All groups of the candidate pipeline, in the order of the stages."""
 
+    input: InputParams = InputParams()
     view: ViewParams = ViewParams()
     ground: GroundParams = GroundParams()
-    dbscan: DbscanParams = DbscanParams()
+    clustering: ClusteringParams = ClusteringParams()
+    boxes: BoxParams = BoxParams()
     height: HeightParams = HeightParams()
     stm: StmParams = StmParams()
     cpa: CpaParams = CpaParams()
@@ -184,17 +265,20 @@ class PipelineParams:
 
 @dataclass(frozen=True)
 class GroundNodeParams:
+    input: InputParams = InputParams()
     view: ViewParams = ViewParams()
     ground: GroundParams = GroundParams()
 
 
 @dataclass(frozen=True)
 class ClusteringNodeParams:
-    dbscan: DbscanParams = DbscanParams()
+    clustering: ClusteringParams = ClusteringParams()
+    boxes: BoxParams = BoxParams()
 
 
 @dataclass(frozen=True)
 class RefinementNodeParams:
+    boxes: BoxParams = BoxParams()
     height: HeightParams = HeightParams()
     stm: StmParams = StmParams()
     cpa: CpaParams = CpaParams()
@@ -246,37 +330,3 @@ class EvaluatorParams(Params):
                       "empty writes none.", fixed=True)
     only_with_pedestrians: bool = param(True, "Score only frames with a Pedestrian in the ground "
                                         "truth (paper A's protocol).")
-
-
-def _groups(params: Any) -> dict[str, Params]:
-    """'dbscan.' -> DbscanParams(...); a single group has the prefix ''."""
-    if isinstance(params, Params):
-        return {"": params}
-    return {f"{group.name}.": getattr(params, group.name) for group in fields(params)}
-
-
-def flatten(params: Any) -> dict[str, Any]:
-    """{'dbscan.eps': (0.15, 0.3, 0.5), ...} of one group or a dataclass of groups."""
-    return {prefix + f.name: getattr(group, f.name)
-            for prefix, group in _groups(params).items() for f in fields(group)}
-
-
-def parameter_fields(params: Any) -> dict[str, dataclasses.Field]:
-    """{'dbscan.eps': Field, ...}: defaults and metadata under the same names as flatten."""
-    return {prefix + f.name: f for prefix, group in _groups(params).items() for f in fields(group)}
-
-
-def with_values(params: Any, values: dict[str, Any]) -> Any:
-    """params with {'dbscan.min_samples': 5, ...} set; ValueError names what is unknown or wrong."""
-    known = parameter_fields(params)
-    if unknown := [name for name in values if name not in known]:
-        raise ValueError(f"unknown parameter {unknown[0]!r}; known are {', '.join(known)}")
-    changed = {}
-    for prefix, group in _groups(params).items():
-        inner = {k.removeprefix(prefix): v for k, v in values.items()
-                 if known[k] in fields(group)}
-        try:
-            changed[prefix[:-1]] = dataclasses.replace(group, **inner)
-        except ValueError as error:
-            raise ValueError(f"{prefix}{error}") from None
-    return changed[""] if "" in changed else dataclasses.replace(params, **changed)

@@ -15,7 +15,7 @@ from time import perf_counter
 import numpy as np
 
 from lidar_perception.camera import Camera
-from lidar_perception.candidates.boxes import cluster_boxes, snap_to_ground
+from lidar_perception.candidates.boxes import snap_to_ground
 from lidar_perception.candidates.refine import Candidates, refine
 from lidar_perception.candidates.seeds import (
     Seed,
@@ -23,9 +23,17 @@ from lidar_perception.candidates.seeds import (
     seed_from_points,
     seed_from_truth,
 )
-from lidar_perception.clustering.dbscan import dbscan, distance_aware_dbscan
-from lidar_perception.ground.threshold import fit_plane, segment_ground
-from lidar_perception.params import DbscanParams, PipelineParams, SeedParams, ViewParams
+from lidar_perception.clustering.cluster import cluster
+from lidar_perception.clustering.shapes import oriented_boxes
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.ground.threshold import fit_plane
+from lidar_perception.params import (
+    ClusteringParams,
+    PipelineParams,
+    SeedParams,
+    ViewParams,
+    with_values,
+)
 from lidar_perception.types import InputError, LidarFrame
 
 
@@ -50,30 +58,33 @@ class Segmented:
 SeedSource = Callable[[Segmented], Seed]
 
 
-def points_in_view(xyz: np.ndarray, camera: Camera | None,
-                   params: ViewParams) -> tuple[np.ndarray, np.ndarray]:
-    """places (M,) int64 and points (M, 3) of those of (N, 3) in the camera's view; all of them
-    while the crop is off. InputError if it is on and there is no camera."""
+def points_in_view(frame: LidarFrame, camera: Camera | None,
+                   params: ViewParams) -> tuple[np.ndarray, LidarFrame]:
+    """places (M,) int64 of the points of the frame in the camera's view, and the frame of these;
+    all of them while the crop is off. InputError if it is on and there is no camera."""
     if not params.enabled:
-        return np.arange(len(xyz)), xyz
+        return np.arange(len(frame)), frame
     if camera is None:
         raise InputError("view.enabled is on but there is no camera calibration; give CameraInfo "
                          "and the LiDAR-to-camera transform, or set view.enabled to false")
-    places = np.flatnonzero(camera.in_view(xyz))
-    return places, xyz.take(places, axis=0)
+    places = np.flatnonzero(camera.in_view(frame.xyz))
+    return places, frame.take(places)
 
 
-def cluster_obstacles(xyz: np.ndarray, ground: np.ndarray, params: DbscanParams) -> np.ndarray:
+def cluster_obstacles(xyz: np.ndarray, ground: np.ndarray,
+                      params: ClusteringParams) -> np.ndarray:
     """(M,) int32 cluster ids of the points (M, 3) that are not ground; ground has 0."""
     labels = np.zeros(len(xyz), np.int32)
     obstacles = np.flatnonzero(~ground)
-    labels[obstacles] = distance_aware_dbscan(xyz.take(obstacles, axis=0), params)
+    labels[obstacles] = cluster(xyz.take(obstacles, axis=0), params)
     return labels
 
 
-def grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray) -> np.ndarray:
-    """(K, 7) boxes of clusters 1..K, down to the plane through the ground points."""
-    return snap_to_ground(cluster_boxes(xyz, cluster_ids),
+def grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray,
+                   shape: str) -> np.ndarray:
+    """(K, 7) boxes of clusters 1..K, of a shape of params.BOX_SHAPES, down to the plane through
+    the ground points."""
+    return snap_to_ground(oriented_boxes(xyz, cluster_ids, shape),
                           fit_plane(xyz.compress(ground, axis=0)))
 
 
@@ -81,34 +92,35 @@ def segment(frame: LidarFrame, camera: Camera | None = None,
             params: PipelineParams = PipelineParams()) -> Segmented:
     """Stages up to the boxes. InputError if the crop is on and there is no camera."""
     t0 = perf_counter()
-    places, xyz = points_in_view(frame.xyz, camera, params.view)
+    places, seen = points_in_view(frame, camera, params.view)
     t1 = perf_counter()
-    ground = segment_ground(xyz, params.ground)
+    ground = segment_ground(seen, params.ground)
     t2 = perf_counter()
-    cluster_ids = cluster_obstacles(xyz, ground, params.dbscan)
+    cluster_ids = cluster_obstacles(seen.xyz, ground, params.clustering)
     t3 = perf_counter()
-    boxes = grounded_boxes(xyz, ground, cluster_ids)
+    boxes = grounded_boxes(seen.xyz, ground, cluster_ids, params.boxes.shape)
     t4 = perf_counter()
     ms = dict(view=t1 - t0, ground=t2 - t1, clustering=t3 - t2, boxes=t4 - t3)
-    return Segmented(places, xyz, ground, cluster_ids, boxes,
+    return Segmented(places, seen.xyz, ground, cluster_ids, boxes,
                      {k: v * 1e3 for k, v in ms.items()})
 
 
-def explain_nothing(usable: int, xyz: np.ndarray, ground: np.ndarray, z_max: float,
+def explain_nothing(usable: int, ground: np.ndarray,
                     cluster_ids: np.ndarray | None = None) -> str | None:
     """Why a frame can have no candidates, with the remedy; None if nothing is wrong so far.
 
-    usable is the number of finite points, xyz (M, 3) those in view; ground (M,), cluster_ids (M,).
+    usable is the number of finite points; ground (M,) and cluster_ids (M,) of those in view.
     """
     if usable == 0:
         return "the cloud is empty or has no finite point"
-    if len(xyz) == 0:
+    if len(ground) == 0:
         return "no point is in the camera's view; check the LiDAR-to-camera transform"
     if not ground.any():
-        return (f"no ground found below z = {z_max:g} m; is the sensor mounted at another height? "
-                "set ground.z_max")
+        return ("no ground found; is the sensor mounted at another height or angle? set "
+                "ground.sensor_pose")
     if cluster_ids is not None and not cluster_ids.any():
-        return "no clusters; are dbscan.eps and dbscan.min_samples right for this sensor?"
+        return ("no clusters; are the numbers of clustering.dbscan or clustering.euclidean right "
+                "for this sensor?")
     return None
 
 
@@ -145,15 +157,17 @@ def fixed_seed(seed: Seed) -> SeedSource:
 
 
 def warm_up() -> None:
-    """Run every stage once on a few made-up points, so that compiled code is loaded (or built and
-    cached, the first time) before the first message arrives."""
+    """Run every stage and method once on a few made-up points, so that compiled code is loaded (or
+    built and cached, the first time) before the first message arrives."""
     rng = np.random.default_rng(0)
     flat = rng.uniform(-20, 20, (600, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
     person = rng.uniform(-0.5, 0.5, (400, 3)) * [0.5, 0.5, 1.7] + [8, 0, -0.8]
-    xyz = np.concatenate([flat, person, person + [12, 0, 0]]).astype(np.float32)
+    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 8, 0]  # takes another way through DBSCAN
+    xyz = np.concatenate([flat, person, person + [12, 0, 0], dense]).astype(np.float32)
     seed = seed_from_points(person.astype(np.float32), 1.7)
     forward = Camera(np.array([[50, -100, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]], float), 100, 100)
-    dbscan(np.zeros((2000, 3), np.float32), 0.1, 5)  # the way that dense points take
-    find_candidates(LidarFrame(xyz), fixed_seed(seed), forward,
-                    PipelineParams(view=ViewParams(enabled=True)))
-
+    base = PipelineParams(view=ViewParams(enabled=True))
+    for ground, clustering, boxes in (("threshold", "dbscan", "axis_aligned"),
+                                      ("cloth", "euclidean", "l_shape")):
+        find_candidates(LidarFrame(xyz), fixed_seed(seed), forward, with_values(base, {
+            "ground.method": ground, "clustering.method": clustering, "boxes.shape": boxes}))

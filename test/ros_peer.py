@@ -6,6 +6,8 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
 from lidar_perception.datasets.bag import decode, encode
@@ -67,3 +69,9 @@ class Peer(Outside):
         self.wait(future.done, f"answer of {service}")
         self.node.destroy_client(client)
         return future.result()
+
+    def set_parameter(self, node: str, name: str, value: Any) -> None:
+        request = SetParameters.Request(parameters=[Parameter(name, value=value)
+                                                    .to_parameter_msg()])
+        result, = self.call(f"{node}/set_parameters", SetParameters, request).results
+        assert result.successful, result.reason

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from samples import DATA, needs_data
 
 from lidar_perception.camera import Camera
-from lidar_perception.candidates.boxes import cluster_boxes, height_matches, snap_to_ground
+from lidar_perception.candidates.boxes import height_matches, snap_to_ground
 from lidar_perception.candidates.refine import group_points, refine
 from lidar_perception.candidates.seeds import (
     Seed,
@@ -23,6 +23,7 @@ from lidar_perception.candidates.seeds import (
     seed_from_truth,
 )
 from lidar_perception.candidates.silhouette import COLUMNS, ROWS, from_pixels, to_pixels
+from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.datasets.kitti import open_kitti
 from lidar_perception.geometry import points_in_box
 from lidar_perception.params import (
@@ -97,27 +98,9 @@ def boxes_at(places, height=1.8):
 
 
 @few
-@given(seeds)
-def test_cluster_boxes_are_the_min_and_max_of_each_cluster(seed):
-    xyz, labels = labelled(seed)
-    boxes = cluster_boxes(xyz, labels)
-    assert boxes.shape == (labels.max(), 7) and boxes.dtype == np.float32
-    for k, box in enumerate(boxes, start=1):
-        low, high = xyz[labels == k].min(axis=0), xyz[labels == k].max(axis=0)
-        np.testing.assert_allclose(box[:3], (low + high) / 2, rtol=0, atol=1e-5)
-        np.testing.assert_allclose(box[3:6], high - low, rtol=0, atol=1e-5)
-        assert box[6] == 0
-
-
-def test_no_clusters_have_no_boxes():
-    assert cluster_boxes(np.zeros((0, 3), np.float32), np.zeros(0, np.int32)).shape == (0, 7)
-    assert cluster_boxes(np.ones((5, 3), np.float32), np.zeros(5, np.int32)).shape == (0, 7)
-
-
-@few
 @given(seeds, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-20, 20))
 def test_snapping_lowers_bottoms_to_the_plane_never_raises_them_and_keeps_tops(seed, a, b, c):
-    boxes = cluster_boxes(*labelled(seed))
+    boxes = oriented_boxes(*labelled(seed), "axis_aligned")
     before = boxes.copy()
     snapped = snap_to_ground(boxes, np.array([a, b, c]))
     assert snapped.dtype == np.float32
@@ -187,7 +170,7 @@ def test_seed_from_truth_needs_a_pedestrian_with_ten_points():
 def clicked_scene():
     xyz = np.concatenate([person(6, 0), person(8, 3, seed=1)]).astype(np.float32)
     labels = np.repeat(np.int32([1, 2]), 400)
-    return xyz, labels, cluster_boxes(xyz, labels)
+    return xyz, labels, oriented_boxes(xyz, labels, "axis_aligned")
 
 
 def test_seed_from_click_is_the_nearest_clusters():

@@ -103,9 +103,9 @@ def test_every_parameter_has_a_flag_that_says_its_default():
     for name, f in parameter_fields(PROTOCOL).items():
         assert f.metadata["doc"] in helps[name.replace(".", "_")]
     assert helps["seed_source"].endswith("Default: ground_truth.")
-    assert helps["ground_seed"].endswith("Default: 0.")
+    assert helps["ground_threshold_seed"].endswith("Default: 0.")
     assert helps["view_enabled"].endswith("Default: on.")
-    assert helps["dbscan_eps"].endswith("Default: 0.15,0.3,0.5.")
+    assert helps["clustering_dbscan_eps"].endswith("Default: 0.15,0.3,0.5.")
 
 
 def test_convert_makes_a_bag_of_every_scan(kitti, bag):
@@ -179,9 +179,11 @@ def test_evaluate_prints_what_it_writes(bag, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("flags", [
-    ("--dbscan-min-samples", 100_000), ("--height-tolerance", 0, "--seed-source", "file"),
-    ("--dbscan-eps", "0.001,0.001,0.001"), ("--no-view-enabled", "--ground-z-max", -100,
-                                           "--dbscan-range-limits", "5,7")])
+    ("--clustering-dbscan-min-samples", 100_000),
+    ("--height-tolerance", 0, "--seed-source", "file"),
+    ("--clustering-dbscan-eps", "0.001,0.001,0.001"),
+    ("--no-view-enabled", "--ground-threshold-max-height", -10,
+     "--clustering-dbscan-range-limits", "5,7")])
 def test_flags_reach_the_pipeline(bag, tmp_path, flags):
     changed = scores(evaluate(tmp_path, "--bag", bag, *flags))
     assert changed["ground_truth"] == 2
@@ -189,7 +191,7 @@ def test_flags_reach_the_pipeline(bag, tmp_path, flags):
 
 
 def test_without_core_points_there_are_no_candidates(bag, tmp_path):
-    content = evaluate(tmp_path, "--bag", bag, "--dbscan-min-samples", 100_000)
+    content = evaluate(tmp_path, "--bag", bag, "--clustering-dbscan-min-samples", 100_000)
     for stage in STAGES:
         row = content[stage]["all"]
         assert (row["tp"], row["fp"], row["fn"], row["f1"]) == (0, 0, 2, 0)
@@ -197,11 +199,13 @@ def test_without_core_points_there_are_no_candidates(bag, tmp_path):
 
 
 def test_a_config_says_the_same_as_flags_and_flags_win(bag, tmp_path):
-    file = write(tmp_path / "p.yaml", "/**:\n  ros__parameters:\n    dbscan.min_samples: 100000\n")
-    no_clusters = scores(evaluate(tmp_path, "--bag", bag, "--dbscan-min-samples", 100_000))
+    flag = "--clustering-dbscan-min-samples"
+    file = write(tmp_path / "p.yaml",
+                 "/**:\n  ros__parameters:\n    clustering.dbscan.min_samples: 100000\n")
+    no_clusters = scores(evaluate(tmp_path, "--bag", bag, flag, 100_000))
     assert scores(evaluate(tmp_path, "--bag", bag, "--config", file)) == no_clusters
-    assert scores(evaluate(tmp_path, "--bag", bag, "--config", file, "--dbscan-min-samples",
-                           10)) == scores(evaluate(tmp_path, "--bag", bag))
+    assert scores(evaluate(tmp_path, "--bag", bag, "--config", file, flag, 10)) == scores(
+        evaluate(tmp_path, "--bag", bag))
 
 
 def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
@@ -223,9 +227,9 @@ BAD_INPUTS = {
                        "--force"], "is no bag"),
     "out under a file": (["convert", "kitti", "{kitti}", "--out",
                           "{kitti}/training/calib/000000.txt/o"], "cannot write"),
-    "out of range": (["evaluate", "candidates", "--bag", "{bag}", "--ground-z-max", "1000"],
-                     "ground.z_max = 1000.0 is outside -100.0 .. 100.0"),
-    "lengths": (["evaluate", "candidates", "--bag", "{bag}", "--dbscan-eps", "0.1"],
+    "out of range": (["evaluate", "candidates", "--bag", "{bag}", "--ground-cloth-resolution",
+                      "99"], "ground.cloth.resolution = 99.0 is outside 0.1 .. 10.0"),
+    "lengths": (["evaluate", "candidates", "--bag", "{bag}", "--clustering-dbscan-eps", "0.1"],
                 "one more eps than range_limits"),
     "missing config": (["evaluate", "candidates", "--bag", "{bag}", "--config", "{tmp}/none"],
                        "{tmp}/none"),
@@ -262,8 +266,9 @@ def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch,
     (["bogus"], "No such command 'bogus'"),
     (["evaluate", "candidates"], "give either --kitti ROOT or --bag FILE"),
     (["evaluate", "candidates", "--kitti", "a", "--bag", "b"], "give either"),
-    (["evaluate", "candidates", "--bag", "b", "--dbscan-min-samples", "few"], "'few'"),
-    (["evaluate", "candidates", "--bag", "b", "--dbscan-eps", "0.1,wide"], "list of numbers"),
+    (["evaluate", "candidates", "--bag", "b", "--clustering-dbscan-min-samples", "few"], "'few'"),
+    (["evaluate", "candidates", "--bag", "b", "--clustering-dbscan-eps", "0.1,wide"],
+     "list of numbers"),
     (["evaluate", "candidates", "--bag", "b", "--seed-source", "luck"], "'luck'"),
     (["convert", "kitti", "a", "--out", "b", "--frames", "0"], "0 is not in the range"),
     (["convert", "kitti", "a"], "--out"),

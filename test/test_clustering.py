@@ -13,7 +13,7 @@ from sklearn.cluster import DBSCAN
 from lidar_perception.clustering.dbscan import dbscan, distance_aware_dbscan
 from lidar_perception.clustering.dense import dbscan_by_cells
 from lidar_perception.clustering.sparse import dbscan_by_pairs
-from lidar_perception.ground.threshold import segment_ground
+from lidar_perception.ground.threshold import segment_by_threshold
 from lidar_perception.params import DbscanParams
 
 SCANS = DATA / "kitti_object/training/velodyne_reduced"
@@ -110,7 +110,7 @@ def test_doubling_every_point_and_min_samples_keeps_the_clusters():
 @pytest.mark.parametrize("scan", [0, 11, 23])
 def test_labels_are_those_of_sklearn_on_real_clouds(scan):
     raw = np.fromfile(sorted(SCANS.glob("*.bin"))[scan], np.float32).reshape(-1, 4)
-    xyz = raw[:, :3][~segment_ground(np.ascontiguousarray(raw[:, :3]))]
+    xyz = raw[:, :3][~segment_by_threshold(np.ascontiguousarray(raw[:, :3]))]
     params = DbscanParams()
     found = distance_aware_dbscan(xyz, params)
     assert found.max() > 20
@@ -160,6 +160,43 @@ def test_a_cluster_across_a_range_limit_is_cut_there():
     xyz[:, 0] = np.linspace(14, 16, 200)
     labels = distance_aware_dbscan(xyz, DbscanParams())
     assert labels.tolist() == [1] * int((xyz[:, 0] < 15).sum()) + [2] * int((xyz[:, 0] >= 15).sum())
+
+
+JOIN = DbscanParams(join_bands=True)
+
+
+def slow_join(xyz, labels, params):
+    """Clusters of neighbouring bands with a pair of points within the smaller eps become one."""
+    band = np.searchsorted(params.range_limits, np.hypot(*xyz[:, :2].T.astype(np.float32)), "right")
+    joined = {frozenset([k]) for k in range(1, labels.max(initial=0) + 1)}
+    for i, j in zip(*np.nonzero(np.abs(band[:, None] - band) == 1)):
+        reach = min(params.eps[band[i]], params.eps[band[j]])
+        if labels[i] and labels[j] and np.linalg.norm(xyz[i].astype(float) - xyz[j]) <= reach:
+            both = {s for s in joined if labels[i] in s or labels[j] in s}
+            joined = joined - both | {frozenset().union(*both)}
+    return {frozenset(np.flatnonzero(np.isin(labels, [*s])).tolist()) for s in joined}
+
+
+@few
+@given(st.integers(0, 2**32 - 1), st.integers(0, 150))
+def test_join_bands_joins_what_touches_across_a_limit_and_nothing_else(seed, count):
+    rng = np.random.default_rng(seed)
+    xyz = (rng.uniform(-6, 6, (count, 3)) * [1, 1, 0.1]).astype(np.float32)
+    cut = DbscanParams(range_limits=(2.0, 4.0), eps=(0.9, 0.7, 1.0), min_samples=3)
+    labels = distance_aware_dbscan(xyz, cut)
+    found = distance_aware_dbscan(xyz, DbscanParams(cut.range_limits, cut.eps, 3, join_bands=True))
+    assert partition(found) == slow_join(xyz, labels, cut)
+    np.testing.assert_array_equal(found > 0, labels > 0)
+    first = [np.flatnonzero(found == k)[0] for k in range(1, found.max(initial=0) + 1)]
+    assert len(set(found.tolist()) - {0}) == len(first)
+
+
+def test_join_bands_makes_one_of_a_cluster_across_a_limit():
+    xyz = np.zeros((200, 3), np.float32)
+    xyz[:, 0] = np.linspace(14, 16, 200)
+    assert distance_aware_dbscan(xyz, JOIN).tolist() == [1] * 200
+    gap = xyz[(xyz[:, 0] < 14.9) | (xyz[:, 0] > 15.1)]  # 0.2 m: more than the smaller eps
+    assert distance_aware_dbscan(gap, JOIN).max() == 2
 
 
 def test_without_limits_distance_aware_is_plain_dbscan():

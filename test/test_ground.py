@@ -11,12 +11,13 @@ from samples import DATA, needs_data
 from sklearn.linear_model import LinearRegression, RANSACRegressor
 
 from lidar_perception.ground.threshold import (
+    find_plane,
     fit_plane,
     height_above,
     ransac_plane,
-    segment_ground,
+    segment_by_threshold,
 )
-from lidar_perception.params import GroundParams
+from lidar_perception.params import ThresholdParams
 
 SCANS = DATA / "kitti_object/training/velodyne"
 few = settings(deadline=None, max_examples=30, database=None)
@@ -55,7 +56,7 @@ def real_scans(*numbers):
 def test_the_plane_is_within_1_cm_and_a_tenth_degree_under_40_percent_outliers(seed, a, b, c):
     true = np.array([a, b, c])
     xyz = sloped_scene(seed, true)
-    found = ransac_plane(xyz, GroundParams(z_max=100.0))
+    found = ransac_plane(xyz, ThresholdParams(max_height=100.0))
     assert angle_between(found, true) < 0.1
     assert abs(height_above(np.zeros((1, 3)), found)[0] - height_above(np.zeros((1, 3)), true)[0]
                ) < 0.01
@@ -65,12 +66,11 @@ def test_the_plane_is_within_1_cm_and_a_tenth_degree_under_40_percent_outliers(s
 @given(st.integers(0, 2**31), slopes, slopes)
 def test_ground_is_every_candidate_within_inlier_distance_of_the_plane(seed, a, b):
     xyz = sloped_scene(seed, [a, b, -1.7])
-    params = GroundParams(z_max=-1.0, inlier_distance=0.07)
-    low = xyz[:, 2] < params.z_max
-    plane = ransac_plane(xyz[low], params)
+    params = ThresholdParams(max_height=0.73, inlier_distance=0.07)
+    plane = find_plane(xyz, params, sensor_height=1.73)
     x, y, z = xyz.T.astype(np.float64)
-    expected = low & (abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= 0.07)
-    np.testing.assert_array_equal(segment_ground(xyz, params), expected)
+    expected = (abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= 0.07)
+    np.testing.assert_array_equal(segment_by_threshold(xyz, params), expected)
     assert expected.sum() > 500
 
 
@@ -79,9 +79,9 @@ def test_ground_is_every_candidate_within_inlier_distance_of_the_plane(seed, a, 
 def test_the_plane_is_a_fixed_point_of_fitting_the_ground(seed, a, b, offset):
     xyz = sloped_scene(seed, [a, b, -1.7])
     xyz[:, 0] += np.float32(offset)
-    params = GroundParams(z_max=100.0)
+    params = ThresholdParams(max_height=100.0)
     plane = ransac_plane(xyz, params)
-    again = fit_plane(xyz[segment_ground(xyz, params)])
+    again = fit_plane(xyz[segment_by_threshold(xyz, params)])
     np.testing.assert_allclose(again[:2], plane[:2], rtol=0, atol=1e-9)
     here = np.array([[offset, 0.0, 0.0]])
     np.testing.assert_allclose(height_above(here, again), height_above(here, plane), rtol=0,
@@ -93,9 +93,9 @@ def test_the_plane_is_a_fixed_point_of_fitting_the_ground(seed, a, b, offset):
 def test_permuting_points_permutes_the_ground(seed, a, b):
     xyz = sloped_scene(seed, [a, b, -1.7])
     order = np.random.default_rng(seed).permutation(len(xyz))
-    params = GroundParams(z_max=100.0)
-    np.testing.assert_array_equal(segment_ground(xyz[order], params),
-                                  segment_ground(xyz, params)[order])
+    params = ThresholdParams(max_height=100.0)
+    np.testing.assert_array_equal(segment_by_threshold(xyz[order], params),
+                                  segment_by_threshold(xyz, params)[order])
 
 
 @few
@@ -111,8 +111,8 @@ def test_fit_plane_is_numpys_least_squares(seed, a, b):
 @pytest.mark.parametrize("scan", [0, 5, 13, 20])
 def test_on_real_clouds_the_plane_is_that_of_2000_trials_of_sklearn(scan):
     xyz, = real_scans(scan)
-    params = GroundParams()
-    low = xyz[xyz[:, 2] < params.z_max]
+    params = ThresholdParams()
+    low = xyz[xyz[:, 2] < -1.3]
     model = RANSACRegressor(LinearRegression(), residual_threshold=params.inlier_distance,
                             max_trials=2000, stop_probability=1.0, random_state=1, min_samples=3)
     sample = np.random.default_rng(0).permutation(len(low))[:5000]  # 2000 trials on all are slow
@@ -131,13 +131,13 @@ def test_on_real_clouds_the_plane_is_that_of_2000_trials_of_sklearn(scan):
 @needs_data
 def test_on_real_clouds_the_plane_is_a_fixed_point_and_not_a_matter_of_order_or_seed():
     for xyz in real_scans(2, 9):
-        params = GroundParams()
-        ground = segment_ground(xyz, params)
-        plane = ransac_plane(xyz[xyz[:, 2] < params.z_max], params)
+        params = ThresholdParams()
+        ground = segment_by_threshold(xyz, params)
+        plane = find_plane(xyz, params)
         np.testing.assert_allclose(fit_plane(xyz[ground]), plane, rtol=0, atol=1e-9)
         order = np.random.default_rng(0).permutation(len(xyz))
-        for other in (segment_ground(xyz, GroundParams(seed=5)),
-                      segment_ground(xyz[order], params)[np.argsort(order)]):
+        for other in (segment_by_threshold(xyz, ThresholdParams(seed=5)),
+                      segment_by_threshold(xyz[order], params)[np.argsort(order)]):
             assert (other != ground).mean() < 0.01
             assert apart(fit_plane(xyz[other]), plane) < 0.05
 
@@ -163,16 +163,17 @@ upside_down = sloped_scene(0, np.array([0.01, 0, -1.73]), high=2.5) * np.float32
     sloped_scene(0, [0, 0, 0.5]),
     upside_down,
 ], ids=["empty", "one point", "two points", "all equal", "line", "slanted line", "pole", "wall",
-        "all above z_max", "upside-down sensor"])
+        "all above max_height", "upside-down sensor"])
 def test_where_there_is_no_ground_nothing_is(xyz):
-    ground = segment_ground(xyz.astype(np.float32))
+    ground = segment_by_threshold(xyz.astype(np.float32))
     assert ground.shape == (len(xyz),) and ground.dtype == bool and not ground.any()
 
 
 def test_three_points_are_enough_for_a_plane():
     xyz = np.float32([[0, 0, -2], [4, 0, -2.5], [0, 4, -1.75]])
-    np.testing.assert_allclose(ransac_plane(xyz, GroundParams()), [-0.125, 0.0625, -2], atol=1e-9)
-    assert segment_ground(xyz).all()
+    np.testing.assert_allclose(ransac_plane(xyz, ThresholdParams()), [-0.125, 0.0625, -2],
+                               atol=1e-9)
+    assert segment_by_threshold(xyz).all()
 
 
 def test_fit_plane_needs_three_points_not_on_a_line():
@@ -184,22 +185,33 @@ def test_fit_plane_needs_three_points_not_on_a_line():
 
 def test_a_plane_steeper_than_max_slope_is_not_ground():
     steep = sloped_scene(1, [np.tan(np.radians(20)), 0, -20], outliers=0, noise=0.0)
-    assert segment_ground(steep, GroundParams(max_slope=21.0, z_max=0.0)).mean() > 0.9
-    assert not segment_ground(steep, GroundParams(max_slope=5.0, z_max=0.0)).any()
+    assert segment_by_threshold(steep, ThresholdParams(max_slope=21.0, max_height=5.0)).mean() > 0.9
+    assert not segment_by_threshold(steep, ThresholdParams(max_slope=5.0, max_height=5.0)).any()
 
 
-def test_points_at_z_max_are_not_ground_and_nothing_above_it_is():
-    xyz = sloped_scene(2, [0, 0, -1.3], outliers=0)
-    xyz[0] = [0, 0, -1.25]
-    params = GroundParams(z_max=-1.25)
-    ground = segment_ground(xyz, params)
-    assert not ground[0] and ground.sum() > 2900
-    assert (xyz[ground, 2] < np.float32(-1.25)).all()
+def test_the_ground_goes_on_where_the_road_climbs_above_max_height():
+    # 12 degrees: 4 m up at 20 m, where a plain threshold would end after 2 m.
+    xyz = sloped_scene(2, [0.2, 0, -1.73], outliers=0.3)
+    on_plane = np.abs(height_above(xyz, np.array([0.2, 0, -1.73]))) < 0.05
+    ground = segment_by_threshold(xyz)
+    assert ground[on_plane].mean() > 0.99 and ground[xyz[:, 0] > 10].sum() > 400
+    assert ground.sum() < 1.1 * on_plane.sum()
+
+
+def test_max_height_counts_from_the_ground_under_the_sensor():
+    """A second, larger plane 0.5 m higher: seen only if max_height reaches it."""
+    rng = np.random.default_rng(0)
+    floor, table = (np.column_stack([rng.uniform(-9, 9, (n, 2)), np.full(n, z)]).astype(np.float32)
+                    for n, z in ((300, -0.7), (900, -0.2)))
+    xyz = np.concatenate([floor, table])
+    for height, max_height, expected in ((0.7, 0.43, -0.7), (0.7, 0.6, -0.2), (0.2, 0.1, -0.2)):
+        plane = find_plane(xyz, ThresholdParams(max_height=max_height), sensor_height=height)
+        np.testing.assert_allclose(plane, [0, 0, expected], atol=1e-6)
 
 
 def test_same_seed_same_ground_and_the_input_stays_unchanged():
     xyz = sloped_scene(3, [0.05, 0.02, -1.8])
     before = xyz.copy()
-    first = segment_ground(xyz)
-    np.testing.assert_array_equal(segment_ground(xyz), first)
+    first = segment_by_threshold(xyz)
+    np.testing.assert_array_equal(segment_by_threshold(xyz), first)
     np.testing.assert_array_equal(xyz, before)

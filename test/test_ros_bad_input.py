@@ -7,7 +7,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from lidar_perception.datasets.bag import Bag, bag_message
+from lidar_perception.datasets.bag import Bag, bag_message, encode
+from lidar_perception.messages import to_frame
 from lidar_perception.topics import POINTS
 from msg_utils.markers import from_marker_array
 from msg_utils.point_cloud2 import from_array
@@ -23,6 +24,10 @@ def cloud(xyz, stamp=1, **changes):
     for name, value in changes.items():
         setattr(msg, name, value)
     return msg
+
+
+def xyz_of(msg):
+    return to_frame(msg)[0].xyz
 
 
 def without_x():
@@ -78,12 +83,67 @@ def test_bad_clouds_become_diagnostics_and_the_node_lives_on(node, processes, pe
     assert names[:4] == ["x", "y", "z", "intensity"] and "ground" in names
 
 
+@pytest.mark.parametrize("values", [
+    {"ground.method": "patchwork"}, {"ground.method": "cloth"},
+    {"ground.method": "cloth", "clustering.method": "euclidean", "boxes.shape": "l_shape"},
+], ids=["patchwork", "cloth", "paper C"])
+def test_no_method_dies_of_a_strange_cloud(values, processes, peer, good_cloud):
+    """The wheels behind some methods end the process on NaN, outliers or nothing at all."""
+    node = "perception" if "clustering.method" in values else "ground_segmentation"
+    processes.start(node, {"~/input/points": "/in", "~/output/points": "/out"}, values)
+    talker, received = peer.talker("/in", CLOUD), peer.listen("/out", CLOUD)
+    rng = np.random.default_rng(0)
+    xyz = xyz_of(good_cloud)
+    some = xyz[:2000]
+    strange = {
+        **{name: msg for name, (msg, _) in BAD.items()},
+        "100 km": cloud(np.concatenate([some, [[1e5, -1e5, 1e5]]])),
+        "1e38": cloud(np.concatenate([some, [[1e38, 0, 0]]])),
+        "upside down": cloud(xyz * [1, -1, -1]),
+        "all equal": cloud(np.full((3000, 3), 7.0)),
+        "no ground": cloud(rng.uniform(3, 9, (3000, 3))),
+        "all ground": cloud(rng.uniform(-30, 30, (3000, 3)) * [1, 1, 0] - [0, 0, 1.73]),
+        "a million": cloud(rng.uniform(-50, 50, (1_000_000, 3)) * [1, 1, 0.05]),
+    }
+    def serve(stamp):
+        """Send a good cloud and wait for its result: what came before it is done then."""
+        msg = cloud(some, stamp)
+        peer.send(talker, msg, lambda: received and to_ns(received[-1].header.stamp) == stamp,
+                  "the result of a good cloud")
+
+    serve(1)
+    for stamp, msg in enumerate(strange.values(), start=2):
+        talker.publish(encode(msg))
+        serve(stamp)
+        processes.check()
+    assert {r.width for r in received} >= {1_000_000, len(xyz), 2001}
+    assert "PatchWork" not in (processes.logs / f"{node}.log").read_text()
+
+
+def test_a_wrong_height_and_a_wrong_scale_of_intensity_are_said(processes, peer, good_cloud):
+    """The sensor hangs 1.73 m high; intensity is 0..1."""
+    processes.start("ground_segmentation", {"~/input/points": "/in"},
+                    {"ground.sensor_pose.height": 1.2, "ground.method": "patchwork"})
+    talker = peer.talker("/in", CLOUD)
+    peer.send(talker, good_cloud, lambda: "ground.sensor_pose.height is 1.2; set it to 1.7"
+              in peer.message_of("ground_segmentation"), "the measured height")
+    peer.set_parameter("/ground_segmentation", "ground.sensor_pose.height", 1.73)
+    peer.set_parameter("/ground_segmentation", "input.intensity_max", 0.001)
+    peer.send(talker, good_cloud, lambda: "input.intensity_max"
+              in peer.message_of("ground_segmentation"), "the scale of the intensity")
+    peer.set_parameter("/ground_segmentation", "input.intensity_max", 1.0)
+    peer.send(talker, good_cloud, lambda: peer.message_of("ground_segmentation") == "segmenting",
+              "a good state")
+    values = {v.key: v.value for v in peer.diagnostics["ground_segmentation"].values}
+    assert abs(float(values["sensor_height"]) - 1.73) < 0.1
+    assert 0.5 < float(values["plane_inlier_share"]) <= 1.0
+
+
 def test_layout_does_not_change_the_result(processes, peer, good_cloud):
     """Big-endian, organised and NaN-padded clouds give the ground of the plain cloud."""
-    from lidar_perception.messages import to_frame
     from msg_utils.point_cloud2 import to_array
     processes.start("ground_segmentation", {"~/input/points": "/in", "~/output/points": "/out"}, {})
-    xyz = to_frame(good_cloud)[0].xyz[:40_000]
+    xyz = xyz_of(good_cloud)[:40_000]
     holes = np.full((20_000, 3), np.nan, np.float32)
     organised = cloud(np.concatenate([xyz, holes, np.zeros_like(holes)]), 3, is_dense=False)
     organised.height, organised.width = 8, 10_000
@@ -113,9 +173,6 @@ def test_clustering_and_refinement_name_the_missing_column(processes, peer, good
 def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
         processes, peer, good_cloud, drive_bag):
     """view.enabled without CameraInfo; then without a seed; then with a clicked pedestrian."""
-    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-    from rcl_interfaces.srv import SetParameters
-
     from lidar_perception.datasets.recording import open_recording
     from lidar_perception.evaluation.candidates import pedestrians
     processes.start("perception", {"~/input/points": "/in", "~/output/detections": "/found"},
@@ -123,10 +180,7 @@ def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
     talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
     peer.send(talker, good_cloud, lambda: "camera calibration" in peer.message_of("perception"),
               "no camera yet")
-    off = Parameter(name="view.enabled",
-                    value=ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=False))
-    assert peer.call("/perception/set_parameters", SetParameters,
-                     SetParameters.Request(parameters=[off])).results[0].successful
+    peer.set_parameter("/perception", "view.enabled", False)
     peer.send(talker, good_cloud, lambda: found and "no seed yet" in peer.message_of("perception"),
               "no seed yet")
     assert len(from_marker_array(found[-1])) == 0

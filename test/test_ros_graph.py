@@ -23,20 +23,37 @@ from msg_utils.point_cloud2 import to_array
 PROTOCOL = with_values(PipelineParams(), {"view.enabled": True, "seed.source": "ground_truth"})
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["three nodes", "one node"])
-def run(request, drive_bag, tmp_path_factory):
-    """One replay: its scores, and the folder with the result bag."""
-    out = tmp_path_factory.mktemp("run")
-    with Bag(drive_bag) as bag:
-        clouds = bag.counts[POINTS]
-    return request.param, replay(drive_bag, clouds, out, PROTOCOL, single=request.param), out
+RUNS = {  # one process?, parameters beside the protocol
+    "three nodes": (False, {}),
+    "one node": (True, {}),
+    "three nodes of paper C": (False, {"ground.method": "cloth", "clustering.method": "euclidean",
+                                       "boxes.shape": "l_shape"}),
+    "one node, patchwork": (True, {"ground.method": "patchwork", "boxes.shape": "min_area",
+                                   "clustering.dbscan.join_bands": True}),
+}
+
+
+@pytest.fixture(scope="module", params=RUNS.values(), ids=RUNS)
+def setting(request):
+    single, values = request.param
+    return single, with_values(PROTOCOL, values)
 
 
 @pytest.fixture(scope="module")
-def offline(drive_bag):
+def run(setting, drive_bag, tmp_path_factory):
+    """One replay: whether in one process, its scores, and the folder with the result bag."""
+    single, params = setting
+    out = tmp_path_factory.mktemp("run")
+    with Bag(drive_bag) as bag:
+        clouds = bag.counts[POINTS]
+    return single, replay(drive_bag, clouds, out, params, single=single), out
+
+
+@pytest.fixture(scope="module")
+def offline(setting, drive_bag):
     """Stamp -> what the offline pipeline finds; and its report."""
     report = CandidateReport()
-    results = [r for r in evaluate(open_recording(bag=drive_bag), PROTOCOL, report) if r]
+    results = [r for r in evaluate(open_recording(bag=drive_bag), setting[1], report) if r]
     return {r.frame.stamp_ns: (segmented, found) for r, segmented, found in results}, report
 
 

@@ -87,7 +87,7 @@ def test_parameters_are_those_of_the_dataclass(processes, peer):
     assert change("stm.threshold", type=double, double_value=0.6).successful
     refused = change("stm.threshold", type=double, double_value=1.5)
     assert not refused.successful and refused.reason
-    refused = change("dbscan.eps", type=ParameterType.PARAMETER_DOUBLE_ARRAY,
+    refused = change("clustering.dbscan.eps", type=ParameterType.PARAMETER_DOUBLE_ARRAY,
                      double_array_value=[0.1])
     assert not refused.successful and "range_limits" in refused.reason
     refused = change("seed.source", type=ParameterType.PARAMETER_STRING, string_value="dream")
@@ -96,7 +96,7 @@ def test_parameters_are_those_of_the_dataclass(processes, peer):
 
 @pytest.mark.parametrize("values, words", [
     ({"stm.threshold": 7.0}, "stm.threshold"),
-    ({"dbscan.eps": [0.1]}, "range_limits"),
+    ({"clustering.dbscan.eps": [0.1]}, "range_limits"),
     ({"seed.file": "/nowhere.json"}, None),
 ])
 def test_bad_parameter_files_are_refused_in_one_line(processes, peer, values, words, drive_bag):

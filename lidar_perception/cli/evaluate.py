@@ -8,6 +8,7 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.options import parameter_options
+from lidar_perception.cli.segmentation import segmentation
 from lidar_perception.datasets.bag import Bag
 from lidar_perception.datasets.recording import open_recording
 from lidar_perception.evaluation.candidates import CandidateReport, pedestrians
@@ -87,3 +88,4 @@ def candidates(kitti: Path | None, bag: Path | None, json_file: Path | None, png
         console.print(f"picture: {png}")
 
 
+evaluate.add_command(segmentation)

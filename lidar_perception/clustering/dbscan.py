@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from lidar_perception.clustering.dense import dbscan_by_cells
 from lidar_perception.clustering.sparse import dbscan_by_pairs
@@ -11,22 +16,51 @@ from lidar_perception.params import DbscanParams
 
 
 def distance_aware_dbscan(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
-    """(N,) int32 cluster ids of points (N, 3) float32 in the LiDAR frame; 0 is noise.
+    """(N,) int32 cluster ids of finite points (N, 3) float32 in the LiDAR frame; 0 is noise.
 
     Each band of horizontal range [range_limits[i-1], range_limits[i]) is clustered by itself with
-    eps[i]; ids go on from band to band (paper A, Section 3.3).
+    eps[i]; ids go on from band to band (paper A, Section 3.3). With join_bands, clusters of
+    neighbouring bands that have points within the smaller eps of each other become one.
     """
     band = np.searchsorted(np.asarray(params.range_limits), horizontal_range(xyz), side="right")
+    bands = [np.flatnonzero(band == i) for i in range(len(params.eps))]
     labels = np.zeros(len(xyz), np.int32)
     last = 0
-    for i, eps in enumerate(params.eps):
-        members = np.flatnonzero(band == i)
-        if len(members) < params.min_samples:
-            continue
-        found = dbscan(xyz.take(members, axis=0), eps, params.min_samples)
-        labels[members] = np.where(found > 0, found + last, 0)
-        last += int(found.max(initial=0))
-    return labels
+    # The compiled code lets go of the GIL: each band has a thread.
+    with ThreadPoolExecutor(len(bands)) as threads:
+        found = threads.map(lambda members, eps: dbscan(xyz.take(members, axis=0), eps,
+                                                        params.min_samples), bands, params.eps)
+        for members, ids in zip(bands, found):
+            labels[members] = np.where(ids > 0, ids + last, 0)
+            last += int(ids.max(initial=0))
+    return _joined(xyz, band, labels, params.eps) if params.join_bands else labels
+
+
+def _joined(xyz: np.ndarray, band: np.ndarray, labels: np.ndarray,
+            eps: tuple[float, ...]) -> np.ndarray:
+    """labels (N,) with clusters joined across neighbouring bands (N,), numbered anew in order."""
+    count = int(labels.max(initial=0))
+    pairs = [np.zeros((0, 2), np.int32)]
+    for i, reach in enumerate(map(min, eps, eps[1:])):
+        inner, outer = (np.flatnonzero((band == b) & (labels > 0)) for b in (i, i + 1))
+        if len(inner) and len(outer):
+            pairs.append(_touching(xyz, labels, inner, outer, reach))
+    joined = np.unique(np.concatenate(pairs), axis=0)
+    graph = coo_matrix((np.ones(len(joined)), joined.T), shape=(count + 1, count + 1))
+    _, component = connected_components(graph, directed=False)
+    # Components are numbered by their first member; 0, the noise, is joined with nothing.
+    return component[labels].astype(np.int32)
+
+
+def _touching(xyz: np.ndarray, labels: np.ndarray, inner: np.ndarray, outer: np.ndarray,
+              reach: float) -> np.ndarray:
+    """(P, 2) labels of pairs of points, one of each band, within reach of each other."""
+    inner_range, outer_range = (horizontal_range(xyz[side]) for side in (inner, outer))
+    inner = inner[inner_range >= outer_range.min() - reach]
+    outer = outer[outer_range <= inner_range.max() + reach]
+    trees = [cKDTree(xyz[side].astype(np.float64)) for side in (inner, outer)]
+    found = trees[0].sparse_distance_matrix(trees[1], reach, output_type="coo_matrix")
+    return np.stack([labels[inner[found.row]], labels[outer[found.col]]], axis=1)
 
 
 def dbscan(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray:

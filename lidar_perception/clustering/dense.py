@@ -23,7 +23,7 @@ def dbscan_by_cells(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray
     return _labels(x, y, z, order, start, first, second, core, eps * eps)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _neighbour_cells(cell_z, column_start, neighbours):
     """first (P,), second (P,): pairs of distinct cells that may hold points within eps, once."""
     capacity = 12 * len(cell_z) + 16
@@ -51,7 +51,7 @@ def _neighbour_cells(cell_z, column_start, neighbours):
     return first[:count], second[:count]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _core_points(x, y, z, start, first, second, eps2, min_samples):
     """(N,) bool in grid order: at least min_samples points within eps, itself included."""
     cells = len(start) - 1
@@ -78,7 +78,7 @@ def _core_points(x, y, z, start, first, second, eps2, min_samples):
     return found >= min_samples
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _wanting(found, begin, end, enough):
     for i in range(begin, end):
         if found[i] < enough:
@@ -86,7 +86,7 @@ def _wanting(found, begin, end, enough):
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _count(x, y, z, start, a, b, eps2, enough, found):
     """Add to found, for the points of cell a, their neighbours in cell b, until enough.
     True if a point of cell a still has too few."""
@@ -104,7 +104,7 @@ def _count(x, y, z, start, a, b, eps2, enough, found):
     return wanting
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _core_extents(x, y, z, start, core):
     """(C, 6): low and high corner of each cell's core points; inf and -inf where it has none."""
     extents = np.empty((len(start) - 1, 6))
@@ -118,7 +118,7 @@ def _core_extents(x, y, z, start, core):
     return extents
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _touch(x, y, z, core, extents, start, a, b, eps2):
     """True if a core point of cell a lies within eps of a core point of cell b."""
     box = extents[b]
@@ -134,7 +134,7 @@ def _touch(x, y, z, core, extents, start, a, b, eps2):
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _labels(x, y, z, order, start, first, second, core, eps2):
     n, cells = len(x), len(start) - 1
     cores = np.zeros(cells, np.int32)
@@ -172,7 +172,7 @@ def _labels(x, y, z, order, start, first, second, core, eps2):
     return labels
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _adopt(x, y, z, order, start, a, b, core, label, labels, eps2):
     """Give the border points of cell a that the core of cell b touches b's label, if lower."""
     for i in range(start[a], start[a + 1]):

@@ -6,12 +6,12 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _hash(ix, iy, mask):
     return (ix * np.int64(73856093) ^ iy * np.int64(19349663)) & mask
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def grid(xyz, side, reach):
     """Sort points by cell: columns of cells with the same x and y, in each column ascending z.
 
@@ -82,7 +82,7 @@ def grid(xyz, side, reach):
     return order, cell_start[:cells + 1], cell_z[:cells], column_start, neighbours
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _order_by_height(z):
     low, high = z.min(), z.max()
     if high - low > 8 * len(z) + 4096:  # far outliers: too many levels to count
@@ -90,7 +90,7 @@ def _order_by_height(z):
     return _stable_order((z - low).astype(np.int32), high - low + 1, np.arange(len(z)))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _stable_order(keys, count, first):
     """`first` reordered by keys 0..count-1; equal keys keep their order. Counting sort."""
     start = np.zeros(count + 1, np.int64)
@@ -105,14 +105,14 @@ def _stable_order(keys, count, first):
     return order
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def near(x, y, z, i, j, eps2):
     """True if points i and j are within eps; float64, as scikit-learn computes it."""
     dx, dy, dz = x[i] - x[j], y[i] - y[j], z[i] - z[j]
     return dx * dx + dy * dy + dz * dz <= eps2
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def root(parent, i):
     """The representative of i in a union-find forest (path halving)."""
     while parent[i] != i:
@@ -121,7 +121,7 @@ def root(parent, i):
     return i
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def grown(values, count, capacity):
     """values[:count] in a new array of that capacity."""
     new = np.empty(capacity, values.dtype)
@@ -129,7 +129,7 @@ def grown(values, count, capacity):
     return new
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def number_clusters(order, core, owner, parent):
     """(S,) int32 cluster of each set of the union-find forest parent (S,), 0 for sets without a
     core point. Clusters are numbered 1..K by their first core point in the order of the input;

@@ -16,18 +16,38 @@ def dbscan_by_pairs(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray
     """(N,) int32 labels of points (N, 3) float32, as dbscan.dbscan; None if they are too dense."""
     # A hair over eps, so that rounding never puts two neighbours more than a column apart.
     order, start, cell_z, column_start, neighbours = grid(xyz, eps * (1.0 + 1e-6), 1)
-    x, y, z = np.ascontiguousarray(xyz.T[:, order], np.float64)
-    found, first, second = _pairs(x, y, z, start, cell_z, column_start, neighbours, eps * eps,
-                                  BUDGET * len(xyz) + 100_000)
-    if len(found) == 0:
+    if _distances(start, cell_z, column_start, neighbours) > BUDGET * len(xyz) + 100_000:
         return None
+    x, y, z = np.ascontiguousarray(xyz.T[:, order], np.float64)
+    found, first, second = _pairs(x, y, z, start, cell_z, column_start, neighbours, eps * eps)
     return _labels(order, found >= min_samples, first, second)
 
 
-@njit(cache=True)
-def _pairs(x, y, z, start, cell_z, column_start, neighbours, eps2, budget):
+@njit(cache=True, nogil=True)
+def _distances(start, cell_z, column_start, neighbours):
+    """How many distances _pairs would compute."""
+    total = 0
+    for c in range(len(column_start) - 1):
+        for k in range(neighbours.shape[1]):
+            other = neighbours[c, k]
+            if other < 0:
+                continue
+            begin, end = column_start[other], column_start[other]
+            last = column_start[other + 1]
+            for a in range(column_start[c], column_start[c + 1]):
+                while begin < last and cell_z[begin] < cell_z[a] - 1:
+                    begin += 1
+                end = max(end, begin)
+                while end < last and cell_z[end] <= cell_z[a] + 1:
+                    end += 1
+                total += (start[a + 1] - start[a]) * (start[end] - start[begin])
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _pairs(x, y, z, start, cell_z, column_start, neighbours, eps2):
     """found (N,): points within eps of each, itself included; first (P,), second (P,): the pairs,
-    each once. All empty if more than budget distances would have to be computed."""
+    each once."""
     capacity = 8 * len(x) + 16
     first, second = np.empty(capacity, np.int32), np.empty(capacity, np.int32)
     found = np.ones(len(x), np.int32)
@@ -47,9 +67,6 @@ def _pairs(x, y, z, start, cell_z, column_start, neighbours, eps2, budget):
                     end += 1
                 low, high = start[begin], start[end]
                 work = (start[a + 1] - start[a]) * (high - low)
-                budget -= work
-                if budget < 0:
-                    return found[:0], first[:0], second[:0]
                 if count + work > capacity:
                     capacity = 2 * (count + work)
                     first, second = grown(first, count, capacity), grown(second, count, capacity)
@@ -63,7 +80,7 @@ def _pairs(x, y, z, start, cell_z, column_start, neighbours, eps2, budget):
     return found, first[:count], second[:count]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _labels(order, core, first, second):
     n = len(order)
     parent = np.arange(n).astype(np.int32)

@@ -71,7 +71,7 @@ def _bag(recording: Recording) -> Iterator[Recorded | InputError]:
                 (infos if topic == CAMERA_INFO else transforms).append((stamp, msg))
         for _, stamp, msg in bag.messages({recording.points_topic}):
             try:
-                frame, _ = to_frame(msg)
+                frame, _ = to_frame(msg, intensity_max=0.0)
                 info, transform = _latest(infos, stamp), _latest(transforms, stamp)
                 camera = camera_of(info, transform) if info and transform else None
                 yield Recorded(str(to_ns(msg.header.stamp)), frame, truth.get(frame.stamp_ns),

@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.params import GroundParams
+from lidar_perception.params import SensorPoseParams, ThresholdParams
 
+SENSOR_HEIGHT = SensorPoseParams().height
 MIN_POINTS = 3
 SAMPLE = 2048        # candidates on which trial planes are compared; the fit uses all of them
 CONFIDENCE = 0.9999  # of having drawn one triple without outliers
@@ -17,20 +18,34 @@ MIN_SINE = 1e-3      # of the angle in a trial's triangle; a thinner one says no
 REFINEMENTS = 50     # the inliers settle after a few; this bounds the rare case that they cycle
 
 
-def segment_ground(xyz: np.ndarray, params: GroundParams = GroundParams()) -> np.ndarray:
-    """(N,) bool, True = ground: points (N, 3) below z_max within inlier_distance of the plane
-    through most of them. All False where no plane can be found (too few points, all steep)."""
-    candidate = xyz[:, 2] < params.z_max
-    plane = ransac_plane(xyz.compress(candidate, axis=0), params)
+def segment_by_threshold(xyz: np.ndarray, params: ThresholdParams = ThresholdParams(),
+                         sensor_height: float = SENSOR_HEIGHT) -> np.ndarray:
+    """(N,) bool, True = ground: points (N, 3) within inlier_distance of the plane that holds most
+    of those lower than max_height above the ground under the sensor. All False where no plane can
+    be found (too few points, all steep)."""
+    plane = find_plane(xyz, params, sensor_height)
     if plane is None:
         return np.zeros(len(xyz), bool)
-    return candidate & (np.abs(height_above(xyz, plane)) <= params.inlier_distance)
+    return np.abs(height_above(xyz, plane)) <= params.inlier_distance
 
 
-def ransac_plane(xyz: np.ndarray, params: GroundParams) -> np.ndarray | None:
+def find_plane(xyz: np.ndarray, params: ThresholdParams = ThresholdParams(),
+               sensor_height: float = SENSOR_HEIGHT) -> np.ndarray | None:
+    """The plane of segment_by_threshold: found among the low points, fitted to all near it."""
+    low = xyz[:, 2] < params.max_height - sensor_height
+    plane = _best_of_trials(xyz.compress(low, axis=0), params)
+    return None if plane is None else refine_plane(xyz, plane, params)
+
+
+def ransac_plane(xyz: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
     """The plane with most points (M, 3) within inlier_distance, then fitted to its inliers until
     they no longer change, so that it does not depend on the triple that found it. None where
     there is none. Fischler and Bolles, 1981, with the adaptive number of trials."""
+    plane = _best_of_trials(xyz, params)
+    return None if plane is None else refine_plane(xyz, plane, params)
+
+
+def _best_of_trials(xyz: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
     if len(xyz) < MIN_POINTS:
         return None
     rng = np.random.default_rng(params.seed)
@@ -39,12 +54,17 @@ def ransac_plane(xyz: np.ndarray, params: GroundParams) -> np.ndarray | None:
     max_gradient = np.tan(np.radians(params.max_slope))
     plane = _best_trial(sample.astype(np.float64), triples, params.inlier_distance, max_gradient,
                         CONFIDENCE)
-    if np.isnan(plane[0]):
-        return None
+    return None if np.isnan(plane[0]) else plane
+
+
+def refine_plane(xyz: np.ndarray, plane: np.ndarray, params: ThresholdParams) -> np.ndarray | None:
+    """The plane fitted to the points (N, 3) within inlier_distance, again and again until these no
+    longer change. None where they lie on one line."""
+    max_gradient = np.tan(np.radians(params.max_slope))
     for _ in range(REFINEMENTS):
         fitted = _plane_of(_moments(xyz, plane, params.inlier_distance))
         if fitted is None:
-            return None  # the inliers lie on one line
+            return None
         if np.array_equal(fitted, plane) or np.hypot(fitted[0], fitted[1]) > max_gradient:
             break
         plane = fitted
@@ -55,6 +75,15 @@ def fit_plane(xyz: np.ndarray) -> np.ndarray | None:
     """Least-squares plane of points (M, 3), errors along z. None for fewer than 3 points or
     points on one line."""
     return _plane_of(_moments(xyz, np.zeros(3), np.inf))
+
+
+def inlier_share(xyz: np.ndarray, plane: np.ndarray,
+                 params: ThresholdParams = ThresholdParams()) -> float:
+    """Of the points (N, 3) lower than max_height above the plane, the share within inlier_distance
+    of it: how well one plane describes the ground. 0 where no point is that low."""
+    height = height_above(xyz, plane)
+    low = height < params.max_height
+    return float((np.abs(height[low]) <= params.inlier_distance).mean()) if low.any() else 0.0
 
 
 def height_above(xyz: np.ndarray, plane: np.ndarray) -> np.ndarray:

@@ -37,5 +37,6 @@ class CandidateRefinement(LidarNode):
             ids = ids.astype(np.int32)
             ground = np.zeros(len(ids), bool) if ground is None else ground > 0
             segmented = Segmented(places, frame.xyz, ground, ids,
-                                  grounded_boxes(frame.xyz, ground, ids))
+                                  grounded_boxes(frame.xyz, ground, ids,
+                                                 self.params.boxes.shape))
             self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params))

@@ -19,8 +19,8 @@ __all__ = ["Clustering", "warm_up"]
 
 
 class Clustering(LidarNode):
-    """Distance-aware DBSCAN of the points that are not ground. Boxes are made only while somebody
-    subscribes."""
+    """Distance-aware DBSCAN or adaptive Euclidean clustering of the points that are not ground.
+    Boxes are made only while somebody subscribes."""
 
     def __init__(self, **options: Any):
         super().__init__("clustering", ClusteringNodeParams(), **options)
@@ -33,14 +33,15 @@ class Clustering(LidarNode):
             frame, places = to_frame(msg)
             marked = column(msg, "ground", places)
             ground = np.zeros(len(frame), bool) if marked is None else marked > 0
-            ids = cluster_obstacles(frame.xyz, ground, self.params.dbscan)
+            ids = cluster_obstacles(frame.xyz, ground, self.params.clustering)
             self.points.publish(encode(add_columns(
                 msg, bag_message, cluster_id=spread(ids, places, msg, "u4"))))
-        self.boxes.publish(msg.header, lambda: grounded_boxes(frame.xyz, ground, ids))
+        self.boxes.publish(msg.header, lambda: grounded_boxes(
+            frame.xyz, ground, ids, self.params.boxes.shape))
         self.counts["clusters"] = int(ids.max(initial=0))
         if marked is None:
             self.report(WARN, "the cloud has no column 'ground', so all of it is clustered; "
                         "remap ~/input/points to the ground segmentation's output")
         else:
-            problem = explain_nothing(len(frame), frame.xyz, ground, np.inf, ids)
+            problem = explain_nothing(len(frame), ground, ids)
             self.report(WARN if problem else OK, problem or "clustering")

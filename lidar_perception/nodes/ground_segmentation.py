@@ -5,10 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 from lidar_perception.datasets.bag import bag_message, encode
-from lidar_perception.ground.threshold import fit_plane, segment_ground
-from lidar_perception.messages import spread, to_frame
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.ground.threshold import fit_plane, inlier_share
+from lidar_perception.messages import spread
 from lidar_perception.nodes.inputs import CameraInput
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN, LidarNode
+from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import GroundNodeParams
 from lidar_perception.pipeline import explain_nothing, points_in_view, warm_up
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
@@ -18,12 +20,13 @@ __all__ = ["GroundSegmentation", "warm_up"]
 
 
 class GroundSegmentation(LidarNode):
-    """Height threshold and RANSAC plane. ~/output/ground and ~/output/nonground are made only
-    while somebody subscribes."""
+    """One plane, Patchwork++ or cloth simulation. ~/output/ground and ~/output/nonground are made
+    only while somebody subscribes."""
 
     def __init__(self, **options: Any):
         super().__init__("ground_segmentation", GroundNodeParams(), **options)
         self.camera = CameraInput(self)
+        self.sensor = SensorCheck(self)
         self.points = self.output("points", CLOUD)
         self.ground = self.output("ground", CLOUD)
         self.nonground = self.output("nonground", CLOUD)
@@ -31,10 +34,10 @@ class GroundSegmentation(LidarNode):
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, usable = to_frame(msg)
+            frame, usable = self.sensor.frame(msg)
             camera = self.camera.get(frame.frame_id, self.params.view)
-            places, xyz = points_in_view(frame.xyz, camera, self.params.view)
-            ground = segment_ground(xyz, self.params.ground)
+            places, seen = points_in_view(frame, camera, self.params.view)
+            ground = segment_ground(seen, self.params.ground)
             places = usable.take(places)
             self.points.publish(encode(add_columns(
                 msg, bag_message, ground=spread(ground, places, msg, "u1"),
@@ -43,9 +46,10 @@ class GroundSegmentation(LidarNode):
             if publisher.get_subscription_count():
                 publisher.publish(encode(from_array(to_array(msg).take(places[chosen]), msg.header,
                                                     bag_message)))
-        plane = fit_plane(xyz.compress(ground, axis=0))
+        plane = fit_plane(seen.xyz.compress(ground, axis=0))
         if plane is not None:
             self.counts.update(plane=" ".join(f"{v:.4f}" for v in plane),
+                               plane_inlier_share=f"{inlier_share(seen.xyz, plane):.3f}",
                                ground_share=f"{ground.mean():.3f}")
-        problem = explain_nothing(len(frame), xyz, ground, self.params.ground.z_max)
+        problem = explain_nothing(len(frame), ground) or self.sensor.problem(frame)
         self.report(WARN if problem else OK, problem or "segmenting")

@@ -10,6 +10,7 @@ import numpy as np
 from std_msgs.msg import Float64
 
 from lidar_perception.candidates.refine import Candidates
+from lidar_perception.clustering.shapes import class_by_diagonal
 from lidar_perception.datasets.bag import bag_message, encode
 from lidar_perception.messages import detection_markers
 from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
@@ -31,9 +32,16 @@ class ClusterBoxes:
         if self.publisher.get_subscription_count():
             found = boxes()
             markers = to_marker_array(found, ["cluster"] * len(found), header=header,
-                                      make=bag_message, previous=self.shown)
+                                      make=bag_message, previous=self.shown,
+                                      extras=_size_classes(found))
             self.shown = marker_keys(markers)
             self.publisher.publish(encode(markers))
+
+
+def _size_classes(boxes: np.ndarray) -> list[dict]:
+    """What each box could be by its length and width alone, for the text of its marker."""
+    ids = class_by_diagonal(boxes)
+    return [{"size_class": CLASSES[i]} if i >= 0 else {} for i in ids]
 
 
 class CandidateOutputs:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from lidar_perception.datasets.bag import bag_message, encode
-from lidar_perception.messages import spread, to_frame
+from lidar_perception.messages import spread
 from lidar_perception.nodes.inputs import CameraInput, SeedInput
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, LidarNode
+from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import STEPS, PipelineParams
 from lidar_perception.pipeline import SeedSource, explain_nothing, refined, segment, warm_up
 from msg_utils.point_cloud2 import add_columns
@@ -24,6 +25,7 @@ class Perception(LidarNode):
     def __init__(self, **options: Any):
         super().__init__("perception", PipelineParams(), **options)
         self.camera = CameraInput(self)
+        self.sensor = SensorCheck(self)
         self.outputs = CandidateOutputs(self, STEPS)
         self.points = self.output("points", CLOUD)
         self.boxes = ClusterBoxes(self)
@@ -32,11 +34,11 @@ class Perception(LidarNode):
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, usable = to_frame(msg)
+            frame, usable = self.sensor.frame(msg)
             segmented = segment(frame, self.camera.get(frame.frame_id, self.params.view),
                                 self.params)
-            problem = explain_nothing(len(frame), segmented.xyz, segmented.ground,
-                                      self.params.ground.z_max, segmented.cluster_ids)
+            problem = (explain_nothing(len(frame), segmented.ground, segmented.cluster_ids)
+                       or self.sensor.problem(frame))
             self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params),
                                  problem)
         if self.points.get_subscription_count():

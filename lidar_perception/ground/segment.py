@@ -1,0 +1,80 @@
+"""The ground of a frame, by any of the three methods; and how high the sensor hangs."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidar_perception.ground.cloth import segment_by_cloth
+from lidar_perception.ground.patchwork import segment_by_patchwork
+from lidar_perception.ground.threshold import ransac_plane, segment_by_threshold
+from lidar_perception.params import GroundParams, SensorPoseParams, ThresholdParams
+from lidar_perception.types import LidarFrame, usable_returns
+
+METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
+    "threshold": lambda xyz, intensity, p: segment_by_threshold(xyz, p.threshold,
+                                                                p.sensor_pose.height),
+    "patchwork": lambda xyz, intensity, p: segment_by_patchwork(xyz, intensity,
+                                                                p.sensor_pose.height, p.patchwork),
+    "cloth": lambda xyz, intensity, p: segment_by_cloth(xyz, p.cloth),
+}
+
+# Where the height of the sensor is measured: beyond the vehicle, near enough for a plane.
+NEAREST, FARTHEST = 2.5, 25.0    # m
+PLANE = ThresholdParams(max_slope=15.0)
+LEAST_SHARE = 0.15               # of these points on the plane
+HEIGHT_TOLERANCE = 0.25          # m between the parameter and the measured height
+
+
+def segment_ground(frame: LidarFrame, params: GroundParams = GroundParams()) -> np.ndarray:
+    """(N,) bool, True = ground, for the N points of the frame. Points that are not finite are not
+    ground; an empty frame has an empty mask. The points are levelled by sensor_pose for this; the
+    frame stays as it is."""
+    usable = usable_returns(frame.xyz)
+    if usable.all():
+        return _segment(frame.xyz, frame.intensity, params)
+    ground = np.zeros(len(frame), bool)
+    intensity = None if frame.intensity is None else frame.intensity[usable]
+    ground[usable] = _segment(frame.xyz[usable], intensity, params)
+    return ground
+
+
+def _segment(xyz, intensity, params: GroundParams) -> np.ndarray:
+    return METHODS[params.method](level(xyz, params.sensor_pose), intensity, params)
+
+
+def level(xyz: np.ndarray, pose: SensorPoseParams) -> np.ndarray:
+    """Points (N, 3) float32 as a level sensor at the same place would see them: turned by roll
+    about x, then by pitch about y, as in a URDF's rpy. xyz itself where both are 0."""
+    if pose.roll == pose.pitch == 0.0:
+        return xyz
+    cos_r, sin_r = np.cos(pose.roll), np.sin(pose.roll)
+    cos_p, sin_p = np.cos(pose.pitch), np.sin(pose.pitch)
+    about_x = np.array([[1, 0, 0], [0, cos_r, -sin_r], [0, sin_r, cos_r]])
+    about_y = np.array([[cos_p, 0, sin_p], [0, 1, 0], [-sin_p, 0, cos_p]])
+    return xyz @ (about_y @ about_x).T.astype(np.float32)
+
+
+def measured_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPoseParams()) -> float | None:
+    """Metres of the sensor above the plane that holds most of the points (N, 3) around it;
+    negative if that is overhead, as for a sensor that hangs upside down. None where there is no
+    such plane."""
+    xyz = level(xyz, pose)
+    square = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
+    near = xyz.compress((square >= NEAREST**2) & (square <= FARTHEST**2), axis=0)
+    plane = ransac_plane(near, PLANE)
+    if plane is None:
+        return None
+    x, y, z = near.T
+    on_plane = np.abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= PLANE.inlier_distance
+    return -float(plane[2]) if on_plane.mean() >= LEAST_SHARE else None
+
+
+def height_problem(measured: float | None, pose: SensorPoseParams) -> str | None:
+    """What a measured height says against sensor_pose, with the remedy; None if they agree."""
+    if measured is None or abs(measured - pose.height) <= HEIGHT_TOLERANCE:
+        return None
+    if measured < 0:
+        return (f"the ground seems to be {-measured:.2f} m above the sensor; if it hangs upside "
+                "down, set ground.sensor_pose.roll to 3.1416")
+    return (f"the sensor is {measured:.2f} m above the ground but ground.sensor_pose.height is "
+            f"{pose.height:g}; set it to {measured:.2f}")
