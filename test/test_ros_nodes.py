@@ -36,14 +36,10 @@ def test_every_node_ends_with_code_0(processes, peer, arguments, number):
     for node in NODES:
         processes.start(node, {}, arguments.get(node, {}))
     peer.wait(lambda: set(NODES) <= set(peer.diagnostics), "all nodes")
-    # Two seconds for each; here seven end at once. Python can swallow a signal that arrives in a
-    # destructor, so whoever is still there gets it again, as from an impatient user.
-    for timeout in (6.0, 6.0, 12.0):
-        for node, process in processes.running.items():
-            if not processes.ended(node):
-                process.send_signal(number)
-        if peer.until(lambda: all(map(processes.ended, NODES)), timeout):
-            break
+    for process in processes.running.values():
+        process.send_signal(number)
+    # Two seconds for each; here seven end at once, on few cores.
+    peer.until(lambda: all(map(processes.ended, NODES)), 8.0)
     assert {n: p.returncode for n, p in processes.running.items()} == dict.fromkeys(NODES, 0)
     for node in NODES:
         assert "Traceback" not in (processes.logs / f"{node}.log").read_text()

@@ -33,7 +33,7 @@ from lidar_perception.params import EuclideanParams
 SMALLEST = 1e-6   # metres, side of a cell at least: the thresholds can be 0
 SAMPLE = 128      # points whose nearest neighbour is looked for among all
 BUDGET = 2e7      # distances that are computed rather than to sort the points into larger cells
-FACTOR = 3.0      # side of the first cells, in medians of the sample's distances
+FACTOR = 6.0      # side of the first cells, in medians of the sample's distances
 GROWTH = 4.0      # of the cells, from one search of the nearest neighbours to the next
 
 
@@ -167,7 +167,7 @@ def _least(x, y, z, begin, end, px, py, pz):
     """Smallest squared distance, inf for no points. Floats from 0 on compare as their bits do, and
     of integers the compiler makes a loop that is 6 times as fast."""
     least = np.int64(0x7FF0000000000000)
-    for j in range(begin, end):
+    for j in range(np.uint64(begin), np.uint64(end)):
         dx, dy, dz = px - x[j], py - y[j], pz - z[j]
         squared = dx * dx + dy * dy + dz * dz
         least = min(least, np.float64(squared).view(np.int64))
@@ -245,7 +245,7 @@ def _mean_near(cells, radius2):
 @njit(cache=True, nogil=True)
 def _count(x, y, z, begin, end, px, py, pz, reach2):
     count = 0
-    for j in range(begin, end):
+    for j in range(np.uint64(begin), np.uint64(end)):
         dx, dy, dz = px - x[j], py - y[j], pz - z[j]
         one = 1 if dx * dx + dy * dy + dz * dz <= reach2 else 0
         count += one

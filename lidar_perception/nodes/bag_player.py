@@ -6,7 +6,6 @@ import importlib.util
 from time import monotonic
 from typing import Any
 
-import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
@@ -84,7 +83,7 @@ class BagPlayer(LidarNode):
         self.serve = executor.spin_once
         self._wait_for_subscribers()
         self.report(OK, f"playing {self.params.bag}")
-        while rclpy.ok():
+        while not self.stop.done():
             self._play_once()
             if not self.params.loop:
                 break
@@ -95,7 +94,7 @@ class BagPlayer(LidarNode):
         rules = [rule.partition(":=") for rule in self.params.wait_for]
         wanted = {name: int(count or 1) for name, _, count in rules}
         give_up = monotonic() + self.params.wait_timeout
-        while rclpy.ok():
+        while not self.stop.done():
             missing = [t for t, count in wanted.items() if self._subscribers(t) < count]
             if not missing:
                 return
@@ -114,7 +113,7 @@ class BagPlayer(LidarNode):
     def _wait_until_delivered(self) -> None:
         from rclpy.duration import Duration
         for publisher in self.publishers_by_topic.values():
-            if rclpy.ok():
+            if not self.stop.done():
                 publisher.wait_for_all_acked(Duration(seconds=2))
 
     def _play_once(self) -> None:
@@ -140,7 +139,7 @@ class BagPlayer(LidarNode):
 
     def _wait_until(self, stamp: int, topic: str) -> bool:
         """Serve until it is time for stamp; False when the node shall end."""
-        while rclpy.ok():
+        while not self.stop.done():
             self._advance()
             if self.steps and self.paused:
                 self.now_ns = stamp

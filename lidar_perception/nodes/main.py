@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import tempfile
+import threading
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
@@ -53,6 +54,7 @@ def main() -> int:
 
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 SHARED_MEMORY_NEEDED = 256 * 2**20
+TEARDOWN_TIMEOUT = 1.5  # seconds
 
 
 def use_large_shared_memory() -> None:
@@ -86,10 +88,8 @@ def run(name: str, arguments: list[str]) -> int:
     if {"-h", "--help"} & set(arguments[1:]):
         print(help_text(name))
         return 0
-    # From here on a signal ends the process cleanly, also while imports and compilation run.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: os._exit(0))
     begin = perf_counter()
+    signals = StopSignals()
     # Threads of a linear algebra library wait actively; nodes that share few cores stand in each
     # other's way.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
@@ -105,41 +105,61 @@ def run(name: str, arguments: list[str]) -> int:
     if hasattr(module, "warm_up"):
         with one_at_a_time():
             module.warm_up()
-    return _spin(getattr(module, NODES[name]), rclpy, arguments, perf_counter() - begin)
+    return _spin(getattr(module, NODES[name]), rclpy, arguments, perf_counter() - begin, signals)
 
 
-def _spin(node_class: type, rclpy, arguments: list[str], seconds: float) -> int:
+class StopSignals(threading.Thread):
+    """SIGINT and SIGTERM, taken by a thread that waits for nothing else. As exceptions in the main
+    thread they could be lost in a destructor, or cut short what must be finished.
+
+    react is called at the first signal; until there is a node, it ends the process.
+    """
+
+    NUMBERS = frozenset({signal.SIGINT, signal.SIGTERM})
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.react = lambda: os._exit(0)
+        # Threads inherit the mask, so this comes before any library starts one.
+        signal.pthread_sigmask(signal.SIG_BLOCK, self.NUMBERS)
+        self.start()
+
+    def run(self) -> None:
+        signal.sigwait(self.NUMBERS)
+        self.react()
+
+
+def _spin(node_class: type, rclpy, arguments: list[str], seconds: float,
+          signals: StopSignals) -> int:
     from rclpy.exceptions import ParameterException
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.signals import SignalHandlerOptions
 
     from lidar_perception.types import InputError
 
-    # rclpy hands on to these: SIGINT raises KeyboardInterrupt, both shut the context down.
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    rclpy.init(args=arguments)
-    node = None
+    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    node, code = None, 0
     try:
         node = node_class()
+        signals.react = lambda: node.stop.set_result(None)
         node.get_logger().info(f"ready: code loaded and warmed up in {seconds:.1f} s")
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        node.spin(executor) if hasattr(node, "spin") else executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+        node.spin(executor)
     except (InputError, ValueError, ParameterException) as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
-        return 2
-    except Exception:
-        if rclpy.ok():  # after a signal has shut the context down, any call of rclpy may fail
-            raise
+        code = 2
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not cut the clean-up
         if node is not None:
             node.close()
+        # All is written now. DDS can hang while it is taken down: then the process ends without.
+        last_resort = threading.Timer(TEARDOWN_TIMEOUT, os._exit, [code])
+        last_resort.daemon = True
+        last_resort.start()
+        if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-    return 0
+    return code
 
 
 if __name__ == "__main__":

@@ -19,10 +19,12 @@ from rcl_interfaces.msg import (
 )
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.task import Future
 from std_msgs.msg import Float64
 
 from lidar_perception.datasets.bag import bag_message, decode, encode, typestore
@@ -56,6 +58,7 @@ class LidarNode(Node):
         super().__init__(name, **options)
         self.params = self._declare(params)
         self.add_on_set_parameters_callback(self._on_set)
+        self.stop = Future()  # done when the node shall end; set from any thread
         self.state = (WARN, "waiting for input")
         self.counts: dict[str, Any] = {"frames": 0, "lost": 0}
         self.last_stamp_ns = 0
@@ -162,6 +165,10 @@ class LidarNode(Node):
         array.header.stamp = self.get_clock().now().to_msg()
         if rclpy.ok(context=self.context):
             self._diagnostics.publish(array)
+
+    def spin(self, executor: Executor) -> None:
+        """Work until stop is done."""
+        executor.spin_until_future_complete(self.stop)
 
     def close(self) -> None:
         """Called once before the node is destroyed."""
