@@ -48,7 +48,7 @@ class SensorPoseParams(Params):
 
     height: float = param(1.73, "Height of the sensor above the ground. Checked against the first "
                           "clouds; a warning gives the measured one.", unit="m",
-                          low=0.05, high=50.0)
+                          low=0.0, high=50.0)
     roll: float = param(0.0, "Rotation of the sensor about its x axis, as in a URDF's rpy; pi is "
                         "upside down.", unit="rad", low=-3.1416, high=3.1416)
     pitch: float = param(0.0, "Rotation of the sensor about its y axis, as in a URDF's rpy; "

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 
 import numpy as np
+from numba import njit
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -22,8 +24,9 @@ def distance_aware_dbscan(xyz: np.ndarray, params: DbscanParams = DbscanParams()
     eps[i]; ids go on from band to band (paper A, Section 3.3). With join_bands, clusters of
     neighbouring bands that have points within the smaller eps of each other become one.
     """
-    band = np.searchsorted(np.asarray(params.range_limits), horizontal_range(xyz), side="right")
-    bands = [np.flatnonzero(band == i) for i in range(len(params.eps))]
+    xyz = np.ascontiguousarray(xyz, np.float32)
+    order, start = _by_band(xyz, np.asarray(params.range_limits, np.float64))
+    bands = [order[a:b] for a, b in pairwise(start)]
     labels = np.zeros(len(xyz), np.int32)
     last = 0
     # The compiled code lets go of the GIL: each band has a thread.
@@ -33,16 +36,35 @@ def distance_aware_dbscan(xyz: np.ndarray, params: DbscanParams = DbscanParams()
         for members, ids in zip(bands, found):
             labels[members] = np.where(ids > 0, ids + last, 0)
             last += int(ids.max(initial=0))
-    return _joined(xyz, band, labels, params.eps) if params.join_bands else labels
+    return _joined(xyz, bands, labels, params.eps) if params.join_bands else labels
 
 
-def _joined(xyz: np.ndarray, band: np.ndarray, labels: np.ndarray,
+@njit(cache=True, nogil=True)
+def _by_band(xyz, limits):
+    """order (N,): the points of each band of horizontal range, in their order, band by band; and
+    start (B + 1,) of each band."""
+    band = np.empty(len(xyz), np.int64)
+    start = np.zeros(len(limits) + 2, np.int64)
+    for i in range(len(xyz)):
+        away = np.sqrt(xyz[i, 0] * xyz[i, 0] + xyz[i, 1] * xyz[i, 1])  # float32: horizontal_range
+        band[i] = np.searchsorted(limits, away, side="right")
+        start[band[i] + 1] += 1
+    start = np.cumsum(start)
+    place, order = start.copy(), np.empty(len(xyz), np.int64)
+    for i in range(len(xyz)):
+        order[place[band[i]]] = i
+        place[band[i]] += 1
+    return order, start
+
+
+def _joined(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray,
             eps: tuple[float, ...]) -> np.ndarray:
-    """labels (N,) with clusters joined across neighbouring bands (N,), numbered anew in order."""
+    """labels (N,) with clusters joined across neighbouring bands, numbered anew in order; bands
+    hold the places of their points."""
     count = int(labels.max(initial=0))
     pairs = [np.zeros((0, 2), np.int32)]
-    for i, reach in enumerate(map(min, eps, eps[1:])):
-        inner, outer = (np.flatnonzero((band == b) & (labels > 0)) for b in (i, i + 1))
+    clustered = [places[labels[places] > 0] for places in bands]
+    for inner, outer, reach in zip(clustered, clustered[1:], map(min, eps, eps[1:])):
         if len(inner) and len(outer):
             pairs.append(_touching(xyz, labels, inner, outer, reach))
     joined = np.unique(np.concatenate(pairs), axis=0)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.clustering.grid import grid, grown, near, number_clusters, root
+from lidar_perception.clustering.grid import grid, grown, in_order, near, number_clusters, root
 
 
 def dbscan_by_cells(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray:
@@ -18,7 +18,7 @@ def dbscan_by_cells(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray
     # A hair under eps / sqrt(3), so that rounding never puts two far points into one cell.
     order, start, cell_z, column_start, neighbours = grid(xyz, eps / np.sqrt(3.0) * (1.0 - 1e-6), 2)
     first, second = _neighbour_cells(cell_z, column_start, neighbours)
-    x, y, z = np.ascontiguousarray(xyz.T[:, order], np.float64)
+    x, y, z = in_order(xyz, order)
     core = _core_points(x, y, z, start, first, second, eps * eps, min_samples)
     return _labels(x, y, z, order, start, first, second, core, eps * eps)
 

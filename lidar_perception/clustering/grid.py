@@ -106,6 +106,16 @@ def _stable_order(keys, count, first):
 
 
 @njit(cache=True, nogil=True)
+def in_order(xyz, order):
+    """(3, N) float64: the coordinates of the points (N, 3) in that order."""
+    out = np.empty((3, len(order)))
+    for k in range(len(order)):
+        i = order[k]
+        out[0, k], out[1, k], out[2, k] = xyz[i, 0], xyz[i, 1], xyz[i, 2]
+    return out
+
+
+@njit(cache=True, nogil=True)
 def near(x, y, z, i, j, eps2):
     """True if points i and j are within eps; float64, as scikit-learn computes it."""
     dx, dy, dz = x[i] - x[j], y[i] - y[j], z[i] - z[j]

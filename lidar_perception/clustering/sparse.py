@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.clustering.grid import grid, grown, near, number_clusters, root
+from lidar_perception.clustering.grid import grid, grown, in_order, near, number_clusters, root
 
 # Distances to compute a point, at most: beyond this, going by cells is faster and takes less
 # memory.
@@ -18,7 +18,7 @@ def dbscan_by_pairs(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray
     order, start, cell_z, column_start, neighbours = grid(xyz, eps * (1.0 + 1e-6), 1)
     if _distances(start, cell_z, column_start, neighbours) > BUDGET * len(xyz) + 100_000:
         return None
-    x, y, z = np.ascontiguousarray(xyz.T[:, order], np.float64)
+    x, y, z = in_order(xyz, order)
     found, first, second = _pairs(x, y, z, start, cell_z, column_start, neighbours, eps * eps)
     return _labels(order, found >= min_samples, first, second)
 
