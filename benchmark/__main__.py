@@ -1,53 +1,54 @@
-"""lidar benchmark: our candidate pipeline beside a plain reading of paper A, and the graph of
-nodes over DDS, in one run on one machine."""
+"""lidar benchmark: our candidate pipeline beside a plain reading of paper A, each algorithm beside
+its peers, and the graph of nodes over DDS, in one run on one machine."""
 
 from __future__ import annotations
 
 import json
 import os
 import platform
-import tempfile
 from pathlib import Path
 
 import click
 import numpy as np
-from rich.table import Table
 
-from benchmark import plain_stm_cpa
-from lidar_perception.candidates.refine import STAGES
-from lidar_perception.cli.evaluate import PROTOCOL
-from lidar_perception.datasets.bag import Bag
+from benchmark import clustering, ground, peers
+from benchmark.candidates import compare, print_comparison
+from benchmark.graph import measure_graph, print_graph
+from benchmark.rows import print_ground, print_measured, print_planes
+from benchmark.timing import spread
+from lidar_perception.datasets.kitti import KittiFrame, open_kitti
 from lidar_perception.datasets.recording import Recorded, open_recording
-from lidar_perception.datasets.to_bag import kitti_scan, write_bag
+from lidar_perception.datasets.semantickitti import open_semantic_kitti
 from lidar_perception.evaluation.candidates import pedestrians
 from lidar_perception.files import write_text
-from lidar_perception.pipeline import (
-    Segmented,
-    cluster_obstacles,
-    find_candidates,
-    grounded_boxes,
-    refined,
-    truth_seed,
-    warm_up,
-)
-from lidar_perception.terminal import console, track
-from lidar_perception.topics import POINTS
-from lidar_perception.types import InputError
+from lidar_perception.ground.cloth import segment_by_cloth
+from lidar_perception.ground.threshold import segment_by_threshold
+from lidar_perception.params import ViewParams
+from lidar_perception.pipeline import points_in_view, warm_up
+from lidar_perception.terminal import errors
+from lidar_perception.types import InputError, LidarFrame
 
-SAME = 0.02  # metres between boxes of the same candidate; planes of two RANSACs differ a little
+FULL_SCAN = 60_000   # points; a scan cut to the camera's view has some 20,000
+FEW = 3              # frames with a pedestrian, below which those without serve too
 
 
 @click.command(context_settings=dict(help_option_names=["-h", "--help"]))
 @click.option("--kitti", type=click.Path(path_type=Path), required=True, metavar="ROOT",
               help="KITTI folder with Pedestrian labels.")
+@click.option("--semantic-kitti", type=click.Path(path_type=Path), metavar="ROOT",
+              help="SemanticKITTI folder; without it the ground methods are timed but not scored.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Write the figures to this file.")
 @click.option("--repeat", type=click.IntRange(1), default=5, show_default=True,
-              help="Runs a frame; its time is the median.")
+              help="Runs a frame; its time is the median. Fewer beside peers that take seconds.")
+@click.option("--frames", "count", type=click.IntRange(1), default=8, show_default=True,
+              help="Frames for the single algorithms, evenly spread over the folder.")
 @click.option("--graph/--no-graph", default=True, show_default=True,
               help="Also replay a bag of the frames through the nodes at 10 Hz.")
-def main(kitti: Path, json_file: Path | None, repeat: int, graph: bool) -> None:
-    """Time our candidate pipeline beside a plain scikit-learn + OpenCV reading of the paper.
+def main(kitti: Path, semantic_kitti: Path | None, json_file: Path | None, repeat: int,
+         count: int, graph: bool) -> None:
+    """Time our candidate pipeline beside a plain scikit-learn + OpenCV reading of the paper, and
+    each algorithm beside its peers. Peers that are not installed are left out.
 
     \b
     Example:
@@ -57,11 +58,19 @@ def main(kitti: Path, json_file: Path | None, repeat: int, graph: bool) -> None:
     frames = [r for r in recording if isinstance(r, Recorded) and len(pedestrians(r))]
     if not frames:
         raise InputError(f"{kitti} has no frame with a Pedestrian label")
+    labelled = spread(open_semantic_kitti(semantic_kitti), count) if semantic_kitti else []
     warm_up()
     content = {"machine": {"cpu": _cpu(), "cores": os.cpu_count(), "python":
                            platform.python_version(), "numpy": np.__version__},
+               "peers": {p.package: p.version() for p in peers.ALL},
                "candidates": compare(frames, repeat)}
     print_comparison(content["candidates"])
+    in_view = [points_in_view(f, camera, ViewParams(enabled=True))[1].xyz
+               for f, camera in _with_camera(kitti, frames, count)]
+    content |= _measure(in_view, _full_scans(open_kitti(kitti), count), repeat)
+    if labelled:
+        content["ground_scores"] = ground.measure_labelled(labelled, repeat)
+        print_ground(content["ground_scores"])
     if graph:
         content["graph"] = {name: measure_graph(kitti, single)
                             for name, single in (("three_nodes", False), ("one_node", True))}
@@ -70,92 +79,48 @@ def main(kitti: Path, json_file: Path | None, repeat: int, graph: bool) -> None:
         write_text(json_file, json.dumps(content, indent=1))
 
 
-def compare(frames: list[Recorded], repeat: int) -> dict:
-    """Medians over the frames of both, and how far their results agree."""
-    ours: dict[str, list[float]] = {}
-    plain: dict[str, list[float]] = {}
-    agree = {"frames": len(frames), "labels_identical": 0, "candidates_same_given_ground": 0,
-             "candidates": 0, "candidates_same": 0}
-    for f in track(frames, "timing", len(frames)):
-        truth = pedestrians(f)
-        arguments = (f.frame.xyz, f.camera.projection, f.camera.width, f.camera.height, truth)
-        theirs = [plain_stm_cpa.candidates(*arguments) for _ in range(min(repeat, 3))]
-        mine = [find_candidates(f.frame, truth_seed(truth), f.camera, PROTOCOL)
-                for _ in range(repeat)]
-        _median_of_steps(plain, [r["ms"] for r in theirs])
-        _median_of_steps(ours, [found.ms for _, found in mine])
-        result = theirs[0]
-        # The same ground for both: then clusters must be identical, and so the candidates.
-        ids = cluster_obstacles(result["points"], result["ground"], PROTOCOL.clustering)
-        agree["labels_identical"] += np.array_equal(ids, result["labels"])
-        boxes = grounded_boxes(result["points"], result["ground"], ids, "axis_aligned")
-        segmented = Segmented(np.arange(len(ids)), result["points"], result["ground"], ids, boxes)
-        found = refined(segmented, truth_seed(truth), PROTOCOL)
-        agree["candidates_same_given_ground"] += all(
-            len(getattr(found, s)) == len(result[s]) == _shared(getattr(found, s).boxes, result[s])
-            for s in STAGES)
-        # Each with its own RANSAC.
-        agree["candidates"] += max(len(mine[0][1].final), len(result["final"]))
-        agree["candidates_same"] += _shared(mine[0][1].final.boxes, result["final"])
-    medians = {name: {k: float(np.median(v)) for k, v in steps.items()}
-               for name, steps in (("ours_ms", ours), ("plain_ms", plain))}
-    ratios = {k: medians["plain_ms"][k] / medians["ours_ms"][k] for k in medians["ours_ms"]}
-    return {**medians, "times_faster": ratios, "agreement": agree}
+def _with_camera(kitti: Path, pedestrian: list[Recorded], count: int) -> list[tuple]:
+    """(frame, camera) of the frames with a pedestrian; of any frames where these are few."""
+    if len(pedestrian) >= FEW:
+        return [(r.frame, r.camera) for r in spread(pedestrian, count)]
+    return [(f.load(), f.calibration().camera()) for f in spread(open_kitti(kitti), count)]
 
 
-def _median_of_steps(times: dict[str, list[float]], runs: list[dict[str, float]]) -> None:
-    for run in runs:
-        run["total"] = sum(run.values())
-    for step in runs[0]:
-        times.setdefault(step, []).append(float(np.median([run[step] for run in runs])))
+def _full_scans(every: list[KittiFrame], count: int) -> list[LidarFrame]:
+    whole = [f for f in every if f.points.stat().st_size > 16 * FULL_SCAN]
+    return [f.load() for f in spread(whole, count)]
 
 
-def _shared(a: np.ndarray, b: np.ndarray) -> int:
-    """How many boxes of a have one in b within SAME metres in every number."""
-    if len(a) == 0 or len(b) == 0:
-        return 0
-    return int((np.abs(a[:, None] - b[None]).max(axis=2) <= SAME).any(axis=1).sum())
+def _measure(in_view: list[np.ndarray], scans: list[LidarFrame], repeat: int) -> dict:
+    """Each algorithm beside its peers, printed one after the other."""
+    whole = [f.xyz for f in scans]
+    near, far, rest = ([xyz.compress(~segment(xyz), axis=0) for xyz in clouds]
+                       for clouds, segment in ((in_view, segment_by_threshold),
+                                               (whole, segment_by_threshold),
+                                               (whole, segment_by_cloth)))
+    content = {}
 
+    def show(name: str, result: dict) -> None:
+        content[name] = result
+        print_measured(result)
 
-def measure_graph(kitti: Path, single: bool) -> dict:
-    """Latency, losses and memory of the nodes at 10 Hz, without recording."""
-    from lidar_perception.datasets.kitti import open_kitti
-    from lidar_perception.nodes.replay import replay
-    with tempfile.TemporaryDirectory() as folder:
-        drive, out = Path(folder) / "drive", Path(folder)
-        found = open_kitti(kitti)
-        write_bag(drive, track(map(kitti_scan, found), "writing a bag", len(found)))
-        with Bag(drive) as bag:
-            clouds = bag.counts[POINTS]
-        content = replay(drive, clouds, out, PROTOCOL, single=single, record=False)
-    return {k: content[k] for k in ("clouds", "results", "latency_ms", "memory_mb", "ms")}
-
-
-def print_comparison(content: dict) -> None:
-    table = Table(title="Median ms a frame: plain reading of the paper, and ours")
-    for name in ("step", "plain", "ours", "times faster"):
-        table.add_column(name, justify="left" if name == "step" else "right")
-    for step, ratio in content["times_faster"].items():
-        table.add_row(step, f"{content['plain_ms'][step]:.2f}", f"{content['ours_ms'][step]:.2f}",
-                      f"{ratio:.1f}", style="bold" if step == "total" else "")
-    console.print(table)
-    agree = content["agreement"]
-    console.print(f"cluster labels identical in {agree['labels_identical']} of {agree['frames']} "
-                  "frames, border points included; candidates of all stages the same in "
-                  f"{agree['candidates_same_given_ground']} (same ground for both); with each "
-                  f"its own RANSAC {agree['candidates_same']} of {agree['candidates']} final "
-                  "candidates are the same")
-
-
-def print_graph(content: dict) -> None:
-    table = Table(title="Nodes over DDS at 10 Hz, no recording")
-    for name in ("graph", "clouds", "lost", "median ms", "95 % under ms", "memory MB"):
-        table.add_column(name, justify="left" if name == "graph" else "right")
-    for name, run in content.items():
-        table.add_row(name.replace("_", " "), str(run["clouds"]),
-                      str(run["clouds"] - run["results"]), f"{run['latency_ms']['median']:.0f}",
-                      f"{run['latency_ms']['p95']:.0f}", f"{run['memory_mb']:.0f}")
-    console.print(table)
+    show("dbscan_in_view", clustering.measure_dbscan("DBSCAN, in view", near, repeat, 12))
+    show("threshold_in_view", ground.measure_threshold("Threshold, in view", in_view, repeat))
+    print_planes(content["threshold_in_view"])
+    if not scans:
+        errors.print(f"no scan has more than {FULL_SCAN} points: whole scans are not measured")
+        return content
+    dbscan = clustering.measure_dbscan("DBSCAN, whole scan", far, repeat, 20)
+    clustering.whole_scan_limits(dbscan, far)
+    show("dbscan_whole_scan", dbscan)
+    for threshold in ("global", "local"):
+        show(f"euclidean_{threshold}", clustering.measure_euclidean(rest, threshold, repeat))
+    show("paper_c", clustering.measure_paper_c(whole, repeat))
+    show("threshold", ground.measure_threshold("Threshold, whole scan", whole, repeat))
+    print_planes(content["threshold"])
+    show("patchwork", ground.measure_patchwork(scans, repeat))
+    show("cloth", ground.measure_cloth(whole, repeat))
+    return content
 
 
 def _cpu() -> str:

@@ -90,7 +90,8 @@ def test_bad_clouds_become_diagnostics_and_the_node_lives_on(node, processes, pe
 def test_no_method_dies_of_a_strange_cloud(values, processes, peer, good_cloud):
     """The wheels behind some methods end the process on NaN, outliers or nothing at all."""
     node = "perception" if "clustering.method" in values else "ground_segmentation"
-    processes.start(node, {"~/input/points": "/in", "~/output/points": "/out"}, values)
+    processes.start(node, {"~/input/points": "/in", "~/output/points": "/out"}, {
+        "qos_overrides./in.subscription.reliability": "reliable", **values})  # each is to arrive
     talker, received = peer.talker("/in", CLOUD), peer.listen("/out", CLOUD)
     rng = np.random.default_rng(0)
     xyz = xyz_of(good_cloud)

@@ -1,0 +1,86 @@
+"""Our candidate pipeline beside a plain reading of paper A."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.table import Table
+
+from benchmark import plain_stm_cpa
+from lidar_perception.candidates.refine import STAGES
+from lidar_perception.cli.evaluate import PROTOCOL
+from lidar_perception.datasets.recording import Recorded
+from lidar_perception.evaluation.candidates import pedestrians
+from lidar_perception.pipeline import (
+    Segmented,
+    cluster_obstacles,
+    find_candidates,
+    grounded_boxes,
+    refined,
+    truth_seed,
+)
+from lidar_perception.terminal import console, track
+
+SAME = 0.02  # metres between boxes of the same candidate; planes of two RANSACs differ a little
+
+
+def compare(frames: list[Recorded], repeat: int) -> dict:
+    """Medians over the frames of both, and how far their results agree."""
+    ours: dict[str, list[float]] = {}
+    plain: dict[str, list[float]] = {}
+    agree = {"frames": len(frames), "labels_identical": 0, "candidates_same_given_ground": 0,
+             "candidates": 0, "candidates_same": 0}
+    for f in track(frames, "timing", len(frames)):
+        truth = pedestrians(f)
+        arguments = (f.frame.xyz, f.camera.projection, f.camera.width, f.camera.height, truth)
+        theirs = [plain_stm_cpa.candidates(*arguments) for _ in range(min(repeat, 3))]
+        mine = [find_candidates(f.frame, truth_seed(truth), f.camera, PROTOCOL)
+                for _ in range(repeat)]
+        _median_of_steps(plain, [r["ms"] for r in theirs])
+        _median_of_steps(ours, [found.ms for _, found in mine])
+        result = theirs[0]
+        # The same ground for both: then clusters must be identical, and so the candidates.
+        ids = cluster_obstacles(result["points"], result["ground"], PROTOCOL.clustering)
+        agree["labels_identical"] += np.array_equal(ids, result["labels"])
+        boxes = grounded_boxes(result["points"], result["ground"], ids, "axis_aligned")
+        segmented = Segmented(np.arange(len(ids)), result["points"], result["ground"], ids, boxes)
+        found = refined(segmented, truth_seed(truth), PROTOCOL)
+        agree["candidates_same_given_ground"] += all(
+            len(getattr(found, s)) == len(result[s]) == _shared(getattr(found, s).boxes, result[s])
+            for s in STAGES)
+        # Each with its own RANSAC.
+        agree["candidates"] += max(len(mine[0][1].final), len(result["final"]))
+        agree["candidates_same"] += _shared(mine[0][1].final.boxes, result["final"])
+    medians = {name: {k: float(np.median(v)) for k, v in steps.items()}
+               for name, steps in (("ours_ms", ours), ("plain_ms", plain))}
+    ratios = {k: medians["plain_ms"][k] / medians["ours_ms"][k] for k in medians["ours_ms"]}
+    return {**medians, "times_faster": ratios, "agreement": agree}
+
+
+def _median_of_steps(times: dict[str, list[float]], runs: list[dict[str, float]]) -> None:
+    for run in runs:
+        run["total"] = sum(run.values())
+    for step in runs[0]:
+        times.setdefault(step, []).append(float(np.median([run[step] for run in runs])))
+
+
+def _shared(a: np.ndarray, b: np.ndarray) -> int:
+    """How many boxes of a have one in b within SAME metres in every number."""
+    if len(a) == 0 or len(b) == 0:
+        return 0
+    return int((np.abs(a[:, None] - b[None]).max(axis=2) <= SAME).any(axis=1).sum())
+
+
+def print_comparison(content: dict) -> None:
+    table = Table(title="Median ms a frame: plain reading of the paper, and ours")
+    for name in ("step", "plain", "ours", "times faster"):
+        table.add_column(name, justify="left" if name == "step" else "right")
+    for step, ratio in content["times_faster"].items():
+        table.add_row(step, f"{content['plain_ms'][step]:.2f}", f"{content['ours_ms'][step]:.2f}",
+                      f"{ratio:.1f}", style="bold" if step == "total" else "")
+    console.print(table)
+    agree = content["agreement"]
+    console.print(f"cluster labels identical in {agree['labels_identical']} of {agree['frames']} "
+                  "frames, border points included; candidates of all stages the same in "
+                  f"{agree['candidates_same_given_ground']} (same ground for both); with each "
+                  f"its own RANSAC {agree['candidates_same']} of {agree['candidates']} final "
+                  "candidates are the same")

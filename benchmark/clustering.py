@@ -1,0 +1,134 @@
+"""Clustering beside its peers. Clouds are points (N, 3) float32 that are not ground, unless a
+function says otherwise."""
+
+from __future__ import annotations
+
+from collections import Counter
+from functools import partial
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from benchmark import peers, plain_euclidean
+from benchmark.memory import METHOD, dbscan_memory
+from benchmark.rows import against, measured, row, with_target
+from benchmark.timing import SLOW_REPEAT, Clock, in_child, spread, thin
+from lidar_perception.clustering.dbscan import distance_aware_dbscan
+from lidar_perception.clustering.euclidean import euclidean
+from lidar_perception.ground.cloth import segment_by_cloth
+from lidar_perception.params import DbscanParams, EuclideanParams
+from lidar_perception.terminal import track
+
+PLAIN = "SciPy and NumPy"
+
+
+def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: float) -> dict:
+    """Ours beside the DBSCANs of peers.py, with paper A's bands. The target is against the faster
+    of scikit-learn's two; the labels must be scikit-learn's, border points included, and of the
+    others noise and the partition of the core points must be the same."""
+    here = [p for p in peers.DBSCANS if not p.missing()]
+    rows = {p.name: row(p.name, note=p.missing()) for p in peers.DBSCANS}
+    ms = {}
+    for group, run in (([p for p in here if p != peers.WHEEL], dbscan_times),
+                       ([p for p in here if p == peers.WHEEL], partial(in_child, dbscan_times))):
+        if group:
+            times, same, differ = run([peers.DBSCANS.index(p) for p in group], clouds, repeat,
+                                      title)
+            ms |= times
+            rows |= {p.name: against(p.name, times, None, same[p.name], differ[p.name])
+                     for p in group}
+    faster = min((p.name for p in peers.SKLEARN), key=ms.get)
+    rows[faster] = with_target(rows[faster], target)
+    return measured(title, len(clouds), np.median([len(c) for c in clouds]), list(rows.values()))
+
+
+def dbscan_times(chosen: list[int], clouds: list[np.ndarray], repeat: int,
+                 title: str) -> tuple[dict, Counter, Counter]:
+    """Medians of ours and of the chosen of peers.DBSCANS (their places, which a child process can
+    be told), in how many clouds their results are the same, and how many points are noise for one
+    and not for the other."""
+    group = [peers.DBSCANS[i] for i in chosen]
+
+    def calls(xyz):
+        return {**{p.name: partial(peers.by_bands, p.run, xyz) for p in group},
+                "ours": partial(distance_aware_dbscan, xyz)}
+
+    clock, same, differ = Clock(repeat, calls(thin(clouds[0]))), Counter(), Counter()
+    for xyz in track(clouds, title, len(clouds)):
+        found = clock.time(calls(xyz))
+        ours, core = found["ours"], core_points(xyz)
+        for p in group:
+            theirs = found[p.name]
+            same[p.name] += (np.array_equal(theirs, ours) if p in peers.SKLEARN
+                             else same_clusters(theirs, ours, core))
+            differ[p.name] += int(((theirs == 0) != (ours == 0)).sum())
+    return clock.medians(), same, differ
+
+
+def whole_scan_limits(content: dict, clouds: list[np.ndarray]) -> None:
+    """Adds to the rows of measure_dbscan on whole scans: its time, and the memory on the largest
+    cloud."""
+    ms = content["rows"][0]["ours_ms"]
+    content["rows"].append(row("(time)", ours_ms=ms, value=ms, unit="ms", target=60))
+    memory = dbscan_memory(max(clouds, key=len))
+    content["rows"].append(row("(memory, largest)", value=memory, unit="MB", target=200,
+                               note="" if memory is not None else "not measured"))
+    content["memory_method"] = METHOD
+
+
+def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> dict:
+    """Ours beside plain_euclidean. The peer takes seconds with the local threshold: half the
+    frames then."""
+    params = EuclideanParams(threshold=threshold)
+    if threshold == "local":
+        clouds, repeat = spread(clouds, (len(clouds) + 1) // 2), min(repeat, SLOW_REPEAT)
+
+    def calls(xyz):
+        return {PLAIN: partial(plain_euclidean.euclidean, xyz, params),
+                "ours": partial(euclidean, xyz, params)}
+
+    title = f"Adaptive Euclidean, {threshold} threshold, whole scan"
+    clock, same = Clock(repeat, calls(thin(clouds[0]))), 0
+    for xyz in track(clouds, title, len(clouds)):
+        found = clock.time(calls(xyz))
+        same += same_clusters(found[PLAIN], found["ours"], found["ours"] > 0)
+    rows = [against(PLAIN, clock.medians(), 3, same)]
+    return measured(title, len(clouds), np.median([len(c) for c in clouds]), rows)
+
+
+def measure_paper_c(scans: list[np.ndarray], repeat: int) -> dict:
+    """Paper C's segmentation of whole scans, ground included: cloth, then Euclidean."""
+    def segment(xyz, threshold):
+        rest = xyz.compress(~segment_by_cloth(xyz), axis=0)
+        return euclidean(rest, EuclideanParams(threshold=threshold))
+
+    def calls(xyz):
+        return {"cloth": partial(segment_by_cloth, xyz),
+                **{t: partial(segment, xyz, t) for t in ("global", "local")}}
+
+    title = "Paper C: cloth and Euclidean, whole scan"
+    clock = Clock(repeat, calls(thin(scans[0])))
+    for xyz in track(scans, title, len(scans)):
+        clock.time(calls(xyz))
+    ms = clock.medians()
+    rows = [row(f"({t} threshold)", ours_ms=ms[t], value=ms[t], unit="ms", target=60)
+            for t in ("global", "local")]
+    return measured(title, len(scans), np.median([len(s) for s in scans]), rows,
+                    cloth_ms=ms["cloth"])
+
+
+def core_points(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
+    """(N,) bool: with min_samples points of its band within its band's eps."""
+    def labels(band, eps, min_samples):
+        tree = cKDTree(band.astype(np.float64))
+        found = tree.query_ball_point(tree.data, eps, return_length=True)
+        return np.where(found >= min_samples, 0, -1)
+    return peers.by_bands(labels, xyz, params) > 0
+
+
+def same_clusters(a: np.ndarray, b: np.ndarray, core: np.ndarray) -> bool:
+    """Whether labels a and b (N,) have the same noise, 0, and part the core points alike."""
+    if not np.array_equal(a == 0, b == 0):
+        return False
+    pairs = np.unique(np.stack([a[core], b[core]]), axis=1)
+    return all(len(np.unique(side)) == pairs.shape[1] for side in pairs)

@@ -1,0 +1,39 @@
+"""The graph of nodes over DDS."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from rich.table import Table
+
+from lidar_perception.cli.evaluate import PROTOCOL
+from lidar_perception.datasets.bag import Bag
+from lidar_perception.datasets.kitti import open_kitti
+from lidar_perception.datasets.to_bag import kitti_scan, write_bag
+from lidar_perception.terminal import console, track
+from lidar_perception.topics import POINTS
+
+
+def measure_graph(kitti: Path, single: bool) -> dict:
+    """Latency, losses and memory of the nodes at 10 Hz, without recording."""
+    from lidar_perception.nodes.replay import replay
+    with tempfile.TemporaryDirectory() as folder:
+        drive, out = Path(folder) / "drive", Path(folder)
+        found = open_kitti(kitti)
+        write_bag(drive, track(map(kitti_scan, found), "writing a bag", len(found)))
+        with Bag(drive) as bag:
+            clouds = bag.counts[POINTS]
+        content = replay(drive, clouds, out, PROTOCOL, single=single, record=False)
+    return {k: content[k] for k in ("clouds", "results", "latency_ms", "memory_mb", "ms")}
+
+
+def print_graph(content: dict) -> None:
+    table = Table(title="Nodes over DDS at 10 Hz, no recording")
+    for name in ("graph", "clouds", "lost", "median ms", "95 % under ms", "memory MB"):
+        table.add_column(name, justify="left" if name == "graph" else "right")
+    for name, run in content.items():
+        table.add_row(name.replace("_", " "), str(run["clouds"]),
+                      str(run["clouds"] - run["results"]), f"{run['latency_ms']['median']:.0f}",
+                      f"{run['latency_ms']['p95']:.0f}", f"{run['memory_mb']:.0f}")
+    console.print(table)

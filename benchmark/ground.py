@@ -1,0 +1,197 @@
+"""Ground beside its peers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from benchmark import peers
+from benchmark.rows import against, measured, row
+from benchmark.timing import SLOW_REPEAT, Clock, spread, thin
+from lidar_perception.datasets.semantickitti import SemanticFrame
+from lidar_perception.evaluation.segmentation import PROTOCOLS, GroundReport
+from lidar_perception.ground.cloth import segment_by_cloth
+from lidar_perception.ground.patchwork import segment_by_patchwork
+from lidar_perception.ground.segment import METHODS
+from lidar_perception.ground.threshold import (
+    SENSOR_HEIGHT,
+    height_above,
+    ransac_plane,
+    segment_by_threshold,
+)
+from lidar_perception.params import ClothParams, GroundParams, ThresholdParams
+from lidar_perception.terminal import track
+from lidar_perception.types import LidarFrame
+
+PARAMS = GroundParams()
+FRAMES_OF_2000 = 3  # scikit-learn's 2000 trials take seconds
+
+
+def measure_threshold(title: str, clouds: list[np.ndarray], repeat: int) -> dict:
+    """Ours beside scikit-learn's RANSAC on points (N, 3) lower than paper A's z < -1.3: with its
+    own early stop and without; and how far the planes of the same low points differ."""
+    rows, planes = [], {}
+    for group, chosen, times in (
+            (peers.RANSACS, clouds, repeat),
+            ((peers.RANSAC_2000,), spread(clouds, FRAMES_OF_2000), 1)):
+        here = [p for p in group if not p.missing()]
+        ms, found = _timed(title, chosen, times, here)
+        for p in group:
+            rows.append(against(p.name, ms, 20) if p in here else row(p.name, note=p.missing()))
+        planes |= {p.name: _plane_differences(chosen, found[p.name]) for p in here}
+    return measured(title, len(clouds), np.median([len(c) for c in clouds]), rows, planes=planes,
+                    frames_of_2000_trials=min(FRAMES_OF_2000, len(clouds)))
+
+
+def _timed(title: str, clouds: list[np.ndarray], repeat: int,
+           here: list[peers.Peer]) -> tuple[dict, dict]:
+    """Medians, and what each peer gave on each cloud."""
+    def calls(xyz):
+        # The low points are chosen within the time, as ours does.
+        return {**{p.name: lambda p=p: p.run(xyz, _low(xyz)) for p in here},
+                "ours": partial(segment_by_threshold, xyz)}
+
+    clock = Clock(repeat, calls(thin(clouds[0])))
+    found = [clock.time(calls(xyz)) for xyz in track(clouds, title, len(clouds))]
+    return clock.medians(), {p.name: [f[p.name] for f in found] for p in here}
+
+
+def _low(xyz: np.ndarray) -> np.ndarray:
+    return xyz[:, 2] < PARAMS.threshold.max_height - SENSOR_HEIGHT
+
+
+def _plane_differences(clouds: list[np.ndarray], found: list[tuple]) -> dict:
+    """Ours from the low points against theirs, as it is and fitted to its inliers until stable:
+    cm at the sensor and degrees, median and max over the frames; and in how many of these either
+    plane has more inliers."""
+    low = [xyz[_low(xyz)] for xyz in clouds]
+    ours = [ransac_plane(points, PARAMS.threshold) for points in low]
+    theirs = [plane for _, plane, _ in found]
+    settled = [_settled(points.astype(np.float64), plane) for points, plane in zip(low, theirs)]
+    result = {"trials": float(np.median([trials for _, _, trials in found])), "difference": {}}
+    for name, planes in (("raw", theirs), ("refined", settled)):
+        pairs = [(a, b) for a, b in zip(ours, planes) if a is not None]
+        more = [_inliers(p, a) - _inliers(p, b)
+                for p, a, b in zip(low, ours, planes) if a is not None]
+        if not pairs:
+            continue
+        height = [100 * abs(a[2] - b[2]) for a, b in pairs]
+        normals = [np.array([[-a[0], -a[1], 1], [-b[0], -b[1], 1]]) for a, b in pairs]
+        angle = [np.degrees(np.arctan2(np.linalg.norm(np.cross(*n)), n[0] @ n[1]))
+                 for n in normals]
+        result["difference"][name] = {
+            **{key: {"median": float(np.median(v)), "max": float(np.max(v))}
+               for key, v in (("height_cm", height), ("angle_deg", angle))},
+            "ours_more": sum(m > 0 for m in more), "its_more": sum(m < 0 for m in more)}
+    return result
+
+
+def _inliers(points: np.ndarray, plane: np.ndarray) -> int:
+    return int((np.abs(height_above(points, plane)) <= PARAMS.threshold.inlier_distance).sum())
+
+
+def _settled(points: np.ndarray, plane: np.ndarray,
+             params: ThresholdParams = PARAMS.threshold) -> np.ndarray:
+    """Least squares on the inliers until these no longer change."""
+    before = None
+    for _ in range(100):
+        near = np.abs(height_above(points, plane)) <= params.inlier_distance
+        if before is not None and np.array_equal(near, before):
+            break
+        columns = np.column_stack([points[near, :2], np.ones(near.sum())])
+        plane, before = np.linalg.lstsq(columns, points[near, 2], rcond=None)[0], near
+    return plane
+
+
+def measure_patchwork(frames: list[LidarFrame], repeat: int) -> dict:
+    """Ours beside the bare library on an array that already exists; a new object for each."""
+    title, name = "Patchwork++, whole scan", peers.PATCHWORK.name
+    points = np.median([len(f) for f in frames])
+    if peers.PATCHWORK.missing():
+        return measured(title, len(frames), points, [row(name, note=peers.PATCHWORK.missing())])
+
+    def calls(frame, cloud):
+        return {name: partial(peers.PATCHWORK.run, cloud, SENSOR_HEIGHT),
+                "ours": partial(segment_by_patchwork, frame.xyz, frame.intensity, SENSOR_HEIGHT)}
+
+    same = 0
+    with peers.silent():
+        clock = Clock(repeat, calls(frames[0], _with_intensity(frames[0])))
+        for frame in track(frames, title, len(frames)):
+            found = clock.time(calls(frame, _with_intensity(frame)))
+            same += np.array_equal(_mask(found[name], len(frame)), found["ours"])
+    ms = clock.medians()
+    return measured(title, len(frames), points, [
+        row(f"{name}, bare", peer_ms=ms[name], ours_ms=ms["ours"], value=ms["ours"] / ms[name],
+            unit="", target=1.1, same=same)])
+
+
+def _with_intensity(frame: LidarFrame) -> np.ndarray:
+    return np.column_stack([frame.xyz, frame.intensity]).astype(np.float32)
+
+
+def _mask(indices, count: int) -> np.ndarray:
+    mask = np.zeros(count, bool)
+    mask[np.asarray(indices, np.int64)] = True
+    return mask
+
+
+def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
+    """Ours beside the wheel's falling cloth of the same resolution, on points within max_range.
+    Not in the wheel's time: its float64 array, and the mask from its indices."""
+    title, name = "Cloth, whole scan", peers.CLOTH.name
+    scans = [_within(xyz) for xyz in scans]
+    points = np.median([len(s) for s in scans])
+    if peers.CLOTH.missing():
+        return measured(title, len(scans), points, [row(name, note=peers.CLOTH.missing())])
+
+    def calls(xyz, precise):
+        return {name: partial(peers.CLOTH.run, precise), "ours": partial(segment_by_cloth, xyz)}
+
+    with peers.silent():
+        clock = Clock(min(repeat, SLOW_REPEAT), calls(*_both(thin(scans[0]))))
+        for xyz in track(scans, title, len(scans)):
+            clock.time(calls(*_both(xyz)))
+    return measured(title, len(scans), points, [against(name, clock.medians(), 6)])
+
+
+def _both(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return xyz, xyz.astype(np.float64)
+
+
+def _within(xyz: np.ndarray, params: ClothParams = PARAMS.cloth) -> np.ndarray:
+    return xyz.compress((np.abs(xyz[:, :2]) <= params.max_range).all(axis=1), axis=0)
+
+
+def measure_labelled(frames: list[SemanticFrame], repeat: int) -> dict:
+    """Precision, recall and F1 of our three methods and the cloth of the wheel by protocol."""
+    missing = {"patchwork": peers.PATCHWORK.missing(), peers.CLOTH.name: peers.CLOTH.missing()}
+    methods: dict[str, Callable] = {
+        **{name: partial(_of_ours, name) for name in METHODS}, peers.CLOTH.name: _of_wheel}
+    reports = {name: GroundReport() for name in methods if not missing.get(name)}
+
+    def calls(frame):
+        return {name: partial(methods[name], frame) for name in reports}
+
+    with peers.silent():
+        clock = None
+        for item in track(frames, "ground of labelled scans", len(frames)):
+            frame, semantic, _ = item.load()
+            clock = clock or Clock(min(repeat, SLOW_REPEAT), calls(frame))
+            for name, found in clock.time(calls(frame)).items():
+                reports[name].add(found, semantic, frame.xyz[:, 2], clock.ms[name][-1])
+    return {"scans": len(frames), "protocols": list(PROTOCOLS),
+            "methods": {name: reports[name].content() if name in reports
+                        else {"note": missing[name]} for name in methods}}
+
+
+def _of_ours(name: str, frame: LidarFrame) -> np.ndarray:
+    return METHODS[name](frame.xyz, frame.intensity, PARAMS)
+
+
+def _of_wheel(frame: LidarFrame) -> np.ndarray:
+    inside = np.flatnonzero((np.abs(frame.xyz[:, :2]) <= PARAMS.cloth.max_range).all(axis=1))
+    ground = peers.CLOTH.run(frame.xyz[inside].astype(np.float64))
+    return _mask(inside[np.asarray(ground, np.int64)], len(frame))

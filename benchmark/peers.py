@@ -1,0 +1,161 @@
+"""The peers that come as packages, thinly wrapped; one that is not installed says so."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import metadata
+from unittest import mock
+
+import numpy as np
+
+from lidar_perception.geometry import horizontal_range
+from lidar_perception.params import ClothParams, DbscanParams, PatchworkParams
+
+
+@dataclass(frozen=True)
+class Peer:
+    """run has the signature of its kind; package is what pip calls it."""
+
+    name: str
+    package: str
+    module: str
+    run: Callable
+
+    def missing(self) -> str:
+        """Why it cannot run here; empty if it can."""
+        try:
+            importlib.import_module(self.module)
+        except ModuleNotFoundError:
+            return "not installed"
+        except (ImportError, OSError):  # a system library is missing
+            return "cannot be imported"
+        return ""
+
+    def version(self) -> str:
+        return self.missing() or metadata.version(self.package)
+
+
+@contextmanager
+def silent() -> Iterator[None]:
+    """File descriptor 1 to nowhere: the C++ libraries print there."""
+    sys.stdout.flush()
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
+
+
+# DBSCAN: points (N, 3) float32, eps, min_samples -> (N,) labels, -1 noise.
+
+def _sklearn(jobs: int | None) -> Callable:
+    def run(xyz, eps, min_samples):
+        from sklearn.cluster import DBSCAN
+        return DBSCAN(eps=eps, min_samples=min_samples, n_jobs=jobs).fit(xyz).labels_
+    return run
+
+
+def _wheel(xyz, eps, min_samples):
+    from dbscan import DBSCAN
+    return DBSCAN(xyz.astype(np.float64), eps, min_samples)[0]
+
+
+def _open3d(xyz, eps, min_samples):
+    import open3d
+    points = open3d.utility.Vector3dVector(xyz.astype(np.float64))
+    return np.asarray(open3d.geometry.PointCloud(points).cluster_dbscan(eps, min_samples))
+
+
+SKLEARN = (Peer("scikit-learn", "scikit-learn", "sklearn", _sklearn(None)),
+           Peer("sklearn, n_jobs=-1", "scikit-learn", "sklearn", _sklearn(-1)))
+OPEN3D = Peer("Open3D", "open3d", "open3d", _open3d)
+# Its threads go on polling after the call, a quarter of a core for the rest of the process.
+WHEEL = Peer("dbscan", "dbscan", "dbscan", _wheel)
+DBSCANS = (*SKLEARN, WHEEL, OPEN3D)
+
+
+def by_bands(run: Callable, xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:
+    """(N,) labels of a DBSCAN band by band, as distance_aware_dbscan numbers them: 0 noise."""
+    band = np.searchsorted(np.asarray(params.range_limits), horizontal_range(xyz), side="right")
+    labels, last = np.zeros(len(xyz), np.int32), 0
+    for i, eps in enumerate(params.eps):
+        members = np.flatnonzero(band == i)
+        if len(members):
+            found = run(xyz[members], eps, params.min_samples)
+            labels[members] = np.where(found >= 0, found + last + 1, 0)
+            last += int(found.max()) + 1
+    return labels
+
+
+# RANSAC: points (N, 3), those among them to look in (N,) bool -> mask (N,), plane [a b c], trials.
+
+def ransac(xyz: np.ndarray, low: np.ndarray, **settings) -> tuple[np.ndarray, np.ndarray, int]:
+    """The ground of scikit-learn's RANSACRegressor with paper A's numbers."""
+    from sklearn.linear_model import LinearRegression, RANSACRegressor
+    found = RANSACRegressor(LinearRegression(), max_trials=2000, residual_threshold=0.1,
+                            random_state=0, **settings).fit(xyz[low, :2], xyz[low, 2])
+    mask = np.abs(xyz[:, 2] - found.predict(xyz[:, :2])) <= 0.1
+    line = found.estimator_
+    return mask, np.array([*line.coef_, line.intercept_], np.float64), found.n_trials_
+
+
+def ransac_without_stop(xyz: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
+    """All 2000 trials. stop_probability=1.0 is not that: it is taken as 1 less the rounding error,
+    so that some 100 trials are enough; the stop has to be patched out."""
+    with mock.patch("sklearn.linear_model._ransac._dynamic_max_trials",
+                    lambda *_: float("inf"), create=True):
+        return ransac(xyz, low)
+
+
+RANSACS = (
+    Peer("scikit-learn, own stop", "scikit-learn", "sklearn", ransac),
+    Peer("scikit-learn, stop at 1.0", "scikit-learn", "sklearn",
+         lambda xyz, low: ransac(xyz, low, stop_probability=1.0)))
+RANSAC_2000 = Peer("scikit-learn, 2000 trials", "scikit-learn", "sklearn", ransac_without_stop)
+
+
+# Ground. Both print on file descriptor 1.
+
+def _bare_patchwork(points: np.ndarray, sensor_height: float,
+                    params: PatchworkParams = PatchworkParams()) -> np.ndarray:
+    """Indices of the ground among points (N, 4) float32, by a new object."""
+    import pypatchworkpp
+    settings = pypatchworkpp.Parameters()
+    settings.verbose = False
+    settings.sensor_height = sensor_height
+    settings.min_range, settings.max_range = params.min_range, params.max_range
+    settings.th_dist, settings.th_seeds = params.inlier_distance, params.seed_distance
+    settings.uprightness_thr = params.uprightness
+    settings.enable_RNR = params.remove_reflections
+    engine = pypatchworkpp.patchworkpp(settings)
+    engine.estimateGround(points)
+    return engine.getGroundIndices()
+
+
+def _falling_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()):
+    """Indices of the ground among points (N, 3) float64, as the wheel's own vector. No point may
+    be far out: the wheel aborts the process where it cannot hold the grid. Rigidness 3 and 500
+    iterations are its defaults."""
+    import CSF
+    cloth = CSF.CSF()
+    cloth.params.bSloopSmooth = False
+    cloth.params.cloth_resolution = params.resolution
+    cloth.params.class_threshold = params.class_threshold
+    cloth.params.rigidness, cloth.params.interations = 3, 500
+    cloth.setPointCloud(xyz)
+    ground, others = CSF.VecInt(), CSF.VecInt()
+    cloth.do_filtering(ground, others, False)
+    return ground
+
+
+PATCHWORK = Peer("pypatchworkpp", "pypatchworkpp", "pypatchworkpp", _bare_patchwork)
+CLOTH = Peer("cloth-simulation-filter", "cloth-simulation-filter", "CSF", _falling_cloth)
+ALL = (*DBSCANS, PATCHWORK, CLOTH)

@@ -1,0 +1,122 @@
+"""A plain reading of paper C's adaptive Euclidean clustering with SciPy and NumPy: the peer of
+lidar_perception.clustering.euclidean.
+
+Same definition (its docstring has it, with the equations), none of our code but the parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from lidar_perception.params import EuclideanParams
+
+AT_ONCE = 4_000_000  # neighbours that are held at a time: about 300 MB
+
+
+def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams()) -> np.ndarray:
+    """(N,) int32 clusters of points (N, 3) float32, metres: 0 none, 1..K."""
+    if len(xyz) == 0:
+        return np.zeros(0, np.int32)
+    tree = cKDTree(np.asarray(xyz, np.float32).astype(np.float64))
+    reach = _thresholds(tree, params)
+    found = tree.query_ball_point(tree.data, reach, return_length=True)
+    leads = found >= params.beta * np.log(len(xyz))
+    leaders = _components(tree, reach, leads)
+    labels = _numbered(_with_followers(tree, reach, leads, leaders), params.min_size)
+    return _merged(tree.data, labels, params.gamma) if params.gamma > 0 else labels
+
+
+def _thresholds(tree: cKDTree, params: EuclideanParams) -> np.ndarray:
+    """(N,) Eq. 6 or Eq. 11, rounded to float32."""
+    if params.threshold == "global":
+        nearest = tree.query(tree.data, k=2)[0][:, 1]  # inf for a single point
+        mean = np.full(tree.n, nearest.mean() if tree.n > 1 else 0.0)
+    else:
+        total, count = np.zeros(tree.n), np.zeros(tree.n, np.int64)
+        for i, j, squared in _neighbours(tree, np.ones(tree.n, bool), params.radius):
+            other = (i != j) & (squared <= params.radius * params.radius)
+            total += np.bincount(i[other], np.sqrt(squared[other]), tree.n)
+            count += np.bincount(i[other], minlength=tree.n)
+        mean = total / np.maximum(count, 1)
+    return (params.alpha * mean).astype(np.float32).astype(np.float64)
+
+
+def _neighbours(tree: cKDTree, wanted: np.ndarray, radius: float) -> Iterator[tuple]:
+    """Rows of wanted points, rows of the points within radius of them (a few more at its rim),
+    squared distances; part by part, so that memory stays bounded."""
+    rows = tree.indices[wanted[tree.indices]]  # in the order of the tree: parts are compact
+    if len(rows) == 0:
+        return
+    count = tree.query_ball_point(tree.data[rows], radius, return_length=True)
+    cuts = np.flatnonzero(np.diff(np.cumsum(count) // AT_ONCE)) + 1
+    for part in np.split(rows, cuts):
+        near = cKDTree(tree.data[part]).sparse_distance_matrix(
+            tree, radius * (1 + 1e-9), output_type="ndarray")
+        i, j = part[near["i"]], near["j"]
+        offset = tree.data[i] - tree.data[j]
+        offset *= offset
+        yield i, j, offset[:, 0] + offset[:, 1] + offset[:, 2]
+
+
+def _components(tree: cKDTree, reach: np.ndarray, leads: np.ndarray) -> np.ndarray:
+    """(N,) component of each leader (Eq. 8); followers are alone in theirs."""
+    component = np.arange(tree.n)
+    for i, j, squared in _neighbours(tree, leads, reach[leads].max(initial=0.0)):
+        link = leads[j] & (squared <= reach[i] ** 2)
+        edges = component[i[link]], component[j[link]]
+        graph = coo_matrix((np.ones(len(edges[0]), bool), edges), (tree.n, tree.n))
+        component = connected_components(graph, directed=False)[1][component]
+    return component
+
+
+def _with_followers(tree: cKDTree, reach: np.ndarray, leads: np.ndarray,
+                    component: np.ndarray) -> np.ndarray:
+    """(N,) component of each point, -1 for a follower that no leader reaches."""
+    result = np.where(leads, component, -1)
+    for i, j, squared in _neighbours(tree, ~leads, reach[leads].max(initial=0.0)):
+        reached = leads[j] & (squared <= reach[j] ** 2)
+        i, j, squared = i[reached], j[reached], squared[reached]
+        x, y, z = tree.data[j].T
+        order = np.lexsort((z, y, x, squared, i))
+        follower, first = np.unique(i[order], return_index=True)
+        result[follower] = component[j[order[first]]]
+    return result
+
+
+def _numbered(component: np.ndarray, min_size: int = 1) -> np.ndarray:
+    """(N,) int32: the components (below 0: none) of min_size points, 1..K by their first point."""
+    kept = component >= 0
+    kept[kept] = np.bincount(component[kept])[component[kept]] >= min_size
+    _, first, inverse = np.unique(component[kept], return_index=True, return_inverse=True)
+    labels = np.zeros(len(component), np.int32)
+    labels[kept] = np.argsort(np.argsort(first))[inverse] + 1
+    return labels
+
+
+def _merged(points: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
+    """Eq. 9; the diameter of a cluster is the diagonal of its axis-aligned box."""
+    count = labels.max(initial=0)
+    if count < 2:
+        return labels
+    size = np.bincount(labels)[1:]
+    centre = np.stack([np.bincount(labels, c)[1:] / size for c in points.T], axis=1)
+    order = np.argsort(labels, kind="stable")[np.count_nonzero(labels == 0):]
+    start = np.cumsum(size) - size
+    extent = (np.maximum.reduceat(points[order], start)
+              - np.minimum.reduceat(points[order], start))
+    diameter = np.sqrt((extent ** 2).sum(axis=1))
+    first, second = [], []
+    for k in range(count - 1):
+        distance = np.sqrt(((centre[k + 1:] - centre[k]) ** 2).sum(axis=1))
+        close = np.flatnonzero(distance < gamma * (diameter[k + 1:] + diameter[k]) / 2)
+        first.append(np.full(len(close), k))
+        second.append(close + k + 1)
+    first, second = np.concatenate(first), np.concatenate(second)
+    graph = coo_matrix((np.ones(len(first), bool), (first, second)), (count, count))
+    component = connected_components(graph, directed=False)[1]
+    return _numbered(np.where(labels > 0, component[labels - 1], -1))

@@ -1,0 +1,105 @@
+"""What every measurement gives: a plain dict with rows for the table and the JSON file.
+
+A row has the peer's name, peer_ms and ours_ms, and the figure itself: value with its unit, the
+target where there is one, whether it is met, in how many frames the results are the same, and
+how many points differ in the others.
+"""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from lidar_perception.terminal import console
+
+
+def measured(title: str, frames: int, points: float, rows: list[dict], **more) -> dict:
+    return {"title": title, "frames": frames, "points": round(points), "rows": rows, **more}
+
+
+def row(name: str, *, peer_ms: float | None = None, ours_ms: float | None = None,
+        value: float | None = None, unit: str = "x", target: float | None = None,
+        same: int | None = None, differ: int | None = None, note: str = "") -> dict:
+    return with_target(dict(name=name, peer_ms=peer_ms, ours_ms=ours_ms, value=value, unit=unit,
+                            target=None, met=None, same=same, differ=differ, note=note), target)
+
+
+def with_target(content: dict, target: float | None) -> dict:
+    """The row with its target: a least value of unit "x", times faster, and a limit of others."""
+    value, met = content["value"], None
+    if target is not None and value is not None:
+        met = value >= target if content["unit"] == "x" else value < target
+    return {**content, "target": target, "met": met}
+
+
+def against(name: str, ms: dict[str, float], target: float | None = None,
+            same: int | None = None, differ: int | None = None) -> dict:
+    """How many times faster ours is than the peer of that name."""
+    return row(name, peer_ms=ms[name], ours_ms=ms["ours"], value=ms[name] / ms["ours"],
+               target=target, same=same, differ=differ)
+
+
+def value_text(value: float | None, unit: str) -> str:
+    if value is None:
+        return ""
+    return {"x": f"{value:.1f}x", "": f"{value:.2f}"}.get(unit, f"{value:.0f} {unit}")
+
+
+def target_text(target: float | None, unit: str) -> str:
+    if target is None:
+        return ""
+    return f"{target:g}x" if unit == "x" else f"< {target:g} {unit}".rstrip()
+
+
+def print_measured(content: dict) -> None:
+    table = Table(title=f"{content['title']} ({content['frames']} frames, "
+                        f"{content['points']} points)")
+    for name in ("beside", "its ms", "our ms", "measured", "target", "met", "same"):
+        table.add_column(name, justify="left" if name == "beside" else "right")
+    for r in content["rows"]:
+        met = {True: "yes", False: "[red]no[/red]", None: ""}[r["met"]]
+        table.add_row(r["name"], _ms(r["peer_ms"]), _ms(r["ours_ms"]),
+                      r["note"] or value_text(r["value"], r["unit"]),
+                      target_text(r["target"], r["unit"]), met,
+                      "" if r["same"] is None else f"{r['same']} of {content['frames']}")
+    console.print(table)
+    for r in content["rows"]:
+        if r["differ"]:
+            console.print(f"{r['name']}: {r['differ']} points are noise for one and not the other")
+
+
+def print_ground(content: dict) -> None:
+    """The ground methods by protocol."""
+    table = Table(title=f"Ground on {content['scans']} labelled scans (SemanticKITTI)")
+    for name in ("method", "precision", "recall", "F1", "ms"):
+        table.add_column(name, justify="left" if name == "method" else "right")
+    for protocol in content["protocols"]:
+        table.add_section()
+        table.add_row(protocol, style="bold")
+        for method, report in content["methods"].items():
+            shown = [report.get("note", "")]
+            if "protocols" in report:
+                scores = report["protocols"][protocol]
+                shown = [f"{scores[k]:.4f}" for k in ("precision", "recall", "f1")]
+                shown.append(_ms(report["ms"]))
+            table.add_row(method, *shown)
+    console.print(table)
+
+
+def print_planes(content: dict) -> None:
+    """How far scikit-learn's planes are from ours."""
+    table = Table(title="scikit-learn's plane beside ours: median (max); the number of frames in "
+                        "which ours : its has more inliers")
+    for name in ("scikit-learn", "trials", "plane", "cm", "degrees", "more inliers"):
+        table.add_column(name, justify="left" if name in ("scikit-learn", "plane") else "right")
+    for name, planes in content["planes"].items():
+        for i, (how, d) in enumerate(planes["difference"].items()):
+            table.add_row(*((name.split(", ")[1], f"{planes['trials']:.0f}") if i == 0
+                            else ("", "")), how,
+                          f"{d['height_cm']['median']:.2f} ({d['height_cm']['max']:.2f})",
+                          f"{d['angle_deg']['median']:.3f} ({d['angle_deg']['max']:.3f})",
+                          f"{d['ours_more']} : {d['its_more']}")
+    console.print(table)
+
+
+def _ms(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}" if value < 100 else f"{value:.0f}"

@@ -1,0 +1,120 @@
+"""Laws of the benchmark: what it compares and what it says. No times."""
+
+from __future__ import annotations
+
+import json
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from samples import object_folder, scene, walker_label
+
+from benchmark import ground, peers, plain_euclidean
+from benchmark.clustering import dbscan_times, measure_dbscan, same_clusters
+from benchmark.rows import print_ground, print_measured, row, target_text, value_text
+from benchmark.timing import Clock, in_child, interleaved
+from lidar_perception.clustering.euclidean import euclidean
+from lidar_perception.params import EuclideanParams
+from lidar_perception.types import LidarFrame
+
+SKLEARN = [p.name for p in peers.SKLEARN]
+OPTIONAL = ("dbscan", "open3d", "CSF", "pypatchworkpp")
+
+
+def cloud(seed=0):
+    """Points (N, 3) float32: clusters in every band, and noise."""
+    rng = np.random.default_rng(seed)
+    centres = rng.uniform(-25, 25, (30, 3)) * [1, 1, 0.05]
+    clusters = np.repeat(centres, 40, axis=0) + rng.normal(0, 0.08, (1200, 3))
+    return np.concatenate([clusters, rng.uniform(-30, 30, (300, 3))]).astype(np.float32)
+
+
+@pytest.fixture
+def nothing_installed(monkeypatch):
+    for name in OPTIONAL:
+        monkeypatch.setitem(sys.modules, name, None)  # import fails as if it were not there
+
+
+def test_everything_is_called_in_turn_after_a_warm_up_that_is_not_timed():
+    called = []
+    ms, results = interleaved({name: lambda name=name: called.append(name) or name.upper()
+                               for name in "abc"}, 3)
+    assert called == list("abc" * 3)
+    assert results == {"a": "A", "b": "B", "c": "C"} and ms.keys() == results.keys()
+    called.clear()
+    clock = Clock(2, {"a": lambda: called.append("warm")})
+    for _ in range(3):
+        clock.time({"a": lambda: called.append("a")})
+    assert called == ["warm"] + 6 * ["a"] and len(clock.ms["a"]) == 3
+
+
+@pytest.mark.parametrize("place", range(len(peers.DBSCANS)))
+def test_the_peers_of_dbscan_give_our_clusters(place):
+    peer = peers.DBSCANS[place]
+    if peer.missing():
+        pytest.skip(f"{peer.package} is {peer.missing()}")
+    arguments = ([place], [cloud()], 1, "test")
+    _, same, differ = (in_child(dbscan_times, *arguments) if peer == peers.WHEEL
+                       else dbscan_times(*arguments))
+    assert same[peer.name] == 1 and differ[peer.name] == 0
+
+
+@pytest.mark.parametrize("threshold", ["local", "global"])
+def test_the_plain_euclidean_gives_our_clusters(threshold):
+    params = EuclideanParams(threshold=threshold)
+    ours = euclidean(cloud(), params)
+    assert ours.max() > 0
+    np.testing.assert_array_equal(plain_euclidean.euclidean(cloud(), params), ours)
+
+
+def test_same_clusters_asks_for_the_same_noise_and_the_same_partition_of_core_points():
+    core = np.array([True, True, True, False, False])
+    ours = np.array([1, 1, 2, 2, 0])
+    assert same_clusters(np.array([7, 7, 3, 7, 0]), ours, core)      # numbers, and a border point
+    assert not same_clusters(np.array([7, 7, 3, 3, 4]), ours, core)  # noise
+    assert not same_clusters(np.array([7, 7, 7, 7, 0]), ours, core)  # joined
+    assert not same_clusters(np.array([7, 8, 3, 3, 0]), ours, core)  # cut
+
+
+@pytest.mark.parametrize("unit, target, good, bad, text", [
+    ("x", 12, 12.0, 11.9, "12x"), ("ms", 60, 59.9, 60.0, "< 60 ms"), ("", 1.1, 1.0, 1.1, "< 1.1")])
+def test_a_missed_target_is_shown(unit, target, good, bad, text):
+    assert row("a", value=good, unit=unit, target=target)["met"] is True
+    assert row("a", value=bad, unit=unit, target=target)["met"] is False
+    assert row("a", value=None, unit=unit, target=target)["met"] is None
+    assert target_text(target, unit) == text and value_text(None, unit) == ""
+
+
+def test_peers_that_are_not_installed_are_said_to_be(nothing_installed, capsys):
+    xyz, frame = cloud(), LidarFrame(scene()[:, :3], scene()[:, 3])
+    for content in (measure_dbscan("DBSCAN", [xyz], 1, 12.0), ground.measure_patchwork([frame], 1),
+                    ground.measure_cloth([xyz], 1)):
+        print_measured(json.loads(json.dumps(content)))
+        assert "not installed" in capsys.readouterr().out
+        for r in content["rows"]:
+            assert (r["name"] in SKLEARN) == (r["note"] == "") == (r["value"] is not None)
+
+
+def test_ground_scores_do_without_the_libraries(nothing_installed, capsys):
+    points = scene()
+    semantic = np.where(points[:, 2] < -1.6, 40, 30).astype(np.uint16)
+    scan = SimpleNamespace(load=lambda: (LidarFrame(points[:, :3], points[:, 3]), semantic, None))
+    content = ground.measure_labelled([scan], 1)
+    print_ground(json.loads(json.dumps(content)))
+    assert capsys.readouterr().out.count("not installed") == 2 * len(content["protocols"])
+    assert content["methods"]["cloth"]["protocols"]["with vegetation"]["f1"] > 0.9
+
+
+def test_the_command_writes_what_it_measured(nothing_installed, tmp_path):
+    pytest.importorskip("cv2")
+    from benchmark.__main__ import main
+    root, out = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "b.json"
+    done = CliRunner().invoke(main, ["--kitti", str(root), "--json", str(out), "--repeat", "1",
+                                     "--no-graph"], catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    content = json.loads(out.read_text())
+    assert {"machine", "peers", "candidates", "dbscan_in_view", "threshold_in_view"} == set(content)
+    assert content["peers"]["open3d"] == "not installed"
+    assert content["dbscan_in_view"]["rows"][0]["same"] == 1
