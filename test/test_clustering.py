@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import multiprocessing
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -333,3 +335,19 @@ def test_by_cells_and_by_pairs_the_labels_are_scikit_learns(seed, n, scale, eps,
 
 def test_dense_points_are_refused_by_pairs_before_they_cost_much():
     assert dbscan_by_pairs(np.zeros((100_000, 3), np.float32), 0.5, 10) is None
+
+
+def test_a_forked_process_clusters_too():
+    """It has none of the threads that its parent keeps for the bands."""
+    xyz = np.random.default_rng(0).uniform(-40, 40, (500, 3)).astype(np.float32)
+    labels = distance_aware_dbscan(xyz)
+    child = multiprocessing.get_context("fork").Process(target=_same, args=(xyz, labels))
+    child.start()
+    child.join(30)
+    if child.is_alive():
+        child.kill()
+    assert child.exitcode == 0
+
+
+def _same(xyz, labels):
+    np.testing.assert_array_equal(distance_aware_dbscan(xyz), labels)
