@@ -56,7 +56,7 @@ setup(
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "test": ["pytest>=7.4", "hypothesis>=6.90", "opencv-python-headless>=4.8",
                  "setuptools>=70.1"],
-        "benchmark": ["opencv-python-headless>=4.8"],
+        "benchmark": ["dbscan>=1.0", "opencv-python-headless>=4.8"],
     },
     entry_points={"console_scripts": [
         "lidar-perception = lidar_perception.cli.main:main",
