@@ -33,8 +33,10 @@ def drive_bag(tmp_path_factory) -> Path:
 def domain() -> int:
     """A ROS domain of this test session's own, reached by this machine only."""
     from lidar_perception.nodes.graph import private_domain
+    from lidar_perception.pipeline import warm_up
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     number = private_domain()
+    warm_up()  # what nodes compile is cached then; on a fresh machine that can outlast a wait
     os.environ["ROS_DOMAIN_ID"] = str(number)
     return number
 
