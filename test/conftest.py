@@ -7,7 +7,10 @@ from pathlib import Path
 
 import pytest
 
+from lidar_perception.nodes.main import use_large_shared_memory
+
 FRAMES = 8
+use_large_shared_memory()  # Fast DDS reads its profile once: before any test that imports rclpy
 
 
 @pytest.fixture(scope="session")

@@ -11,12 +11,10 @@ from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
 from lidar_perception.datasets.bag import decode, encode
-from lidar_perception.nodes.main import use_large_shared_memory
 from lidar_perception.nodes.runtime import RELIABLE
 from lidar_perception.nodes.watch import Outside
 from msg_utils.messages import message_class
 
-use_large_shared_memory()
 TIMEOUT = 60.0  # seconds; the first start on a machine compiles
 
 
