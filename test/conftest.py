@@ -26,9 +26,10 @@ def data() -> Path:
 def drive_bag(tmp_path_factory) -> Path:
     """A bag of a simulated drive: clouds, labels, camera."""
     from lidar_perception.datasets.to_bag import write_bag
+    from lidar_perception.simulation.scene import CROWDED
     from lidar_perception.simulation.to_bag import simulated_scans
     path = tmp_path_factory.mktemp("drive") / "drive"
-    write_bag(path, simulated_scans(seed=1, frames=FRAMES))
+    write_bag(path, simulated_scans(seed=19, frames=FRAMES, streets=CROWDED))
     return path
 
 

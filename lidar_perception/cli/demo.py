@@ -33,7 +33,7 @@ from msg_utils.markers import from_marker_array
               show_default=True, help="Folder for the results.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
               help="Length of the simulated drive, 10 frames a second.")
-@click.option("--drive-seed", type=click.IntRange(0), default=1, show_default=True,
+@click.option("--drive-seed", type=click.IntRange(0), default=19, show_default=True,
               help="Seed of the simulated drive.")
 @click.option("--rate", type=click.FloatRange(0.01, 100), default=1.0, show_default=True,
               help="Speed of the replay.")
@@ -88,8 +88,10 @@ def _make_bag(path: Path, kitti: Path | None, frames: int, drive_seed: int) -> P
         found = open_kitti(kitti)
         scans = track(map(kitti_scan, found), f"converting {kitti}", len(found))
     else:
+        from lidar_perception.simulation.scene import CROWDED
         from lidar_perception.simulation.to_bag import simulated_scans
-        scans = track(simulated_scans(drive_seed, frames), "simulating a drive", frames)
+        scans = track(simulated_scans(drive_seed, frames, streets=CROWDED), "simulating a drive",
+                      frames)
     write_bag(path, scans, force=True)
     return path
 

@@ -14,7 +14,7 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
     "convert": ("convert.convert", "Turn a data set into a rosbag2 bag."),
     "evaluate": ("evaluate.evaluate", "Score the algorithms without ROS."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),
-    "simulate": ("simulate.simulate", "Write a simulated drive as a bag."),
+    "simulate": ("simulate.simulate", "Write simulated scans as a bag or a data set."),
     "info": ("info.info", "Say what is in a bag."),
     "run": ("run.run_node", "Start one ROS node."),
     "benchmark": ("checkout.benchmark", "Time the algorithms beside their peers."),

@@ -1,29 +1,159 @@
-"""simulate: labelled scans without a data set."""
+"""simulate: labelled scans without a data set, and how they compare with real ones."""
 
 from __future__ import annotations
 
+import json
+import os
+from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import click
+import numpy as np
 
+from lidar_perception import __version__
+from lidar_perception.datasets.recording import Recorded, open_recording
 from lidar_perception.datasets.to_bag import write_bag
+from lidar_perception.files import write_text
+from lidar_perception.simulation.camera import FORWARD_CAMERA
+from lidar_perception.simulation.dataset import LAYOUTS, Plan, write_frames
+from lidar_perception.simulation.drive import drive, longest_drive
+from lidar_perception.simulation.folder import is_finished, unfinished
+from lidar_perception.simulation.scene import KINDS, Streets
+from lidar_perception.simulation.sensor import SENSORS, sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.terminal import console, track
+from lidar_perception.types import GroundTruth, InputError
 
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Bag folder to make.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder to make.")
+@click.option("--format", "layout", type=click.Choice(["mcap", *LAYOUTS]), default="mcap",
+              show_default=True, help="A rosbag2 bag, or the folders of one of these data sets.")
+@click.option("--sensor", "sensor_name", default="hdl64e", show_default=True,
+              help=f"One of {', '.join(SENSORS)}.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
-              help="Scans, 10 a second.")
+              help="Scans; with --compare, one of each of as many streets.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
-              help="Seed of the scene; the same seed gives the same scans.")
-@click.option("--force", is_flag=True, help="Replace the bag if it exists.")
-def simulate(out: Path, frames: int, seed: int, force: bool) -> None:
-    """Write a simulated street drive with true boxes as an MCAP bag.
+              help="Seed of the first street; the same seed gives the same bytes.")
+@click.option("--street", "kind", type=click.Choice(list(KINDS)), help="Streets of this kind only. "
+              "Default: all, as often as in KITTI.")
+@click.option("--people", type=click.FloatRange(0), default=1.0, show_default=True,
+              help="How many times as many pedestrians and cyclists as in KITTI.")
+@click.option("--streets-of", type=click.IntRange(1), metavar="N",
+              help="Go on with the next street after N scans. Default: 1 for kitti, 20 s of "
+                   "driving for the others.")
+@click.option("--jobs", type=click.IntRange(1), help="Processes that write the folders of a data "
+              "set. Default: one for each core.")
+@click.option("--resume", is_flag=True, help="Go on with a data set that was not finished.")
+@click.option("--force", is_flag=True, help="Replace what was simulated into --out before.")
+@click.option("--compare", "kitti", type=click.Path(path_type=Path), metavar="KITTI_ROOT",
+              help="Compare with the labelled scans of a KITTI folder; nothing is made.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
+              help="With --compare: write every curve to this file.")
+@click.option("--png", type=click.Path(path_type=Path), metavar="FILE",
+              help="With --compare: draw every curve.")
+def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed: int,
+             kind: str | None, people: float, streets_of: int | None, jobs: int | None,
+             resume: bool, force: bool, kitti: Path | None, json_file: Path | None,
+             png: Path | None) -> None:
+    """Write labelled scans of simulated streets as a bag or data set, or measure how real they are.
+
+    A data set that was stopped is marked by a file INCOMPLETE; --resume goes on with it.
 
     \b
-    Example:
+    Examples:
       lidar-perception simulate --frames 100 --seed 7 --out drive
+      lidar-perception simulate --format kitti --frames 1000 --out training_data
+      lidar-perception simulate --compare /data/kitti/object --png realism.png
     """
-    count = write_bag(out, track(simulated_scans(seed, frames), "simulating", frames), force=force)
-    console.print(f"{out}: {count} scans")
+    if (out is None) == (kitti is None):
+        raise click.UsageError("give either --out FOLDER or --compare KITTI_ROOT")
+    streets = Streets(kind, people)
+    if kitti is not None:
+        _compare(kitti, frames, seed, streets, json_file, png)
+        return
+    if json_file or png:
+        raise click.UsageError("--json and --png go with --compare")
+    if resume and force:
+        raise click.UsageError("--resume goes on, --force starts again: give one of them")
+    sensor = sensor_named(sensor_name)
+    plan = Plan(layout, sensor, seed, frames,
+                streets_of or (1 if layout == "kitti" else longest_drive(sensor)), streets)
+    if layout == "mcap":
+        if resume:
+            raise click.UsageError("a bag is one file and cannot be resumed; make kitti-tracking, "
+                                   "which can, and turn it into a bag with 'convert kitti'")
+        _bag(out, plan, force)
+    else:
+        _data_set(out, plan, sensor_name, jobs or len(os.sched_getaffinity(0)), resume, force)
+
+
+def _bag(out: Path, plan: Plan, force: bool) -> None:
+    scans = simulated_scans(plan.seed, plan.frames, plan.sensor, plan.streets_of,
+                            plan.streets)
+    try:
+        count = write_bag(out, track(scans, "simulating", plan.frames), force=force)
+    except OSError as error:
+        raise click.ClickException(f"cannot write {out}: {error.strerror}; what is done lies in "
+                                   f"{out}.incomplete") from None
+    console.print(f"{out}: {count} scans", soft_wrap=True)
+
+
+def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
+              force: bool) -> None:
+    asked = {"format": plan.layout, "sensor": sensor_name, "seed": plan.seed,
+             "frames": plan.frames, "street": plan.streets.kind, "people": plan.streets.people,
+             "streets_of": plan.streets_of, "version": __version__}
+    asked["command"] = (f"lidar-perception simulate --format {plan.layout} --sensor {sensor_name} "
+                        f"--seed {plan.seed} --frames {plan.frames} "
+                        f"--people {plan.streets.people:g} --streets-of {plan.streets_of}"
+                        + (f" --street {plan.streets.kind}" if plan.streets.kind else ""))
+    complete, begun = resume and is_finished(out), False
+    try:
+        with unfinished(out, asked, resume=resume, force=force) as missing:
+            begun = True
+            with closing(write_frames(out, plan, missing, jobs)) as written:
+                for _ in track(written, "simulating", len(missing)):
+                    pass
+    except InputError as error:
+        if not begun:
+            raise
+        raise click.ClickException(f"{error}; what is done stays, go on with --resume") from None
+    console.print(f"{out} is complete: there is nothing to do" if complete else
+                  f"{out}: {plan.frames} scans" + (f", {plan.frames - len(missing)} of them from "
+                                                   "before" if resume else ""), soft_wrap=True)
+
+
+def _compare(kitti: Path, frames: int, seed: int, streets: Streets, json_file: Path | None,
+             png: Path | None) -> None:
+    from lidar_perception.cli.evaluate import PROTOCOL
+    from lidar_perception.evaluation.realism import compare, labelled, measure
+    from lidar_perception.evaluation.realism_report import draw_realism, print_realism
+    from lidar_perception.pipeline import warm_up
+
+    recording = labelled(open_recording(kitti=kitti))
+    warm_up()
+    real = measure(track(recording, "measuring real scans", recording.count), PROTOCOL)
+    simulated = measure(track(_scans(seed, frames, streets), "measuring simulated scans", frames),
+                        PROTOCOL)
+    content = {"kitti": str(kitti), "seed": seed, **compare(real, simulated)}
+    if json_file:
+        write_text(json_file, json.dumps(content, indent=1))
+    if png:
+        draw_realism(png, content)
+    print_realism(content, console)
+    if png:
+        console.print(f"picture: {png}", soft_wrap=True)
+
+
+def _scans(seed: int, count: int, streets: Streets) -> Iterator[Recorded]:
+    """The first scans of streets seed, seed + 1, ..., with labels of the objects whose centre the
+    camera sees, as in KITTI."""
+    camera = FORWARD_CAMERA.camera()
+    for street in range(seed, seed + count):
+        frame, labels = next(iter(drive(street, 1, streets=streets)))
+        seen = np.flatnonzero(camera.in_view(labels.boxes[:, :3]))
+        truth = GroundTruth.of(labels.boxes[seen], labels.class_ids[seen],
+                               [labels.extras[i] for i in seen])
+        yield Recorded(f"street {street}", frame, truth, camera)

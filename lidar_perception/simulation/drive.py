@@ -1,13 +1,17 @@
-"""A simulated drive: labelled scans, one a turn of the sensor."""
+"""Simulated drives: scans of a street, one a turn of the sensor, with all that is known of them."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from lidar_perception.simulation.raycast import Hits, cast, measure
-from lidar_perception.simulation.scene import SECONDS, Moment, make_scene
+from lidar_perception.datasets.semantickitti import MOVING
+from lidar_perception.simulation.raycast import Hits, cast
+from lidar_perception.simulation.returns import measure
+from lidar_perception.simulation.scene import ANY, SECONDS, Moment, Scene, Streets, make_scene
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.topics import LIDAR_FRAME
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
@@ -15,29 +19,70 @@ from lidar_perception.types import GroundTruth, InputError, LidarFrame
 START_NS = 1_700_000_000 * 10**9
 LABEL_RANGE = 80.0  # metres; what is farther has no label, as in KITTI
 
+MOVES_AS = {still: moving for moving, still in MOVING.items()}
 
-def drive(seed: int = 0, frames: int = 40,
-          sensor: Sensor = HDL64E) -> Iterator[tuple[LidarFrame, GroundTruth]]:
-    """Scans of the street make_scene(seed), with their truth; the same for the same arguments.
 
-    Each scan is a snapshot: the sensor does not move during a turn. Objects without a point or
-    beyond LABEL_RANGE have no label. extras: track_id, truncated 0.0, occluded 0 | 1 | 2 as in
-    KITTI, num_points. ValueError (at the call) for a seed or a number of frames out of range.
+@dataclass(frozen=True)
+class SimulatedScan:
+    """One turn of the sensor: N points, in the sensor's frame at frame.stamp_ns.
+
+    truth: the objects all around; semantic (N,) uint16 SemanticKITTI classes, the moving ones
+    too; instance (N,) uint16 track id of the object, 0 for none; ring (N,) uint16, 0 the highest
+    beam; time (N,) float32 seconds after the stamp; pose (4, 4) float64 the sensor's frame in that
+    of the drive's first scan.
     """
-    most = int(SECONDS * sensor.rate)
+
+    frame: LidarFrame
+    truth: GroundTruth
+    semantic: np.ndarray
+    instance: np.ndarray
+    ring: np.ndarray
+    time: np.ndarray
+    pose: np.ndarray
+
+
+def longest_drive(sensor: Sensor) -> int:
+    """Scans that fit into the time of one street."""
+    return int(SECONDS * sensor.rate)
+
+
+def scans(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
+          streets: Streets = ANY) -> Iterator[SimulatedScan]:
+    """A drive along the street make_scene(seed, *streets); the same for the same arguments.
+
+    Points are where they were met, in the sensor's frame at the stamp; boxes are those at the
+    stamp. Objects without a point or beyond LABEL_RANGE have no label. extras: track_id,
+    truncated 0.0, occluded 0 | 1 | 2 as in KITTI, num_points. InputError (at the call) for a seed
+    or a number of frames out of range.
+    """
+    most = longest_drive(sensor)
     if not 1 <= frames <= most:
         raise InputError(f"frames = {frames} must be 1 .. {most}: the street is that long")
     if seed < 0:
         raise InputError(f"seed = {seed} must not be negative")
-    return (_scan(seed, i, sensor, scene) for scene in [make_scene(seed)] for i in range(frames))
+    return (scan_at(seed, i, sensor, streets) for i in range(frames))
 
 
-def _scan(seed, i, sensor, scene) -> tuple[LidarFrame, GroundTruth]:
+def drive(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E, streets: Streets = ANY
+          ) -> Iterator[tuple[LidarFrame, GroundTruth]]:
+    """The frames of scans() with their truth."""
+    return ((scan.frame, scan.truth) for scan in scans(seed, frames, sensor, streets))
+
+
+def scan_at(seed: int, i: int, sensor: Sensor, streets: Streets = ANY) -> SimulatedScan:
+    """Scan i of the drive along street seed, whatever was asked for before."""
+    scene = _street(seed, streets)
     moment = scene.at(i / sensor.rate, sensor.height)
-    hits = cast(moment.solids, scene.ground, moment.position, sensor)
-    xyz, intensity, owner = measure(hits, sensor, np.random.default_rng([seed, i]))
+    hits = cast(moment.solids, scene.ground, moment.position, sensor, moment.motion,
+                seed=(seed << 20) + i)
+    got = measure(hits, sensor, moment.motion, np.random.default_rng([seed, i]))
     stamp = START_NS + round(i * 10**9 / sensor.rate)
-    return LidarFrame(xyz, intensity, stamp, LIDAR_FRAME), truth(moment, hits, owner)
+    pose = np.eye(4)
+    pose[:3, 3] = moment.position - scene.at(0.0, sensor.height).position
+    return SimulatedScan(
+        LidarFrame(got.xyz, got.intensity, stamp, LIDAR_FRAME), truth(moment, hits, got.owner),
+        _moving(moment, got.owner, got.semantic), got.owner.astype(np.uint16), got.ring, got.time,
+        pose)
 
 
 def truth(moment: Moment, hits: Hits, owner: np.ndarray) -> GroundTruth:
@@ -52,3 +97,17 @@ def truth(moment: Moment, hits: Hits, owner: np.ndarray) -> GroundTruth:
                "num_points": int(n)}
               for track, level, n in zip(moment.track_ids[keep], occluded[keep], points[keep])]
     return GroundTruth.of(moment.boxes[keep], moment.class_ids[keep], extras)
+
+
+@functools.lru_cache(maxsize=2)
+def _street(seed: int, streets: Streets) -> Scene:
+    return make_scene(seed, *streets)
+
+
+def _moving(moment: Moment, owner: np.ndarray, semantic: np.ndarray) -> np.ndarray:
+    """semantic (N,) with the classes of what moves for the points of owners that do."""
+    moves = np.zeros(int(max(moment.track_ids, default=0)) + 1, bool)
+    moves[moment.track_ids[moment.speeds > 0]] = True
+    table = np.arange(1 << 16, dtype=np.uint16)
+    table[list(MOVES_AS)] = list(MOVES_AS.values())
+    return np.where(moves[owner], table[semantic], semantic)

@@ -1,236 +1,147 @@
-"""A short street drive: who stands, walks and drives where, and what that is in the LiDAR frame."""
+"""A drive along a street: what that is in the LiDAR frame at any time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from lidar_perception.simulation import shapes
-from lidar_perception.simulation.raycast import Solids
-from lidar_perception.simulation.terrain import Ground, ground_height, surface_height
-from lidar_perception.types import CLASSES
+from lidar_perception.simulation.actors import FAR_SIGHT, LARGE, SIGHT, Actor, Room
+from lidar_perception.simulation.roadside import furnish
+from lidar_perception.simulation.sensor import Motion
+from lidar_perception.simulation.solids import PART, Solids, extents, place
+from lidar_perception.simulation.street import KINDS, lay_out
+from lidar_perception.simulation.terrain import Ground, surface_height
+from lidar_perception.simulation.traffic import populate
+from lidar_perception.types import CLASSES, InputError
 
 SECONDS = 20.0  # for so long nobody walks or drives into anything
-START, END = -60.0, 200.0  # x of the built-up street
-LEFT_CURB, RIGHT_CURB = 7.3, -4.1  # y; ego drives at 0, oncoming traffic at 3.2
-LEFT_PARKING, RIGHT_PARKING = 6.2, -3.05
-LEFT_WALL, RIGHT_WALL = 11.5, -8.5
-UNLABELLED = -1
+EGO = (3.0, 1.1)  # half length and width that the ego vehicle keeps clear, m
 
 
-@dataclass(frozen=True)
-class Actor:
-    """Something that stands at x, y (world, time 0) or moves straight ahead at speed m/s.
+class Streets(NamedTuple):
+    """Which streets, see make_scene: all kinds, or one; how many times as many people as in
+    KITTI."""
 
-    shape(travelled m) gives its parts, see shapes.py. class_id into CLASSES, or UNLABELLED.
-    """
-
-    shape: Callable[[float], np.ndarray]
-    x: float
-    y: float
-    heading: float = 0.0
-    speed: float = 0.0
-    class_id: int = UNLABELLED
-
-    def position(self, t):
-        """(x, y) at time t, a float or an array."""
-        return (self.x + np.cos(self.heading) * self.speed * t,
-                self.y + np.sin(self.heading) * self.speed * t)
+    kind: str | None = None
+    people: float = 1.0
 
 
-@dataclass(frozen=True)
-class Moment:
+ANY = Streets()
+CROWDED = Streets("zone", 3.0)  # for demos and tests of pedestrian detectors
+
+
+class Moment(NamedTuple):
     """The scene at one time, as the sensor at position (3,) in the world finds it. boxes (K, 7)
-    as in GroundTruth, class_ids (K,), track_ids (K,) in 1.. which are also the solids' owners."""
+    as in GroundTruth, class_ids (K,) int32, track_ids (K,) int32 in 1.., which are also the
+    solids' owners, speeds (K,) m/s over the ground, motion of the sensor."""
 
     solids: Solids
     position: np.ndarray
     boxes: np.ndarray
     class_ids: np.ndarray
     track_ids: np.ndarray
+    speeds: np.ndarray
+    motion: Motion
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A street along x. The ego vehicle drives at y = 0 from x = 0; it stays upright, so that
-    the ground has its slope in the LiDAR frame too. Actor i has track id i + 1."""
+    """A street along x. The ego vehicle drives at y = 0 from x = 0 at speed m/s; all vehicles stay
+    upright, so that the ground has its slope in the LiDAR frame too. The labelled actors have the
+    track ids 1.. in their order. seconds: how long the drive may be."""
 
     ground: Ground
     actors: tuple[Actor, ...]
     speed: float
+    kind: str = ""
+    seconds: float = SECONDS
 
     def at(self, t: float, sensor_height: float) -> Moment:
         """The scene after t seconds, relative to a sensor so high above the road."""
-        ego = self.speed * t
-        sensor = np.array([ego, 0.0, ground_height(self.ground, ego, 0.0) + sensor_height])
-        parts = [a.shape(a.speed * t) for a in self.actors]
-        flat = np.array([a.position(t) for a in self.actors]).reshape(-1, 2)
-        base = np.array([(x, y, surface_height(self.ground, x, y)) for x, y in flat]) - sensor
-        heading = np.array([a.heading for a in self.actors])
-        classes = np.array([a.class_id for a in self.actors])
-        labelled = np.flatnonzero(classes != UNLABELLED)
-        boxes = [_box(parts[i], base[i], heading[i]) for i in labelled]
-        actor = np.repeat(np.arange(len(parts)), [len(p) for p in parts])
-        owner = np.where(classes != UNLABELLED, np.arange(1, len(parts) + 1), 0)
-        return Moment(_solids(np.concatenate(parts), base[actor], heading[actor], owner[actor]),
-                      sensor, np.array(boxes).reshape(-1, 7), classes[labelled], labelled + 1)
+        ego = np.array([self.speed * t, 0.0])
+        sensor = np.array([*ego, surface_height(self.ground, *ego) + sensor_height])
+        a = self._table
+        way = a["speed"] * np.clip(t - a["start"], 0.0, a["stop"] - a["start"])
+        flat = a["xy"] + a["forward"] * way[:, None]
+        near = np.flatnonzero(np.hypot(*(flat - ego).T) <= a["sight"])
+        a, way, flat = a[near], way[near], flat[near]
+        feet = np.where(np.isnan(a["feet"]), surface_height(self.ground, *flat.T), a["feet"])
+        base = np.column_stack([flat, feet]) - sensor
+        speed = np.where((a["start"] <= t) & (t < a["stop"]), a["speed"], 0.0)
+        velocity = self._climbing(a["forward"] * speed[:, None])
+
+        made = [self.actors[i].thing.parts(s) for i, s in zip(near, way)]
+        whose = np.repeat(np.arange(len(made)), [len(m) for m in made])
+        solids = place(np.concatenate([np.zeros(0, PART), *made]), base[whose],
+                       a["heading"][whose], a["track"][whose], velocity[whose])
+
+        known = np.flatnonzero(a["track"])
+        boxes = np.column_stack([base, a["size"], a["heading"]])[known]
+        boxes[:, 2] += boxes[:, 5] / 2
+        motion = Motion(tuple(self._climbing(np.array([[self.speed, 0.0]]))[0].tolist()))
+        return Moment(solids, sensor, boxes, a["class"][known], a["track"][known], speed[known],
+                      motion)
+
+    @cached_property
+    def _table(self) -> np.ndarray:
+        """One row for every actor. feet: the least height of the ground below what never moves and
+        has no label, which may be too long to stand on a slope; NaN for the rest."""
+        rows = []
+        for a in self.actors:
+            label = a.thing.label
+            low, high = extents(a.thing.parts(0.0))
+            span = high.max(axis=0) - low.min(axis=0)
+            sight = np.hypot(*span[:2]) / 2 + (FAR_SIGHT if span.max() > LARGE else SIGHT)
+            feet = (np.nan if a.speed or label else
+                    surface_height(self.ground, *_corners(a.footprint)).min())
+            rows.append(((a.x, a.y), a.heading, (np.cos(a.heading), np.sin(a.heading)), a.speed,
+                         a.start, a.stop, a.thing.size, CLASSES.index(label) if label else -1, 0,
+                         sight, feet))
+        table = np.array(rows, [
+            ("xy", float, 2), ("heading", float), ("forward", float, 2), ("speed", float),
+            ("start", float), ("stop", float), ("size", float, 3), ("class", np.int32),
+            ("track", np.int32), ("sight", float), ("feet", float)])
+        known = table["class"] >= 0
+        table["track"] = np.where(known, np.cumsum(known), 0)
+        return table
+
+    def _climbing(self, flat: np.ndarray) -> np.ndarray:
+        """(n, 3) velocities along the slope of the ground from those (n, 2) in the plane."""
+        slope = np.array([self.ground.slope_x, self.ground.slope_y])
+        return np.column_stack([flat, flat @ slope])
 
 
-def _solids(parts: np.ndarray, base: np.ndarray, heading: np.ndarray,
-            owner: np.ndarray) -> Solids:
-    """Parts (P, 9) of objects at base (P, 3), turned by heading (P,), in the frame of base."""
-    cos, sin = np.cos(heading), np.sin(heading)
-    down, nose = np.cos(parts[:, 7]), np.sin(parts[:, 7])
-    zero = np.zeros(len(parts))
-    forward = np.stack([cos * down, sin * down, -nose], axis=1)
-    left = np.stack([-sin, cos, zero], axis=1)
-    up = np.stack([cos * nose, sin * nose, down], axis=1)
-    x, y, z = parts[:, 1:4].T
-    centre = base + np.stack([cos * x - sin * y, sin * x + cos * y, z], axis=1)
-    return Solids(parts[:, 0].astype(np.int64), centre, parts[:, 4:7],
-                  np.stack([forward, left, up], axis=2), parts[:, 8], owner)
+def _corners(f: np.ndarray) -> np.ndarray:
+    """(2, 4) x and y of the corners of a footprint (8,) at time 0."""
+    x, y, heading, length, width = f[:5]
+    ahead, aside = length * np.array([1, 1, -1, -1]), width * np.array([1, -1, 1, -1])
+    return np.array([x + np.cos(heading) * ahead - np.sin(heading) * aside,
+                     y + np.sin(heading) * ahead + np.cos(heading) * aside])
 
 
-def _box(parts: np.ndarray, base: np.ndarray, heading: float) -> np.ndarray:
-    """(7,) the smallest box with this heading around the parts of an object at base (3,)."""
-    low, high = shapes.extents(parts)
-    low, high = low.min(axis=0), high.max(axis=0)
-    x, y, z = (low + high) / 2
-    cos, sin = np.cos(heading), np.sin(heading)
-    return np.array([*(base + (cos * x - sin * y, sin * x + cos * y, z)), *(high - low), heading])
+def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0) -> Scene:
+    """A street of its own for every seed. kind: one of KINDS; None draws it by their
+    shares. people: multiplies how many pedestrians, sitting people and cyclists are tried; 1 comes
+    near KITTI's labels, 0 is none.
 
-
-def make_scene(seed: int = 0, speed: float = 4.0) -> Scene:
-    """A street of its own for every seed; the ego vehicle drives along it at speed m/s.
-
-    The first walkers are cast so that at 4 m/s they stay ahead of the ego vehicle, within 40
-    degrees of its heading, for four seconds at least. The rest is drawn at random and dropped
-    where it would ever touch something that is there already.
+    What is placed later is dropped where it would ever touch what is there already. InputError
+    for a negative seed or people and an unknown kind.
     """
+    if seed < 0:
+        raise InputError(f"seed = {seed} must not be negative")
+    if not 0 <= people < np.inf:
+        raise InputError(f"people = {people} must be 0 or more, such as 1")
+    if kind is not None and kind not in KINDS:
+        raise InputError(f"kind = {kind!r} must be one of {', '.join(KINDS)}")
     rng = np.random.default_rng(seed)
-    ground = Ground(*np.tan(np.radians(rng.uniform((-0.8, -1.2), (0.8, 1.2)))), wave=0.03,
-                    curb_left=LEFT_CURB, curb_right=RIGHT_CURB, curb_height=0.12)
-    ego = Actor(lambda _: shapes.car(4.6, 1.9, 1.6, 0.0), 0.0, 0.0, speed=speed)
-    placed: list[Actor] = []
-    swept = _swept(ego)[None]
-    for actor in (a for part in (_cast, _traffic, _street, _passers_by) for a in part(rng)):
-        footprint = _swept(actor)
-        if not _touch(footprint, swept):
-            placed.append(actor)
-            swept = np.concatenate([swept, footprint[None]])
-    return Scene(ground, tuple(placed), speed)
-
-
-def _swept(actor: Actor) -> np.ndarray:
-    """(T, 4) [x low, y low, -x high, -y high] of what is below 2.2 m, over SECONDS."""
-    low, high = shapes.extents(actor.shape(0.0))
-    below = low[:, 2] < 2.2
-    (l0, w0), (l1, w1) = low[below, :2].min(axis=0), high[below, :2].max(axis=0)
-    if actor.speed:  # limbs swing
-        l0, l1 = min(l0, -0.4), max(l1, 0.4)
-    cos, sin = np.cos(actor.heading), np.sin(actor.heading)
-    x = [cos * a - sin * b for a in (l0, l1) for b in (w0, w1)]
-    y = [sin * a + cos * b for a in (l0, l1) for b in (w0, w1)]
-    at_x, at_y = actor.position(np.linspace(0.0, SECONDS, 101))
-    return np.stack([at_x + min(x), at_y + min(y), -at_x - max(x), -at_y - max(y)], axis=1)
-
-
-def _touch(footprint: np.ndarray, others: np.ndarray, gap: float = 0.1) -> bool:
-    """Whether a footprint (T, 4) ever comes within gap metres of one of others (M, T, 4)."""
-    both = np.maximum(footprint, others)
-    return bool((both[..., :2] + both[..., 2:] <= gap).all(axis=-1).any())
-
-
-def _walker(rng: np.random.Generator, x: float, y: float, heading: float,
-            speed: float = -1.0) -> Actor:
-    """A pedestrian of random build; speed -1 draws that too."""
-    speed = rng.uniform(1.1, 1.6) if speed < 0 else speed
-    shape = partial(shapes.pedestrian, height=rng.uniform(1.62, 1.9),
-                    girth=rng.uniform(0.9, 1.2), phase=rng.uniform(0, 2 * np.pi),
-                    stride=rng.uniform(0.95, 1.05) * speed, coat=rng.uniform(0.1, 0.6),
-                    trousers=rng.uniform(0.05, 0.4))
-    return Actor(shape, x, y, heading, speed, CLASSES.index("Pedestrian"))
-
-
-def _cast(rng: np.random.Generator) -> Iterator[Actor]:
-    """Eight walkers who stay in view, each on a track of their own; the last one crosses."""
-    pace, x, y = rng.uniform(1.1, 1.5), rng.uniform(21, 24), rng.uniform(-7.0, -6.6)
-    yield _walker(rng, x, y, 0.0, pace)  # a pair on the right
-    yield _walker(rng, x + rng.uniform(-0.2, 0.2), y + rng.uniform(0.85, 0.95), 0.0, pace)
-    yield _walker(rng, rng.uniform(16, 18), -1.5, 0.0, rng.uniform(1.2, 1.5))  # past parked cars
-    yield _walker(rng, rng.uniform(24, 28), rng.uniform(8.1, 8.4), 0.0)
-    pace, x, y = rng.uniform(1.1, 1.5), rng.uniform(37, 41), rng.uniform(10.1, 10.3)
-    yield _walker(rng, x, y, np.pi, pace)  # a pair that comes towards us on the left
-    yield _walker(rng, x + rng.uniform(-0.2, 0.2), y - rng.uniform(0.85, 0.95), np.pi, pace)
-    yield _walker(rng, rng.uniform(27, 31), rng.uniform(-5.0, -4.7), rng.uniform(-3, 3), 0.0)
-    yield _walker(rng, rng.uniform(29, 34), rng.uniform(-4.5, -3), np.pi / 2)
-
-
-def _passers_by(rng: np.random.Generator) -> Iterator[Actor]:
-    """More walkers on both sidewalks, some two by two."""
-    for x in np.arange(START, END, 9.0):
-        y = rng.uniform(8.2, 10.6) if rng.random() < 0.5 else rng.uniform(-7.6, -5.2)
-        heading, pace = np.pi * rng.integers(2), rng.uniform(1.0, 1.6)
-        yield _walker(rng, x, y, heading, pace)
-        if rng.random() < 0.3:
-            yield _walker(rng, x + rng.uniform(-0.2, 0.2), y + 0.8, heading, pace)
-
-
-def _traffic(rng: np.random.Generator) -> Iterator[Actor]:
-    """Cars, vans and cyclists: oncoming, one ahead of us, and parked along both curbs."""
-    def vehicle(x, y, heading, speed=0.0, share_of_vans=0.0):
-        paint = rng.uniform(0.1, 0.7)
-        if rng.random() < share_of_vans:
-            size = rng.uniform((5.0, 1.85, 2.0), (5.6, 2.0, 2.3))
-            return _rigid(shapes.van(*size, paint), x, y, heading, speed, "Van")
-        size = rng.uniform((3.7, 1.6, 1.4), (4.6, 1.78, 1.6))
-        return _rigid(shapes.car(*size, paint), x, y, heading, speed, "Car")
-
-    yield vehicle(rng.uniform(38, 48), 0.0, 0.0, rng.uniform(5, 6))
-    for x in (rng.uniform(26, 34), rng.uniform(60, 75), rng.uniform(120, 150)):
-        yield vehicle(x, 3.2, np.pi, rng.uniform(7, 9))
-    for x, y, heading in ((rng.uniform(18, 26), 1.9, np.pi), (rng.uniform(25, 35), -1.4, 0.0),
-                          (rng.uniform(70, 90), 4.6, np.pi)):
-        shape = partial(shapes.cyclist, height=rng.uniform(1.6, 1.85),
-                        coat=rng.uniform(0.1, 0.6), trousers=rng.uniform(0.05, 0.4))
-        yield Actor(shape, x, y, heading, rng.uniform(4, 5.5), CLASSES.index("Cyclist"))
-    for y, heading in ((LEFT_PARKING, np.pi), (RIGHT_PARKING, 0.0)):
-        for x in np.arange(START, END, 6.5):
-            free, vans = (0.75, 0.0) if 0 < x < 40 else (0.4, 0.2)  # the cast must be seen
-            if rng.random() > free:
-                yield vehicle(x + rng.uniform(-0.4, 0.4), y + rng.uniform(-0.05, 0.05),
-                              heading + rng.uniform(-0.03, 0.03), share_of_vans=vans)
-
-
-def _street(rng: np.random.Generator) -> Iterator[Actor]:
-    """Buildings with gaps between them, and trees, lamps, bushes and clutter on the sidewalks."""
-    for wall, curb, heading in ((LEFT_WALL, LEFT_CURB, 0.0), (RIGHT_WALL, RIGHT_CURB, np.pi)):
-        out = np.sign(wall)
-        x = START + rng.uniform(0, 5)
-        while x < END:
-            length = rng.uniform(8, 20)
-            parts = shapes.building(length, rng.uniform(8, 12), rng.uniform(4, 12),
-                                    rng.uniform(0.25, 0.5))
-            yield _rigid(parts, x + length / 2, wall + out * rng.uniform(0.1, 1.2), heading)
-            x += length + rng.choice([0.2, 3.0, 6.0])
-        for x in np.arange(START, END, 5.0) + rng.uniform(0, 5):
-            y = curb + out * rng.uniform(0.4, 0.6)
-            pick = rng.random()
-            if pick < 0.35:
-                yield _rigid(shapes.tree(rng), x, y, rng.uniform(-3, 3))
-            elif pick < 0.5:
-                yield _rigid(shapes.lamp(), x, y, -out * np.pi / 2)
-            elif pick < 0.9:
-                yield _rigid(shapes.clutter(rng), x, y, rng.uniform(-3, 3))
-        for x in np.arange(START, END, 7.0) + rng.uniform(0, 7):
-            parts = shapes.bush(rng) if rng.random() < 0.5 else shapes.clutter(rng)
-            yield _rigid(parts, x, wall - out * 0.55, heading)
-
-
-def _rigid(parts: np.ndarray, x: float, y: float, heading: float, speed: float = 0.0,
-           label: str = "") -> Actor:
-    return Actor(lambda _: parts, x, y, heading, speed,
-                 CLASSES.index(label) if label else UNLABELLED)
+    drawn = str(rng.choice(list(KINDS), p=[k.share for k in KINDS.values()]))
+    kind = kind or drawn
+    street = lay_out(rng, KINDS[kind], SECONDS)
+    ego = [0.0, 0.0, 0.0, *EGO, street.speed, 0.0, np.inf]
+    room = Room(SECONDS, np.array([ego]))
+    furnish(rng, street, room)
+    populate(rng, street, room, people)
+    return Scene(street.ground, tuple(room.actors), street.speed, kind)

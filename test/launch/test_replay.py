@@ -28,6 +28,7 @@ from visualization_msgs.msg import MarkerArray
 from launch import LaunchDescription
 from lidar_perception.datasets.to_bag import write_bag
 from lidar_perception.nodes.graph import STAGES, result_topics
+from lidar_perception.simulation.scene import CROWDED
 from lidar_perception.simulation.to_bag import simulated_scans
 
 LAUNCH = Path(__file__).resolve().parents[2] / "launch" / "replay.launch.py"
@@ -38,7 +39,7 @@ TIMEOUT = 120.0  # seconds; the first start compiles
 
 @pytest.mark.launch_test
 def generate_test_description():
-    write_bag(FOLDER / "drive", simulated_scans(seed=1, frames=FRAMES), force=True)
+    write_bag(FOLDER / "drive", simulated_scans(seed=19, frames=FRAMES, streets=CROWDED), force=True)
     replay = IncludeLaunchDescription(PythonLaunchDescriptionSource(str(LAUNCH)), launch_arguments={
         "bag": str(FOLDER / "drive"), "scores": str(FOLDER / "scores.json"), "loop": "true",
     }.items())

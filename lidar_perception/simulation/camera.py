@@ -1,0 +1,13 @@
+"""The camera beside the simulated LiDAR: it takes no pictures, but says what is labelled."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidar_perception.datasets.kitti_calibration import KittiCalibration
+
+# A camera of KITTI's field of view, level, 0.27 m ahead of the LiDAR and 0.08 m below it.
+FORWARD_CAMERA = KittiCalibration(
+    intrinsics=np.array([[720.0, 0, 621, 0], [0, 720, 187.5, 0], [0, 0, 1, 0]]),
+    lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]),
+    width=1242, height=375)

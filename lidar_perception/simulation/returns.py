@@ -1,0 +1,68 @@
+"""What a sensor makes of what its rays meet: noise, lost returns and intensity."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lidar_perception.simulation.raycast import Hits
+from lidar_perception.simulation.sensor import STILL, Motion, Sensor, rays
+
+# How a grazed surface weakens a return, as a power of the cosine of the incidence, and how the
+# logarithm of the power scatters. With these the road is lost as ahead of KITTI's car, where in 27
+# scans (median) 0.7 of the rays return from 38 m, 0.5 from 43 m, 0.35 from 50 m and none from 60 m.
+# Losses come in runs: on a SemanticKITTI scan only 0.03 of the returns of the road beyond 35 m are
+# missing between others.
+GRAZING = 1 / 3
+SCATTER, RUN = 0.5, 16  # RUN: columns
+# Of the intensity: so much neighbouring points of one beam differ on the road, sidewalks (0.03) and
+# facades (0.04) of a SemanticKITTI scan (robust standard deviation).
+SPECKLE = 0.035
+
+
+class Returns(NamedTuple):
+    """The points of one turn, beam by beam, each counter-clockwise from straight ahead, as in
+    KITTI's files. xyz (N, 3) float32 m in the sensor's frame; intensity (N,) float32 0..1 in
+    hundredths; owner (N,) int32 and semantic (N,) uint16 as in Hits; ring (N,) uint16, 0 the
+    highest beam; time (N,) float32 seconds after the stamp."""
+
+    xyz: np.ndarray
+    intensity: np.ndarray
+    owner: np.ndarray
+    semantic: np.ndarray
+    ring: np.ndarray
+    time: np.ndarray
+
+
+def measure(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator,
+            compensated: bool = True) -> Returns:
+    """What the sensor reports. compensated: the points are where they were met, in the frame at
+    the stamp, as KITTI publishes them; otherwise as if the sensor had stood still.
+
+    A return is lost where its power, which goes with brightness over range squared, is below that
+    of a surface of brightness 0.1 that faces the sensor at sensor.reach.
+    """
+    shape = hits.range.shape
+    turn = rays(sensor, motion if compensated else STILL)
+    noisy = hits.range + rng.normal(0.0, sensor.range_noise, shape)
+    with np.errstate(divide="ignore"):
+        power = (np.log(hits.brightness / 0.1) + GRAZING * np.log(hits.cosine)
+                 - 2 * np.log(hits.range / sensor.reach))
+    scatter = rng.normal(0.0, SCATTER, (-(-shape[0] // RUN), shape[1]))
+    keep = power > np.repeat(scatter, RUN, axis=0)[:shape[0]]
+    keep &= (rng.random(shape) >= sensor.dropout) & sensor.open_rays()
+    # A hair within the limits, so that rounding to float32 does not step over them.
+    keep &= (noisy > sensor.min_range + 1e-4) & (noisy < sensor.max_range - 1e-4)
+    ring, column = np.nonzero(keep.T)
+    origin = np.broadcast_to(turn.origin, turn.direction.shape)
+    xyz = origin[column, ring] + turn.direction[column, ring] * noisy[column, ring, None]
+    intensity = hits.brightness[column, ring] + rng.normal(0.0, SPECKLE, len(ring))
+    intensity -= sensor.fade[1] * np.maximum(hits.range[column, ring] - sensor.fade[0], 0.0)
+    if sensor.biases:
+        intensity += np.asarray(sensor.biases)[ring]
+    intensity = np.round(np.clip(intensity, 0.0, 1.0), 2)
+    intensity[rng.random(len(intensity)) < sensor.silent] = 0.0
+    time = rays(sensor, motion).since[column]
+    return Returns(xyz.astype(np.float32), intensity.astype(np.float32), hits.owner[column, ring],
+                   hits.semantic[column, ring], ring.astype(np.uint16), time.astype(np.float32))

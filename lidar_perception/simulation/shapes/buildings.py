@@ -1,0 +1,65 @@
+"""Houses: a front with real openings, glass in them and rooms behind."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidar_perception.simulation.shapes.thing import GLASS, METAL, block
+from lidar_perception.simulation.solids import parts
+
+BUILDING = 50
+FOOT = -1.0  # how deep a house reaches into the ground, m
+ROOM = 3.0  # depth of the rooms behind the front, m
+
+
+def building(rng: np.random.Generator, length: float, depth: float, storeys: int) -> np.ndarray:
+    """(P,) PART of a house along x, centred, whose front is at y = 0 and looks to -y; depth at
+    least 4 m. Piers and deep bands, which are the floors, leave the windows open; a beam goes
+    through the glass or not. Base, sills, balconies and the edge of the roof stand out of the
+    front by up to 1.2 m; at most 40 parts for 15 m and four storeys."""
+    x, tone = length / 2, rng.uniform(0.25, 0.55)  # half of SemanticKITTI's: 0.34 to 0.52
+    ground, storey = rng.uniform(2.9, 3.8), rng.uniform(2.7, 3.2)
+    floors = ground + storey * np.arange(storeys)  # the upper faces of the ceilings
+    top = float(floors[-1])
+    wall = dict(reflectance=tone)
+    count = max(int(length / rng.uniform(2.8, 4.0)), 1)
+    pitch, pier = length / count, rng.uniform(0.35, 0.6)
+    places = (np.arange(count + 1) - count / 2) * pitch
+    rows = [block((-x, ROOM, FOOT), (x, depth, top), reflectance=0.2)]
+    rows += [block((max(at - pier * pitch / 2, -x), 0, FOOT), (min(at + pier * pitch / 2, x), 0.35,
+                                                               top), **wall) for at in places]
+    rows += [block((side * x, 0.3, FOOT), (side * (x - 0.3), depth, top), **wall)
+             for side in (-1, 1)]
+    sill = rng.uniform(0.8, 1.0)
+    for below, above in zip([0.0, *floors[:-1]], floors):
+        rows += [block((-x, 0.02, above - 0.55), (x, ROOM, above), **wall),
+                 block((-x, 0.02, below if below else FOOT), (x, 0.33, below + sill), **wall),
+                 block((-x, 0.15, below + sill), (x, 0.17, above - 0.55), reflectance=GLASS,
+                       transmission=rng.uniform(0.5, 0.75))]
+    door = (places[count // 2] + places[count // 2 + 1]) / 2 if count > 1 else 0.0
+    half = (1 - pier) * pitch / 2
+    rows += [block((door - half, 0.0, FOOT), (door + half, 0.1, 2.1), reflectance=0.25),
+             block((door - half - 0.1, -0.3, -0.3), (door + half + 0.1, 0.0, 0.15),
+                   reflectance=0.4),
+             block((-x, -0.05, FOOT), (x, 0.0, rng.uniform(0.4, 0.8)), reflectance=0.8 * tone),
+             block((-x, -rng.uniform(0.2, 0.6), top), (x, depth, top + 0.25), reflectance=0.3)]
+    if rng.random() < 0.6:  # the ridge of the roof
+        rows.append(block((-x, 0.3 * depth, top), (x, 0.7 * depth, top + rng.uniform(1.5, 3.0)),
+                          reflectance=0.3))
+    rows += [row for below in floors[:-1] for row in _front_of(rng, below, sill, x, places, pitch)]
+    return parts(rows, BUILDING)
+
+
+def _front_of(rng: np.random.Generator, below: float, sill: float, x: float, places: np.ndarray,
+              pitch: float) -> list[tuple]:
+    """A sill along an upper storey, or a balcony on it, or nothing."""
+    pick = rng.random()
+    if pick < 0.35:
+        return [block((-x, -0.08, below + sill - 0.08), (x, 0.05, below + sill), reflectance=0.4)]
+    if pick < 0.7 and len(places) > 2:
+        left = places[rng.integers(len(places) - 1)]
+        out = -rng.uniform(0.8, 1.2)
+        return [block((left, out, below - 0.15), (left + pitch, 0, below), reflectance=0.4),
+                block((left, out, below), (left + pitch, out + 0.04, below + 1.0),
+                      reflectance=METAL, transmission=0.5)]
+    return []

@@ -1,0 +1,135 @@
+"""Cyclists, and bicycles and motorcycles without a rider."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from lidar_perception.simulation.shapes.people import knee
+from lidar_perception.simulation.shapes.thing import (
+    METAL,
+    PLATE,
+    RUBBER,
+    SKIN,
+    Thing,
+    block,
+    disc,
+    draw_size,
+    rod,
+)
+from lidar_perception.simulation.solids import BOX, ELLIPSOID, part, parts
+
+BICYCLE, MOTORCYCLE, BICYCLIST = 11, 15, 31
+CRANK, GEAR = 0.17, 5.0  # metres: length of a crank, way for one turn of the cranks
+SPOKES = 0.75  # share of the beams that pass between the spokes
+THIGH, SHANK = 0.26, 0.27  # lengths as shares of the rider's height, down to the pedal
+
+
+class Rider(NamedTuple):
+    """A rider on a bicycle. size: length, width, height in metres; lean: of the trunk, radians;
+    phase: of the cranks, radians; frame, coat, trousers, head: reflectances; load: "", "basket",
+    or "backpack"."""
+
+    size: tuple[float, float, float]
+    lean: float
+    phase: float
+    frame: float
+    coat: float
+    trousers: float
+    head: float
+    load: str = ""
+
+
+def cyclist(rng: np.random.Generator) -> Thing:
+    """Someone who rides; the box's length is the bicycle's, its width the handlebar's."""
+    size = draw_size(rng, "Cyclist")
+    rider = Rider(size, rng.uniform(0.15, 0.6), rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.7),
+                  rng.uniform(0.15, 0.7), rng.uniform(0.1, 0.6), rng.uniform(0.1, 0.6),
+                  ("", "basket", "backpack")[rng.integers(3)])
+    return Thing(partial(riding, rider=rider), size, "Cyclist")
+
+
+def riding(travelled: float, rider: Rider) -> np.ndarray:
+    """(P,) PART of a rider after so many metres; the cranks turn, the wheels are discs that let
+    most beams pass."""
+    length, width, height = rider.size
+    seat = 0.53 * height
+    trunk = (height - seat) / (0.31 * np.cos(rider.lean) + 0.16)  # the rider's height
+    hip = (-0.13 * length, seat)
+    ahead, up = np.sin(rider.lean), np.cos(rider.lean)
+
+    def along(share: float) -> tuple[float, float]:
+        return hip[0] + share * trunk * ahead, seat + share * trunk * up
+
+    shoulder, neck = along(0.27), along(0.31)
+    bar_x, bar_z = 0.22 * length, 0.61 * height
+    head = (neck[0] + 0.03, 0.0, height - 0.075 * trunk)
+    rows = [
+        *_bicycle(length, width / 2, (bar_x, bar_z), (hip[0] - 0.03, seat - 0.1), rider.frame),
+        part(ELLIPSOID, head, (0.057 * trunk, 0.047 * trunk, 0.075 * trunk),
+             reflectance=(SKIN + rider.head) / 2),
+        part(ELLIPSOID, (along(0.15)[0], 0.0, along(0.15)[1]),
+             (0.08 * trunk, min(0.125 * trunk, 0.42 * width), 0.17 * trunk), pitch=rider.lean,
+             reflectance=rider.coat),
+        part(ELLIPSOID, (hip[0], 0.0, seat + 0.02), (0.16, min(0.17, 0.4 * width), 0.11),
+             reflectance=rider.trousers)]
+    turn = rider.phase + 2 * np.pi * travelled / GEAR
+    for side, at in ((-1, turn), (1, turn + np.pi)):
+        foot = (-0.02 * length + CRANK * np.sin(at), 0.17 * height + CRANK * np.cos(at))
+        thigh, shank = THIGH * trunk, SHANK * trunk
+        x, z = knee(hip, foot, thigh, shank)
+        y = side * 0.11
+        rows += [rod((*hip[:1], y, seat), (x, y, z), 0.085, reflectance=rider.trousers),
+                 rod((x, y, z), (foot[0], y, foot[1] + 0.03), 0.06, reflectance=rider.trousers),
+                 part(BOX, (foot[0] + 0.05, y, foot[1]), (0.13, 0.045, 0.03), reflectance=RUBBER),
+                 rod((shoulder[0], side * min(0.11 * trunk, 0.36 * width), shoulder[1]),
+                     (bar_x, side * (width / 2 - 0.06), bar_z), 0.05, reflectance=rider.coat)]
+    if rider.load == "basket":
+        rows.append(block((bar_x + 0.05, -0.16, bar_z - 0.3), (bar_x + 0.33, 0.16, bar_z - 0.05),
+                          reflectance=METAL, transmission=0.4))
+    elif rider.load == "backpack":
+        x, z = along(0.18)
+        rows.append(part(ELLIPSOID, (x - 0.17 * up, 0.0, z + 0.17 * ahead), (0.1, 0.14, 0.22),
+                         pitch=rider.lean, reflectance=0.2))
+    return parts(rows, BICYCLIST)
+
+
+def _bicycle(length: float, half_bar: float, bar: tuple, seat: tuple, frame: float) -> list[tuple]:
+    """Wheels, tubes and handlebar, with bar (x, z) and seat (x, z)."""
+    radius = 0.19 * length
+    axle, crank = length / 2 - radius, (-0.02 * length, 0.0, 0.88 * radius)
+    return [disc((-axle, 0, radius), radius, 0.02, reflectance=0.3, transmission=SPOKES),
+            disc((axle, 0, radius), radius, 0.02, reflectance=0.3, transmission=SPOKES),
+            rod((axle, 0, radius), (bar[0], 0, bar[1]), 0.02, reflectance=frame),
+            rod(crank, (0.85 * bar[0], 0, 0.8 * bar[1]), 0.025, reflectance=frame),
+            rod(crank, (seat[0], 0, seat[1]), 0.025, reflectance=frame),
+            rod((bar[0], -half_bar, bar[1]), (bar[0], half_bar, bar[1]), 0.018, reflectance=METAL)]
+
+
+def parked_bicycle(rng: np.random.Generator) -> np.ndarray:
+    """(P,) PART of a bicycle that stands, with a reflector that shines."""
+    length = rng.uniform(1.6, 1.85)
+    seat = (-0.15 * length, 0.92)
+    rows = [*_bicycle(length, 0.3, (0.22 * length, 1.02), seat, rng.uniform(0.05, 0.5)),
+            part(ELLIPSOID, (seat[0], 0, seat[1]), (0.13, 0.08, 0.05), reflectance=RUBBER),
+            block((seat[0] - 0.4, -0.04, 0.68), (seat[0] - 0.38, 0.04, 0.74), reflectance=PLATE)]
+    return parts(rows, BICYCLE)
+
+
+def parked_motorcycle(rng: np.random.Generator) -> np.ndarray:
+    """(P,) PART of a motorcycle or scooter that stands."""
+    length, paint = rng.uniform(1.8, 2.2), rng.uniform(0.05, 0.5)
+    radius = rng.uniform(0.25, 0.31)
+    axle = length / 2 - radius
+    rows = [disc((-axle, 0, radius), radius, 0.07, reflectance=RUBBER),
+            disc((axle, 0, radius), radius, 0.06, reflectance=RUBBER),
+            part(ELLIPSOID, (0, 0, 0.5), (0.45, 0.18, 0.28), reflectance=paint),
+            part(ELLIPSOID, (-0.45, 0, 0.78), (0.4, 0.15, 0.09), reflectance=RUBBER),
+            part(ELLIPSOID, (0.18, 0, 0.85), (0.28, 0.17, 0.14), reflectance=paint),
+            rod((axle, 0, radius), (axle - 0.3, 0, 1.02), 0.06, reflectance=METAL),
+            rod((axle - 0.3, -0.36, 1.02), (axle - 0.3, 0.36, 1.02), 0.02, reflectance=METAL),
+            block((-length / 2 + 0.05, -0.1, 0.55), (-length / 2 + 0.07, 0.1, 0.7),
+                  reflectance=PLATE)]
+    return parts(rows, MOTORCYCLE)

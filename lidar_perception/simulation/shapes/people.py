@@ -1,0 +1,243 @@
+"""Pedestrians who walk or stand, with what they carry, and people who sit."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from lidar_perception.simulation.shapes.thing import (
+    METAL,
+    RUBBER,
+    SKIN,
+    Thing,
+    block,
+    disc,
+    draw_size,
+    rigid,
+    rod,
+)
+from lidar_perception.simulation.solids import BOX, ELLIPSOID, extents, part, parts
+
+PERSON, OTHER = 30, 99
+CARRIED = ("", "backpack", "bag", "umbrella", "trolley", "pram")
+
+STANCE = 0.54  # share of a stride for which a foot is on the ground; real walkers: 0.6
+SHORTEST = 0.3  # shortest box as a share of the height, in KITTI
+HEEL_OFF = 0.6  # share of the stance after which the heel rises
+# Lengths as shares of the height, after Drillis and Contini (1966); radii with clothes.
+THIGH, SHANK, ANKLE, FOOT, SHOULDER, UPPER_ARM, FOREARM = (0.245, 0.246, 0.039, 0.152, 0.818,
+                                                           0.186, 0.2)
+REACH = 0.99 * (THIGH + SHANK)
+HIP = REACH + ANKLE
+
+
+class Build(NamedTuple):
+    """A person. step: metres from one footfall to the next, 0 stands; phase: share of a stride at
+    the start; shift: metres that the hips are ahead of the origin; hair, coat, trousers:
+    reflectances; carried: one of CARRIED."""
+
+    height: float
+    width: float
+    step: float
+    phase: float
+    hair: float
+    coat: float
+    trousers: float
+    carried: str = ""
+    shift: float = 0.0
+
+
+def pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
+               carried: str = "") -> Thing:
+    """Someone who walks at speed m/s, or stands. The length of the box is what the body covers
+    over a whole stride, without a bag, umbrella, trolley or pram, but not below SHORTEST.
+
+    Faster walkers take longer steps, too: the steps grow with the root of the speed (Sekiya et
+    al. 1996: length over rate is 0.0065 m min for all speeds).
+    """
+    _, width, height = draw_size(rng, "Pedestrian")
+    if child:
+        shrink = rng.uniform(0.62, 0.8)
+        width, height = width * max(shrink, 0.7), height * shrink
+    step = min(np.sqrt(60 * 0.0065 * abs(speed)) * height / 1.72, 0.5 * height)
+    build = Build(height, max(width, 0.27 * height), step, rng.uniform(), rng.uniform(0.03, 0.3),
+                  rng.uniform(0.15, 0.7), rng.uniform(0.1, 0.6), carried)
+    low, high = _covered(build)
+    build = build._replace(shift=-(low + high) / 2)
+    size = (max(high - low, SHORTEST * height), build.width, height)
+    return Thing(partial(walker, build=build), size, "Pedestrian")
+
+
+def _covered(build: Build) -> tuple[float, float]:
+    """The least and largest x over a stride; both halves of it are alike."""
+    body = build._replace(carried="backpack" if build.carried == "backpack" else "", phase=0.0)
+    poses = np.arange(12) / 12 * build.step if build.step else [0.0]
+    low, high = extents(np.concatenate([walker(x, body) for x in poses]))
+    return float(low[:, 0].min()), float(high[:, 0].max())
+
+
+def walker(travelled: float, build: Build) -> np.ndarray:
+    """(P,) PART of a walker after so many metres; the last two rows before what is carried are the
+    feet, right and left. A foot on the ground stays where it is, and the hips sink as far as the
+    legs spread, so that the height is the box's when a leg is upright below the hips."""
+    h, w, _, _, hair, coat, trousers, carried, shift = build
+    turns = build.phase + (travelled / (2 * build.step) if build.step else 0.0)
+    feet = [_foot((turns + half) % 1.0, 2 * build.step, h) for half in (0.0, 0.5)]
+    hip = min(HIP * h, *(z + np.sqrt((REACH * h) ** 2 - min(0.88 * abs(x), 0.9 * REACH * h) ** 2)
+                         for _, _, (x, z) in feet))
+    up = hip - HIP * h
+    rows = [
+        part(ELLIPSOID, (0.012 * h, 0, 0.93 * h + up), (0.055 * h, 0.045 * h, 0.068 * h),
+             reflectance=SKIN),
+        part(ELLIPSOID, (-0.012 * h, 0, 0.948 * h + up), (0.05 * h, 0.047 * h, 0.052 * h),
+             reflectance=hair),
+        rod((0, 0, 0.8 * h + up), (0.005 * h, 0, 0.89 * h + up), 0.032 * h, reflectance=SKIN),
+        part(ELLIPSOID, (0, 0, 0.70 * h + up), (0.08 * h, min(0.125 * h, 0.42 * w), 0.15 * h),
+             reflectance=coat),
+        part(ELLIPSOID, (0, 0, 0.54 * h + up), (0.075 * h, min(0.105 * h, 0.38 * w), 0.11 * h),
+             reflectance=trousers)]
+    for side, (u, left) in zip((-1, 1), ((turns + 0.5, False), (turns, True))):
+        rows += _arm(side, u, build, up, left)
+    for side, (_, _, ankle) in zip((-1, 1), feet):
+        rows += _leg(side, ankle, hip, h, trousers)
+    for side, (toe, tilt, _) in zip((-1, 1), feet):
+        cos, sin, half = np.cos(tilt), np.sin(tilt), FOOT * h / 2
+        rows.append(part(BOX, (toe[0] - half * cos + 0.02 * h * sin, side * 0.055 * h,
+                               toe[1] + half * sin + 0.02 * h * cos),
+                         (half, 0.03 * h, 0.02 * h), pitch=tilt, reflectance=RUBBER))
+    made = parts(rows + _load(carried, h, w, up, coat), PERSON)
+    made["centre"][:, 0] += shift
+    return made
+
+
+def _foot(u: float, stride: float, h: float) -> tuple[tuple, float, tuple]:
+    """The tip of the sole (x, z), the tilt of the foot (heel up) and the ankle (x, z) at share u
+    of a stride, in metres from the hips and the ground. It stands from u = 0 to STANCE."""
+    most = 0.6 * min(stride / (0.8 * h), 1.0)
+    if u < STANCE:
+        x = (STANCE / 2 - u) * stride
+        lift, rise = 0.0, max(u / STANCE - HEEL_OFF, 0.0) / (1 - HEEL_OFF)
+    else:
+        v = (u - STANCE) / (1 - STANCE)
+        smooth = v * v * (3 - 2 * v)
+        x = stride * (STANCE * (smooth - 0.5))
+        lift, rise = 0.03 * stride * np.sin(np.pi * v), 1.0 - smooth
+    tilt = most * rise
+    ahead = 0.7 * FOOT * h  # from the ankle to the tip
+    cos, sin = np.cos(tilt), np.sin(tilt)
+    toe = (x + ahead, lift)
+    ankle = (toe[0] - ahead * cos + ANKLE * h * sin, lift + ahead * sin + ANKLE * h * cos)
+    return toe, tilt, ankle
+
+
+def _leg(side: int, ankle: tuple, hip: float, h: float, trousers: float) -> list[tuple]:
+    """Thigh and shank; the knee bends forward as far as the ankle is near. The pelvis turns with
+    the legs."""
+    start = (0.12 * ankle[0], hip)
+    x, z = knee(start, ankle, THIGH * h, SHANK * h)
+    y = side * 0.055 * h
+    return [rod((start[0], y, hip), (x, y, z), 0.05 * h, reflectance=trousers),
+            rod((x, y, z), (ankle[0], y, ankle[1]), 0.037 * h, reflectance=trousers)]
+
+
+def knee(hip: tuple, ankle: tuple, thigh: float, shank: float) -> tuple[float, float]:
+    """Where the knee is (x, z) between a hip and an ankle (x, z)."""
+    x, z = ankle[0] - hip[0], ankle[1] - hip[1]
+    far = np.hypot(x, z)
+    x, z = x / far, z / far
+    far = min(far, 0.9999 * (thigh + shank))
+    along = (thigh ** 2 - shank ** 2 + far ** 2) / (2 * far)
+    bend = np.sqrt(max(thigh ** 2 - along ** 2, 0.0))
+    return hip[0] + along * x - bend * z, hip[1] + along * z + bend * x
+
+
+def _arm(side: int, u: float, build: Build, up: float, left: bool) -> list[tuple]:
+    """Upper arm and forearm, which swings with the other leg, or holds what is carried. The
+    forearm reaches the width of the box."""
+    h, w, coat = build.height, build.width, build.coat
+    swing = 0.45 * min(build.step / (0.43 * h), 1.2) * np.cos(2 * np.pi * u)
+    bend = 0.3 if build.step else build.phase  # who stands holds the arms in many ways
+    if build.carried == "pram" or (build.carried == "umbrella" and left):
+        swing, bend = 0.2, (1.1 if build.carried == "pram" else 2.2)
+    elif build.carried == "trolley" and not left:
+        swing, bend = -0.45, 0.0
+    radius = 0.03 * h
+    y = side * (w / 2 - radius)
+    shoulder = (0.0, side * min(0.115 * h, w / 2 - 2 * radius), SHOULDER * h + up)
+    elbow = (UPPER_ARM * h * np.sin(swing), y, shoulder[2] - UPPER_ARM * h * np.cos(swing))
+    hand = (elbow[0] + FOREARM * h * np.sin(swing + bend), y,
+            elbow[2] - FOREARM * h * np.cos(swing + bend))
+    return [rod(shoulder, elbow, radius, reflectance=coat),
+            rod(elbow, hand, radius, reflectance=coat)]
+
+
+def _load(carried: str, h: float, w: float, up: float, coat: float) -> list[tuple]:
+    """What somebody carries, pulls or pushes; bag and trolley on the right."""
+    if carried == "backpack":
+        return [part(ELLIPSOID, (-0.1 * h, 0, 0.7 * h + up), (0.07 * h, 0.085 * h, 0.13 * h),
+                     reflectance=0.5 * coat)]
+    if carried == "bag":
+        return [block((-0.15, -w / 2 - 0.05, 0.28 * h), (0.15, -w / 2 + 0.05, 0.28 * h + 0.3),
+                      reflectance=0.35, semantic=OTHER)]
+    if carried == "umbrella":
+        top = h + 0.25
+        return [part(ELLIPSOID, (0.08, 0, top - 0.11), (0.5, 0.5, 0.11), reflectance=coat),
+                rod((0.1, w / 2 - 0.06, 0.7 * h), (0.08, 0.02, top - 0.1), 0.01,
+                    reflectance=METAL)]
+    if carried == "trolley":
+        y = -w / 2 + 0.03
+        return [block((-0.85, y - 0.18, 0.05), (-0.6, y + 0.18, 0.6), reflectance=0.25,
+                      semantic=OTHER),
+                rod((-0.6, y, 0.6), (-0.25, y, 0.47 * h), 0.015, reflectance=METAL,
+                    semantic=OTHER),
+                disc((-0.72, y, 0.05), 0.05, 0.18, reflectance=RUBBER, semantic=OTHER)]
+    if carried == "pram":
+        return [part(ELLIPSOID, (0.85, 0, 0.72), (0.42, 0.22, 0.2), reflectance=0.3,
+                     semantic=OTHER),
+                part(ELLIPSOID, (0.66, 0, 0.88), (0.25, 0.23, 0.2), reflectance=0.25,
+                     semantic=OTHER),
+                rod((0.25, 0, 0.6 * h), (1.1, 0, 0.3), 0.02, reflectance=METAL, semantic=OTHER),
+                disc((0.55, 0, 0.14), 0.14, 0.27, reflectance=RUBBER, transmission=0.6,
+                     semantic=OTHER),
+                disc((1.15, 0, 0.12), 0.12, 0.25, reflectance=RUBBER, transmission=0.6,
+                     semantic=OTHER)]
+    return []
+
+
+def sitting(rng: np.random.Generator, chair: bool = True) -> Thing:
+    """Someone who sits, knees and feet ahead; without a chair they need a bench below them, whose
+    seat is 0.45 m high. The box holds the person and the chair."""
+    length, width, height = size = draw_size(rng, "Person_sitting")
+    coat, trousers = rng.uniform(0.15, 0.7), rng.uniform(0.1, 0.6)
+    front, back, seat = length / 2, -length / 2, 0.45
+    hip, trunk = back + 0.22, height - seat
+    knees, radius = front - 0.18, 0.05
+    rows = [
+        part(ELLIPSOID, (hip + 0.04, 0, height - 0.115), (0.095, 0.08, 0.115), reflectance=SKIN),
+        part(ELLIPSOID, (hip, 0, seat + 0.42 * trunk), (0.13, min(0.2, 0.36 * width),
+                                                        0.38 * trunk), reflectance=coat),
+        part(ELLIPSOID, (hip, 0, seat + 0.1), (0.15, min(0.18, 0.36 * width), 0.11),
+             reflectance=trousers)]
+    for side in (-1, 1):
+        y = side * 0.1
+        rows += [rod((hip, y, seat + 0.09), (knees, y, seat + 0.07), 0.075, reflectance=trousers),
+                 rod((knees, y, seat + 0.07), (knees, y, 0.07), 0.055, reflectance=trousers),
+                 block((front - 0.26, y - 0.05, 0.0), (front, y + 0.05, 0.08),
+                       reflectance=RUBBER)]
+        y = side * (width / 2 - radius)
+        elbow, hand = (hip, y, seat + 0.32 * trunk), (knees - 0.05, y, seat + 0.2)
+        rows += [rod((hip, side * 0.3 * width, seat + 0.68 * trunk), elbow, radius,
+                     reflectance=coat), rod(elbow, hand, radius, reflectance=coat)]
+    if chair:
+        rows += [block((back + 0.03, -0.22, seat - 0.04), (hip + 0.28, 0.22, seat),
+                       reflectance=METAL, semantic=OTHER),
+                 block((back, -0.22, seat), (back + 0.03, 0.22, seat + 0.42), reflectance=METAL,
+                       semantic=OTHER)]
+        rows += [rod((x, 0.0, 0.0), (x, 0.0, seat), 0.02, reflectance=METAL, semantic=OTHER)
+                 for x in (back + 0.05, hip + 0.25)]
+    else:
+        rows.append(part(ELLIPSOID, (back + 0.1, 0, seat + 0.45 * trunk), (0.1, 0.1, 0.2),
+                         reflectance=coat))
+    return rigid(parts(rows, PERSON), size, "Person_sitting")

@@ -1,0 +1,150 @@
+"""Cars and vans: a hollow body with wheels in arches, and a cabin of panes with seats inside."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lidar_perception.simulation.shapes.thing import (
+    GLASS,
+    PLATE,
+    Thing,
+    block,
+    disc,
+    draw_size,
+    rigid,
+    rod,
+    slope,
+    upright_pane,
+)
+from lidar_perception.simulation.solids import ELLIPSOID, part, parts
+
+CAR = 10
+PILLAR = 0.035  # radius, m
+LIGHTS = 0.9
+
+
+class Style(NamedTuple):
+    """The outline of a body from the side. Places along the body are shares of its length from
+    the tail (0) to the nose (1): where the windscreen ends at the bonnet and at the roof, where
+    the roof ends behind and the rear window below. bonnet and belt: heights of the bonnet and of
+    the lower edge of the windows as shares of the height. load: from the tail up to here the body
+    is closed up to the roof, as a panel van's."""
+
+    screen_low: float
+    screen_high: float
+    roof_rear: float
+    rear_low: float
+    bonnet: float
+    belt: float
+    load: float = 0.0
+
+
+HATCHBACK = Style(0.74, 0.55, 0.12, 0.03, 0.60, 0.63)
+SEDAN = Style(0.71, 0.53, 0.27, 0.13, 0.60, 0.63)
+ESTATE = Style(0.73, 0.55, 0.07, 0.03, 0.59, 0.63)
+SUV = Style(0.74, 0.58, 0.06, 0.02, 0.60, 0.62)
+MINIBUS = Style(0.85, 0.70, 0.03, 0.01, 0.52, 0.56)
+PANEL_VAN = Style(0.85, 0.70, 0.03, 0.01, 0.52, 0.56, 0.55)
+
+
+def car(rng: np.random.Generator, driver: bool = True) -> Thing:
+    """A car of random size, body and paint. driver: whether someone sits in it."""
+    size = draw_size(rng, "Car")
+    if size[2] > 1.62:
+        style = SUV
+    elif size[0] > 4.2:
+        style = (SEDAN, SEDAN, ESTATE)[rng.integers(3)]
+    else:
+        style = (HATCHBACK, HATCHBACK, HATCHBACK, ESTATE, SEDAN)[rng.integers(5)]
+    return rigid(body(size, style, paint(rng), rng.uniform(0.8, 0.92), driver), size, "Car")
+
+
+def van(rng: np.random.Generator, driver: bool = True) -> Thing:
+    """A minibus or a panel van of random size and paint."""
+    size = draw_size(rng, "Van")
+    style = PANEL_VAN if rng.random() < 0.6 else MINIBUS
+    return rigid(body(size, style, max(paint(rng), paint(rng)), rng.uniform(0.6, 0.9), driver),
+                 size, "Van")
+
+
+def paint(rng: np.random.Generator) -> float:
+    """The reflectance of a coat of paint. Half of all points on KITTI's cars are below 0.03 and a
+    tenth is above 0.4: dark paint throws the beam away."""
+    dark, middle, light = (0.005, 0.04), (0.04, 0.35), (0.35, 0.85)
+    return float(rng.uniform(*(dark, middle, light)[rng.choice(3, p=(0.5, 0.25, 0.25))]))
+
+
+def body(size: tuple[float, float, float], style: Style, colour: float, glass: float,
+         driver: bool = True) -> np.ndarray:
+    """(P,) PART. size: length, width, height in metres, without the mirrors; colour: reflectance;
+    glass: share of the beams that pass a pane. Below the belt are door panels, boxes over the
+    axles and a floor with sills between the wheels."""
+    length, width, height = size
+    x, y = length / 2, width / 2
+    radius = min(0.205 * height, 0.34)
+    arch, clear = 2 * radius, 0.13 * height
+    axle = max(0.305 * length, x - 0.95)
+    front, rear = axle - radius - 0.03, radius + 0.03 - axle
+    belt, bonnet = style.belt * height, style.bonnet * height
+    low, high, roof, tail = ((share - 0.5) * length for share in style[:4])
+    load = (style.load - 0.5) * length if style.load else rear - radius
+    deck = height if style.load else belt
+    top, narrow = height - 0.05, 0.86 * y if not style.load else 0.92 * y
+    shell = dict(reflectance=colour)
+    pane = dict(reflectance=GLASS, transmission=glass)
+    rows = [
+        block((rear, -0.98 * y, clear), (front, 0.98 * y, arch), reflectance=0.5 * colour),
+        block((low, -0.97 * y, arch), (x - 0.25, 0.97 * y, bonnet), **shell),
+        block((0.15 - x, -0.97 * y, arch), (load, 0.97 * y, deck - 0.02), **shell),
+        _nose(x, 0.97 * y, clear, bonnet, shell),
+        _nose(-x, 0.97 * y, clear, belt, shell),
+        block((roof, -narrow, height - 0.06), (high, narrow, height), **shell),
+        slope((low, bonnet), (high, top), 0.9 * y, **pane)]
+    if style.load:
+        rows.append(block((0.02 - x, -0.95 * y, belt), (0.2 - x, 0.95 * y, top), **shell))
+    else:
+        rows.append(slope((roof, top), (tail, belt), 0.88 * y, **pane))
+    for side in (-1, 1):
+        start, end = (load if style.load else (roof + tail) / 2), (low + high) / 2
+        rows += [
+            block((0.15 - x, side * y, arch), (low + 0.02, side * (y - 0.05), belt), **shell),
+            upright_pane((start, end), (side * 0.97 * y, belt), (side * narrow, top), **pane),
+            rod((low, side * 0.95 * y, bonnet), (high, side * narrow, top), PILLAR, **shell),
+            disc((axle, side * (y - 0.1), radius), radius, 0.1, reflectance=0.2),
+            disc((-axle, side * (y - 0.1), radius), radius, 0.1, reflectance=0.2),
+            part(ELLIPSOID, (low - 0.1, side * (y + 0.08), belt + 0.05), (0.07, 0.1, 0.08),
+                 **shell)]
+        if not style.load:
+            rows += [rod((max(tail, 0.06 - x), side * 0.91 * y, belt),
+                         (max(roof, 0.06 - x), side * narrow, top - 0.02), 0.06, **shell),
+                     rod((-0.02 * length, side * 0.95 * y, belt),
+                         (-0.02 * length, side * narrow, top), PILLAR, **shell)]
+    rows += [  # plates in front and behind; the tail lights are the ends of a strip in the tail
+        block((x - 0.02, -0.26, 0.28 * height), (x, 0.26, 0.28 * height + 0.11), reflectance=PLATE),
+        block((-x, -0.26, 0.4 * height), (0.02 - x, 0.26, 0.4 * height + 0.11), reflectance=PLATE),
+        block((0.1 - x, -0.92 * y, 0.38 * height), (0.2 - x, 0.92 * y, 0.46 * height),
+              reflectance=LIGHTS)]
+    rows += _seats(0.5 * (low + high) - 0.75, load, 0.75 * y, arch, 0.45 * belt + 0.55 * top,
+                   driver)
+    return parts(rows, CAR)
+
+
+def _nose(x: float, y: float, low: float, high: float, surface: dict) -> tuple:
+    """A nose or tail that ends at x, rounded when seen from above."""
+    return part(ELLIPSOID, (x - np.sign(x) * 0.45, 0.0, (low + high) / 2),
+                (0.45, y, (high - low) / 2), **surface)
+
+
+def _seats(x: float, rear: float, y: float, low: float, high: float, driver: bool) -> list[tuple]:
+    """Backs of the front seats at x, of the bench ahead of rear if there is room, the driver.
+    Some beams end on none of them: what comes back through two panes is weak."""
+    cloth = dict(reflectance=0.1, transmission=0.3)
+    rows = [block((x - 0.08, -y, low), (x + 0.04, y, high), **cloth)]
+    if x - rear > 0.9:
+        rows.append(block((rear + 0.1, -y, low), (rear + 0.25, y, high - 0.05), **cloth))
+    if driver:
+        rows.append(part(ELLIPSOID, (x + 0.18, y / 2 + 0.06, (low + high) / 2 + 0.05),
+                         (0.13, 0.2, (high - low) / 2 + 0.08), reflectance=0.25))
+    return rows

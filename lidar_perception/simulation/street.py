@@ -1,0 +1,206 @@
+"""Kinds of streets, and how their lanes, sidewalks and side streets lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from lidar_perception.simulation.actors import Actor, prop
+from lidar_perception.simulation.shapes.thing import Thing
+from lidar_perception.simulation.terrain import Ground
+
+BEHIND, AHEAD = 100.0, 130.0  # metres of street behind the start and beyond the end of a drive
+CORNER = 2.5                  # sidewalk along a side street, m
+ARM = 60.0                    # length of a side street, m
+PARALLEL, ACROSS = 2.2, 5.0   # widths of parking strips: cars along the curb, or nose to it
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Ranges (low, high) are drawn from uniformly; lengths in metres, speeds in m/s; shares,
+    chances and the weights of fronts are in 0 .. 1; rates count per 100 m."""
+
+    share: float                      # how often it is drawn, a choice
+    fronts: dict[str, float]          # what lines a side (roadside.py), and how often
+    lane: tuple[float, float] = (3.0, 3.5)
+    beside: tuple[int, int] = (0, 1)  # how many more lanes in our direction, high excluded
+    oncoming: tuple[int, int] = (1, 2)
+    rails: float = 0.0                # chance of tram tracks
+    cycle: float = 0.0                # chance of a strip for bicycles
+    parking: float = 0.0              # chance of parking strips
+    across: float = 0.0               # chance that cars park nose to the curb
+    taken: tuple[float, float] = (0.0, 0.6)
+    walk: tuple[float, float] = (1.6, 3.0)
+    curb: float = 0.12
+    crossing: tuple[float, float] = (50.0, 120.0)  # from one side street to the next
+    speed: tuple[float, float] = (3.0, 13.0)
+    stands: float = 0.15              # chance that a lane stands
+    headway: float = 5.0              # mean time between vehicles of a lane, s, beyond the least
+    lamp: float = 3.0                 # rates for each side
+    tree: float = 4.0
+    clutter: float = 4.0
+    walkers: float = 1.5
+    standers: float = 0.5
+    seats: float = 0.05
+    riders: float = 0.3
+
+
+KINDS = {
+    "city": Kind(0.28, {"facade": 0.65, "garden": 0.15, "verge": 0.2}, cycle=0.25, parking=0.65,
+                 across=0.15, walk=(2.0, 4.5), rails=0.05, clutter=7, walkers=2.2, standers=0.7,
+                 riders=0.5, crossing=(45, 100)),
+    "residential": Kind(0.30, {"garden": 0.8, "facade": 0.1, "verge": 0.1}, lane=(2.8, 3.2),
+                        parking=0.5, walk=(1.5, 2.4), speed=(2.0, 9.0), headway=12.0, tree=3.0,
+                        stands=0.1, walkers=0.6, standers=0.2, seats=0.02, riders=0.3),
+    "arterial": Kind(0.20, {"verge": 0.8, "facade": 0.1, "wild": 0.1}, lane=(3.2, 3.7),
+                     beside=(0, 2), oncoming=(1, 3), rails=0.4, cycle=0.4, parking=0.15,
+                     walk=(2.0, 3.5), crossing=(90, 200), speed=(5.0, 14.0), headway=3.0,
+                     tree=5.0, walkers=0.6, riders=0.5),
+    "country": Kind(0.13, {"wild": 1.0}, walk=(0.0, 0.0), curb=0.0, crossing=(150, 400),
+                    speed=(7.0, 14.0), stands=0.05, headway=5.0, lamp=0.5, tree=0.0, clutter=1.0,
+                    walkers=0.1, standers=0.0, seats=0.0, riders=0.2),
+    "zone": Kind(0.09, {"facade": 0.6, "square": 0.4}, walk=(4.0, 8.0), curb=0.03, rails=0.1,
+                 speed=(0.5, 3.5), stands=0.4, headway=40.0, tree=3.0, clutter=8.0, walkers=6.0,
+                 standers=2.0, seats=0.3, riders=1.5, crossing=(40, 80), parking=0.1),
+}
+
+
+class Lane(NamedTuple):
+    """A lane with its middle line at y; direction 1 along x or -1; use: road, rail or cycle."""
+
+    y: float
+    direction: int
+    speed: float
+    use: str = "road"
+
+
+class Side(NamedTuple):
+    """The line of a curb from x, y along heading. What is beyond it lies to its left: walk metres
+    of sidewalk, then the front. parking: width of the strip on this side of the curb."""
+
+    x: float
+    y: float
+    heading: float
+    length: float
+    walk: float
+    front: str
+    parking: float = 0.0
+
+    def put(self, thing: Thing | np.ndarray, along: float, out: float, turn: float = 0.0,
+            **moves) -> Actor:
+        """An actor so far along the curb and out from it, turned against its line; parts (P,) PART
+        are a thing without a label."""
+        thing = prop(thing) if isinstance(thing, np.ndarray) else thing
+        cos, sin = np.cos(self.heading), np.sin(self.heading)
+        return Actor(thing, self.x + cos * along - sin * out, self.y + sin * along + cos * out,
+                     self.heading + turn, **moves)
+
+
+class Street(NamedTuple):
+    """What lay_out drew. blocks: sides between the crossings; arms: sides of the side streets.
+    speed of the ego vehicle."""
+
+    kind: Kind
+    ground: Ground
+    lanes: tuple[Lane, ...]
+    blocks: tuple[Side, ...]
+    arms: tuple[Side, ...]
+    speed: float
+    start: float
+    end: float
+
+
+def lay_out(rng: np.random.Generator, kind: Kind, seconds: float) -> Street:
+    """A street long enough for a drive of so many seconds."""
+    speed = 0.0 if rng.random() < kind.stands else rng.uniform(*kind.speed)
+    start, end = -BEHIND, speed * seconds + AHEAD
+    parking = 0.0
+    if rng.random() < kind.parking:
+        parking = ACROSS if rng.random() < kind.across else PARALLEL
+    lanes, right, left = _lanes(rng, kind, speed, parking)
+    walk, crossings = rng.uniform(*kind.walk), _crossings(rng, kind, start, end)
+    # Slopes of 27 scans of KITTI: 0.67 +- 0.2 degrees ahead (the sensor's own pitch), +- 0.45
+    # aside. Wave, camber, roughness and reflectances are guesses.
+    ground = Ground(*np.tan(np.radians(rng.normal((0.6, 0.05), (0.25, 0.4)))),
+                    wave=rng.uniform(0.03, 0.16), wavelength=rng.uniform(25, 60),
+                    camber=rng.uniform(0.01, 0.035), curb_left=left, curb_right=right,
+                    curb_height=kind.curb * rng.uniform(0.6, 1.2), walk=walk, crossings=crossings,
+                    parking=parking, rough=rng.uniform(0.03, 0.12),
+                    road=rng.uniform(0.23, 0.38), sidewalk=rng.uniform(0.33, 0.48),
+                    grass=rng.uniform(0.3, 0.4))
+    names, weights = list(kind.fronts), list(kind.fronts.values())
+    fronts = rng.choice(names, 2, p=weights)
+    edges = [start, *np.ravel(crossings), end]
+    blocks = []
+    for low, high in zip(edges[::2], edges[1::2]):
+        for y, heading, front in ((left, 0.0, fronts[0]), (right, np.pi, fronts[1])):
+            front = front if rng.random() < 0.7 else rng.choice(names, p=weights)
+            blocks.append(Side(low if y > 0 else high, y, heading, high - low, walk, str(front),
+                               parking))
+    arms = [_arm(rng.choice(fronts), x, land, curb, up, walk, parked_width(crossing))
+            for crossing in crossings for curb, up in ((left, 1), (right, -1))
+            for x, land in zip(crossing, (-1, 1))]
+    return Street(kind, ground, lanes, tuple(blocks), tuple(arms), speed, start, end)
+
+
+def _lanes(rng, kind: Kind, speed: float, parking: float) -> tuple[tuple[Lane, ...], float, float]:
+    """The lanes, ours first, and the curbs right and left of them."""
+    width = rng.uniform(*kind.lane)
+    lanes, right = [Lane(0.0, 1, speed)], -width / 2
+    for _ in range(rng.integers(*kind.beside)):
+        lanes.append(Lane(right - width / 2, 1, _lane_speed(rng, kind)))
+        right -= width
+    left, use = width / 2, ["road"] * rng.integers(*kind.oncoming)
+    ways = [-1] * len(use)
+    if rng.random() < kind.rails:
+        use, ways = ["rail", "rail", *use], [1, -1, *ways]
+    for what, way in zip(use, ways):
+        lanes.append(Lane(left + width / 2, way, _lane_speed(rng, kind), what))
+        left += width
+    strip = 1.6 if rng.random() < kind.cycle else 0.0
+    if strip:
+        lanes += [Lane(right - strip / 2, 1, 5.0, "cycle"),
+                  Lane(left + strip / 2, -1, 5.0, "cycle")]
+    edge = strip + parking + rng.uniform(0.1, 0.6)
+    return tuple(lanes), right - edge, left + edge
+
+
+def _lane_speed(rng, kind: Kind) -> float:
+    return 0.0 if rng.random() < kind.stands else rng.uniform(*kind.speed)
+
+
+def _crossings(rng, kind: Kind, start: float, end: float) -> tuple[tuple[float, float], ...]:
+    """x intervals of side streets; none at the very ends."""
+    found, x = [], start + rng.uniform(0.1, 1.0) * kind.crossing[1]
+    while x < end - 20:
+        width = rng.uniform(5.5, 7.0) + 2 * PARALLEL * (rng.random() < kind.parking)
+        found.append((x, x + width))
+        x += width + rng.uniform(*kind.crossing)
+    return tuple(found)
+
+
+def _arm(front: str, x: float, land: int, curb: float, up: int, walk: float,
+         parking: float) -> Side:
+    """The side of a side street at x, with its land towards land * x, that leaves the street from
+    behind the houses at its curb towards up * y."""
+    near = curb + up * (walk + 9.0)
+    return Side(x, near if up == -land else near + up * ARM, -land * np.pi / 2, ARM, CORNER,
+                str(front), parking)
+
+
+def parked_width(crossing: tuple[float, float]) -> float:
+    """The width of the parking strips on both sides of a side street."""
+    return PARALLEL if crossing[1] - crossing[0] > 8.0 else 0.0
+
+
+def spread(rng, length: float, spacing: float) -> np.ndarray:
+    """Places along a length, spacing apart in the mean."""
+    places = np.arange(rng.uniform(0, spacing), length, spacing)
+    return np.clip(places + rng.uniform(-0.2, 0.2, len(places)) * spacing, 0, length)
+
+
+def scattered(rng, length: float, rate: float) -> np.ndarray:
+    """Places along a length, rate of them on 100 m in the mean, each on its own."""
+    return rng.uniform(0, length, rng.poisson(max(length, 0.0) * rate / 100))

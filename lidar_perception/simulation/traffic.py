@@ -1,0 +1,248 @@
+"""Who drives, parks, rides, walks, stands and sits in a street."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from lidar_perception.simulation.actors import SIGHT, Actor, Room
+from lidar_perception.simulation.shapes.cyclists import (
+    cyclist,
+    parked_bicycle,
+    parked_motorcycle,
+)
+from lidar_perception.simulation.shapes.furniture import bench
+from lidar_perception.simulation.shapes.heavy_vehicles import bus, tram, truck
+from lidar_perception.simulation.shapes.people import CARRIED, pedestrian, sitting
+from lidar_perception.simulation.shapes.thing import Thing, block, disc, rigid
+from lidar_perception.simulation.shapes.vehicles import car, van
+from lidar_perception.simulation.solids import parts
+from lidar_perception.simulation.street import (
+    CORNER,
+    PARALLEL,
+    Lane,
+    Side,
+    Street,
+    parked_width,
+    scattered,
+)
+
+DRAWBAR = 0.8  # between a car and what it pulls, m
+FREE = 5.0     # nobody parks so near to a crossing, m
+STANDING, WALKING = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)  # chances of groups of 1, 2, ..
+OTHER_VEHICLE = 20  # of SemanticKITTI
+
+
+def populate(rng: np.random.Generator, street: Street, room: Room, people: float) -> None:
+    """Everybody who has a label, and bicycles and motorcycles that nobody rides."""
+    kind, blocks = street.kind, street.blocks
+    for lane in street.lanes:
+        for group in _queue(rng, lane, street, room.seconds):
+            room.admit(*group, gap=0.3)
+    for crossing in street.ground.crossings:
+        for actor in _side_street(rng, crossing, street.ground):
+            room.admit(actor, gap=0.3)
+    for side, share in [(b, 1.0) for b in blocks] + [(arm, 0.7) for arm in street.arms]:
+        for actor in _parked(rng, side, share * rng.uniform(*kind.taken)):
+            room.admit(actor)
+    for side in blocks:
+        for seat, *sitters in _seats(rng, side, kind.seats, people):
+            if room.admit(seat, gap=0.4):
+                room.add(*sitters)
+    for actor in _riders(rng, street, room.seconds, people):
+        room.admit(actor, gap=0.3)
+    for side in blocks:
+        for group in _standing(rng, side, kind.standers * people):
+            room.admit(*group)
+    for side in (*blocks, *_crosswalks(street)):
+        for group in _walking(rng, side, kind.walkers * people, roam=kind.curb < 0.05):
+            room.admit(*group)
+
+
+def _vehicles(rng, use: str) -> list[Thing]:
+    """What comes along a lane, the first ahead of what it pulls; shares set by trial, so that
+    the labels of many scenes come near KITTI's."""
+    if use == "rail":
+        return [tram(rng)]
+    pick = rng.random()
+    if pick < 0.97:
+        return [(car if pick < 0.82 else van if pick < 0.91 else truck)(rng)]
+    return [bus(rng)] if pick < 0.985 else [car(rng), trailer(rng)]
+
+
+def trailer(rng) -> Thing:
+    """A trailer with a closed load behind a car, on one axle."""
+    length, width, height = size = tuple(rng.uniform((1.8, 1.3, 0.9), (3.8, 1.9, 2.3)).tolist())
+    x, y = length / 2, width / 2
+    return rigid(parts([block((-x, -y, 0.35), (x, y, height), reflectance=rng.uniform(0.1, 0.5)),
+                        *(disc((0, s * (y - 0.1), 0.3), 0.3, 0.1, reflectance=0.06)
+                          for s in (-1, 1))], OTHER_VEHICLE), size, "Misc")
+
+
+def _queue(rng, lane: Lane, street: Street, seconds: float) -> Iterator[list[Actor]]:
+    """The vehicles of a lane that are ever in sight; nobody tailgates the ego vehicle."""
+    if lane.use == "cycle":
+        return
+    ours, way = lane is street.lanes[0], lane.direction
+    past = (street.speed - way * lane.speed) * seconds  # how far we get ahead of the lane
+    x, last = sorted((-way * SIGHT, way * SIGHT))
+    x, last = x + min(past, 0.0), last + max(past, 0.0)
+    stop_lines = [25.0] if ours else [edge[way < 0] for edge in street.ground.crossings]
+    waiting = rng.uniform(0, 40)
+    while True:
+        group = _vehicles(rng, lane.use)
+        length = sum(t.size[0] for t in group) + DRAWBAR * (len(group) - 1)
+        least = 1.2 + lane.speed
+        x += least + rng.exponential(street.kind.headway * lane.speed + 1.0) * (
+            2.0 if lane.use == "rail" else 1.0)
+        if x + length > last:
+            return
+        back, front = (x, x + length) if way > 0 else (x + length, x)
+        x += length
+        if lane.speed == 0.0 and not any(0 < (line - front) * way < waiting
+                                         for line in stop_lines):
+            continue
+        if ours and min(back, front) - 2.5 < least and max(back, front) + 2.5 > -least:
+            continue
+        speed = lane.speed * rng.uniform(0.98, 1.02)
+        aside, head = rng.normal(0, 0.12), np.pi * (way < 0)
+        actors = []
+        for thing in group:
+            middle = front - way * thing.size[0] / 2
+            actors.append(Actor(thing, middle, lane.y + aside, head, speed))
+            front = middle - way * (thing.size[0] / 2 + DRAWBAR)
+        yield actors
+
+
+def _side_street(rng, crossing: tuple[float, float], ground) -> Iterator[Actor]:
+    """Cars that wait for us, drive away or pass our street."""
+    low, high = crossing
+    strip = parked_width(crossing)
+    quarter = (high - low - 2 * strip) / 4 + strip
+    for curb, up in ((ground.curb_left, 1), (ground.curb_right, -1)):
+        coming, going = (low, high) if up > 0 else (high, low)
+        coming, going = coming + up * quarter, going - up * quarter
+        y = curb + up * rng.uniform(0.5, 1.0 + ground.walk)
+        while rng.random() < 0.5:
+            thing = _vehicles(rng, "road")[0]
+            yield Actor(thing, coming, y + up * thing.size[0] / 2, -up * np.pi / 2)
+            y += up * (thing.size[0] + rng.uniform(1, 3))
+        for chance, far in ((0.25, rng.uniform(5, 50)), (0.3, -rng.uniform(15, 100))):
+            if rng.random() < chance:
+                yield Actor(_vehicles(rng, "road")[0], going, curb + up * far, up * np.pi / 2,
+                            rng.uniform(3, 9))
+
+
+def _parked(rng, side: Side, taken: float) -> Iterator[Actor]:
+    """Rows along the curb, cars in drives, and now and then a car park behind the sidewalk."""
+    def vehicle():
+        pick = rng.random()
+        if pick < 0.965:
+            return (car if pick < 0.88 else van)(rng, driver=False)
+        return (truck if pick < 0.99 else trailer)(rng)
+
+    def across(out, angle):
+        for along in np.arange(FREE, side.length - FREE, 2.6 / abs(np.sin(angle))):
+            if rng.random() < taken:
+                turn = angle + np.pi * (rng.random() < 0.3) + rng.normal(0, 0.03)
+                yield side.put(car(rng, driver=False), along, out + rng.normal(0, 0.15), turn)
+
+    if side.parking > PARALLEL:
+        yield from across(-side.parking / 2 - 0.1, rng.choice([1.57, 2.2]))
+    along = FREE
+    while side.parking == PARALLEL and along < side.length - FREE - 4:
+        thing = vehicle()
+        if rng.random() < taken:
+            turn = np.pi * (rng.random() < 0.95) + rng.normal(0, 0.025)
+            yield side.put(thing, along + thing.size[0] / 2,
+                           -0.25 - thing.size[1] / 2 + rng.normal(0, 0.06), turn)
+        along += thing.size[0] + rng.uniform(0.7, 1.8)
+    if side.front == "garden":
+        for along in scattered(rng, side.length, 6.0):
+            yield side.put(car(rng, driver=False), along, side.walk + rng.uniform(3, 6),
+                           rng.choice([-1, 1]) * np.pi / 2 + rng.normal(0, 0.04))
+    if side.front == "verge" and rng.random() < 0.35:
+        yield from across(side.walk + rng.uniform(5, 9), 1.57)
+
+
+def _seats(rng, side: Side, rate: float, people: float) -> Iterator[list[Actor]]:
+    """A bench with its back to the wall, and who sits there; chairs of cafes."""
+    for along in scattered(rng, side.length, 8 * rate):
+        out, turn = max(side.walk - 0.7, 1.5), -np.pi / 2
+        sitters = [side.put(sitting(rng, chair=False), along + aside, out, turn)
+                   for aside in (-0.45, 0.45) if rng.random() < min(0.2 * people, 0.8)]
+        yield [side.put(bench(rng), along, out, turn), *sitters]
+    for along in scattered(rng, side.length, rate * people):
+        out = side.walk - rng.uniform(0.8, 2.5)
+        for aside in rng.uniform((-0.9, 0.5), (-0.5, 0.9)):
+            yield [side.put(sitting(rng), along + aside, out,
+                            np.pi * (aside > 0) + rng.normal(0, 0.2))]
+
+
+def _riders(rng, street: Street, seconds: float, people: float) -> Iterator[Actor]:
+    """Cyclists at the edges of the road, on the sidewalks and across; parked two-wheelers."""
+    ground, kind = street.ground, street.kind
+    lanes = [lane for lane in street.lanes if lane.use == "cycle"]
+    places = [(lane.y, lane.direction) for lane in lanes] or [
+        (ground.curb_right + ground.parking + 0.6, 1),
+        (ground.curb_left - ground.parking - 0.6, -1)]
+    for y, way in places:
+        speed = rng.uniform(3.5, 5.5)
+        first = street.start - (street.speed * seconds if way > 0 else 0.0)
+        for x in first + scattered(rng, street.end - first, kind.riders * people
+                                   * (2.0 if lanes else 1.0)):
+            yield Actor(cyclist(rng), x, y + rng.normal(0, 0.1), np.pi * (way < 0),
+                        speed * rng.uniform(0.95, 1.05))
+    for side in (*street.blocks, *_crosswalks(street)):
+        for along in scattered(rng, side.length, kind.riders * people * 0.5):
+            yield side.put(cyclist(rng), along, max(side.walk, 1.0) * rng.uniform(0.5, 0.7),
+                           np.pi * rng.integers(2), speed=rng.uniform(2.0, 4.5))
+    for side in street.blocks:
+        for along in scattered(rng, side.length, kind.clutter / 6 if side.walk else 0.0):
+            out, turn = rng.choice([0.9, max(side.walk - 1.0, 0.9)]), rng.normal(np.pi / 2, 0.2)
+            made = parked_bicycle if rng.random() < 0.75 else parked_motorcycle
+            for i in range(rng.integers(1, 6)):
+                yield side.put(made(rng), along + 0.75 * i, out, turn)
+
+
+def _pedestrian(rng, speed: float = 0.0) -> Thing:
+    carried = rng.choice(CARRIED, p=(0.6, 0.14, 0.14, 0.04, 0.04, 0.04))
+    return pedestrian(rng, speed, child=rng.random() < 0.08, carried=str(carried))
+
+
+def _standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
+    """People who wait, and some who talk and face one another."""
+    for along in scattered(rng, side.length, rate):
+        out, many = rng.uniform(0.4, max(side.walk - 0.4, 1.0)), rng.choice([1, 2, 3, 4],
+                                                                            p=STANDING)
+        first, wide = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 0.7) * (many > 1)
+        angles = first + 2 * np.pi / many * np.arange(many)
+        yield [side.put(_pedestrian(rng), along + wide * np.cos(a), out + wide * np.sin(a),
+                        a + np.pi + rng.normal(0, 0.15)) for a in angles]
+
+
+def _walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Actor]]:
+    """People on their way along a sidewalk, alone, in pairs or more; where they may roam, on the
+    road and in any direction, too. Some start or stop on the way."""
+    for along in scattered(rng, side.length, rate):
+        speed = float(np.clip(rng.normal(1.35, 0.25), 0.6, 2.0) if rng.random() < 0.97 else 2.7)
+        turn = np.pi * rng.integers(2) + rng.normal(0, 0.02)
+        low = 0.9
+        if roam:
+            low, turn = -3.0, turn + rng.normal(0, 0.6) * (rng.random() < 0.5)
+        out = rng.uniform(low, max(side.walk - 0.5, low + 0.5))
+        moves = {"speed": speed}
+        pick = rng.random()
+        if pick < 0.2:
+            moves["start" if pick < 0.1 else "stop"] = rng.uniform(1, 15)
+        many = rng.choice([1, 2, 3], p=WALKING)
+        yield [side.put(_pedestrian(rng, speed), along + rng.uniform(-0.2, 0.2),
+                        out + 0.85 * i, turn, **moves) for i in range(many)]
+
+
+def _crosswalks(street: Street) -> list[Side]:
+    """The sidewalks of the side streets, and on across our street."""
+    far = 40.0
+    return [Side(x, land * far, -land * np.pi / 2, 2 * far, CORNER, "")
+            for crossing in street.ground.crossings for x, land in zip(crossing, (-1, 1))]

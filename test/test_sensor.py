@@ -1,0 +1,173 @@
+"""Laws of sensors and of what they report."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidar_perception.simulation.raycast import Hits
+from lidar_perception.simulation.returns import measure
+from lidar_perception.simulation.sensor import (
+    HDL64E,
+    SENSORS,
+    STILL,
+    Motion,
+    Sensor,
+    generic,
+    hdl64e,
+    rays,
+    sensor_named,
+)
+from lidar_perception.types import InputError
+
+SMALL = generic(8, -10.0, 4.0, 0.5, 10.0)
+
+
+def hits(sensor, distance, brightness=0.3, cosine=1.0):
+    """Every ray meets something at this distance, of this brightness; arrays or numbers."""
+    shape = sensor.columns, sensor.rings
+    return Hits(np.broadcast_to(np.asarray(distance, float), shape),
+                np.broadcast_to(np.asarray(brightness, float), shape),
+                np.broadcast_to(cosine, shape), np.ones(shape, np.int32),
+                np.full(shape, 10, np.uint16), np.zeros(shape, np.int32), np.array([0, 1]))
+
+
+def measured(sensor, distance, brightness=0.3, motion=STILL, seed=0, cosine=1.0, **flags):
+    return measure(hits(sensor, distance, brightness, cosine), sensor, motion,
+                   np.random.default_rng(seed), **flags)
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_presets_are_sensible(name):
+    sensor = sensor_named(name)
+    direction = sensor.directions()
+    assert direction.shape == (sensor.columns, sensor.rings, 3)
+    assert np.allclose(np.linalg.norm(direction, axis=2), 1)
+    assert np.allclose(direction[0, :, 1], 0) and (direction[0, :, 0] > 0).all()
+    assert (np.diff(direction[..., 2], axis=1) < 0).all()
+    assert sensor.rings == {"hdl64e": 64, "hdl32e": 32, "vlp16": 16, "os1_64": 64}[name]
+    times = sensor.times()
+    assert times.min() == 0 and times.max() < 1 / sensor.rate
+    assert len(np.unique(times)) == sensor.columns
+
+
+def test_kittis_sensor_is_kittis():
+    assert (HDL64E.height, HDL64E.columns, HDL64E.rate) == (1.73, 2140, 10.0)
+    step = {rate: np.degrees(hdl64e(rate).azimuth_step) for rate in (5, 10, 20)}
+    assert step[5] < 0.085 and abs(step[10] - 0.168) < 1e-3 and abs(step[20] / step[10] - 2) < 1e-3
+    for rate in (4.9, 20.1, -1, np.nan):
+        with pytest.raises(InputError, match="rate"):
+            hdl64e(rate)
+
+
+@pytest.mark.parametrize("change, named", [
+    ({"elevations": ()}, "elevations"), ({"elevations": (0.1, 0.2)}, "elevations"),
+    ({"elevations": (2.0,)}, "elevations"), ({"elevations": (np.nan,)}, "elevations"),
+    ({"lifts": (0.1,)}, "lifts"), ({"biases": (0.1,)}, "biases"),
+    ({"azimuth_step": 0.0}, "azimuth_step"), ({"azimuth_step": np.nan}, "azimuth_step"),
+    ({"height": 0.0}, "height"), ({"max_range": 0.5}, "max_range"),
+    ({"min_range": -1}, "max_range"),
+    ({"rate": 0.0}, "rate"), ({"reach": 0.0}, "reach"), ({"dropout": 1.5}, "dropout"),
+    ({"range_noise": -0.1}, "range_noise"), ({"divergence": np.inf}, "divergence"),
+    ({"pulse": -1.0}, "pulse"), ({"fade": (np.nan, 0)}, "fade")])
+def test_impossible_sensors_are_refused(change, named):
+    with pytest.raises(InputError, match=named) as error:
+        replace(SMALL, **change)
+    assert "\n" not in str(error.value)
+
+
+def test_impossible_generic_sensors_and_unknown_names_are_refused():
+    for wrong in ((0, -10, 10), (16, 10, -10), (16, -95, 10)):
+        with pytest.raises(InputError):
+            generic(*wrong, 0.2, 10.0)
+    with pytest.raises(InputError, match="hdl64e"):
+        sensor_named("hdl128")
+
+
+def test_rays_turn_and_move_with_the_sensor():
+    motion = Motion((3.0, -2.0, 0.5), 0.7, stamp=0.25)
+    still, turn = rays(SMALL), rays(SMALL, motion)
+    assert np.allclose(turn.since, SMALL.times() - 0.025)
+    assert np.allclose(turn.origin[:, 0], turn.since[:, None] * motion.velocity)
+    bearing = np.arctan2(turn.direction[..., 1], turn.direction[..., 0])
+    before = np.arctan2(still.direction[..., 1], still.direction[..., 0])
+    turned = (bearing - before - 0.7 * turn.since[:, None] + np.pi) % (2 * np.pi) - np.pi
+    assert np.allclose(turned, 0)
+    assert np.allclose(turn.direction[..., 2], still.direction[..., 2])
+
+
+def test_same_seed_same_bytes():
+    one, again, other = (measured(SMALL, 20.0, seed=seed) for seed in (1, 1, 2))
+    assert all(a.tobytes() == b.tobytes() for a, b in zip(one, again))
+    assert one.xyz.tobytes() != other.xyz.tobytes()
+
+
+def test_returns_are_as_promised():
+    sensor = replace(HDL64E, azimuth_step=np.radians(1.0))
+    rng = np.random.default_rng(0)
+    shape = sensor.columns, sensor.rings
+    found = measured(sensor, rng.uniform(0, 130, shape), rng.uniform(0, 1, shape))
+    n = len(found.xyz)
+    assert n > 1000
+    assert [(f.shape, f.dtype) for f in found] == [
+        ((n, 3), np.float32), ((n,), np.float32), ((n,), np.int32), ((n,), np.uint16),
+        ((n,), np.uint16), ((n,), np.float32)]
+    reach = np.linalg.norm(found.xyz - [0, 0, 0.16], axis=1)
+    assert reach.min() > sensor.min_range - 0.06 and reach.max() < sensor.max_range + 0.06
+    assert found.intensity.min() >= 0 and found.intensity.max() <= 1
+    hundredths = found.intensity * 100
+    assert np.abs(hundredths - np.round(hundredths)).max() < 1e-4
+    assert (np.diff(found.ring.astype(int)) >= 0).all()  # beam by beam
+    bearing = np.arctan2(found.xyz[:, 1], found.xyz[:, 0]) % (2 * np.pi)
+    assert (np.diff(bearing)[np.diff(found.ring) == 0] > -1e-5).all()
+
+
+def test_a_ring_keeps_its_elevation_and_time_its_bearing():
+    found = measured(SMALL, 30.0)
+    rise = found.xyz[:, 2] / np.linalg.norm(found.xyz, axis=1)
+    assert np.allclose(np.arcsin(rise), np.array(SMALL.elevations)[found.ring], atol=1e-5)
+    column = np.round(np.arctan2(found.xyz[:, 1], found.xyz[:, 0]) / (2 * np.pi) * SMALL.columns)
+    assert np.allclose(found.time, rays(SMALL).since[column.astype(int) % SMALL.columns])
+
+
+def test_noise_is_as_wide_as_told():
+    found = measured(replace(SMALL, range_noise=0.05), 20.0)
+    assert abs((np.linalg.norm(found.xyz, axis=1) - 20).std() - 0.05) < 0.003
+
+
+def test_far_and_dark_is_lost():
+    open_sensor = replace(SMALL, dropout=0.0)
+    share = {(r, b): len(measured(open_sensor, r, b).xyz) / SMALL.columns / SMALL.rings
+             for r in (5, 25, 50, 100) for b in (0.03, 0.1, 0.4, 0.9)}
+    for b in (0.03, 0.1, 0.4, 0.9):
+        assert share[5, b] >= share[25, b] >= share[50, b] >= share[100, b]
+    for r in (5, 25, 50, 100):
+        assert share[r, 0.03] <= share[r, 0.1] <= share[r, 0.4] <= share[r, 0.9]
+    assert share[5, 0.1] == 1 and abs(share[50, 0.1] - 0.5) < 0.1
+    assert abs(share[100, 0.4] - 0.5) < 0.1  # power goes with brightness over range squared
+    assert len(measured(open_sensor, 5.0, 0.0).xyz) == 0 and not len(measured(SMALL, np.inf).xyz)
+    assert len(measured(SMALL, 50.0, cosine=0.05).xyz) < len(measured(SMALL, 50.0).xyz)
+    lost = 1 - len(measured(replace(SMALL, dropout=0.2), 5.0).xyz) / SMALL.columns / SMALL.rings
+    assert abs(lost - 0.2) < 0.03
+
+
+def test_intensity_is_the_brightness_unless_the_beam_or_range_says_otherwise():
+    plain = measured(SMALL, 10.0, 0.4)
+    assert abs(plain.intensity.mean() - 0.4) < 0.005
+    faded = measured(replace(SMALL, fade=(18.0, 0.01)), 28.0, 0.4)
+    assert abs(faded.intensity.mean() - 0.3) < 0.005
+    biases = tuple(np.linspace(-0.1, 0.1, 8))
+    biased = measured(replace(SMALL, biases=biases), 10.0, 0.4)
+    for ring, bias in enumerate(biases):
+        assert abs(biased.intensity[biased.ring == ring].mean() - 0.4 - bias) < 0.01
+
+
+def test_the_vehicle_blocks_its_sectors():
+    sensor = replace(SMALL, blocked=((4, 350, 10), (6, 90, 120)), dropout=0.0)
+    found = measured(sensor, 10.0)
+    bearing = np.degrees(np.arctan2(found.xyz[:, 1], found.xyz[:, 0]))
+    low, lower = found.ring >= 4, found.ring >= 6
+    assert not (low & (np.abs(bearing) < 9.9)).any() and (~low & (np.abs(bearing) < 9.9)).any()
+    side = (bearing > 90.1) & (bearing < 119.9)
+    assert not (lower & side).any() and (~lower & side).any()
+    assert isinstance(sensor, Sensor) and len(found.xyz) == sensor.open_rays().sum()

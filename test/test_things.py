@@ -1,0 +1,236 @@
+"""Laws of the things in a street: their sizes, what they are made of, and how they walk."""
+
+from functools import partial
+
+import numpy as np
+import pytest
+
+from lidar_perception.simulation.shapes import (
+    buildings,
+    cyclists,
+    furniture,
+    heavy_vehicles,
+    people,
+    vegetation,
+    vehicles,
+)
+from lidar_perception.simulation.shapes.thing import SIZES, block, disc, draw_size, rod
+from lidar_perception.simulation.solids import extents, parts
+from lidar_perception.types import CLASSES
+
+SEEDS = range(12)
+LABELLED = {
+    "walker": (partial(people.pedestrian, speed=1.3), 16),
+    "child": (partial(people.pedestrian, speed=0.8, child=True), 16),
+    "stander": (partial(people.pedestrian, speed=0.0), 16),
+    "backpack": (partial(people.pedestrian, speed=1.2, carried="backpack"), 16),
+    "sitting": (people.sitting, 18), "on bench": (partial(people.sitting, chair=False), 16),
+    "cyclist": (cyclists.cyclist, 20), "car": (vehicles.car, 30),
+    "parked": (partial(vehicles.car, driver=False), 30), "van": (vehicles.van, 30),
+    "truck": (heavy_vehicles.truck, 32), "bus": (heavy_vehicles.bus, 32),
+    "tram": (heavy_vehicles.tram, 32)}
+SCENERY = {
+    **{f.__name__: (f, 8) for f in (
+        furniture.pole, furniture.lamp, *furniture.PERSON_SIZED, cyclists.parked_bicycle,
+        cyclists.parked_motorcycle, vegetation.tree, vegetation.conifer, vegetation.bush)},
+    **{f.__name__: (partial(f, length=7.0), 8) for f in (
+        furniture.fence, furniture.wall, vegetation.hedge)},
+    "building": (partial(buildings.building, length=15.0, depth=10.0, storeys=4), 40),
+    "cottage": (partial(buildings.building, length=6.0, depth=8.0, storeys=1), 40)}
+SEMANTICS = {10, 11, 15, 16, 18, 20, 30, 31, 50, 51, 70, 71, 80, 81, 99}
+
+
+def made_by(make, seed):
+    """Parts of a thing, labelled or not."""
+    thing = make(np.random.default_rng(seed))
+    return thing.parts(0.7) if hasattr(thing, "parts") else thing
+
+
+def hull(made):
+    low, high = extents(made)
+    return low.min(axis=0), high.max(axis=0)
+
+
+def stride(thing):
+    return 2 * thing.parts.keywords["build"].step
+
+
+@pytest.mark.parametrize("name", [*LABELLED, *SCENERY])
+def test_parts_are_sound(name):
+    make, most = {**LABELLED, **SCENERY}[name]
+    for seed in SEEDS:
+        made = made_by(make, seed)
+        assert 0 < len(made) <= most
+        assert np.isin(made["kind"], (0, 1, 2)).all()
+        assert set(made["semantic"].tolist()) <= SEMANTICS
+        for field in ("centre", "half", "pitch", "yaw"):
+            assert np.isfinite(made[field]).all(), field
+        assert (made["half"] > 0).all() and (made["density"] > 0).all()
+        assert (made["reflectance"] >= 0).all() and (made["reflectance"] <= 1).all()
+        assert (made["transmission"] >= 0).all() and (made["transmission"] < 1).all()
+
+
+@pytest.mark.parametrize("name", [*LABELLED, *SCENERY])
+def test_the_same_seed_gives_the_same_thing(name):
+    make, _ = {**LABELLED, **SCENERY}[name]
+    assert made_by(make, 5).tobytes() == made_by(make, 5).tobytes()
+    assert made_by(make, 5).tobytes() != made_by(make, 6).tobytes()
+
+
+@pytest.mark.parametrize("name", LABELLED)
+def test_the_box_of_a_labelled_thing_is_what_its_body_covers(name):
+    make, _ = LABELLED[name]
+    for seed in SEEDS:
+        thing = make(np.random.default_rng(seed))
+        assert thing.label in CLASSES
+        low, high = extents(thing.parts(0.0))
+        body = np.abs((low + high)[:, 1] / 2) < thing.size[1] / 2  # all but the mirrors
+        low, high = low[body].min(axis=0), high[body].max(axis=0)
+        length, width, height = thing.size
+        if thing.label != "Pedestrian":
+            assert np.allclose(low, (-length / 2, -width / 2, 0.0), atol=1e-6)
+            assert np.allclose(high, (length / 2, width / 2, height), atol=1e-6)
+        assert np.isclose(high[1] - low[1], width)
+        assert (~body).sum() <= 2
+
+
+@pytest.mark.parametrize("name", ["walker", "child", "stander", "backpack"])
+def test_the_box_of_a_pedestrian_holds_for_a_whole_stride(name):
+    make, _ = LABELLED[name]
+    for seed in SEEDS:
+        thing = make(np.random.default_rng(seed))
+        hulls = [hull(thing.parts(x)) for x in np.linspace(0, stride(thing), 101)]
+        low, high = np.array(hulls).transpose(1, 0, 2)
+        assert np.abs(low[:, 2]).max() < 1e-9  # a foot is always on the ground
+        assert high[:, 2].max() <= thing.size[2] + 0.002
+        assert high[:, 2].max() > thing.size[2] - 0.005
+        assert np.isclose(high[:, 1].max(), thing.size[1] / 2)
+        if name != "stander":
+            assert abs(low[:, 0].min() + thing.size[0] / 2) < 0.01
+            assert abs(high[:, 0].max() - thing.size[0] / 2) < 0.01
+
+
+def test_a_foot_on_the_ground_does_not_slide():
+    for seed in SEEDS:
+        thing = people.pedestrian(np.random.default_rng(seed), 1.3)
+        ways = np.linspace(0, stride(thing), 401)
+        feet = np.array([thing.parts(x)[-2:] for x in ways])
+        tip = feet["centre"][..., 0] + feet["half"][..., 0] * np.cos(feet["pitch"]) + (
+            ways[:, None] - feet["half"][..., 2] * np.sin(feet["pitch"]))
+        sole = np.array([extents(f)[0][:, 2] for f in feet])
+        stands = (sole[1:] < 1e-9) & (sole[:-1] < 1e-9)
+        assert (stands.any(axis=1)).all()
+        assert np.abs(np.diff(tip, axis=0)[stands]).max() < 1e-6
+        assert 0.5 < stands.mean() < 0.7
+
+
+def test_a_walk_repeats_after_a_stride_and_mirrors_after_a_step():
+    thing = people.pedestrian(np.random.default_rng(3), 1.4)
+    now, later = thing.parts(0.2), thing.parts(0.2 + stride(thing))
+    assert np.allclose(now["centre"], later["centre"])
+    low, high = extents(now)
+    low_step, _ = extents(thing.parts(0.2 + stride(thing) / 2))
+    assert np.allclose(np.sort(low[:, 0]), np.sort(low_step[:, 0]))
+    assert np.allclose(np.sort(high[:, 1]), np.sort(-low_step[:, 1]))
+
+
+def test_limbs_hold_together():
+    """Between their joints, limbs keep their length; knees bend forward."""
+    thing = people.pedestrian(np.random.default_rng(4), 1.4)
+    height = thing.size[2]
+    for x in np.linspace(0, stride(thing), 50):
+        thigh, shank = (thing.parts(x)[[-6, -5]], thing.parts(x)[[-4, -3]])
+        for row in (*thigh, *shank):
+            assert 0.24 * height < 2 * row["half"][2] < 0.25 * height
+
+
+def test_faster_walkers_take_longer_steps():
+    lengths = [people.pedestrian(np.random.default_rng(1), speed).size[0]
+               for speed in (0.5, 0.8, 1.1, 1.4)]
+    assert (np.diff(lengths) > 0).all()
+
+
+@pytest.mark.parametrize("carried", people.CARRIED[1:])
+def test_what_is_carried_changes_no_width_or_height_of_the_box(carried):
+    plain = people.pedestrian(np.random.default_rng(2), 1.2)
+    loaded = people.pedestrian(np.random.default_rng(2), 1.2, carried=carried)
+    assert len(loaded.parts(0.0)) > len(plain.parts(0.0))
+    assert loaded.size[1:] == plain.size[1:]
+    low, _ = hull(loaded.parts(0.3))
+    assert abs(low[2]) < 1e-9
+
+
+def test_wheels_stay_on_the_road_while_pedals_turn():
+    for seed in SEEDS:
+        thing = cyclists.cyclist(np.random.default_rng(seed))
+        poses = [thing.parts(x) for x in np.linspace(0, 5, 41)]
+        for made in poses:
+            assert np.allclose(extents(made[:2])[0][:, 2], 0.0, atol=1e-9)
+            low, high = hull(made)
+            assert np.allclose(high - low, thing.size, atol=1e-6)
+        assert not np.array_equal(poses[0]["centre"], poses[4]["centre"])
+
+
+@pytest.mark.parametrize("style", ["HATCHBACK", "SEDAN", "ESTATE", "SUV", "MINIBUS", "PANEL_VAN"])
+def test_vehicles_are_alike_left_and_right(style):
+    made = vehicles.body((4.2, 1.7, 1.6), getattr(vehicles, style), 0.3, 0.8, driver=False)
+    low, high = extents(made)
+    mirrored = np.stack([low[:, 0], -high[:, 1], low[:, 2], high[:, 0], -low[:, 1], high[:, 2]], 1)
+    there = np.hstack([low, high])
+    far = np.abs(mirrored[:, None] - there).max(axis=2).min(axis=1)
+    assert far.max() < 1e-9
+
+
+def test_a_beam_from_the_side_can_pass_a_car_between_its_panes():
+    """Above the belt, behind the screens, there is nothing solid but pillars and seats."""
+    made = vehicles.body((4.0, 1.65, 1.5), vehicles.HATCHBACK, 0.3, 0.85, driver=False)
+    low, high = extents(made)
+    x, z = -0.45, 1.25  # between the pillars in the middle and at the back, above the seats
+    met = (low[:, 0] < x) & (x < high[:, 0]) & (low[:, 2] < z) & (z < high[:, 2])
+    assert (made["transmission"][met] > 0.5).all() and met.sum() == 2
+
+
+@pytest.mark.parametrize("label", SIZES)
+def test_sizes_spread_as_in_the_table(label):
+    rng = np.random.default_rng(0)
+    sizes = np.array([draw_size(rng, label) for _ in range(4000)])
+    mean, spread, together = SIZES[label]
+    assert np.allclose(sizes.mean(axis=0), mean, atol=0.06 * np.array(spread))
+    assert np.allclose(sizes.std(axis=0), spread, rtol=0.2)
+    assert abs(np.corrcoef(sizes[:, 0], sizes[:, 2])[0, 1] - together) < 0.08
+    assert (sizes > 0.2).all()
+
+
+def test_sizes_are_those_of_the_labels(data):
+    """The table is what the labels of the sample say, to the digits that it gives."""
+    rows = {}
+    for path in (data / "kitti_object/training/label_2").glob("*.txt"):
+        for line in path.read_text().splitlines():
+            name, *rest = line.split()
+            rows.setdefault((name, len(rows)), np.array(rest, float)[[9, 8, 7]])
+    for line in (data / "kitti_tracking/training/label_02/0000.txt").read_text().splitlines():
+        _, track, name, *rest = line.split()
+        rows[name, "track", track] = np.array(rest, float)[[9, 8, 7]]
+    for label, (mean, spread, _) in SIZES.items():
+        sizes = np.array([size for key, size in rows.items() if key[0] == label])
+        if label == "Person_sitting":
+            assert not len(sizes)
+            continue
+        assert np.allclose(sizes.mean(axis=0), mean, rtol=0.01)
+        assert np.allclose(sizes.std(axis=0), spread, atol=0.06)
+
+
+@pytest.mark.parametrize("name", SCENERY)
+def test_scenery_stands_on_or_in_the_ground(name):
+    make, _ = SCENERY[name]
+    for seed in SEEDS:
+        low, high = hull(made_by(make, seed))
+        assert low[2] <= 1e-9 < high[2]
+
+
+def test_rods_and_discs_end_where_they_should():
+    made = parts([rod((0, 0, 0), (3, 4, 12), 1e-6), disc((1, 2, 3), 0.5, 0.1),
+                  block((1, -1, 2), (0, 1, 0))], 10)
+    low, high = extents(made)
+    assert np.allclose(low, [(0, 0, 0), (0.5, 1.9, 2.5), (0, -1, 0)], atol=1e-5)
+    assert np.allclose(high, [(3, 4, 12), (1.5, 2.1, 3.5), (1, 1, 2)], atol=1e-5)
