@@ -15,6 +15,7 @@ from benchmark import clustering, ground, peers
 from benchmark.candidates import compare, print_comparison
 from benchmark.graph import measure_graph, print_graph
 from benchmark.rows import print_ground, print_measured, print_planes
+from benchmark.simulation import measure_simulation
 from benchmark.timing import spread
 from lidar_perception.datasets.kitti import KittiFrame, open_kitti
 from lidar_perception.datasets.recording import Recorded, open_recording
@@ -71,6 +72,8 @@ def main(kitti: Path, semantic_kitti: Path | None, json_file: Path | None, repea
     if labelled:
         content["ground_scores"] = ground.measure_labelled(labelled, repeat)
         print_ground(content["ground_scores"])
+    content["simulation"] = measure_simulation(count, repeat)
+    print_measured(content["simulation"])
     if graph:
         content["graph"] = {name: measure_graph(kitti, single)
                             for name, single in (("three_nodes", False), ("one_node", True))}

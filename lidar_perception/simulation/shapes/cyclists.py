@@ -45,8 +45,8 @@ class Rider(NamedTuple):
 def cyclist(rng: np.random.Generator) -> Thing:
     """Someone who rides; the box's length is the bicycle's, its width the handlebar's."""
     size = draw_size(rng, "Cyclist")
-    rider = Rider(size, rng.uniform(0.15, 0.6), rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.7),
-                  rng.uniform(0.15, 0.7), rng.uniform(0.1, 0.6), rng.uniform(0.1, 0.6),
+    rider = Rider(size, rng.uniform(0.15, 0.6), rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.8),
+                  rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75), rng.uniform(0.15, 0.75),
                   ("", "basket", "backpack")[rng.integers(3)])
     return Thing(partial(riding, rider=rider), size, "Cyclist")
 

@@ -63,7 +63,7 @@ def pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
         width, height = width * max(shrink, 0.7), height * shrink
     step = min(np.sqrt(60 * 0.0065 * abs(speed)) * height / 1.72, 0.5 * height)
     build = Build(height, max(width, 0.27 * height), step, rng.uniform(), rng.uniform(0.03, 0.3),
-                  rng.uniform(0.15, 0.7), rng.uniform(0.1, 0.6), carried)
+                  rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75), carried)
     low, high = _covered(build)
     build = build._replace(shift=-(low + high) / 2)
     size = (max(high - low, SHORTEST * height), build.width, height)
@@ -210,7 +210,7 @@ def sitting(rng: np.random.Generator, chair: bool = True) -> Thing:
     """Someone who sits, knees and feet ahead; without a chair they need a bench below them, whose
     seat is 0.45 m high. The box holds the person and the chair."""
     length, width, height = size = draw_size(rng, "Person_sitting")
-    coat, trousers = rng.uniform(0.15, 0.7), rng.uniform(0.1, 0.6)
+    coat, trousers = rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75)
     front, back, seat = length / 2, -length / 2, 0.45
     hip, trunk = back + 0.22, height - seat
     knees, radius = front - 0.18, 0.05
