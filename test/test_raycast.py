@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from lidar_perception.simulation import foliage
 from lidar_perception.simulation.hashing import uniform
 from lidar_perception.simulation.pairs import View
 from lidar_perception.simulation.raycast import cast, cast_batch
@@ -160,8 +161,32 @@ def test_a_wall_is_flat_only_after_compensation():
     assert np.ptp(measure(still, exact, STILL, np.random.default_rng(0), False).xyz[:, 0]) < 1e-5
 
 
+@pytest.fixture
+def even_leaves(monkeypatch):
+    """Leaves everywhere, not in clumps."""
+    monkeypatch.setattr(foliage, "FILLED", 1.0)
+
+
+def test_leaves_hang_in_clumps_that_do_not_change_along_a_drive():
+    """Two casts with other random numbers meet leaves in the same cells only; a share of FILLED."""
+    fine = generic(64, -8.0, 8.0, 0.1, 10.0, divergence=0.0)
+    plant = solids(BOX, (12, 0, 0), (3, 3, 3), density=2.0)
+    filled = []
+    for seed in (1, 2):
+        hits = cast(plant, Ground(), NO_GROUND, fine, seed=seed)
+        met = np.isfinite(hits.range)
+        xyz = fine.directions()[met] * hits.range[met][:, None] - [12, 0, 0]
+        filled.append({tuple(c) for c in np.floor(xyz / foliage.CLUMP).astype(int)})
+        assert len(xyz) > 2000
+    both = filled[0] & filled[1]
+    assert len(both) > 0.6 * min(map(len, filled))
+    front = {c for c in filled[0] | filled[1] if c[0] == -6}  # the first layer, 12 by 5 cells seen
+    seen = {(-6, y, z) for y in range(-5, 5) for z in range(-2, 2)}
+    assert 0.08 < len(front & seen) / len(seen) < 0.5
+
+
 @pytest.mark.parametrize("kind", [BOX, ELLIPSOID, CYLINDER])
-def test_foliage_stops_rays_after_its_mean_free_path(kind):
+def test_foliage_stops_rays_after_its_mean_free_path(kind, even_leaves):
     fine = generic(32, -8.0, 8.0, 0.2, 10.0, divergence=0.0)
     thin, thick = (cast(solids(kind, (12, 0, 0), (3, 3, 3), density=density), Ground(), NO_GROUND,
                         fine, seed=5) for density in (np.inf, 0.7))
@@ -176,7 +201,7 @@ def test_foliage_stops_rays_after_its_mean_free_path(kind):
     assert thick.reached[1] == np.isfinite(thick.range).sum() < thin.reached[1]
 
 
-def test_from_within_foliage_stops_rays_and_what_is_opaque_does_not():
+def test_from_within_foliage_stops_rays_and_what_is_opaque_does_not(even_leaves):
     inside = [cast(solids(ELLIPSOID, (0.5, 0, 0), (4, 4, 4), density=density), Ground(), NO_GROUND,
                    SENSOR).range for density in (np.inf, 1.0)]
     assert not np.isfinite(inside[0]).any()

@@ -97,7 +97,7 @@ def test_boxes_stand_on_the_ground_and_apart(seed):
 
 
 def test_pedestrians_walk_in_view_all_the_time():
-    for _, found in drive(1, 11, replace(COARSE, rate=2.5), CROWDED):
+    for _, found in drive(33, 11, replace(COARSE, rate=2.5), CROWDED):
         boxes = found.of_class(PEDESTRIAN)
         reach, bearing = np.hypot(boxes[:, 0], boxes[:, 1]), np.arctan2(boxes[:, 1], boxes[:, 0])
         seen = (np.abs(bearing) < np.radians(40)) & (reach > 6) & (reach < 35)

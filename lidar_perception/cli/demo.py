@@ -33,7 +33,7 @@ from msg_utils.markers import from_marker_array
               show_default=True, help="Folder for the results.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
               help="Length of the simulated drive, 10 frames a second.")
-@click.option("--drive-seed", type=click.IntRange(0), default=19, show_default=True,
+@click.option("--drive-seed", type=click.IntRange(0), default=33, show_default=True,
               help="Seed of the simulated drive.")
 @click.option("--rate", type=click.FloatRange(0.01, 100), default=1.0, show_default=True,
               help="Speed of the replay.")

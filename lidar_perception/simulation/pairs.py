@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from lidar_perception.simulation.foliage import through_leaves
 from lidar_perception.simulation.hashing import mixed, signed, uniform
 from lidar_perception.simulation.sensor import STILL, Motion, Sensor, rays
 from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID, Solids
@@ -196,15 +197,20 @@ def stop(scene: Scene, solid: torch.Tensor, ray: torch.Tensor, enter: torch.Tens
     """(n,) range at which rays that pass through the solids' shapes are stopped; inf where they
     are not, as when they start within an opaque one."""
     t = torch.where(enter > 0, enter, torch.inf)
-    density, clear = scene.density[solid], scene.transmission[solid]
-    special = torch.nonzero((density < torch.inf) | (clear > 0))[:, 0]
-    if len(special):
-        place = scene.salt[solid[special]] + scene.place[ray[special]]
-        density = density[special]
-        path = torch.where(density < torch.inf, -torch.log(uniform(1, place)) / density, 0.0)
-        at = torch.where(density < torch.inf, enter[special].clip(min=0.0) + path, t[special])
-        passes = (at >= leave[special]) | (uniform(2, place) < clear[special])
-        t[special] = torch.where(passes, torch.inf, at)
+    leafy = torch.nonzero(scene.density[solid] < torch.inf)[:, 0]
+    if len(leafy):
+        s, r = solid[leafy], ray[leafy]
+        m = scene.matrix[:, s]
+        half = [1 / torch.sqrt(m[i] ** 2 + m[i + 1] ** 2 + m[i + 2] ** 2) for i in (0, 3, 6)]
+        t[leafy] = through_leaves(
+            *unit_rays(scene, s, r, scene.lift[r]), half, enter[leafy], leave[leafy],
+            scene.density[s], plant=scene.reflectance[s].view(torch.int64),
+            place=scene.salt[s] + scene.place[r])
+    clear = scene.transmission[solid]
+    glass = torch.nonzero(clear > 0)[:, 0]
+    if len(glass):
+        place = scene.salt[solid[glass]] + scene.place[ray[glass]]
+        t[glass] = torch.where(uniform(2, place) < clear[glass], torch.inf, t[glass])
     return t
 
 

@@ -60,8 +60,8 @@ def _facade(rng, side: Side) -> Iterator[Actor]:
 
 def _yard(rng, side: Side, line: float) -> Iterator[Actor]:
     """What one sees between the houses."""
-    for along in scattered(rng, side.length, 10):
-        yield side.put(_tree(rng), along, line + rng.uniform(0, 25))
+    for along in scattered(rng, side.length, 22):
+        yield side.put(_tree(rng), along, line + rng.uniform(0, 30))
     for along in scattered(rng, side.length, 15):
         yield side.put(vegetation.bush(rng), along, line + rng.uniform(0, 25), rng.uniform(-3, 3))
 
@@ -81,7 +81,7 @@ def _garden(rng, side: Side) -> Iterator[Actor]:
         house = lot - drive - rng.uniform(0.5, 3)
         yield side.put(building(rng, house, rng.uniform(8, 11), rng.integers(1, 4)),
                        along + drive + house / 2, back)
-        for at in scattered(rng, lot - drive, 12):
+        for at in scattered(rng, lot - drive, 20):
             yield side.put(_tree(rng), along + drive + at, rng.uniform(line + 1.2, back))
         for at in scattered(rng, lot - drive, 70):
             yield side.put(vegetation.bush(rng), along + drive + at, rng.uniform(line + 1, back),
@@ -109,7 +109,8 @@ def _verge(rng, side: Side) -> Iterator[Actor]:
         elif pick < 0.8:
             border = BORDERS[rng.integers(len(BORDERS))]
             yield side.put(border(rng, length), along + length / 2, side.walk + deep)
-        along += length + rng.uniform(0.3, 8)
+        along += length + rng.uniform(0.3, 12)
+    yield from _yard(rng, side, side.walk + deep + 2)
 
 
 def _wild(rng, side: Side) -> Iterator[Actor]:

@@ -48,7 +48,7 @@ class Kind:
 
 
 KINDS = {
-    "city": Kind(0.28, {"facade": 0.65, "garden": 0.15, "verge": 0.2}, cycle=0.25, parking=0.65,
+    "city": Kind(0.28, {"facade": 0.4, "garden": 0.2, "verge": 0.4}, cycle=0.25, parking=0.65,
                  across=0.15, walk=(2.0, 4.5), rails=0.05, clutter=7, walkers=2.2, standers=0.7,
                  riders=0.5, crossing=(45, 100)),
     "residential": Kind(0.30, {"garden": 0.8, "facade": 0.1, "verge": 0.1}, lane=(2.8, 3.2),

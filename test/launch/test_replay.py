@@ -39,7 +39,7 @@ TIMEOUT = 120.0  # seconds; the first start compiles
 
 @pytest.mark.launch_test
 def generate_test_description():
-    write_bag(FOLDER / "drive", simulated_scans(seed=19, frames=FRAMES, streets=CROWDED), force=True)
+    write_bag(FOLDER / "drive", simulated_scans(33, FRAMES, streets=CROWDED), force=True)
     replay = IncludeLaunchDescription(PythonLaunchDescriptionSource(str(LAUNCH)), launch_arguments={
         "bag": str(FOLDER / "drive"), "scores": str(FOLDER / "scores.json"), "loop": "true",
     }.items())
