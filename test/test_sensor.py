@@ -171,3 +171,16 @@ def test_the_vehicle_blocks_its_sectors():
     side = (bearing > 90.1) & (bearing < 119.9)
     assert not (lower & side).any() and (~lower & side).any()
     assert isinstance(sensor, Sensor) and len(found.xyz) == sensor.open_rays().sum()
+
+
+def test_a_generic_sensor_can_be_named():
+    assert sensor_named("generic:32,-25,15,0.2,10") == generic(32, -25.0, 15.0, 0.2, 10.0)
+
+
+@pytest.mark.parametrize("name", ["generic:", "generic:32", "generic:a,b,c,d,e",
+                                  "generic:32,-25,15,0.2,10,3", "generic:32,15,-25,0.2,10",
+                                  "generic:0,-25,15,0.2,10", "generic:nan,-25,15,0.2,10"])
+def test_a_generic_sensor_that_cannot_be_is_refused_in_one_line(name):
+    with pytest.raises(InputError) as error:
+        sensor_named(name)
+    assert "\n" not in str(error.value) and "must" in str(error.value)

@@ -20,7 +20,7 @@ from lidar_perception.simulation.dataset import LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import drive, longest_drive
 from lidar_perception.simulation.folder import is_finished, unfinished
 from lidar_perception.simulation.scene import KINDS, Streets
-from lidar_perception.simulation.sensor import SENSORS, sensor_named
+from lidar_perception.simulation.sensor import GENERIC, SENSORS, sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.terminal import console, track
 from lidar_perception.types import GroundTruth, InputError
@@ -31,7 +31,7 @@ from lidar_perception.types import GroundTruth, InputError
 @click.option("--format", "layout", type=click.Choice(["mcap", *LAYOUTS]), default="mcap",
               show_default=True, help="A rosbag2 bag, or the folders of one of these data sets.")
 @click.option("--sensor", "sensor_name", default="hdl64e", show_default=True,
-              help=f"One of {', '.join(SENSORS)}.")
+              help=f"One of {', '.join(SENSORS)}, or {GENERIC}.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
               help="Scans; with --compare, one of each of as many streets.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,

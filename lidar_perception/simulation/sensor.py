@@ -190,8 +190,10 @@ def hdl64e(rate: float = 10.0) -> Sensor:
 
 HDL64E = hdl64e()
 
-# Angles, ranges and divergences of the others are those of their data sheets; the HDL-32E is
-# nuScenes', whose sweeps have 1084 firings.
+GENERIC = "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE (degrees, turns a second)"
+
+# Angles, ranges and divergences of the others are meant to be those of their data sheets; the
+# HDL-32E is nuScenes', whose sweeps have 1084 firings.
 SENSORS: dict[str, Sensor] = {
     "hdl64e": HDL64E,
     "hdl32e": generic(32, 10.67 - 31 * 4 / 3, 10.67, 360 / 1084, 20.0, height=1.84,
@@ -204,7 +206,18 @@ SENSORS: dict[str, Sensor] = {
 
 
 def sensor_named(name: str) -> Sensor:
-    """The preset of that name; InputError, which names them all, if there is none."""
+    """The preset of that name, or a generic one as GENERIC says; InputError, which names them all,
+    for anything else."""
+    if name.startswith("generic:"):
+        try:
+            beams, *numbers = map(float, name.removeprefix("generic:").split(","))
+            return generic(int(beams), *numbers)
+        except (TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"sensor {name!r} must be {GENERIC}, such as "
+                             "generic:32,-25,15,0.2,10") from None
     if name not in SENSORS:
-        raise InputError(f"unknown sensor {name!r}: must be one of {', '.join(SENSORS)}")
+        raise InputError(f"unknown sensor {name!r}: must be one of {', '.join(SENSORS)}, or "
+                         f"{GENERIC}")
     return SENSORS[name]
