@@ -13,7 +13,7 @@ from benchmark.timing import SLOW_REPEAT, Clock, spread, thin
 from lidar_perception.datasets.semantickitti import SemanticFrame
 from lidar_perception.evaluation.segmentation import PROTOCOLS, GroundReport
 from lidar_perception.ground.cloth import segment_by_cloth
-from lidar_perception.ground.patchwork import segment_by_patchwork
+from lidar_perception.ground.patchwork import segment_by_patchwork, silent_stdout
 from lidar_perception.ground.segment import METHODS
 from lidar_perception.ground.threshold import (
     SENSOR_HEIGHT,
@@ -117,7 +117,7 @@ def measure_patchwork(frames: list[LidarFrame], repeat: int) -> dict:
                 "ours": partial(segment_by_patchwork, frame.xyz, frame.intensity, SENSOR_HEIGHT)}
 
     same = 0
-    with peers.silent():
+    with silent_stdout():
         clock = Clock(repeat, calls(frames[0], _with_intensity(frames[0])))
         for frame in track(frames, title, len(frames)):
             found = clock.time(calls(frame, _with_intensity(frame)))
@@ -150,7 +150,7 @@ def measure_cloth(scans: list[np.ndarray], repeat: int) -> dict:
     def calls(xyz, precise):
         return {name: partial(peers.CLOTH.run, precise), "ours": partial(segment_by_cloth, xyz)}
 
-    with peers.silent():
+    with silent_stdout():
         clock = Clock(min(repeat, SLOW_REPEAT), calls(*_both(thin(scans[0]))))
         for xyz in track(scans, title, len(scans)):
             clock.time(calls(*_both(xyz)))
@@ -175,7 +175,7 @@ def measure_labelled(frames: list[SemanticFrame], repeat: int) -> dict:
     def calls(frame):
         return {name: partial(methods[name], frame) for name in reports}
 
-    with peers.silent():
+    with silent_stdout():
         clock = None
         for item in track(frames, "ground of labelled scans", len(frames)):
             frame, semantic, _ = item.load()

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import os
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import metadata
 from unittest import mock
@@ -38,20 +35,6 @@ class Peer:
 
     def version(self) -> str:
         return self.missing() or metadata.version(self.package)
-
-
-@contextmanager
-def silent() -> Iterator[None]:
-    """File descriptor 1 to nowhere: the C++ libraries print there."""
-    sys.stdout.flush()
-    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 1)
-        yield
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
-        os.close(nowhere)
 
 
 # DBSCAN: points (N, 3) float32, eps, min_samples -> (N,) labels, -1 noise.

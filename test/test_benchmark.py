@@ -112,9 +112,11 @@ def test_the_command_writes_what_it_measured(nothing_installed, tmp_path):
     from benchmark.__main__ import main
     root, out = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "b.json"
     done = CliRunner().invoke(main, ["--kitti", str(root), "--json", str(out), "--repeat", "1",
-                                     "--no-graph"], catch_exceptions=False)
+                                     "--frames", "2", "--no-graph"], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     content = json.loads(out.read_text())
-    assert {"machine", "peers", "candidates", "dbscan_in_view", "threshold_in_view"} == set(content)
+    assert {"machine", "peers", "candidates", "dbscan_in_view", "threshold_in_view",
+            "simulation"} == set(content)
+    assert content["simulation"]["points"] > 50_000
     assert content["peers"]["open3d"] == "not installed"
     assert content["dbscan_in_view"]["rows"][0]["same"] == 1

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from lidar_perception.geometry import box_corners
+from lidar_perception.types import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TRUTH_COLOR, FOUND_COLOR = "#009e73", "#d55e00"
 
@@ -44,6 +49,17 @@ def draw_frame(path: str | Path, xyz: np.ndarray, ground: np.ndarray, cluster_id
     axes.set_axisbelow(True)
     if len(truth) or len(found):
         axes.legend(loc="upper right", framealpha=0.9)
-    Path(path).parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, bbox_inches="tight")
-    plt.close(figure)
+    save_picture(path, figure, bbox_inches="tight")
+
+
+def save_picture(path: str | Path, figure: Figure, **options) -> None:
+    """Write a figure as PNG and close it. InputError where it cannot be written."""
+    import matplotlib.pyplot as plt
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(path, format="png", **options)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror}") from None
+    finally:
+        plt.close(figure)

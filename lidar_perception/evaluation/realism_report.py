@@ -10,9 +10,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from lidar_perception.evaluation.pictures import save_picture
 from lidar_perception.evaluation.realism import LEAST_SAMPLES, factor_off
 from lidar_perception.evaluation.scan_statistics import CURVES
-from lidar_perception.types import InputError
 
 WORST = 25
 REAL, SIMULATED, WRONG = "#0072b2", "#d55e00", "#b00000"
@@ -131,13 +131,7 @@ def draw_realism(path: Path, content: dict) -> None:
                     f"scans, {content['simulated']['scans']} simulated\nmedian and 10 to 90 % of "
                     "the scans or objects; [bins within 20 % / bins judged]", x=0.01, ha="left",
                     fontsize=15)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, format="png")
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from None
-    finally:
-        plt.close(figure)
+    save_picture(path, figure)
 
 
 def _draw_curve(axes, curve: dict, log: bool) -> None:

@@ -10,8 +10,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from lidar_perception.evaluation.pictures import save_picture
 from lidar_perception.evaluation.segmentation import HIT_IOU, MIN_POINTS, PROTOCOLS, true_ground
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import LidarFrame
 
 # Patchwork++ on sequences 00 to 10 of SemanticKITTI, mean of the sequences, in percent: precision,
 # recall, F1. The first from the paper (IROS 2022, Table I), the second from its repository.
@@ -122,10 +123,4 @@ def draw_ground(path: Path, name: str, frame: LidarFrame, semantic: np.ndarray,
                  xlabel="right [m]", ylabel="forward [m]", title=f"{method}, scan {name}")
         for handle in axes.legend(loc="upper right", framealpha=0.9).legend_handles:
             handle.set_sizes([30])
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, format="png")
-    except OSError as error:
-        raise InputError(f"cannot write {path}: {error.strerror}") from None
-    finally:
-        plt.close(figure)
+    save_picture(path, figure)

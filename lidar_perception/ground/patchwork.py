@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ import numpy as np
 from lidar_perception.params import PatchworkParams
 from lidar_perception.types import InputError
 
-_redirecting = threading.Lock()
+_redirecting = threading.RLock()  # a caller may silence a whole run
 
 
 def segment_by_patchwork(xyz: np.ndarray, intensity: np.ndarray | None, sensor_height: float,
@@ -39,7 +40,7 @@ def segment_by_patchwork(xyz: np.ndarray, intensity: np.ndarray | None, sensor_h
     points[:, :3] = xyz
     points[:, 3] = 0.0 if intensity is None else intensity
     ground = np.zeros(len(xyz), bool)
-    with _silent_stdout():
+    with silent_stdout():
         engine = pypatchworkpp.patchworkpp(settings)
         if len(xyz):
             engine.estimateGround(points)
@@ -48,9 +49,10 @@ def segment_by_patchwork(xyz: np.ndarray, intensity: np.ndarray | None, sensor_h
 
 
 @contextmanager
-def _silent_stdout() -> Iterator[None]:
-    """The library greets on file descriptor 1, where sys.stdout has no say."""
+def silent_stdout() -> Iterator[None]:
+    """Libraries in C++ write to file descriptor 1, where sys.stdout has no say."""
     with _redirecting:
+        sys.stdout.flush()
         kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
         try:
             os.dup2(nowhere, 1)
