@@ -14,7 +14,7 @@ from sklearn.cluster import DBSCAN
 
 from lidar_perception.clustering.dbscan import dbscan, distance_aware_dbscan
 from lidar_perception.clustering.dense import dbscan_by_cells
-from lidar_perception.clustering.sparse import dbscan_by_pairs
+from lidar_perception.clustering.growing import dbscan_by_growing
 from lidar_perception.ground.threshold import segment_by_threshold
 from lidar_perception.params import DbscanParams
 
@@ -330,11 +330,11 @@ def test_by_cells_and_by_pairs_the_labels_are_scikit_learns(seed, n, scale, eps,
         xyz = np.round(xyz * 20) / np.float32(20)  # many ties at exactly eps
     expected = DBSCAN(eps=eps, min_samples=min_samples).fit(xyz).labels_ + 1
     np.testing.assert_array_equal(dbscan_by_cells(xyz, eps, min_samples), expected)
-    np.testing.assert_array_equal(dbscan_by_pairs(xyz, eps, min_samples), expected)
+    np.testing.assert_array_equal(dbscan_by_growing(xyz, eps, min_samples), expected)
 
 
 def test_dense_points_are_refused_by_pairs_before_they_cost_much():
-    assert dbscan_by_pairs(np.zeros((100_000, 3), np.float32), 0.5, 10) is None
+    assert dbscan_by_growing(np.zeros((100_000, 3), np.float32), 0.5, 10) is None
 
 
 def test_a_forked_process_clusters_too():

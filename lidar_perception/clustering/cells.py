@@ -7,7 +7,9 @@ from collections import namedtuple
 import numpy as np
 from numba import njit
 
-from lidar_perception.clustering.grid import grid
+from lidar_perception.clustering.grid import grid, in_order
+
+BLOCK = 32  # distances at a time: few enough to stop early, many enough for vector loops
 
 # Points sorted into cells: their rows order (N,), float64 xyz (3, N), and start (C+1,) the first
 # of each cell. All within `reach` of cell a are in the cells low[a, k] to high[a, k] - 1 for
@@ -20,7 +22,7 @@ def cells_of(xyz: np.ndarray, reach: float) -> Cells:
     # A hair over reach, so that rounding never puts two neighbours more than a cell apart; at
     # least a micrometre, as thresholds may be 0.
     order, *rest = grid(xyz, max(reach, 1e-6) * (1.0 + 1e-6), 1)
-    return Cells(reach, order, xyz[order].T.astype(np.float64, order="C"), rest[0], *_ranges(*rest))
+    return Cells(reach, order, in_order(xyz, order), rest[0], *_ranges(*rest))
 
 
 @njit(cache=True, nogil=True)
@@ -28,26 +30,32 @@ def _ranges(start, cell_z, column_start, neighbours):
     columns, half = neighbours.shape
     low = np.empty((len(cell_z), 2 * half - 1), np.int32)
     high, ranges, size = np.empty_like(low), np.zeros_like(cell_z), np.zeros_like(cell_z)
-    for side in range(2 * half - 1):
-        for c in range(columns):
-            own, other = c, neighbours[c, side % half + side // half]
-            if other < 0:
-                continue
-            if side >= half:  # each pair of columns from the other side
-                own, other = other, c
-            begin = end = column_start[other]
-            last = column_start[other + 1]
-            for a in range(column_start[own], column_start[own + 1]):
-                while begin < last and cell_z[begin] < cell_z[a] - 1:
-                    begin += 1
-                end = max(end, begin)
-                while end < last and cell_z[end] <= cell_z[a] + 1:
-                    end += 1
-                if begin < end:
-                    low[a, ranges[a]], high[a, ranges[a]] = begin, end
-                    ranges[a] += 1
-                    size[a] += start[end] - start[begin]
+    for c in range(columns):
+        _add_ranges(start, cell_z, column_start, c, c, low, high, ranges, size)
+    for c in range(columns):
+        for k in range(1, half):
+            other = neighbours[c, k]
+            if other >= 0:
+                _add_ranges(start, cell_z, column_start, c, other, low, high, ranges, size)
+                _add_ranges(start, cell_z, column_start, other, c, low, high, ranges, size)
     return ranges, size, low, high
+
+
+@njit(cache=True, nogil=True)
+def _add_ranges(start, cell_z, column_start, own, other, low, high, ranges, size):
+    """The cells of column `other` that are at most one higher or lower than each of column own."""
+    begin = end = column_start[other]
+    last = column_start[other + 1]
+    for a in range(column_start[own], column_start[own + 1]):
+        while begin < last and cell_z[begin] < cell_z[a] - 1:
+            begin += 1
+        end = max(end, begin)
+        while end < last and cell_z[end] <= cell_z[a] + 1:
+            end += 1
+        if begin < end:
+            low[a, ranges[a]], high[a, ranges[a]] = begin, end
+            ranges[a] += 1
+            size[a] += start[end] - start[begin]
 
 
 @njit(cache=True, nogil=True)
@@ -61,3 +69,23 @@ def gather(cells, a, out):
             for axis in range(3):
                 out[axis, put] = cells.xyz[axis, j]
             put += np.uint64(1)
+
+
+@njit(cache=True, nogil=True)
+def crowded(cells, reach2, enough):
+    """(N,) bool, cell by cell: at least `enough` points lie within reach, itself included. reach2
+    (N,): the square of each point's own, at most that of the cells."""
+    leads, near = np.zeros(len(reach2), np.bool_), np.empty((3, cells.size.max()))
+    for a in range(len(cells.size)):
+        gather(cells, a, near)
+        for i in range(cells.start[a], cells.start[a + 1]):
+            px, py, pz = cells.xyz[0, i], cells.xyz[1, i], cells.xyz[2, i]
+            found, begin, size = 0, 0, cells.size[a]
+            while found < enough and begin < size:
+                for j in range(np.uint64(begin), np.uint64(min(begin + BLOCK, size))):
+                    dx, dy, dz = px - near[0, j], py - near[1, j], pz - near[2, j]
+                    one = 1 if dx * dx + dy * dy + dz * dz <= reach2[i] else 0
+                    found += one
+                begin += BLOCK
+            leads[i] = found >= enough
+    return leads

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from lidar_perception.clustering.dense import dbscan_by_cells
-from lidar_perception.clustering.sparse import dbscan_by_pairs
+from lidar_perception.clustering.growing import dbscan_by_growing
 from lidar_perception.geometry import horizontal_range
 from lidar_perception.params import DbscanParams
 
@@ -105,5 +105,5 @@ def dbscan(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray:
     if len(xyz) == 0:
         return np.zeros(0, np.int32)
     xyz = np.ascontiguousarray(xyz, np.float32)
-    labels = dbscan_by_pairs(xyz, eps, min_samples)
+    labels = dbscan_by_growing(xyz, eps, min_samples)
     return dbscan_by_cells(xyz, eps, min_samples) if labels is None else labels

@@ -22,7 +22,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.clustering.cells import cells_of, gather
+from lidar_perception.clustering.cells import cells_of, crowded, gather
 from lidar_perception.clustering.grid import number_clusters, root
 from lidar_perception.params import EuclideanParams
 
@@ -46,7 +46,7 @@ def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams()) -> n
     if reach.max() > cells.reach:
         cells = cells_of(xyz, reach.max())
     reach2 = reach[cells.order] ** 2
-    leads = _leads(cells, reach2, params.beta * np.log(n))
+    leads = crowded(cells, reach2, params.beta * np.log(n))
     component = np.empty(n, np.int32)
     component[cells.order] = _components(cells, np.stack([*cells.xyz, reach2], axis=1), leads)
     size = np.bincount(component + 1)  # the first is of none
@@ -133,25 +133,6 @@ def _means(cells, radius2):
                 count += one
             means[i] = total / max(count - 1.0, 1.0)  # itself is one of them
     return means
-
-
-@njit(cache=True, nogil=True)
-def _leads(cells, reach2, enough):
-    """(N,) bool, cell by cell: `enough` points or more are within reach."""
-    leads, near = np.zeros(len(reach2), np.bool_), np.empty((3, cells.size.max()))
-    for a in range(len(cells.size)):
-        gather(cells, a, near)
-        for i in range(cells.start[a], cells.start[a + 1]):
-            px, py, pz = cells.xyz[0, i], cells.xyz[1, i], cells.xyz[2, i]
-            found, begin, size = 0, 0, cells.size[a]
-            while found < enough and begin < size:
-                for j in range(np.uint64(begin), np.uint64(min(begin + 256, size))):
-                    dx, dy, dz = px - near[0, j], py - near[1, j], pz - near[2, j]
-                    one = 1 if dx * dx + dy * dy + dz * dz <= reach2[i] else 0
-                    found += one
-                begin += 256
-            leads[i] = found >= enough
-    return leads
 
 
 @njit(cache=True, nogil=True)

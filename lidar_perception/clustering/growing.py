@@ -1,0 +1,85 @@
+"""DBSCAN cluster by cluster: from each core point to all that are within eps of those found."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from lidar_perception.clustering.cells import cells_of, crowded
+
+# Points around a point, in the mean, beyond which going by cells is faster.
+LIMIT = 500
+
+
+def dbscan_by_growing(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray | None:
+    """(N,) int32 labels of points (N, 3) float32, as dbscan.dbscan; None if they are too dense.
+    No pairs are stored: memory grows with the number of points only."""
+    cells = cells_of(xyz, eps)
+    if np.diff(cells.start) @ cells.size > LIMIT * len(xyz):
+        return None
+    core = crowded(cells, np.full(len(xyz), eps * eps), min_samples)
+    labels = np.empty(len(xyz), np.int32)
+    labels[cells.order] = _grow(cells, np.ascontiguousarray(cells.xyz.T), core, eps * eps)
+    return labels
+
+
+@njit(cache=True, nogil=True)
+def _grow(cells, points, core, eps2):
+    """(N,) labels in the order of the cells. Clusters start at core points in the order of the
+    input, so that they are numbered by their first one, and a border point has the first to come.
+
+    items are the points of each cell: core points without a cluster up to new[a], others without
+    one from free[a] on, and between them those that have one.
+    """
+    n, start = len(points), cells.start
+    cell, items, place = np.empty(n, np.int32), np.arange(n), np.empty(n, np.int64)
+    new, free = start[:-1].copy(), start[:-1].copy()
+    for a in range(len(new)):
+        for i in range(start[a], start[a + 1]):
+            cell[i] = a
+            if core[i]:
+                items[new[a]], items[i] = i, items[new[a]]
+                new[a] += 1
+        free[a] = new[a]
+    for m in range(n):
+        place[items[m]] = m
+    grid_place, stack = np.empty(n, np.int64), np.empty(n, np.int64)
+    for k in range(n):
+        grid_place[cells.order[k]] = k
+    labels, count = np.zeros(n, np.int32), 0
+    for row in range(n):
+        seed = grid_place[row]
+        if not core[seed] or labels[seed]:
+            continue
+        count += 1
+        labels[seed], stack[0], waiting = count, seed, 1
+        _swap(items, place, place[seed], new[cell[seed]] - 1)
+        new[cell[seed]] -= 1
+        while waiting:
+            waiting -= 1
+            i = stack[waiting]
+            x, y, z, a = points[i, 0], points[i, 1], points[i, 2], cell[i]
+            for k in range(cells.ranges[a]):
+                for b in range(cells.low[a, k], cells.high[a, k]):
+                    for m in range(new[b] - 1, start[b] - 1, -1):
+                        j = items[m]
+                        dx, dy, dz = x - points[j, 0], y - points[j, 1], z - points[j, 2]
+                        if dx * dx + dy * dy + dz * dz <= eps2:
+                            labels[j], stack[waiting] = count, j
+                            waiting += 1
+                            new[b] -= 1
+                            _swap(items, place, m, new[b])
+                    for m in range(free[b], start[b + 1]):
+                        j = items[m]
+                        dx, dy, dz = x - points[j, 0], y - points[j, 1], z - points[j, 2]
+                        if dx * dx + dy * dy + dz * dz <= eps2:
+                            labels[j] = count
+                            _swap(items, place, m, free[b])
+                            free[b] += 1
+    return labels
+
+
+@njit(cache=True, nogil=True)
+def _swap(items, place, m, k):
+    i, j = items[m], items[k]
+    items[m], items[k], place[i], place[j] = j, i, k, m
