@@ -61,6 +61,10 @@ BAD = {  # what is wrong -> message, words that the diagnostic must hold
 }
 
 
+# Each cloud is to arrive, even where shared memory is small.
+RELIABLE_IN = {"qos_overrides./in.subscription.reliability": "reliable"}
+
+
 @pytest.fixture(scope="module")
 def good_cloud(drive_bag):
     with Bag(drive_bag) as bag:
@@ -70,7 +74,7 @@ def good_cloud(drive_bag):
 @pytest.mark.parametrize("node", ["ground_segmentation", "perception"])
 def test_bad_clouds_become_diagnostics_and_the_node_lives_on(node, processes, peer, good_cloud):
     processes.start(node, {"~/input/points": "/in", "~/output/points": "/out"},
-                    {"seed.source": "file"} if node == "perception" else {})
+                    RELIABLE_IN | ({"seed.source": "file"} if node == "perception" else {}))
     talker = peer.talker("/in", CLOUD)
     received = peer.listen("/out", CLOUD)
     for name, (msg, words) in BAD.items():
@@ -91,7 +95,7 @@ def test_no_method_dies_of_a_strange_cloud(values, processes, peer, good_cloud):
     """The wheels behind some methods end the process on NaN, outliers or nothing at all."""
     node = "perception" if "clustering.method" in values else "ground_segmentation"
     processes.start(node, {"~/input/points": "/in", "~/output/points": "/out"}, {
-        "qos_overrides./in.subscription.reliability": "reliable", **values})  # each is to arrive
+        **RELIABLE_IN, **values})
     talker, received = peer.talker("/in", CLOUD), peer.listen("/out", CLOUD)
     rng = np.random.default_rng(0)
     xyz = xyz_of(good_cloud)
@@ -124,7 +128,7 @@ def test_no_method_dies_of_a_strange_cloud(values, processes, peer, good_cloud):
 def test_a_wrong_height_and_a_wrong_scale_of_intensity_are_said(processes, peer, good_cloud):
     """The sensor hangs 1.73 m high; intensity is 0..1."""
     processes.start("ground_segmentation", {"~/input/points": "/in"},
-                    {"ground.sensor_pose.height": 1.2, "ground.method": "patchwork"})
+                    RELIABLE_IN | {"ground.sensor_pose.height": 1.2, "ground.method": "patchwork"})
     talker = peer.talker("/in", CLOUD)
     peer.send(talker, good_cloud, lambda: "ground.sensor_pose.height is 1.2; set it to 1.7"
               in peer.message_of("ground_segmentation"), "the measured height")
@@ -143,7 +147,8 @@ def test_a_wrong_height_and_a_wrong_scale_of_intensity_are_said(processes, peer,
 def test_layout_does_not_change_the_result(processes, peer, good_cloud):
     """Big-endian, organised and NaN-padded clouds give the ground of the plain cloud."""
     from msg_utils.point_cloud2 import to_array
-    processes.start("ground_segmentation", {"~/input/points": "/in", "~/output/points": "/out"}, {})
+    processes.start("ground_segmentation", {"~/input/points": "/in", "~/output/points": "/out"},
+                    RELIABLE_IN)
     xyz = xyz_of(good_cloud)[:40_000]
     holes = np.full((20_000, 3), np.nan, np.float32)
     organised = cloud(np.concatenate([xyz, holes, np.zeros_like(holes)]), 3, is_dense=False)
@@ -162,8 +167,8 @@ def test_layout_does_not_change_the_result(processes, peer, good_cloud):
 
 
 def test_clustering_and_refinement_name_the_missing_column(processes, peer, good_cloud):
-    processes.start("clustering", {"~/input/points": "/in"}, {})
-    processes.start("candidate_refinement", {"~/input/points": "/in"}, {})
+    for node in ("clustering", "candidate_refinement"):
+        processes.start(node, {"~/input/points": "/in"}, RELIABLE_IN)
     talker = peer.talker("/in", CLOUD)
     peer.send(talker, good_cloud, lambda: (
         "no column 'ground'" in peer.message_of("clustering")
