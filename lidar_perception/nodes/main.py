@@ -53,25 +53,28 @@ def main() -> int:
 
 
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-SHARED_MEMORY_NEEDED = 256 * 2**20
+PROFILES = {256 * 2**20: "fastdds.xml", 40 * 2**20: "fastdds_small.xml"}  # free bytes needed
 TEARDOWN_TIMEOUT = 1.5  # seconds
 
 
 def use_large_shared_memory() -> None:
-    """Let Fast DDS pass whole clouds through shared memory, see fastdds.xml. A profile of the
-    user's own stays; so does the default where /dev/shm is small, as in a container."""
+    """Let Fast DDS pass whole clouds through shared memory, see fastdds.xml; less of it where
+    /dev/shm is small, as the 64 MB of a container are. A profile of the user's own stays."""
     if any(os.environ.get(name) for name in PROFILE_VARIABLES):
         return
     try:
         memory = os.statvfs("/dev/shm")
     except OSError:
         return
-    if memory.f_bavail * memory.f_frsize < SHARED_MEMORY_NEEDED:
-        print("/dev/shm is small, so large clouds may get lost between processes; start the "
-              "container with --shm-size=1g", file=sys.stderr)
-        return
-    for name in PROFILE_VARIABLES:
-        os.environ[name] = str(Path(__file__).with_name("fastdds.xml"))
+    free = memory.f_bavail * memory.f_frsize
+    profile = next((name for needed, name in PROFILES.items() if free >= needed), None)
+    if profile != "fastdds.xml":
+        print(f"/dev/shm has only {free / 2**20:.0f} MB free, so clouds above "
+              f"{3 if profile else 0} MB may get lost between processes; start the container with "
+              "--shm-size=1g", file=sys.stderr)
+    if profile:
+        for name in PROFILE_VARIABLES:
+            os.environ[name] = str(Path(__file__).with_name(profile))
 
 
 @contextmanager
