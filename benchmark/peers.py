@@ -11,6 +11,7 @@ from unittest import mock
 import numpy as np
 
 from lidar_perception.geometry import horizontal_range
+from lidar_perception.ground.patchwork import library_settings
 from lidar_perception.params import ClothParams, DbscanParams, PatchworkParams
 
 
@@ -111,14 +112,7 @@ def _bare_patchwork(points: np.ndarray, sensor_height: float,
                     params: PatchworkParams = PatchworkParams()) -> np.ndarray:
     """Indices of the ground among points (N, 4) float32, by a new object."""
     import pypatchworkpp
-    settings = pypatchworkpp.Parameters()
-    settings.verbose = False
-    settings.sensor_height = sensor_height
-    settings.min_range, settings.max_range = params.min_range, params.max_range
-    settings.th_dist, settings.th_seeds = params.inlier_distance, params.seed_distance
-    settings.uprightness_thr = params.uprightness
-    settings.enable_RNR = params.remove_reflections
-    engine = pypatchworkpp.patchworkpp(settings)
+    engine = pypatchworkpp.patchworkpp(library_settings(sensor_height, params))
     engine.estimateGround(points)
     return engine.getGroundIndices()
 

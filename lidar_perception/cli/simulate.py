@@ -9,13 +9,12 @@ from contextlib import closing
 from pathlib import Path
 
 import click
-import numpy as np
 
 from lidar_perception import __version__
 from lidar_perception.datasets.recording import Recorded, open_recording
 from lidar_perception.datasets.to_bag import write_bag
 from lidar_perception.files import write_text
-from lidar_perception.simulation.camera import FORWARD_CAMERA
+from lidar_perception.simulation.camera import FORWARD_CAMERA, labels_in_view
 from lidar_perception.simulation.dataset import LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import drive, longest_drive
 from lidar_perception.simulation.folder import is_finished, unfinished
@@ -23,7 +22,7 @@ from lidar_perception.simulation.scene import KINDS, Streets
 from lidar_perception.simulation.sensor import GENERIC, SENSORS, sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.terminal import console, track
-from lidar_perception.types import GroundTruth, InputError
+from lidar_perception.types import InputError
 
 
 @click.command()
@@ -153,7 +152,4 @@ def _scans(seed: int, count: int, streets: Streets) -> Iterator[Recorded]:
     camera = FORWARD_CAMERA.camera()
     for street in range(seed, seed + count):
         frame, labels = next(iter(drive(street, 1, streets=streets)))
-        seen = np.flatnonzero(camera.in_view(labels.boxes[:, :3]))
-        truth = GroundTruth.of(labels.boxes[seen], labels.class_ids[seen],
-                               [labels.extras[i] for i in seen])
-        yield Recorded(f"street {street}", frame, truth, camera)
+        yield Recorded(f"street {street}", frame, labels_in_view(labels), camera)

@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 
@@ -29,12 +30,7 @@ def segment_by_patchwork(xyz: np.ndarray, intensity: np.ndarray | None, sensor_h
     except ImportError:
         raise InputError("ground.method 'patchwork' needs the package pypatchworkpp: pip install "
                          "pypatchworkpp, or choose threshold or cloth") from None
-    settings = pypatchworkpp.Parameters()
-    settings.verbose = False
-    settings.sensor_height = sensor_height
-    settings.min_range, settings.max_range = params.min_range, params.max_range
-    settings.th_dist, settings.th_seeds = params.inlier_distance, params.seed_distance
-    settings.uprightness_thr = params.uprightness
+    settings = library_settings(sensor_height, params)
     settings.enable_RNR = params.remove_reflections and intensity is not None
     points = np.empty((len(xyz), 4), np.float32)
     points[:, :3] = xyz
@@ -46,6 +42,19 @@ def segment_by_patchwork(xyz: np.ndarray, intensity: np.ndarray | None, sensor_h
             engine.estimateGround(points)
             ground[engine.getGroundIndices()] = True
     return ground
+
+
+def library_settings(sensor_height: float, params: PatchworkParams) -> Any:
+    """The library's own Parameters."""
+    import pypatchworkpp
+    settings = pypatchworkpp.Parameters()
+    settings.verbose = False
+    settings.sensor_height = sensor_height
+    settings.min_range, settings.max_range = params.min_range, params.max_range
+    settings.th_dist, settings.th_seeds = params.inlier_distance, params.seed_distance
+    settings.uprightness_thr = params.uprightness
+    settings.enable_RNR = params.remove_reflections
+    return settings
 
 
 @contextmanager

@@ -78,7 +78,7 @@ def scan_at(seed: int, i: int, sensor: Sensor, streets: Streets = ANY) -> Simula
     got = measure(hits, sensor, moment.motion, np.random.default_rng([seed, i]))
     stamp = START_NS + round(i * 10**9 / sensor.rate)
     pose = np.eye(4)
-    pose[:3, 3] = moment.position - scene.at(0.0, sensor.height).position
+    pose[:3, 3] = moment.position - scene.sensor_position(0.0, sensor.height)
     return SimulatedScan(
         LidarFrame(got.xyz, got.intensity, stamp, LIDAR_FRAME), truth(moment, hits, got.owner),
         _moving(moment, got.owner, got.semantic), got.owner.astype(np.uint16), got.ring, got.time,

@@ -59,10 +59,15 @@ class Scene:
     kind: str = ""
     seconds: float = SECONDS
 
+    def sensor_position(self, t: float, sensor_height: float) -> np.ndarray:
+        """(3,) float64 in the world after t seconds."""
+        ego = np.array([self.speed * t, 0.0])
+        return np.array([*ego, surface_height(self.ground, *ego) + sensor_height])
+
     def at(self, t: float, sensor_height: float) -> Moment:
         """The scene after t seconds, relative to a sensor so high above the road."""
-        ego = np.array([self.speed * t, 0.0])
-        sensor = np.array([*ego, surface_height(self.ground, *ego) + sensor_height])
+        sensor = self.sensor_position(t, sensor_height)
+        ego = sensor[:2]
         a = self._table
         way = a["speed"] * np.clip(t - a["start"], 0.0, a["stop"] - a["start"])
         flat = a["xy"] + a["forward"] * way[:, None]

@@ -7,11 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from lidar_perception.datasets.to_bag import Scan
-from lidar_perception.simulation.camera import FORWARD_CAMERA
+from lidar_perception.simulation.camera import FORWARD_CAMERA, labels_in_view
 from lidar_perception.simulation.drive import longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Streets
 from lidar_perception.simulation.sensor import HDL64E, Sensor
-from lidar_perception.types import GroundTruth
 
 GAP_NS = 10 * 10**9  # between the drives along two streets, as between KITTI's recordings
 
@@ -20,15 +19,11 @@ def simulated_scans(seed: int, frames: int, sensor: Sensor = HDL64E,
                     streets_of: int | None = None, streets: Streets = ANY) -> Iterator[Scan]:
     """Scans with the forward camera and, as in KITTI, labels of the objects whose centre it sees:
     streets_of (default: as many as fit) of each of the streets seed, seed + 1, ..."""
-    camera = FORWARD_CAMERA.camera()
     each = streets_of or longest_drive(sensor)
     drive_ns = GAP_NS + round(each * 10**9 / sensor.rate)
     for number in range(frames):
         street, moment = divmod(number, each)
         scan = scan_at(seed + street, moment, sensor, streets)
-        labels = scan.truth
-        seen = np.flatnonzero(camera.in_view(labels.boxes[:, :3]))
-        truth = GroundTruth.of(labels.boxes[seen], labels.class_ids[seen],
-                               [labels.extras[i] for i in seen])
         cloud = np.column_stack([scan.frame.xyz, scan.frame.intensity])
-        yield Scan(cloud, scan.frame.stamp_ns + street * drive_ns, truth, FORWARD_CAMERA)
+        yield Scan(cloud, scan.frame.stamp_ns + street * drive_ns, labels_in_view(scan.truth),
+                   FORWARD_CAMERA)
