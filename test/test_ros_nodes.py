@@ -38,8 +38,8 @@ def test_every_node_ends_with_code_0(processes, peer, arguments, number):
     peer.wait(lambda: set(NODES) <= set(peer.diagnostics), "all nodes")
     for process in processes.running.values():
         process.send_signal(number)
-    # Two seconds for each; here seven end at once, on few cores.
-    peer.until(lambda: all(map(processes.ended, NODES)), 8.0)
+    # Two seconds for each as a rule; where DDS hangs, stopping.py ends a node after 6.5.
+    peer.until(lambda: all(map(processes.ended, NODES)), 15.0)
     assert {n: p.returncode for n, p in processes.running.items()} == dict.fromkeys(NODES, 0)
     for node in NODES:
         assert "Traceback" not in (processes.logs / f"{node}.log").read_text()

@@ -8,10 +8,13 @@ import os
 import signal
 import sys
 import tempfile
-import threading
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from lidar_perception.nodes.stopping import Stop
 
 NODES = {  # executable -> class; the module has the executable's name
     "bag_player": "BagPlayer",
@@ -52,9 +55,9 @@ def main() -> int:
     return run(Path(sys.argv[0]).name.removesuffix(".exe"), sys.argv)
 
 
+STOP_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 PROFILES = {256 * 2**20: "fastdds.xml", 40 * 2**20: "fastdds_small.xml"}  # free bytes needed
-TEARDOWN_TIMEOUT = 1.5  # seconds
 
 
 def use_large_shared_memory() -> None:
@@ -92,12 +95,16 @@ def run(name: str, arguments: list[str]) -> int:
         print(help_text(name))
         return 0
     begin = perf_counter()
-    signals = StopSignals()
+    # Threads inherit the mask, so this comes before any library starts one; what arrives from now
+    # on waits for Stop.
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     # Threads of a linear algebra library wait actively; nodes that share few cores stand in each
     # other's way.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
     use_large_shared_memory()
+    from lidar_perception.nodes.stopping import Stop
+    stop = Stop(STOP_SIGNALS)
     try:
         import rclpy
     except ImportError:
@@ -108,32 +115,10 @@ def run(name: str, arguments: list[str]) -> int:
     if hasattr(module, "warm_up"):
         with one_at_a_time():
             module.warm_up()
-    return _spin(getattr(module, NODES[name]), rclpy, arguments, perf_counter() - begin, signals)
+    return _spin(getattr(module, NODES[name]), rclpy, arguments, perf_counter() - begin, stop)
 
 
-class StopSignals(threading.Thread):
-    """SIGINT and SIGTERM, taken by a thread that waits for nothing else. As exceptions in the main
-    thread they could be lost in a destructor, or cut short what must be finished.
-
-    react is called at the first signal; until there is a node, it ends the process.
-    """
-
-    NUMBERS = frozenset({signal.SIGINT, signal.SIGTERM})
-
-    def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self.react = lambda: os._exit(0)
-        # Threads inherit the mask, so this comes before any library starts one.
-        signal.pthread_sigmask(signal.SIG_BLOCK, self.NUMBERS)
-        self.start()
-
-    def run(self) -> None:
-        signal.sigwait(self.NUMBERS)
-        self.react()
-
-
-def _spin(node_class: type, rclpy, arguments: list[str], seconds: float,
-          signals: StopSignals) -> int:
+def _spin(node_class: type, rclpy, arguments: list[str], seconds: float, stop: Stop) -> int:
     from rclpy.exceptions import ParameterException
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
@@ -144,7 +129,7 @@ def _spin(node_class: type, rclpy, arguments: list[str], seconds: float,
     node, code = None, 0
     try:
         node = node_class()
-        signals.react = lambda: node.stop.set_result(None)
+        stop.react = lambda: node.stop.set_result(None)
         node.get_logger().info(f"ready: code loaded and warmed up in {seconds:.1f} s")
         executor = SingleThreadedExecutor()
         executor.add_node(node)
@@ -153,12 +138,10 @@ def _spin(node_class: type, rclpy, arguments: list[str], seconds: float,
         rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
         code = 2
     finally:
+        stop.closing()
         if node is not None:
             node.close()
-        # All is written now. DDS can hang while it is taken down: then the process ends without.
-        last_resort = threading.Timer(TEARDOWN_TIMEOUT, os._exit, [code])
-        last_resort.daemon = True
-        last_resort.start()
+        stop.closed(code)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
