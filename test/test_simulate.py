@@ -24,15 +24,17 @@ from lidar_perception.datasets.semantickitti import MOVING, THINGS, open_semanti
 from lidar_perception.geometry import box_corners, points_in_box, wrap_angle
 from lidar_perception.simulation import dataset
 from lidar_perception.simulation.batch import training_scans
-from lidar_perception.simulation.camera import FORWARD_CAMERA
+from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
 from lidar_perception.simulation.dataset import LAYOUTS
 from lidar_perception.simulation.drive import drive, scan_at, scans
+from lidar_perception.simulation.scene import CROWDED
 from lidar_perception.simulation.sensor import SENSORS, generic
 from lidar_perception.types import InputError
 
 TINY = generic(16, -14.0, 3.0, 2.0, 10.0)
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPT = """
+from lidar_perception.simulation.scene import CROWDED
 from lidar_perception.simulation.sensor import SENSORS, generic
 SENSORS["tiny"] = generic(16, -14.0, 3.0, 2.0, 10.0)
 from lidar_perception.cli.main import main
@@ -110,12 +112,23 @@ def test_object_layout_reads_back(made):
     for number, recorded in enumerate(recording):
         scan = scan_at(3 + number // 2, number % 2, TINY)
         order = np.argsort(scan.ring, kind="stable")
-        assert recorded.name == f"{number:06}" and len(recorded.truth)
+        assert recorded.name == f"{number:06}"
         assert np.array_equal(recorded.frame.xyz, scan.frame.xyz[order])
         assert np.array_equal(recorded.frame.intensity, scan.frame.intensity[order])
         assert np.allclose(recorded.camera.projection, FORWARD_CAMERA.camera().projection)
         assert (recorded.camera.width, recorded.camera.height) == (1242, 375)
-        same_objects(recorded.truth, write_kitti.seen_by_camera(scan.truth, FORWARD_CAMERA), 0.0051)
+        same_objects(recorded.truth, kitti_labels(scan.truth), 0.0051)
+
+
+def test_what_is_hidden_or_nearly_so_is_not_labelled_but_marked():
+    scan = scan_at(33, 0, SENSORS["hdl64e"], CROWDED)
+    seen, labels = write_kitti.seen_by_camera(scan.truth, FORWARD_CAMERA), kitti_labels(scan.truth)
+    assert 0 < len(labels) < len(seen) == len(labels) + len(labels.notes)
+    assert all(e["num_points"] >= 5 and e["visible"] >= 0.15 for e in labels.extras)
+    kept = {e["track_id"] for e in labels.extras}
+    left_out = [e for e in seen.extras if e["track_id"] not in kept]
+    assert all(e["num_points"] < 5 or e["visible"] < 0.15 for e in left_out)
+    assert [e["bbox"] for e in left_out] == [note["bbox"] for _, note in labels.notes]
 
 
 def test_tracking_layout_reads_back(made):
@@ -124,7 +137,7 @@ def test_tracking_layout_reads_back(made):
                                         "0002/000000"]
     for number, recorded in enumerate(open_recording(kitti=made / "kitti-tracking")):
         scan = scan_at(3 + number // 2, number % 2, TINY)
-        expected = write_kitti.seen_by_camera(scan.truth, FORWARD_CAMERA)
+        expected = kitti_labels(scan.truth)
         same_objects(recorded.truth, expected, 6e-7, truncation=0.26)
         assert ([e["track_id"] for e in recorded.truth.extras]
                 == [e["track_id"] for e in expected.extras])
@@ -133,6 +146,9 @@ def test_tracking_layout_reads_back(made):
 def same_objects(found, expected, accuracy, truncation=None):
     """Equal up to the digits of the text."""
     assert found.labels == expected.labels
+    assert [name for name, _ in found.notes] == [name for name, _ in expected.notes]
+    for (_, a), (_, b) in zip(found.notes, expected.notes):
+        assert a["bbox"] == pytest.approx(b["bbox"], abs=accuracy)
     assert np.abs(found.boxes - expected.boxes)[:, :6].max(initial=0) <= 1.6 * accuracy
     turned = wrap_angle(found.boxes[:, 6] - expected.boxes[:, 6])
     assert np.abs(turned).max(initial=0) <= accuracy

@@ -16,6 +16,9 @@ from lidar_perception.types import CLASSES, GroundTruth, InputError
 # The label file's own names and numbers, in its order; they travel in GroundTruth.extras.
 COLUMNS = ("truncated", "occluded", "alpha", "bbox", "dimensions", "location", "rotation_y")
 OTHER_NAMES = {"Person": "Person_sitting"}  # the tracking benchmark's name
+# A region that was not labelled: only its 2D box is known.
+DONT_CARE = {"track_id": -1, "truncated": -1.0, "occluded": -1, "alpha": -10.0,
+             "dimensions": [-1.0] * 3, "location": [-1000.0] * 3, "rotation_y": -10.0}
 RAW_NAMES = {"Person (sitting)": "Person_sitting"}
 
 

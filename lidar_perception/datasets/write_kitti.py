@@ -76,7 +76,7 @@ def tracking_label_text(number: int, truth: GroundTruth, calibration: KittiCalib
     Truncation is a level here: 0, 1, 2 for a share nearest to none, half, all."""
     lines = []
     for label in to_labels(truth, calibration.lidar_to_camera):
-        level = str(round(2 * label["truncated"]))
+        level = str(max(-1, round(2 * label["truncated"])))
         name = TRACKING_NAMES.get(label["class"], label["class"])
         line = format_label({**label, "class": name, "truncated": level}, decimals=6)
         lines.append(f"{number} {label['track_id']} {line}\n")

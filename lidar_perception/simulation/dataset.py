@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from lidar_perception.datasets import write_kitti, write_semantickitti
-from lidar_perception.simulation.camera import FORWARD_CAMERA
+from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
 from lidar_perception.simulation.drive import SimulatedScan, longest_drive, scan_at
 from lidar_perception.simulation.folder import finish_frame
 from lidar_perception.simulation.scene import ANY, Streets
@@ -64,7 +64,7 @@ def write_frame(folder: Path, plan: Plan, number: int) -> None:
     if plan.layout == "semantickitti":
         shares = _semantic(folder, plan, sequence, moment, scan, cloud, order)
     else:
-        truth = write_kitti.seen_by_camera(scan.truth, FORWARD_CAMERA)
+        truth = kitti_labels(scan.truth)
         if plan.layout == "kitti":
             write_kitti.write_object(folder, number, cloud, truth, FORWARD_CAMERA)
             shares = {}

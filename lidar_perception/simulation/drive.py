@@ -52,7 +52,8 @@ def scans(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
 
     Points are where they were met, in the sensor's frame at the stamp; boxes are those at the
     stamp. Objects without a point or beyond LABEL_RANGE have no label. extras: track_id,
-    truncated 0.0, occluded 0 | 1 | 2 as in KITTI, num_points. InputError (at the call) for a seed
+    truncated 0.0, occluded 0 | 1 | 2 as in KITTI, num_points, visible (the share of the object's
+    directions that is not hidden behind others). InputError (at the call) for a seed
     or a number of frames out of range.
     """
     most = longest_drive(sensor)
@@ -94,8 +95,9 @@ def truth(moment: Moment, hits: Hits, owner: np.ndarray) -> GroundTruth:
     occluded = (share < 0.8).astype(int) + (share < 0.4)
     keep = (points > 0) & (np.hypot(*moment.boxes[:, :2].T) <= LABEL_RANGE)
     extras = [{"track_id": int(track), "truncated": 0.0, "occluded": int(level),
-               "num_points": int(n)}
-              for track, level, n in zip(moment.track_ids[keep], occluded[keep], points[keep])]
+               "num_points": int(n), "visible": float(part)}
+              for track, level, n, part in zip(moment.track_ids[keep], occluded[keep],
+                                               points[keep], share[keep])]
     return GroundTruth.of(moment.boxes[keep], moment.class_ids[keep], extras)
 
 
