@@ -7,7 +7,7 @@ from rich.table import Table
 
 from benchmark import plain_stm_cpa
 from lidar_perception.candidates.refine import STAGES
-from lidar_perception.cli.evaluate import PROTOCOL
+from lidar_perception.configurations import PAPER
 from lidar_perception.datasets.recording import Recorded
 from lidar_perception.evaluation.candidates import pedestrians
 from lidar_perception.pipeline import (
@@ -33,17 +33,17 @@ def compare(frames: list[Recorded], repeat: int) -> dict:
         truth = pedestrians(f)
         arguments = (f.frame.xyz, f.camera.projection, f.camera.width, f.camera.height, truth)
         theirs = [plain_stm_cpa.candidates(*arguments) for _ in range(min(repeat, 3))]
-        mine = [find_candidates(f.frame, truth_seed(truth), f.camera, PROTOCOL)
+        mine = [find_candidates(f.frame, truth_seed(truth), f.camera, PAPER)
                 for _ in range(repeat)]
         _median_of_steps(plain, [r["ms"] for r in theirs])
         _median_of_steps(ours, [found.ms for _, found in mine])
         result = theirs[0]
         # The same ground for both: then clusters must be identical, and so the candidates.
-        ids = cluster_obstacles(result["points"], result["ground"], PROTOCOL.clustering)
+        ids = cluster_obstacles(result["points"], result["ground"], PAPER.clustering)
         agree["labels_identical"] += np.array_equal(ids, result["labels"])
         boxes = grounded_boxes(result["points"], result["ground"], ids, "axis_aligned")
         segmented = Segmented(np.arange(len(ids)), result["points"], result["ground"], ids, boxes)
-        found = refined(segmented, truth_seed(truth), PROTOCOL)
+        found = refined(segmented, truth_seed(truth), PAPER)
         agree["candidates_same_given_ground"] += all(
             len(getattr(found, s)) == len(result[s]) == _shared(getattr(found, s).boxes, result[s])
             for s in STAGES)

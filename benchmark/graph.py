@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.table import Table
 
-from lidar_perception.cli.evaluate import PROTOCOL
+from lidar_perception.configurations import PAPER
 from lidar_perception.datasets.bag import Bag
 from lidar_perception.datasets.kitti import open_kitti
 from lidar_perception.datasets.to_bag import kitti_scan, write_bag
@@ -24,7 +24,7 @@ def measure_graph(kitti: Path, single: bool) -> dict:
         write_bag(drive, track(map(kitti_scan, found), "writing a bag", len(found)))
         with Bag(drive) as bag:
             clouds = bag.counts[POINTS]
-        content = replay(drive, clouds, out, PROTOCOL, single=single, record=False)
+        content = replay(drive, clouds, out, PAPER, single=single, record=False)
     return {k: content[k] for k in ("clouds", "results", "latency_ms", "memory_mb", "ms")}
 
 

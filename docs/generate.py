@@ -1,4 +1,5 @@
-"""Makes docs/nodes/*.md from the parameter dataclasses: python docs/generate.py
+"""Makes docs/nodes/*.md from the parameter dataclasses and config/best.param.yaml from
+configurations.py: python docs/generate.py
 
 test/test_docs.py holds that the pages are up to date and the topics those of the running nodes.
 """
@@ -8,8 +9,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lidar_perception import params
+import yaml
 
+from lidar_perception import params
+from lidar_perception.configurations import BEST_VALUES
+
+BEST = Path(__file__).parents[1] / "config/best.param.yaml"
 FOLDER = Path(__file__).parent / "nodes"
 CLOUD, MARKERS = "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray"
 STRING_TIMES = "std_msgs/Float64"
@@ -33,8 +38,8 @@ CANDIDATES_OUT = [
      "installed."),
     ("~/debug/stage1", MARKERS, "Clusters of the seed's height; made only while subscribed."),
     ("~/debug/stage2", MARKERS, "After STM without CPA; made only while subscribed."),
-    ("~/debug/height_ms, stm_ms, cpa_ms", STRING_TIMES, "Time of each step; perception has "
-     "view_ms, ground_ms, clustering_ms and boxes_ms too."),
+    ("~/debug/height_ms, stm_ms, cpa_ms, confidence_ms", STRING_TIMES, "Time of each "
+     "step; perception has view_ms, ground_ms, clustering_ms and boxes_ms too."),
 ]
 ALWAYS_OUT = [
     ("~/debug/processing_time_ms", STRING_TIMES, "Time of the work on one cloud."),
@@ -121,6 +126,20 @@ def page(name: str) -> str:
     return "\n".join(lines) + "\n"
 
 
+def best() -> str:
+    """The parameter file of the configuration `best`, for nodes."""
+    tree: dict[str, Any] = {}
+    for key, value in BEST_VALUES.items():
+        *groups, name = key.split(".")
+        place = tree
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[name] = list(value) if isinstance(value, tuple) else value
+    return ("# The configuration `best` (lidar_perception/configurations.py), for nodes; made by "
+            "docs/generate.py.\n# Every parameter with its unit, range and default: docs/nodes/.\n"
+            + yaml.safe_dump({"/**": {"ros__parameters": tree}}, sort_keys=False))
+
+
 def _default(f: Any) -> str:
     unit = f" {f.metadata['unit']}" if f.metadata["unit"] else ""
     if isinstance(f.default, tuple):
@@ -142,3 +161,4 @@ if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
     for name in NODES:
         (FOLDER / f"{name}.md").write_text(page(name))
+    BEST.write_text(best())

@@ -16,8 +16,10 @@ import numpy as np
 
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.boxes import snap_to_ground
-from lidar_perception.candidates.refine import Candidates, refine
+from lidar_perception.candidates.confidence import confidence, shape_features
+from lidar_perception.candidates.refine import Candidates, group_points, refine
 from lidar_perception.candidates.seeds import (
+    MIN_POINTS,
     Seed,
     seed_from_click,
     seed_from_points,
@@ -151,6 +153,20 @@ def clicked_seed(click: np.ndarray, params: SeedParams = SeedParams()) -> SeedSo
     return lambda s: seed_from_click(click, s.xyz, s.cluster_ids, s.boxes, params.click_radius)
 
 
+def automatic_seed(template: Seed, params: PipelineParams) -> SeedSource:
+    """The cluster of the frame that is most like a pedestrian, or the template where none is."""
+    def source(s: Segmented) -> Seed:
+        clusters = np.arange(1, len(s.boxes) + 1)
+        likely = confidence(shape_features(*group_points(s.xyz, s.cluster_ids, clusters), s.boxes,
+                                           params))
+        likely[np.bincount(s.cluster_ids, minlength=len(s.boxes) + 1)[1:] < MIN_POINTS] = 0.0
+        if likely.max(initial=0.0) < params.seed.least_confidence:
+            return template
+        best = int(likely.argmax())
+        return seed_from_points(s.xyz[s.cluster_ids == best + 1], s.boxes[best])
+    return source
+
+
 def fixed_seed(seed: Seed) -> SeedSource:
     """The same seed in every frame."""
     return lambda s: seed
@@ -164,10 +180,12 @@ def warm_up() -> None:
     person = rng.uniform(-0.5, 0.5, (400, 3)) * [0.5, 0.5, 1.7] + [8, 0, -0.8]
     dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 8, 0]  # takes another way through DBSCAN
     xyz = np.concatenate([flat, person, person + [12, 0, 0], dense]).astype(np.float32)
-    seed = seed_from_points(person.astype(np.float32), 1.7)
+    seed = seed_from_points(person.astype(np.float32), np.array([8, 0, -0.85, 1, 1, 1.7, 0]))
     forward = Camera(np.array([[50, -100, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]], float), 100, 100)
     base = PipelineParams(view=ViewParams(enabled=True))
-    for ground, clustering, boxes in (("threshold", "dbscan", "axis_aligned"),
-                                      ("cloth", "euclidean", "l_shape")):
-        find_candidates(LidarFrame(xyz), fixed_seed(seed), forward, with_values(base, {
-            "ground.method": ground, "clustering.method": clustering, "boxes.shape": boxes}))
+    for ground, clustering, boxes, sure in (("threshold", "dbscan", "axis_aligned", False),
+                                            ("cloth", "euclidean", "l_shape", True)):
+        params = with_values(base, {
+            "ground.method": ground, "clustering.method": clustering, "boxes.shape": boxes,
+            "confidence.enabled": sure, "seed.least_confidence": 0.0})
+        find_candidates(LidarFrame(xyz), automatic_seed(seed, params), forward, params)

@@ -11,8 +11,8 @@ import pytest
 from click.testing import CliRunner
 from samples import LABELS, WALKER, object_folder, walker_label, write
 
-from lidar_perception.cli.evaluate import PROTOCOL
 from lidar_perception.cli.main import COMMANDS, cli, main
+from lidar_perception.configurations import PAPER
 from lidar_perception.datasets.bag import Bag
 from lidar_perception.params import parameter_fields
 from lidar_perception.topics import POINTS, TRUTH
@@ -100,7 +100,7 @@ def test_every_command_has_a_docstring(name):
 def test_every_parameter_has_a_flag_that_says_its_default():
     command = dict(LEAVES)["evaluate", "candidates"]
     helps = {option.name: option.help for option in command.params}
-    for name, f in parameter_fields(PROTOCOL).items():
+    for name, f in parameter_fields(PAPER).items():
         assert f.metadata["doc"] in helps[name.replace(".", "_")]
     assert helps["seed_source"].endswith("Default: ground_truth.")
     assert helps["ground_threshold_seed"].endswith("Default: 0.")

@@ -73,3 +73,13 @@ def test_links_lead_somewhere(page):
     for target in re.findall(r"\]\(([^)#]+)", page.read_text()):
         if "://" not in target:
             assert (page.parent / target).exists(), target
+
+
+def test_the_parameter_file_of_best_is_made_from_the_code(generate):
+    from lidar_perception.cli.options import read_config
+    from lidar_perception.configurations import BEST_VALUES
+    from lidar_perception.params import PipelineParams, with_values
+    assert generate.BEST.read_text() == generate.best(), "run: python docs/generate.py"
+    assert (with_values(PipelineParams(), read_config(generate.BEST, PipelineParams()))
+            == with_values(PipelineParams(), BEST_VALUES))
+    assert read_config(Path("best"), PipelineParams()) == BEST_VALUES

@@ -13,8 +13,8 @@ from click.testing import CliRunner
 from rich.console import Console
 from samples import CALIBRATION, calibration_text, object_folder, scene, walker_label, write
 
-from lidar_perception.cli.evaluate import PROTOCOL
 from lidar_perception.cli.main import cli
+from lidar_perception.configurations import PAPER
 from lidar_perception.datasets.recording import Recorded, open_recording
 from lidar_perception.evaluation.realism import (
     LEAST_SAMPLES,
@@ -78,7 +78,7 @@ def changed(change, count: int = SCANS) -> list[Recorded]:
 
 @cache
 def street():
-    return measure(map(recorded, range(SCANS)), PROTOCOL)
+    return measure(map(recorded, range(SCANS)), PAPER)
 
 
 def judged(content: dict, names=CURVES) -> list[dict]:
@@ -96,7 +96,7 @@ def test_a_recording_is_as_real_as_itself():
 def test_half_the_points_are_found_by_the_points_and_not_by_the_heights():
     def half(frame, rng):
         return frame.take(np.flatnonzero(rng.random(len(frame)) < 0.5))
-    content = compare(street(), measure(changed(half), PROTOCOL))
+    content = compare(street(), measure(changed(half), PAPER))
     for name in COUNTS:
         bins = [b for b in judged(content, [name]) if b["real"]["median"] >= 100]
         assert all(b["ratio"] == pytest.approx(0.5, abs=0.1) for b in bins), name
@@ -107,7 +107,7 @@ def test_half_the_points_are_found_by_the_points_and_not_by_the_heights():
 
 def test_a_weaker_light_is_found_by_the_intensities_alone():
     content = compare(street(), measure(
-        changed(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PROTOCOL))
+        changed(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PAPER))
     for name, curve in content["curves"].items():
         if name not in LIGHT:
             assert all(b["ratio"] in (1.0, None) for b in curve["bins"]), name
@@ -117,7 +117,7 @@ def test_a_weaker_light_is_found_by_the_intensities_alone():
 
 def test_the_order_of_the_points_does_not_matter():
     content = compare(street(), measure(
-        changed(lambda frame, rng: frame.take(rng.permutation(len(frame)))), PROTOCOL))
+        changed(lambda frame, rng: frame.take(rng.permutation(len(frame)))), PAPER))
     for name, curve in content["curves"].items():
         for b in curve["bins"]:
             assert b["real"] == b["simulated"], name
@@ -136,7 +136,7 @@ def test_counts_add_up():
 
 
 def test_bins_with_few_real_samples_are_not_judged():
-    content = compare(measure(map(recorded, range(LEAST_SAMPLES - 1)), PROTOCOL), street())
+    content = compare(measure(map(recorded, range(LEAST_SAMPLES - 1)), PAPER), street())
     assert all(content["curves"][name]["judged"] == 0 for name in (*COUNTS, *EXTENTS))
     for name, curve in content["curves"].items():
         for b in curve["bins"]:
@@ -145,7 +145,7 @@ def test_bins_with_few_real_samples_are_not_judged():
 
 
 def test_what_is_missing_on_the_simulated_side_is_wrong():
-    content = compare(street(), measure([], PROTOCOL))
+    content = compare(street(), measure([], PAPER))
     assert content["within"] == 0 and content["judged"] == compare(street(), street())["judged"]
 
 
@@ -153,7 +153,7 @@ def test_nothing_is_compared_with_nothing():
     empty = Recorded("0", LidarFrame(np.zeros((0, 3), np.float32)), GroundTruth.of([], []),
                      CALIBRATION.camera())
     for scans in ([], [empty], [replace(empty, truth=None)]):
-        measured = measure(scans, PROTOCOL)
+        measured = measure(scans, PAPER)
         content = compare(measured, measured)
         assert (content["judged"], content["share"]) == (0, None)
         print_realism(content, Console(file=StringIO()))
@@ -162,7 +162,7 @@ def test_nothing_is_compared_with_nothing():
 def test_scans_without_intensity_or_camera_have_the_other_curves():
     bare = [replace(r, camera=None, frame=replace(r.frame, intensity=None))
             for r in map(recorded, range(2))]
-    measured = measure(bare, replace(PROTOCOL, view=replace(PROTOCOL.view, enabled=False)))
+    measured = measure(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
     assert all((len(rows) == 0) == (name in LIGHT) for name, rows in measured.rows.items()
                if not name.startswith(("stage", "final")))
 
@@ -172,7 +172,7 @@ def test_a_scan_cropped_to_the_view_counts_for_its_objects_only():
     seen = np.flatnonzero(whole.camera.in_view(whole.frame.xyz))
     cropped = replace(whole, frame=whole.frame.take(seen))
     assert is_whole(whole.frame) and not is_whole(cropped.frame)
-    measured = measure([cropped], PROTOCOL)
+    measured = measure([cropped], PAPER)
     assert (measured.scans, measured.whole_scans) == (1, 0)
     assert all(not measured.rows[name] for name in ("points", "clusters", "ground intensity"))
     expected = object_rows(whole)
@@ -225,7 +225,7 @@ def test_what_lies_among_uncertain_real_samples_is_plausible():
     def thinned(shares):
         return measure([replace(r, frame=r.frame.take(np.flatnonzero(
             np.random.default_rng(100).random(len(r.frame)) < share)))
-            for r, share in zip(map(recorded, range(SCANS)), shares)], PROTOCOL)
+            for r, share in zip(map(recorded, range(SCANS)), shares)], PAPER)
     content = compare(thinned(np.linspace(0.3, 1, SCANS)), thinned([0.9] * SCANS))
     points = judged(content, ["scan points", "Car points"])
     assert not any(b["within"] for b in points) and all(b["plausible"] for b in points)
@@ -235,13 +235,13 @@ def test_what_lies_among_uncertain_real_samples_is_plausible():
 
 def test_content_survives_json_and_is_shown(tmp_path):
     import matplotlib.pyplot as plt
-    content = compare(street(), measure(map(recorded, range(3)), PROTOCOL))
+    content = compare(street(), measure(map(recorded, range(3)), PAPER))
     again = json.loads(json.dumps(content, allow_nan=False))
     assert again == content
     shown = StringIO()
     print_realism(again, Console(file=shown, width=100))
     assert f"{content['within']} of {content['judged']} bins" in shown.getvalue()
-    draw_realism(tmp_path / "new/realism.png", compare(street(), measure([], PROTOCOL)))
+    draw_realism(tmp_path / "new/realism.png", compare(street(), measure([], PAPER)))
     picture = plt.imread(tmp_path / "new/realism.png")
     assert min(picture.shape[:2]) > 1000 and picture[..., :3].std() > 0.05
     with pytest.raises(InputError, match="cannot write"):
@@ -258,7 +258,7 @@ def tracking_folder(root):
 @pytest.mark.parametrize("make", [lambda root: object_folder(root, walker_label(), 1),
                                   tracking_folder])
 def test_object_and_tracking_folders_are_read(tmp_path, make):
-    measured = measure(labelled(open_recording(kitti=make(tmp_path))), PROTOCOL)
+    measured = measure(labelled(open_recording(kitti=make(tmp_path))), PAPER)
     assert measured.objects == {"Car": 0, "Pedestrian": 1, "Cyclist": 0}
     assert (measured.scans, measured.whole_scans, measured.skipped) == (1, 1, [])
 
@@ -274,13 +274,13 @@ def test_folders_without_labels_are_refused(tmp_path):
 def test_broken_scans_are_skipped_and_counted(tmp_path):
     scans = sorted(object_folder(tmp_path, walker_label(), 3).rglob("velodyne/*.bin"))
     write(scans[1], b"cut")
-    measured = measure(labelled(open_recording(kitti=tmp_path)), PROTOCOL)
+    measured = measure(labelled(open_recording(kitti=tmp_path)), PAPER)
     assert measured.scans == 2 and len(measured.skipped) == 1
     assert compare(measured, measured)["real"]["skipped"] == measured.skipped
     for scan in scans:
         write(scan, b"cut")
     with pytest.raises(InputError, match=r"none of 3 scans can be read: .*000000.bin"):
-        measure(labelled(open_recording(kitti=tmp_path)), PROTOCOL)
+        measure(labelled(open_recording(kitti=tmp_path)), PAPER)
 
 
 def test_of_a_large_folder_an_even_choice_is_compared(tmp_path):
@@ -305,7 +305,7 @@ def test_the_command_compares(tmp_path):
 
 def test_real_scans_are_as_real_as_themselves(data):
     scans = [r for r in open_recording(kitti=data / "kitti_object") if is_whole(r.frame)][:2]
-    first, second = (measure(scans, PROTOCOL) for _ in range(2))
+    first, second = (measure(scans, PAPER) for _ in range(2))
     content = compare(first, second)
     assert all(b["ratio"] in (1.0, None) for c in content["curves"].values() for b in c["bins"])
     assert first.whole_scans == 2

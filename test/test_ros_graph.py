@@ -20,7 +20,7 @@ from lidar_perception.topics import POINTS
 from msg_utils.markers import from_marker_array
 from msg_utils.point_cloud2 import to_array
 
-PROTOCOL = with_values(PipelineParams(), {"view.enabled": True, "seed.source": "ground_truth"})
+PAPER = with_values(PipelineParams(), {"view.enabled": True, "seed.source": "ground_truth"})
 
 
 RUNS = {  # one process?, parameters beside the protocol
@@ -36,7 +36,7 @@ RUNS = {  # one process?, parameters beside the protocol
 @pytest.fixture(scope="module", params=RUNS.values(), ids=RUNS)
 def setting(request):
     single, values = request.param
-    return single, with_values(PROTOCOL, values)
+    return single, with_values(PAPER, values)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ from time import perf_counter
 import numpy as np
 
 from lidar_perception.candidates.boxes import height_matches
+from lidar_perception.candidates.confidence import confidence, shape_features
 from lidar_perception.candidates.seeds import Seed
 from lidar_perception.candidates.silhouette import cpa_scales, silhouettes, similarity
 from lidar_perception.params import PipelineParams
@@ -19,7 +20,8 @@ STAGES = ("stage1", "stage2", "final")
 @dataclass(frozen=True)
 class Candidates:
     """Detections after the height filter (stage1), STM (stage2) and STM with CPA (final); scores
-    are the similarity with the seed (stage1: without CPA). ms: time of each step."""
+    are the similarity with the seed (stage1: without CPA), or the confidence where that is on.
+    ms: time of each step."""
 
     stage1: Detections
     stage2: Detections
@@ -37,27 +39,38 @@ def refine(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, seed: Seed,
     t0 = perf_counter()
     kept = np.flatnonzero(height_matches(boxes, seed.height, params.height))
     boxes = boxes[kept]
+    floors = boxes[:, 2] - boxes[:, 5] / 2
     t1 = perf_counter()
+    template = seed.silhouette(params)
     points, start = group_points(xyz, labels, kept + 1)
-    plain = similarity(silhouettes(points, start, np.ones((len(kept), 1))), seed.silhouette)
+    plain = similarity(silhouettes(points, start, np.ones((len(kept), 1)), floors, params),
+                       template, params.stm)
     t2 = perf_counter()
     ranges = np.hypot(boxes[:, 0], boxes[:, 1])
     scales = cpa_scales(ranges, params.cpa)
-    augmented = (scales < 1.0).any(axis=1)
+    chosen = np.flatnonzero((scales < 1.0).any(axis=1))
     final = plain.copy()
-    if augmented.any():
-        chosen = np.flatnonzero(augmented)
-        points, start = group_points(xyz, labels, kept[chosen] + 1)
-        final[chosen] = similarity(silhouettes(points, start, scales[chosen]), seed.silhouette)
+    if len(chosen):
+        augmented = group_points(xyz, labels, kept[chosen] + 1)
+        final[chosen] = similarity(silhouettes(*augmented, scales[chosen], floors[chosen], params),
+                                   template, params.stm)
     t3 = perf_counter()
+    threshold = params.stm.threshold
+    if params.confidence.enabled:
+        threshold = params.confidence.threshold
+        shape = shape_features(points, start, boxes, params)
+        difference = shape["height_m"] - seed.height
+        plain, final = (confidence(shape, alike, difference) for alike in (plain, final))
+    t4 = perf_counter()
 
     def detections(scores, accepted):
         return Detections.of(boxes[accepted], PEDESTRIAN, scores[accepted])
 
     return Candidates(detections(plain, np.ones(len(kept), bool)),
-                      detections(plain, plain >= params.stm.threshold),
-                      detections(final, final >= params.stm.threshold),
-                      dict(height=(t1 - t0) * 1e3, stm=(t2 - t1) * 1e3, cpa=(t3 - t2) * 1e3))
+                      detections(plain, plain >= threshold),
+                      detections(final, final >= threshold),
+                      dict(height=(t1 - t0) * 1e3, stm=(t2 - t1) * 1e3, cpa=(t3 - t2) * 1e3,
+                           confidence=(t4 - t3) * 1e3))
 
 
 def group_points(xyz: np.ndarray, labels: np.ndarray,

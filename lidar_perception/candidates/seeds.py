@@ -1,4 +1,4 @@
-"""The seed pedestrian: its silhouette and height (paper A, Section 3.5)."""
+"""The seed pedestrian: its points and height (paper A, Section 3.5)."""
 
 from __future__ import annotations
 
@@ -9,35 +9,37 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.candidates.silhouette import (
-    COLUMNS,
-    ROWS,
-    from_pixels,
-    silhouettes,
-    to_pixels,
-)
+from lidar_perception.candidates.silhouette import silhouettes, to_pixels
 from lidar_perception.files import write_text
 from lidar_perception.geometry import points_in_box
+from lidar_perception.params import PipelineParams
 from lidar_perception.types import InputError
 
 MIN_POINTS = 10  # a thinner seed has no shape to compare with; DBSCAN's min_samples likewise
+DIGITS = 4  # of a metre, in a template
 
 
 @dataclass(frozen=True)
 class Seed:
-    """silhouette (80,) uint32, see silhouette.py; height in metres."""
+    """xyz (M, 3) float32 in the LiDAR frame, M >= 10; floor, the height of the ground under it,
+    and its own height above that, in metres."""
 
-    silhouette: np.ndarray
+    xyz: np.ndarray
+    floor: float
     height: float
 
+    def silhouette(self, params: PipelineParams = PipelineParams()) -> np.ndarray:
+        """(80,) uint32, see silhouette.py."""
+        return silhouettes(self.xyz, np.array([0, len(self.xyz)]), np.ones((1, 1)),
+                           np.array([self.floor]), params)[0]
 
-def seed_from_points(xyz: np.ndarray, height: float) -> Seed:
-    """Seed of a pedestrian's points (M, 3), M >= 10, and its height above the ground."""
+
+def seed_from_points(xyz: np.ndarray, box: np.ndarray) -> Seed:
+    """Seed of a pedestrian's points (M, 3), M >= 10, and box (7,), which stands on the ground."""
     if len(xyz) < MIN_POINTS:
         raise InputError(f"the seed pedestrian has {len(xyz)} points; pick a nearer one "
                          f"(at least {MIN_POINTS})")
-    image = silhouettes(xyz, np.array([0, len(xyz)]), np.ones((1, 1)))[0]
-    return Seed(image, float(height))
+    return Seed(np.ascontiguousarray(xyz, np.float32), float(box[2] - box[5] / 2), float(box[5]))
 
 
 def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray) -> Seed:
@@ -46,7 +48,7 @@ def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray
     if len(pedestrians) == 0:
         raise InputError("no Pedestrian in the ground truth of this frame, so no seed")
     nearest = pedestrians[np.argmin(np.hypot(pedestrians[:, 0], pedestrians[:, 1]))]
-    return seed_from_points(xyz[points_in_box(xyz, nearest) & ~ground], nearest[5])
+    return seed_from_points(xyz[points_in_box(xyz, nearest) & ~ground], nearest)
 
 
 def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray,
@@ -61,13 +63,16 @@ def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxe
         raise InputError(f"nearest cluster is {distance.min():.1f} m from the clicked point; "
                          f"click within {radius:g} m of a pedestrian")
     label = labels[clustered[distance.argmin()]]
-    return seed_from_points(xyz[labels == label], boxes[label - 1, 5])
+    return seed_from_points(xyz[labels == label], boxes[label - 1])
 
 
 def save_seed(seed: Seed, path: str | Path) -> None:
-    """Write a template as JSON with the silhouette drawn in characters."""
-    rows = ["".join(".#"[bit] for bit in row) for row in to_pixels(seed.silhouette).astype(int)]
-    write_text(path, json.dumps({"height_m": round(seed.height, 4), "silhouette": rows}, indent=1))
+    """Write a template as JSON: the points, and the silhouette drawn in characters for people."""
+    rows = ["".join(".#"[bit] for bit in row) for row in to_pixels(seed.silhouette()).astype(int)]
+    points = [[round(float(v), DIGITS) for v in p] for p in seed.xyz]
+    write_text(path, json.dumps({"height_m": round(seed.height, DIGITS),
+                                 "floor_m": round(seed.floor, DIGITS), "points_m": points,
+                                 "silhouette": rows}, indent=1))
 
 
 def load_seed(path: str | Path = "") -> Seed:
@@ -76,14 +81,15 @@ def load_seed(path: str | Path = "") -> Seed:
     source = Path(path) if path else files("lidar_perception.candidates") / "pedestrian.json"
     try:
         content = json.loads(source.read_text())
-        pixels = np.array([list(row) for row in content["silhouette"]]) == "#"
-        height = float(content["height_m"])
+        xyz = np.array(content["points_m"], np.float32)
+        floor, height = float(content["floor_m"]), float(content["height_m"])
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the template {source}: {error}") from None
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"{source} is not a template ({error!r}); make one with "
                          "'lidar-perception seed'") from None
-    if pixels.shape != (ROWS, COLUMNS) or not pixels.any() or not 0 < height < np.inf:
-        raise InputError(f"{source}: a template has {ROWS} rows of {COLUMNS} characters with some "
-                         "'#', and height_m above 0; make one with 'lidar-perception seed'")
-    return Seed(from_pixels(pixels), height)
+    if (xyz.ndim != 2 or xyz.shape[1] != 3 or len(xyz) < MIN_POINTS or not 0 < height < np.inf
+            or not np.isfinite(xyz).all() or not np.isfinite(floor)):
+        raise InputError(f"{source}: a template has {MIN_POINTS} points_m or more of x, y, z, and "
+                         "height_m above 0; make one with 'lidar-perception seed'")
+    return Seed(xyz, floor, height)

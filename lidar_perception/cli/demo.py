@@ -9,8 +9,9 @@ from pathlib import Path
 import click
 import numpy as np
 
-from lidar_perception.cli.evaluate import PROTOCOL, view_as_recorded
+from lidar_perception.cli.evaluate import view_as_recorded
 from lidar_perception.cli.options import parameter_options
+from lidar_perception.configurations import PAPER
 from lidar_perception.datasets.bag import Bag
 from lidar_perception.evaluation.matching import match_centres
 from lidar_perception.evaluation.report import print_candidate_report
@@ -38,7 +39,7 @@ from msg_utils.markers import from_marker_array
 @click.option("--rate", type=click.FloatRange(0.01, 100), default=1.0, show_default=True,
               help="Speed of the replay.")
 @click.option("--single", is_flag=True, help="All stages in one process instead of three.")
-@parameter_options(PROTOCOL)
+@parameter_options(PAPER)
 def demo(kitti: Path | None, bag: Path | None, out: Path, frames: int, drive_seed: int,
          rate: float, single: bool, params: PipelineParams) -> None:
     """Replay a drive through the real nodes over DDS and score the pedestrian candidates.

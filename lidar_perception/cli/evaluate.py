@@ -9,20 +9,18 @@ import click
 
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.cli.segmentation import segmentation
+from lidar_perception.configurations import PAPER
 from lidar_perception.datasets.bag import Bag
 from lidar_perception.datasets.recording import open_recording
 from lidar_perception.evaluation.candidates import CandidateReport, pedestrians
 from lidar_perception.evaluation.candidates import evaluate as evaluate_frames
 from lidar_perception.evaluation.report import print_candidate_report
 from lidar_perception.files import write_text
-from lidar_perception.params import PipelineParams, SeedParams, ViewParams, with_values
+from lidar_perception.params import PipelineParams, with_values
 from lidar_perception.pipeline import warm_up
 from lidar_perception.terminal import console, errors, track
 from lidar_perception.topics import CAMERA_INFO, EXTRINSICS
 from lidar_perception.types import InputError
-
-# Paper A's protocol: points in the camera's view, the nearest labelled pedestrian as seed.
-PROTOCOL = PipelineParams(view=ViewParams(enabled=True), seed=SeedParams(source="ground_truth"))
 
 
 def view_as_recorded(bag: Path, params: PipelineParams) -> PipelineParams:
@@ -47,7 +45,7 @@ def evaluate() -> None:
               help="Write the scores to this file.")
 @click.option("--png", type=click.Path(path_type=Path), metavar="FILE",
               help="Draw the frame with most pedestrians from above.")
-@parameter_options(PROTOCOL)
+@parameter_options(PAPER)
 def candidates(kitti: Path | None, bag: Path | None, json_file: Path | None, png: Path | None,
                params: PipelineParams) -> None:
     """Pedestrian candidates of paper A (STM-CPA) against the Pedestrian labels.

@@ -10,6 +10,7 @@ from typing import Any
 import click
 import yaml
 
+from lidar_perception.configurations import CONFIGURATIONS
 from lidar_perception.params import flatten, parameter_fields, with_values
 from lidar_perception.types import InputError
 
@@ -47,8 +48,9 @@ def parameter_options(defaults: Any) -> Callable:
         wrapper.__click_params__ = getattr(function, "__click_params__", [])
         for name, f in reversed(parameter_fields(defaults).items()):
             wrapper = _option(name, f, defaults)(wrapper)
-        return click.option("--config", type=click.Path(path_type=Path), metavar="YAML",
-                            help="ROS parameter file, as in config/.")(wrapper)
+        return click.option("--config", type=click.Path(path_type=Path), metavar="YAML|NAME",
+                            help="ROS parameter file, as in config/, or one of "
+                            f"{', '.join(CONFIGURATIONS)}.")(wrapper)
 
     return decorate
 
@@ -73,7 +75,11 @@ def _option(name: str, f: dataclasses.Field, defaults: Any) -> Callable:
 
 
 def read_config(path: Path, params: Any) -> dict[str, Any]:
-    """Values of a ROS parameter file for params; other nodes' parameters are left out."""
+    """Values of a ROS parameter file for params, or of a named configuration; other nodes'
+    parameters are left out."""
+    if str(path) in CONFIGURATIONS:
+        return {name: value for name, value in CONFIGURATIONS[str(path)].items()
+                if name in parameter_fields(params)}
     try:
         content = yaml.safe_load(path.read_text())
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:

@@ -50,7 +50,7 @@ def seed(kitti: Path | None, bag: Path | None, number: int | None,
               else truth_seed(pedestrians(recorded)))
     template = source(segmented)
     save_seed(template, out)
-    for row in to_pixels(template.silhouette)[::2]:
+    for row in to_pixels(template.silhouette(params))[::2]:
         console.print("".join(".#"[bit] for bit in row.astype(int)), markup=False)
     console.print(f"{out}: frame {recorded.name}, height {template.height:.2f} m")
 

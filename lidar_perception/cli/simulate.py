@@ -126,16 +126,16 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
 
 def _compare(kitti: Path, frames: int, seed: int, streets: Streets, json_file: Path | None,
              png: Path | None) -> None:
-    from lidar_perception.cli.evaluate import PROTOCOL
+    from lidar_perception.configurations import PAPER
     from lidar_perception.evaluation.realism import compare, labelled, measure
     from lidar_perception.evaluation.realism_report import draw_realism, print_realism
     from lidar_perception.pipeline import warm_up
 
     recording = labelled(open_recording(kitti=kitti))
     warm_up()
-    real = measure(track(recording, "measuring real scans", recording.count), PROTOCOL)
+    real = measure(track(recording, "measuring real scans", recording.count), PAPER)
     simulated = measure(track(_scans(seed, frames, streets), "measuring simulated scans", frames),
-                        PROTOCOL)
+                        PAPER)
     content = {"kitti": str(kitti), "seed": seed, **compare(real, simulated)}
     if json_file:
         write_text(json_file, json.dumps(content, indent=1))

@@ -8,13 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lidar_perception.candidates.refine import STAGES, Candidates
-from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.datasets.recording import Recorded, Recording
 from lidar_perception.evaluation.matching import RANGE_NAMES, Score, range_bins
 from lidar_perception.params import PipelineParams
 from lidar_perception.pipeline import (
     SeedSource,
     Segmented,
+    automatic_seed,
     find_candidates,
     fixed_seed,
     truth_seed,
@@ -71,7 +72,7 @@ def evaluate(recording: Iterable[Recorded | InputError] | Recording, params: Pip
              report: CandidateReport) -> Iterator[tuple[Recorded, Segmented, Candidates] | None]:
     """Run the pipeline over a recording and fill the report; yields after every frame what was
     found, or None where the frame has no pedestrian or cannot be read."""
-    template = load_seed(params.seed.file) if params.seed.source == "file" else None
+    template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
     for recorded in recording:
         if isinstance(recorded, InputError):
             report.skipped.append(str(recorded))
@@ -82,7 +83,7 @@ def evaluate(recording: Iterable[Recorded | InputError] | Recording, params: Pip
             yield None
             continue
         try:
-            segmented, found = find_candidates(recorded.frame, _seed(truth, template),
+            segmented, found = find_candidates(recorded.frame, _seed(truth, template, params),
                                                recorded.camera, params)
             ms = found.ms
         except InputError as error:  # no seed, or no camera: this frame has no candidates
@@ -94,5 +95,9 @@ def evaluate(recording: Iterable[Recorded | InputError] | Recording, params: Pip
         yield None if segmented is None else (recorded, segmented, found)
 
 
-def _seed(truth: np.ndarray, template) -> SeedSource:
-    return truth_seed(truth) if template is None else fixed_seed(template)
+def _seed(truth: np.ndarray, template: Seed | None, params: PipelineParams) -> SeedSource:
+    if template is None:
+        return truth_seed(truth)
+    if params.seed.source == "automatic":
+        return automatic_seed(template, params)
+    return fixed_seed(template)

@@ -13,7 +13,14 @@ from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.messages import camera_of, to_truth
 from lidar_perception.nodes.runtime import JUMP_NS, LATCHED, MARKERS, RELIABLE, LidarNode
 from lidar_perception.params import SeedParams, ViewParams
-from lidar_perception.pipeline import SeedSource, Segmented, clicked_seed, fixed_seed, truth_seed
+from lidar_perception.pipeline import (
+    SeedSource,
+    Segmented,
+    automatic_seed,
+    clicked_seed,
+    fixed_seed,
+    truth_seed,
+)
 from lidar_perception.topics import CLICK, TF_STATIC
 from lidar_perception.types import PEDESTRIAN, InputError
 from msg_utils.markers import from_marker_array
@@ -128,7 +135,9 @@ class SeedInput:
         else:
             if self.loaded is None or self.loaded[0] != self.params.file:
                 self.loaded = (self.params.file, load_seed(self.params.file))
-            self.deliver(msg, fixed_seed(self.loaded[1]))
+            template = self.loaded[1]
+            self.deliver(msg, fixed_seed(template) if self.params.source == "file"
+                         else automatic_seed(template, self.node.params))
 
     def _on_truth(self, msg: Any) -> None:
         objects = from_marker_array(msg)

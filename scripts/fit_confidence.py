@@ -1,0 +1,118 @@
+"""Fit candidates/confidence.json to simulated scans: two additive models of log-odds, one from the
+shape of a cluster, one from its likeness to a seed, too.
+
+    lidar-perception simulate --format kitti --frames 1000 --people 3 --seed 6000 --out scans
+    python scripts/fit_confidence.py scans
+
+Pedestrians are weighted so that they are as far away as in KITTI's training set (paper A, Table 1).
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from multiprocessing import Pool
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit
+
+from lidar_perception.candidates import confidence as module
+from lidar_perception.candidates.confidence import SEED_KNOTS, SHAPE_KNOTS, shape_features
+from lidar_perception.candidates.refine import group_points
+from lidar_perception.candidates.silhouette import silhouettes, similarity
+from lidar_perception.configurations import BEST
+from lidar_perception.datasets.kitti import KittiFrame, open_kitti
+from lidar_perception.evaluation.matching import match_centres, range_bins
+from lidar_perception.files import write_text
+from lidar_perception.params import PipelineParams
+from lidar_perception.pipeline import segment, truth_seed
+from lidar_perception.types import PEDESTRIAN, InputError
+
+KITTI_RANGES = np.array([2093, 1771, 468, 118, 37])  # paper A, Table 1
+PENALTY = 0.3  # chosen on streets left out
+OUT = Path(module.__file__).with_name("confidence.json")
+
+
+def samples(frame: KittiFrame, params: PipelineParams) -> dict | None:
+    """Features of the clusters of one frame, hit (K,) bool, and the true ranges' bins."""
+    truth = frame.truth().of_class(PEDESTRIAN)
+    segmented = segment(frame.load(), frame.calibration().camera(), params)
+    boxes, ids = segmented.boxes, np.arange(1, len(segmented.boxes) + 1)
+    if len(boxes) == 0:
+        return None
+    points, start = group_points(segmented.xyz, segmented.cluster_ids, ids)
+    features = shape_features(points, start, boxes, params)
+    found, _ = match_centres(boxes, truth)
+    try:
+        seed = truth_seed(truth)(segmented)
+        images = silhouettes(points, start, np.ones((len(boxes), 1)),
+                             boxes[:, 2] - boxes[:, 5] / 2, params)
+        features["similarity"] = similarity(images, seed.silhouette(params), params.stm)
+        features["height_difference_m"] = np.abs(features["height_m"] - seed.height)
+    except InputError:
+        features["similarity"] = features["height_difference_m"] = np.full(len(boxes), np.nan)
+    return {"features": features, "hit": np.isin(np.arange(len(boxes)), found),
+            "bins": range_bins(boxes), "truth": range_bins(truth)}
+
+
+def ramps(values: np.ndarray, knots: tuple[float, ...]) -> np.ndarray:
+    """(K, len(knots) - 1) how far each of K values has come from one knot to the next, 0..1."""
+    low, high = np.array(knots[:-1]), np.array(knots[1:])
+    return np.clip((values[:, None] - low) / (high - low), 0.0, 1.0)
+
+
+def fit(features: dict[str, np.ndarray], hit: np.ndarray, weight: np.ndarray,
+        knots: dict[str, tuple[float, ...]]) -> dict:
+    """One model, as confidence.json has it: logistic regression on the steps from knot to knot.
+    The penalty on them keeps curves level where there is nothing to learn from. More likeness is
+    never less likely."""
+    design = np.concatenate([ramps(features[name], k) for name, k in knots.items()], axis=1)
+    sign = np.where(hit, 1.0, -1.0)
+    rising = {"similarity": (0, None), "height_difference_m": (None, 0)}
+    bounds = [rising.get(name, (None, None)) for name, k in knots.items() for _ in k[1:]]
+
+    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+        margin = sign * (design @ x[1:] + x[0])
+        slope = -weight * sign * expit(-margin)
+        return (weight @ np.logaddexp(0, -margin) + PENALTY / 2 * x[1:] @ x[1:],
+                np.concatenate([[slope.sum()], slope @ design + PENALTY * x[1:]]))
+
+    x = minimize(loss, np.zeros(design.shape[1] + 1), jac=True, method="L-BFGS-B",
+                 bounds=[(None, None), *bounds], options={"maxiter": 5000, "maxfun": 10000}).x
+    ends = np.cumsum([len(k) - 1 for k in knots.values()])[:-1]
+    return {"bias": round(float(x[0]), 4),
+            "curves": {name: {"knots": k, "values": [0.0, *np.round(np.cumsum(steps), 3).tolist()]}
+                       for (name, k), steps in zip(knots.items(), np.split(x[1:], ends))}}
+
+
+def work(job: tuple[str, int]) -> dict | None:
+    root, number = job
+    return samples(open_kitti(root)[number], BEST)
+
+
+def main(roots: list[str]) -> None:
+    jobs = [(root, i) for root in roots for i in range(len(open_kitti(root)))]
+    with Pool() as pool:
+        frames = [s for s in pool.imap(work, jobs, chunksize=8) if s is not None]
+    features = {name: np.concatenate([f["features"][name] for f in frames])
+                for name in (*SHAPE_KNOTS, *SEED_KNOTS)}
+    hit, bins = (np.concatenate([f[name] for f in frames]) for name in ("hit", "bins"))
+    truth = np.bincount(np.concatenate([f["truth"] for f in frames]), minlength=5)
+    share = KITTI_RANGES / KITTI_RANGES.sum() / np.maximum(truth / truth.sum(), 1e-9)
+    weight = np.where(hit, share[bins], 1.0)
+    seeded = np.isfinite(features["similarity"])
+    models = {
+        "trained_on": {"frames": len(frames), "clusters": len(hit), "pedestrians": int(hit.sum()),
+                       "of": int(truth.sum()), "weights_by_range": share.round(2).tolist()},
+        "shape": fit(features, hit, weight, SHAPE_KNOTS),
+        "seed": fit({k: v[seeded] for k, v in features.items()}, hit[seeded], weight[seeded],
+                    {**SHAPE_KNOTS, **SEED_KNOTS}),
+    }
+    write_text(OUT, json.dumps(models, indent=1))
+    print(OUT, models["trained_on"])
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
