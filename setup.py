@@ -55,7 +55,7 @@ setup(
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "test": ["pytest>=7.4", "hypothesis>=6.90", "opencv-python-headless>=4.8",
-                 "setuptools>=70.1"],
+                 "setuptools>=70.1", "shapely>=2.0"],
         "benchmark": ["dbscan>=1.0", "opencv-python-headless>=4.8"],
     },
     entry_points={"console_scripts": [

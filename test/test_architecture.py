@@ -186,6 +186,7 @@ def test_no_source_is_longer_than_a_reader_can_hold(name):
     ("msg_utils.point_cloud2", "numba torch matplotlib scipy rosbags lidar_perception"),
     ("msg_utils.markers", "numba torch matplotlib scipy rosbags lidar_perception"),
     ("lidar_perception.evaluation.candidates", "torch matplotlib sklearn click"),
+    ("lidar_perception.evaluation.detection", "torch matplotlib sklearn rich click"),
     ("lidar_perception.cli.main", "numba torch matplotlib scipy sklearn rosbags"),
 ])
 def test_importing_a_module_does_not_load_what_it_does_not_need(module, heavy):

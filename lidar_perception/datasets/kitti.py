@@ -62,19 +62,21 @@ def read_velodyne(path: Path) -> np.ndarray:
     return raw.reshape(-1, 4)
 
 
-def open_kitti(root: str | Path) -> list[KittiFrame]:
+def open_kitti(root: str | Path, scans: bool = True) -> list[KittiFrame]:
     """The frames of a KITTI folder, in order of time; nothing is read but the file lists.
 
     root is a 3D-object or tracking folder (with velodyne/, or its parent with training/), or a
-    raw drive, day or folder of days. InputError says what is missing.
+    raw drive, day or folder of days. Without scans, labels are enough to make a frame in the
+    object layout: its points may not exist. InputError says what is missing.
     """
     root = Path(root)
     if not root.is_dir():
         raise InputError(f"{root} is not a folder; give the folder of a KITTI download")
     for folder in (root / "training", root):
-        if any((folder / name).is_dir() for name in ("velodyne", "velodyne_reduced")):
+        known = ("velodyne", "velodyne_reduced", *(() if scans else ("label_2",)))
+        if any((folder / name).is_dir() for name in known):
             tracking = (folder / "label_02").is_dir() or any(folder.glob("velodyne/*/"))
-            frames = _tracking(folder) if tracking else _object(folder)
+            frames = _tracking(folder) if tracking else _object(folder, scans)
             break
     else:
         frames = _raw(root)
@@ -85,11 +87,13 @@ def open_kitti(root: str | Path) -> list[KittiFrame]:
     return frames
 
 
-def _object(folder: Path) -> list[KittiFrame]:
-    scans = {p.stem: p for name in ("velodyne_reduced", "velodyne")  # the full scan wins
-             for p in folder.glob(f"{name}/*.bin")}
+def _object(folder: Path, scans: bool) -> list[KittiFrame]:
+    files = {} if scans else {p.stem: folder / f"velodyne/{p.stem}.bin"
+                              for p in folder.glob("label_2/*.txt")}
+    files |= {p.stem: p for name in ("velodyne_reduced", "velodyne")  # the full scan wins
+              for p in folder.glob(f"{name}/*.bin")}
     frames = []
-    for i, (name, points) in enumerate(sorted(scans.items())):
+    for i, (name, points) in enumerate(sorted(files.items())):
         image, label = folder / f"image_2/{name}.png", folder / f"label_2/{name}.txt"
         calibration = functools.cache(
             functools.partial(read_calibration, folder / f"calib/{name}.txt", image))

@@ -5,6 +5,7 @@ label_2 (object), label_02 (tracking) and tracklet_labels.xml (raw).
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -24,7 +25,7 @@ RAW_NAMES = {"Person (sitting)": "Person_sitting"}
 
 def read_object_labels(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
     """The objects of one label_2 file; lidar_to_camera (4, 4)."""
-    return to_ground_truth([parse(line, path, i) for i, line in _lines(path)], lidar_to_camera)
+    return to_ground_truth([label for _, label in parsed_lines(path)], lidar_to_camera)
 
 
 def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray) -> dict[int, GroundTruth]:
@@ -42,12 +43,17 @@ def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray) -> dict[int, G
     return {k: to_ground_truth(v, lidar_to_camera) for k, v in frames.items()}
 
 
+def parsed_lines(path: Path) -> list[tuple[int, dict]]:
+    """Line number, from 1, and parse() of every line of a label_2 or result file."""
+    return [(i, parse(line, path, i)) for i, line in _lines(path)]
+
+
 def parse(line: str, path: Path | str = "label", number: int = 0) -> dict:
     """One label line as a dict: class, the COLUMNS, and score where the line has one."""
     words = line.split()
     try:
         numbers = [float(w) for w in words[1:]]
-        if len(numbers) not in (14, 15):
+        if len(numbers) not in (14, 15) or not all(map(math.isfinite, numbers)):
             raise ValueError
     except ValueError:
         raise InputError(f"{path}:{number} is no KITTI label (a class and 14 or 15 numbers): "

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from lidar_perception.candidates.refine import STAGES
@@ -12,6 +14,24 @@ STAGE_TITLES = {"stage1": "clusters", "stage2": "STM", "final": "STM + CPA"}
 # Paper A, Table 6: recall, precision, F1 in percent, centre error in metres
 PAPER = {"stage1": (55.5, 27.6, 36.8, 0.15), "stage2": (44.7, 60.5, 51.4, 0.14),
          "final": (46.7, 58.8, 52.1, 0.16)}
+
+
+def narrow_table(title: str, first: str, *others: str, width: int = 0) -> Table:
+    """A table whose columns fit into 80 characters: the first one of words, the others, each at
+    least width wide, of numbers."""
+    table = Table(title=title, box=SIMPLE_HEAD, padding=0, caption_justify="left")
+    table.add_column(first, no_wrap=True)
+    for name in others:
+        table.add_column(name, justify="right", no_wrap=True, min_width=width)
+    return table
+
+
+def print_skipped(lines: list[str], console: Console, most: int = 5) -> None:
+    """The first reasons why frames were left out."""
+    for line in lines[:most]:
+        console.print(f"[yellow]skipped[/]: {escape(line)}")
+    if len(lines) > most:
+        console.print(f"[yellow]skipped[/]: {len(lines) - most} more, see the JSON file")
 
 
 def print_candidate_report(content: dict, console: Console, paper: bool = True) -> None:
@@ -42,7 +62,4 @@ def print_candidate_report(content: dict, console: Console, paper: bool = True) 
         for step, ms in content["ms"].items():
             times.add_row(step, f"{ms:.2f}", style="bold" if step == "total" else "")
         console.print(times)
-    for line in content.get("skipped", [])[:5]:
-        console.print(f"[yellow]skipped[/]: {line}")
-    if len(content.get("skipped", [])) > 5:
-        console.print(f"[yellow]skipped[/]: {len(content['skipped']) - 5} more, see the JSON file")
+    print_skipped(content.get("skipped", []), console)

@@ -5,12 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from lidar_perception.evaluation.pictures import save_picture
+from lidar_perception.evaluation.report import narrow_table, print_skipped
 from lidar_perception.evaluation.segmentation import HIT_IOU, MIN_POINTS, PROTOCOLS, true_ground
 from lidar_perception.types import LidarFrame
 
@@ -28,16 +26,13 @@ def print_scores(content: dict, ground_method: str, console: Console) -> None:
     for source, reports in content["clusters"].items():
         _print_clusters(reports, f"Clusters against {SOURCES[source]}, ground by {ground_method}",
                         console)
-    for line in content["skipped"][:5]:
-        console.print(f"[yellow]skipped[/]: {escape(line)}")
-    if len(content["skipped"]) > 5:
-        console.print(f"[yellow]skipped[/]: {len(content['skipped']) - 5} more, see the JSON file")
+    print_skipped(content["skipped"], console)
 
 
 def _print_ground(reports: dict, console: Console) -> None:
     scans = max(report["scans"] for report in reports.values())
-    table = _table(f"Ground of SemanticKITTI, {_count(scans, 'scan')}", "vegetation is", "prec.",
-                   "recall", "F1", "acc.", "TP", "FP", "FN", "ms")
+    table = narrow_table(f"Ground of SemanticKITTI, {_count(scans, 'scan')}", "vegetation is",
+                         "prec.", "recall", "F1", "acc.", "TP", "FP", "FN", "ms")
     titles = dict(zip(PROTOCOLS, ("left out", "ground if below -1.3 m", "not ground")))
     for protocol in PROTOCOLS:
         table.add_row(titles[protocol], style="bold")
@@ -55,8 +50,8 @@ def _print_ground(reports: dict, console: Console) -> None:
 
 def _print_clusters(reports: dict, title: str, console: Console) -> None:
     frames = max(report["frames"] for report in reports.values())
-    table = _table(f"{title}, {_count(frames, 'frame')}", "method", "objects", "hits", "recall",
-                   "prec.", "F1", "IoU", "over", "under", "found", "ms")
+    table = narrow_table(f"{title}, {_count(frames, 'frame')}", "method", "objects", "hits",
+                         "recall", "prec.", "F1", "IoU", "over", "under", "found", "ms")
     for name, report in reports.items():
         table.add_row(name, *_object_cells(report), f"{report['clusters_per_frame']:.1f}",
                       _ms(report), style="bold")
@@ -88,15 +83,6 @@ def _ms(report: dict) -> str:
 
 def _count(count: int, noun: str) -> str:
     return f"{count} {noun}{'' if count == 1 else 's'}"
-
-
-def _table(title: str, first: str, *others: str) -> Table:
-    # Narrow: all columns fit into 80 characters.
-    table = Table(title=title, box=SIMPLE_HEAD, padding=0, caption_justify="left")
-    table.add_column(first, no_wrap=True)
-    for name in others:
-        table.add_column(name, justify="right", no_wrap=True)
-    return table
 
 
 def draw_ground(path: Path, name: str, frame: LidarFrame, semantic: np.ndarray,
