@@ -17,7 +17,8 @@ from lidar_perception.candidates.confidence import (
     confidence,
     shape_features,
 )
-from lidar_perception.candidates.seeds import load_seed, seed_from_points
+from lidar_perception.candidates.refine import refine
+from lidar_perception.candidates.seeds import load_seed, own_cluster, seed_from_points
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
     HEIGHT,
@@ -207,6 +208,39 @@ def test_the_models_have_every_curve_and_likeness_makes_surer():
             assert len(curve["values"]) == len(curve["knots"])
     alike = models["seed"]["curves"]["similarity"]["values"]
     assert alike == sorted(alike) and alike[-1] > alike[0]
+
+
+def two_people():
+    """Points of a person and of a like one beside, where each begins, and their boxes."""
+    xyz = np.concatenate([board(9.0), board(9.0, offset=0.7) + np.float32([0, 3, 0])])
+    first = len(board(9.0))
+    return xyz, np.array([0, first, len(xyz)]), np.concatenate([box_of(9.0), box_of(9.0)])
+
+
+def test_a_seeds_own_cluster_is_known_by_its_points_whatever_is_with_them():
+    xyz, start, boxes = two_people()
+    seed = seed_from_points(xyz[:start[1]], boxes[0])
+    assert own_cluster(seed, xyz, start).tolist() == [True, False]
+    most = seed_from_points(xyz[:int(0.6 * start[1])], boxes[0])
+    assert own_cluster(most, xyz, start).tolist() == [True, False]
+    elsewhere = seed_from_points(xyz[:start[1]] + np.float32(1e-3), boxes[0])
+    assert not own_cluster(elsewhere, xyz, start).any()
+    assert own_cluster(seed, np.zeros((0, 3), np.float32), np.array([0])).shape == (0,)
+
+
+@pytest.mark.parametrize("certain", [True, False])
+def test_a_certain_seed_is_a_pedestrian_and_another_is_judged_by_its_shape(certain):
+    xyz, start, boxes = two_people()
+    boxes[1, 1] += 3.0
+    ids = np.repeat(np.int32([1, 2]), np.diff(start))
+    params = with_values(BEST, {"confidence.threshold": 0.0})
+    seed = seed_from_points(xyz[:start[1]], boxes[0], certain)
+    scores = refine(xyz, ids, boxes, seed, params).final.scores
+    shape = confidence(shape_features(xyz, start, boxes, BEST))
+    assert scores[0] == pytest.approx(1.0 if certain else shape[0], abs=1e-6)
+    assert scores[1] == pytest.approx(refine(
+        xyz, ids, boxes, seed_from_points(xyz[:start[1]] + np.float32([0, 0.5, 0]), boxes[0]),
+        params).final.scores[1], abs=0.05)
 
 
 # --- the configuration ---------------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 
 from lidar_perception.candidates.boxes import height_matches
 from lidar_perception.candidates.confidence import confidence, shape_features
-from lidar_perception.candidates.seeds import Seed
+from lidar_perception.candidates.seeds import Seed, own_cluster
 from lidar_perception.candidates.silhouette import cpa_scales, silhouettes, similarity
 from lidar_perception.params import PipelineParams
 from lidar_perception.types import PEDESTRIAN, Detections
@@ -59,8 +59,12 @@ def refine(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, seed: Seed,
     if params.confidence.enabled:
         threshold = params.confidence.threshold
         shape = shape_features(points, start, boxes, params)
-        difference = shape["height_m"] - seed.height
-        plain, final = (confidence(shape, alike, difference) for alike in (plain, final))
+        # The seed is as like itself as can be, which says nothing: it is what it was taken for.
+        own = own_cluster(seed, points, start)
+        itself = 1.0 if seed.certain else confidence(shape)
+        plain, final = (np.where(own, itself, confidence(shape, alike, shape["height_m"]
+                                                         - seed.height))
+                        for alike in (plain, final))
     t4 = perf_counter()
 
     def detections(scores, accepted):

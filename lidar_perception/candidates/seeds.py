@@ -22,11 +22,13 @@ DIGITS = 4  # of a metre, in a template
 @dataclass(frozen=True)
 class Seed:
     """xyz (M, 3) float32 in the LiDAR frame, M >= 10; floor, the height of the ground under it,
-    and its own height above that, in metres."""
+    and its own height above that, in metres. certain: a person or a label says that it is a
+    pedestrian."""
 
     xyz: np.ndarray
     floor: float
     height: float
+    certain: bool = False
 
     def silhouette(self, params: PipelineParams = PipelineParams()) -> np.ndarray:
         """(80,) uint32, see silhouette.py."""
@@ -34,12 +36,23 @@ class Seed:
                            np.array([self.floor]), params)[0]
 
 
-def seed_from_points(xyz: np.ndarray, box: np.ndarray) -> Seed:
+def seed_from_points(xyz: np.ndarray, box: np.ndarray, certain: bool = False) -> Seed:
     """Seed of a pedestrian's points (M, 3), M >= 10, and box (7,), which stands on the ground."""
     if len(xyz) < MIN_POINTS:
         raise InputError(f"the seed pedestrian has {len(xyz)} points; pick a nearer one "
                          f"(at least {MIN_POINTS})")
-    return Seed(np.ascontiguousarray(xyz, np.float32), float(box[2] - box[5] / 2), float(box[5]))
+    return Seed(np.ascontiguousarray(xyz, np.float32), float(box[2] - box[5] / 2), float(box[5]),
+                certain)
+
+
+def own_cluster(seed: Seed, xyz: np.ndarray, start: np.ndarray) -> np.ndarray:
+    """(K,) bool: the cluster that holds half of the seed's very points, or more. Clusters are rows
+    start[k]:start[k + 1] of xyz (N, 3) float32. In another frame than the seed's there is none."""
+    row = np.dtype((np.void, 12))
+    same = np.isin(np.ascontiguousarray(xyz, np.float32).view(row).ravel(),
+                   np.ascontiguousarray(seed.xyz, np.float32).view(row).ravel())
+    shared = np.diff(np.concatenate([[0], np.cumsum(same)])[start])
+    return 2 * shared >= len(seed.xyz)
 
 
 def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray) -> Seed:
@@ -48,7 +61,7 @@ def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray
     if len(pedestrians) == 0:
         raise InputError("no Pedestrian in the ground truth of this frame, so no seed")
     nearest = pedestrians[np.argmin(np.hypot(pedestrians[:, 0], pedestrians[:, 1]))]
-    return seed_from_points(xyz[points_in_box(xyz, nearest) & ~ground], nearest)
+    return seed_from_points(xyz[points_in_box(xyz, nearest) & ~ground], nearest, certain=True)
 
 
 def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray,
@@ -63,7 +76,7 @@ def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxe
         raise InputError(f"nearest cluster is {distance.min():.1f} m from the clicked point; "
                          f"click within {radius:g} m of a pedestrian")
     label = labels[clustered[distance.argmin()]]
-    return seed_from_points(xyz[labels == label], boxes[label - 1])
+    return seed_from_points(xyz[labels == label], boxes[label - 1], certain=True)
 
 
 def save_seed(seed: Seed, path: str | Path) -> None:
