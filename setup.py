@@ -39,7 +39,7 @@ setup(
     maintainer_email="maintainers@lidar-perception.invalid",
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "msg_utils*"]),
-    package_data={NAME: ["nodes/*.xml", "candidates/*.json"]},
+    package_data={NAME: ["nodes/*.xml", "candidates/*.json", "reproduction/*.html"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -48,14 +48,17 @@ setup(
         (f"lib/{NAME}", node_executables()),
     ],
     install_requires=[
-        "click>=8.1", "cloth-simulation-filter>=1.1.5", "matplotlib>=3.6", "mcap>=1.2",
-        "numba>=0.59", "numpy>=1.26", "pypatchworkpp>=1.0", "pyyaml>=6", "rich>=13",
-        "rosbags>=0.11.6", "scikit-learn>=1.3", "scipy>=1.11", "torch>=2.2", "zstandard>=0.21",
+        "click>=8.1", "cloth-simulation-filter>=1.1.5", "jinja2>=3.1", "matplotlib>=3.7",
+        "mcap>=1.2", "numba>=0.59", "numpy>=1.26", "pypatchworkpp>=1.0", "pyyaml>=6", "rich>=13",
+        "rosbags>=0.11.6", "scikit-learn>=1.3", "scipy>=1.11", "threadpoolctl>=3.1", "torch>=2.2",
+        "zstandard>=0.21",
     ],
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "test": ["pytest>=7.4", "hypothesis>=6.90", "opencv-python-headless>=4.8",
                  "setuptools>=70.1", "shapely>=2.0"],
+        "distributed": ["distributed>=2024.1"],
+        "odometry": ["kiss-icp>=1.2"],
         "benchmark": ["dbscan>=1.0", "opencv-python-headless>=4.8"],
     },
     entry_points={"console_scripts": [

@@ -24,6 +24,7 @@ from lidar_perception.evaluation.candidates import pedestrians
 from lidar_perception.files import write_text
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.threshold import segment_by_threshold
+from lidar_perception.machine import cpu_name
 from lidar_perception.params import ViewParams
 from lidar_perception.pipeline import points_in_view, warm_up
 from lidar_perception.terminal import errors
@@ -61,7 +62,7 @@ def main(kitti: Path, semantic_kitti: Path | None, json_file: Path | None, repea
         raise InputError(f"{kitti} has no frame with a Pedestrian label")
     labelled = spread(open_semantic_kitti(semantic_kitti), count) if semantic_kitti else []
     warm_up()
-    content = {"machine": {"cpu": _cpu(), "cores": os.cpu_count(), "python":
+    content = {"machine": {"cpu": cpu_name(), "cores": os.cpu_count(), "python":
                            platform.python_version(), "numpy": np.__version__},
                "peers": {p.package: p.version() for p in peers.ALL},
                "candidates": compare(frames, repeat)}
@@ -124,14 +125,6 @@ def _measure(in_view: list[np.ndarray], scans: list[LidarFrame], repeat: int) ->
     show("patchwork", ground.measure_patchwork(scans, repeat))
     show("cloth", ground.measure_cloth(whole, repeat))
     return content
-
-
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(x.split(":")[1].strip() for x in lines if x.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor()
 
 
 if __name__ == "__main__":

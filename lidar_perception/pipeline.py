@@ -178,7 +178,7 @@ def warm_up() -> None:
     rng = np.random.default_rng(0)
     flat = rng.uniform(-20, 20, (600, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
     person = rng.uniform(-0.5, 0.5, (400, 3)) * [0.5, 0.5, 1.7] + [8, 0, -0.8]
-    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 8, 0]  # takes another way through DBSCAN
+    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 2, 0]  # takes another way through DBSCAN
     xyz = np.concatenate([flat, person, person + [12, 0, 0], dense]).astype(np.float32)
     seed = seed_from_points(person.astype(np.float32), np.array([8, 0, -0.85, 1, 1, 1.7, 0]))
     forward = Camera(np.array([[50, -100, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]], float), 100, 100)

@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from lidar_perception.datasets.bag import bag_message
 from lidar_perception.datasets.kitti_calibration import KittiCalibration
 from lidar_perception.datasets.kitti_labels import format_label, to_labels
-from lidar_perception.types import PEDESTRIAN, GroundTruth
+from lidar_perception.datasets.write_kitti import write_object
+from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth
 from msg_utils.messages import ros_message
 from msg_utils.stamps import header_message
 
@@ -95,4 +96,51 @@ def object_folder(root: Path, labels: str = LABELS, count: int = 2) -> Path:
         write(root / f"training/velodyne/{i:06}.bin", scene(i).tobytes())
         write(root / f"training/calib/{i:06}.txt", calibration_text())
         write(root / f"training/label_2/{i:06}.txt", labels)
+    return root
+
+
+def upright(rng, x: float, y: float, height: float, width: float) -> np.ndarray:
+    """(N, 3) the side of a thing that a sensor sees, with fewer points the farther it stands: a
+    person if width is negative, narrow at the head and at the feet."""
+    away = np.hypot(x, y)
+    z, across = (m.ravel() for m in np.meshgrid(np.arange(0.02, height, 0.0073 * away),
+                                                np.arange(-0.5, 0.5, 0.003 * away)))
+    wide = np.interp(z / height, [0, 0.5, 0.8, 0.85, 1], [0.2, 0.3, 0.5, 0.2, 0.15])
+    kept = np.abs(across) < (wide / 2 if width < 0 else width / 2)
+    side, depth = np.array([-y, x, 0]) / away, np.array([x, y, 0]) / away
+    xyz = np.outer(across[kept], side) + [x, y, -1.7] + np.outer(z[kept], [0, 0, 1])
+    return xyz + np.outer(rng.uniform(-0.2, 0.2, len(xyz)), depth)
+
+
+def crowd(seed: int, people: int = 4) -> tuple[np.ndarray, GroundTruth]:
+    """(N, 4) float32 cloud and labels: people, posts, boxes and a labelled car without points on
+    flat ground 1.7 m below, 6 to 40 m away, none of them across 15 or 30 m."""
+    rng = np.random.default_rng(seed)
+    parts = [rng.uniform([2, -20, -1.7], [50, 20, -1.69], (4000, 3))]
+    boxes, ids = [], []
+
+    def somewhere(azimuth):
+        away = rng.uniform(*((6, 13.5), (16.5, 28.5), (31.5, 40))[rng.integers(3)])
+        return away * np.cos(azimuth), away * np.sin(azimuth)
+
+    for azimuth in rng.permutation(np.linspace(-0.2, 0.2, 5))[:people]:
+        (x, y), height = somewhere(azimuth), rng.uniform(1.6, 1.9)
+        parts.append(upright(rng, x, y, height, -1))
+        boxes.append([x, y, height / 2 - 1.7, 0.6, 0.6, height, rng.uniform(-3, 3)])
+        ids.append(PEDESTRIAN)
+    for width in (0.15, 0.4, 0.4, 0.8, 0.8, 1.0):
+        parts.append(upright(rng, *somewhere(rng.choice([-1, 1]) * rng.uniform(0.3, 0.5)),
+                             rng.uniform(1.5, 2.0), width))
+    boxes.append([15, 8, -0.95, 4.0, 1.6, 1.5, 0.1])
+    ids.append(CLASSES.index("Car"))
+    xyz = np.concatenate(parts)
+    return np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32), GroundTruth.of(
+        boxes, ids)
+
+
+def crowd_folder(root: Path, count: int = 6) -> Path:
+    """KITTI 3D object: frames 000000... of people, of which the last has none."""
+    for i in range(count):
+        cloud, truth = crowd(i, people=4 if i < count - 1 else 0)
+        write_object(root, i, cloud, truth, CALIBRATION)
     return root

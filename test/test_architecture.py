@@ -75,7 +75,8 @@ def public_functions(tree):
 
 def test_there_are_sources_to_look_at():
     assert len(files_in("msg_utils")) >= 5
-    for folder in ("ground", "clustering", "candidates", "nodes", "cli", "datasets", "evaluation"):
+    for folder in ("ground", "clustering", "candidates", "nodes", "cli", "datasets", "evaluation",
+                   "reproduction"):
         assert len(files_in(f"lidar_perception/{folder}")) >= 2
 
 
@@ -121,6 +122,10 @@ def test_algorithms_import_numbers_and_the_shared_files_only(name):
     ("lidar_perception/geometry.py", []),
     ("lidar_perception/files.py", ["lidar_perception.types"]),
     ("lidar_perception/topics.py", []),
+    ("lidar_perception/machine.py", []),
+    ("lidar_perception/processes.py", ["lidar_perception.types"]),
+    ("lidar_perception/resuming.py", ["lidar_perception.types"]),
+    ("lidar_perception/reproduction/paper.py", ["lidar_perception.params"]),
     ("lidar_perception/param_fields.py", []),
     ("lidar_perception/params.py", ["lidar_perception.param_fields"]),
     ("lidar_perception/camera.py", ["scipy", "numba", "lidar_perception.types"]),
@@ -135,6 +140,12 @@ def test_the_shared_files_are_leaves(name, allowed):
 def test_data_sources_know_no_algorithm(name):
     above = [*ALGORITHMS, "lidar_perception.pipeline", "lidar_perception.evaluation"]
     assert [m for m in imports(TREES[name]) if within(m, above)] == []
+
+
+@pytest.mark.parametrize("name", [n for n in OUTSIDE if "/reproduction/" not in n])
+def test_experiments_are_on_top_of_the_core(name):
+    found = [m for m in imports(TREES[name]) if within(m, ["lidar_perception.reproduction"])]
+    assert all(within(m, ["lidar_perception.reproduction.paper"]) for m in found)
 
 
 def test_modules_do_not_import_in_circles():
@@ -187,6 +198,8 @@ def test_no_source_is_longer_than_a_reader_can_hold(name):
     ("msg_utils.markers", "numba torch matplotlib scipy rosbags lidar_perception"),
     ("lidar_perception.evaluation.candidates", "torch matplotlib sklearn click"),
     ("lidar_perception.evaluation.detection", "torch matplotlib sklearn rich click"),
+    ("lidar_perception.reproduction.stm_cpa", "torch matplotlib sklearn click jinja2 distributed"),
+    ("lidar_perception.cli.reproduce", "numba torch matplotlib scipy sklearn jinja2 distributed"),
     ("lidar_perception.cli.main", "numba torch matplotlib scipy sklearn rosbags"),
 ])
 def test_importing_a_module_does_not_load_what_it_does_not_need(module, heavy):

@@ -13,6 +13,7 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
     "demo": ("demo.demo", "Replay a drive through the real nodes and score the result."),
     "convert": ("convert.convert", "Turn a data set into a rosbag2 bag."),
     "evaluate": ("evaluate.evaluate", "Score the algorithms without ROS."),
+    "reproduce": ("reproduce.reproduce", "Measure every table of the STM-CPA paper."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),
     "simulate": ("simulate.simulate", "Write simulated scans as a bag or a data set."),
     "info": ("info.info", "Say what is in a bag."),
@@ -50,6 +51,7 @@ def cli() -> None:
       lidar-perception demo --kitti /data/kitti/tracking
       lidar-perception convert kitti /data/kitti/object --out kitti.bag
       lidar-perception evaluate candidates --kitti /data/kitti/object --json scores.json
+      lidar-perception reproduce stm-cpa --kitti /data/kitti/object --out report
       lidar-perception run perception --ros-args -r '~/input/points:=/points'
 
     Exit codes: 0 done, 1 ran but something failed, 2 the command or its input cannot be used.

@@ -26,6 +26,7 @@ from lidar_perception.types import GroundTruth, InputError, LidarFrame, usable_r
 START_NS = 1_316_995_200 * 10**9  # 26 September 2011, the first day of KITTI's recordings
 PERIOD_NS = 10**8                 # the sensor turns at 10 Hz
 GAP_NS = 10 * 10**9               # between recordings that share a bag
+SCANS = ("velodyne_reduced", "velodyne")  # of one name, the full scan wins
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ def open_kitti(root: str | Path, scans: bool = True) -> list[KittiFrame]:
     if not root.is_dir():
         raise InputError(f"{root} is not a folder; give the folder of a KITTI download")
     for folder in (root / "training", root):
-        known = ("velodyne", "velodyne_reduced", *(() if scans else ("label_2",)))
+        known = SCANS if scans else (*SCANS, "label_2")
         if any((folder / name).is_dir() for name in known):
             tracking = (folder / "label_02").is_dir() or any(folder.glob("velodyne/*/"))
             frames = _tracking(folder) if tracking else _object(folder, scans)
@@ -87,11 +88,17 @@ def open_kitti(root: str | Path, scans: bool = True) -> list[KittiFrame]:
     return frames
 
 
+def labels_without_scan(root: str | Path) -> list[Path]:
+    """Label files of a 3D-object folder whose scans are not there."""
+    return sorted(label for folder in (Path(root) / "training", Path(root))
+                  for label in folder.glob("label_2/*.txt")
+                  if not any((folder / name / f"{label.stem}.bin").exists() for name in SCANS))
+
+
 def _object(folder: Path, scans: bool) -> list[KittiFrame]:
     files = {} if scans else {p.stem: folder / f"velodyne/{p.stem}.bin"
                               for p in folder.glob("label_2/*.txt")}
-    files |= {p.stem: p for name in ("velodyne_reduced", "velodyne")  # the full scan wins
-              for p in folder.glob(f"{name}/*.bin")}
+    files |= {p.stem: p for name in SCANS for p in folder.glob(f"{name}/*.bin")}
     frames = []
     for i, (name, points) in enumerate(sorted(files.items())):
         image, label = folder / f"image_2/{name}.png", folder / f"label_2/{name}.txt"

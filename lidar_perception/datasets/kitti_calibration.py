@@ -19,6 +19,7 @@ from lidar_perception.types import InputError
 # and tracking calibration files do not say it.
 IMAGE_SIZES = {721.5377: (1242, 375), 707.0493: (1224, 370), 718.3351: (1238, 374),
                707.0912: (1226, 370), 718.856: (1241, 376)}
+MOST_SKEW = 0.01  # of a rotation that was rounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +51,7 @@ def read_calibration(path: Path, image: Path | None = None) -> KittiCalibration:
     rectify = _matrix(values, path, "R0_rect", (3, 3), "R_rect")
     velodyne = _matrix(values, path, "Tr_velo_to_cam", (3, 4), "Tr_velo_cam")
     size = _png_size(image) or _size_by_focal_length(intrinsics)
-    return KittiCalibration(intrinsics, _homogeneous(rectify) @ _homogeneous(velodyne), *size)
+    return KittiCalibration(intrinsics, _pose(path, rectify, velodyne), *size)
 
 
 def read_raw_calibration(day: Path) -> KittiCalibration:
@@ -61,7 +62,7 @@ def read_raw_calibration(day: Path) -> KittiCalibration:
     width, height = _matrix(values, cameras, "S_rect_02", (2,)).astype(int)
     rectify = _matrix(values, cameras, "R_rect_00", (3, 3))
     return KittiCalibration(_matrix(values, cameras, "P_rect_02", (3, 4)),
-                            _homogeneous(rectify) @ _homogeneous(velodyne), width, height)
+                            _pose(day, rectify, velodyne), width, height)
 
 
 def _matrices(path: Path) -> dict[str, np.ndarray]:
@@ -88,6 +89,17 @@ def _matrix(values: dict, path: Path, name: str, shape: tuple[int, ...],
         raise InputError(f"{path} has no {name} of {int(np.prod(shape))} numbers; download KITTI's "
                          "calibration again")
     return found.reshape(shape)
+
+
+def _pose(path: Path, rectify: np.ndarray, velodyne: np.ndarray) -> np.ndarray:
+    """(4, 4) LiDAR into the rectified camera frame."""
+    pose = _homogeneous(rectify) @ _homogeneous(velodyne)
+    turn = pose[:3, :3]
+    if not (np.isfinite(pose).all() and np.allclose(turn @ turn.T, np.eye(3), atol=MOST_SKEW)
+            and True):
+        raise InputError(f"the pose of the LiDAR in {path} is no rotation; download KITTI's "
+                         "calibration again")
+    return pose
 
 
 def _homogeneous(matrix: np.ndarray) -> np.ndarray:

@@ -30,11 +30,25 @@ def range_bins(boxes: np.ndarray) -> np.ndarray:
     return np.searchsorted(RANGE_LIMITS, np.hypot(boxes[:, 0], boxes[:, 1]), side="right")
 
 
-class Score:
-    """Counts of one stage, by range: true and false positives, misses, centre errors.
+def counts_by_range(found: np.ndarray, truth: np.ndarray, pairs: tuple[np.ndarray, np.ndarray],
+                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """True positives, false positives, misses (5,) int and summed centre errors (5,) metres of one
+    frame, by RANGE_NAMES: found boxes (K, 7), true boxes (M, 7), pairs of match_centres.
 
     A true positive and a miss belong to the range of the true object, a false positive to its own.
     """
+    i, j = pairs
+    true_bin, found_bin = range_bins(truth), range_bins(found)
+    bins = len(RANGE_NAMES)
+    hits = np.bincount(true_bin[j], minlength=bins)
+    misses = np.bincount(true_bin, minlength=bins) - hits
+    false = np.bincount(np.delete(found_bin, i), minlength=bins)
+    error = np.linalg.norm(found[i, :3].astype(float) - truth[j, :3], axis=1)
+    return hits, false, misses, np.bincount(true_bin[j], weights=error, minlength=bins)
+
+
+class Score:
+    """Counts of one stage, by range: true and false positives, misses, centre errors."""
 
     def __init__(self) -> None:
         self.tp, self.fp, self.fn = (np.zeros(len(RANGE_NAMES), int) for _ in range(3))
@@ -42,15 +56,9 @@ class Score:
 
     def add(self, found: np.ndarray, truth: np.ndarray) -> None:
         """One frame: found boxes (K, 7), true boxes (M, 7)."""
-        i, j = match_centres(found, truth)
-        true_bin, found_bin = range_bins(truth), range_bins(found)
-        bins = len(RANGE_NAMES)
-        hits = np.bincount(true_bin[j], minlength=bins)
-        self.tp += hits
-        self.fn += np.bincount(true_bin, minlength=bins) - hits
-        self.fp += np.bincount(np.delete(found_bin, i), minlength=bins)
-        error = np.linalg.norm(found[i, :3].astype(float) - truth[j, :3], axis=1)
-        self.error += np.bincount(true_bin[j], weights=error, minlength=bins)
+        counts = counts_by_range(found, truth, match_centres(found, truth))
+        for total, count in zip((self.tp, self.fp, self.fn, self.error), counts):
+            total += count
 
     def table(self) -> dict[str, dict]:
         """Range name (and 'all') to tp, fp, fn, precision, recall, f1, centre_error_m. A ratio

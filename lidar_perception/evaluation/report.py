@@ -9,11 +9,9 @@ from rich.table import Table
 
 from lidar_perception.candidates.refine import STAGES
 from lidar_perception.evaluation.matching import RANGE_NAMES
+from lidar_perception.reproduction.paper import TABLE_6
 
 STAGE_TITLES = {"stage1": "clusters", "stage2": "STM", "final": "STM + CPA"}
-# Paper A, Table 6: recall, precision, F1 in percent, centre error in metres
-PAPER = {"stage1": (55.5, 27.6, 36.8, 0.15), "stage2": (44.7, 60.5, 51.4, 0.14),
-         "final": (46.7, 58.8, 52.1, 0.16)}
 
 
 def narrow_table(title: str, first: str, *others: str, width: int = 0) -> Table:
@@ -51,7 +49,7 @@ def print_candidate_report(content: dict, console: Console, paper: bool = True) 
                           "-" if row["centre_error_m"] is None else f"{row['centre_error_m']:.2f}",
                           style="bold" if name == "all" else "")
         if paper:
-            recall, precision, f1, error = PAPER[stage]
+            recall, precision, f1, _, error = TABLE_6[stage]
             table.add_row("  the paper", "all", "", "", "", f"{recall}",
                           f"{precision}", f"{f1}", f"{error:.2f}", style="dim", end_section=True)
     console.print(table)

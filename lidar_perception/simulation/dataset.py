@@ -6,18 +6,15 @@ between changes a byte.
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+import functools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
 import numpy as np
 
 from lidar_perception.datasets import write_kitti, write_semantickitti
+from lidar_perception.processes import in_processes
 from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
 from lidar_perception.simulation.drive import SimulatedScan, longest_drive, scan_at
 from lidar_perception.simulation.folder import finish_frame
@@ -94,68 +91,11 @@ def _semantic(folder: Path, plan: Plan, sequence: int, moment: int, scan: Simula
 def write_frames(folder: Path, plan: Plan, numbers: list[int], jobs: int) -> Iterator[int]:
     """Write the frames of these numbers with so many processes; yields each when it is there.
     InputError, and the end of all processes, where one fails; they end with the iterator too."""
-    if min(jobs, len(numbers)) <= 1:
-        for number in numbers:
-            write_frame(folder, plan, number)
-            yield number
-        return
-    context = multiprocessing.get_context("spawn")
-    running: dict[Connection, multiprocessing.process.BaseProcess] = {}
-    try:
-        for j in range(min(jobs, len(numbers))):
-            receiver, sender = context.Pipe(duplex=False)
-            process = context.Process(target=_work, daemon=True,
-                                      args=(folder, plan, numbers[j::jobs], sender))
-            with _without_interrupts():
-                process.start()
-            sender.close()
-            running[receiver] = process
-        while running:
-            for receiver in wait(list(running)):
-                yield from _receive(receiver, running)
-    finally:
-        for process in running.values():
-            process.terminate()
-        for process in running.values():
-            process.join()
+    return in_processes(functools.partial(_writer, folder, plan), numbers, jobs, "wrote frames")
 
 
-def _receive(receiver: Connection, running: dict) -> Iterator[int]:
-    try:
-        done = receiver.recv()
-    except EOFError:
-        process = running.pop(receiver)
-        process.join()
-        if process.exitcode:
-            raise InputError(f"a process that wrote frames ended with exit code {process.exitcode}"
-                             + (", perhaps for want of memory: try fewer --jobs"
-                                if process.exitcode == -signal.SIGKILL else "")) from None
-        return
-    if isinstance(done, str):
-        raise InputError(done)
-    yield done
-
-
-def _work(folder: Path, plan: Plan, numbers: list[int], sender: Connection) -> None:
-    parent = multiprocessing.parent_process()
-    with suppress(BrokenPipeError):  # nobody is there any more
-        for number in numbers:
-            if parent is not None and not parent.is_alive():
-                return
-            try:
-                write_frame(folder, plan, number)
-            except InputError as error:
-                sender.send(str(error))
-                return
-            sender.send(number)
-
-
-@contextmanager
-def _without_interrupts() -> Iterator[None]:
-    """What is started in here never sees ctrl-C: the process that started it ends it."""
-    resource_tracker.ensure_running()  # or it would be started below, and lift the block
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+def _writer(folder: Path, plan: Plan) -> Callable[[int], int]:
+    def write(number: int) -> int:
+        write_frame(folder, plan, number)
+        return number
+    return write

@@ -8,15 +8,14 @@ how the folder was made, and .parts goes.
 
 from __future__ import annotations
 
-import fcntl
 import json
-import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
 from lidar_perception.files import remove_temporaries, write_bytes, write_text
+from lidar_perception.resuming import differences, locked
 from lidar_perception.types import InputError
 
 MARK, PARTS, RECORD = "INCOMPLETE", ".parts", "dataset.json"
@@ -37,7 +36,7 @@ def unfinished(folder: Path, asked: dict, *, resume: bool = False,
     InputError if the folder is there already, without resume or force; to resume, if it was begun
     with something else asked for; to force, if it is no data set of ours.
     """
-    with _locked(folder):
+    with locked(folder):
         _begin(folder, asked, resume, force)
         if not is_finished(folder):
             remove_temporaries(folder)
@@ -84,8 +83,7 @@ def _compare(folder: Path, asked: dict) -> None:
     path = folder / (RECORD if is_finished(folder) else MARK)
     try:
         before = json.loads(path.read_text())
-        different = [f"{key} {before.get(key)!r}, not {value!r}" for key, value in asked.items()
-                     if before.get(key) != value and key != "command"]
+        different = differences(before, {k: v for k, v in asked.items() if k != "command"})
     except (OSError, ValueError, AttributeError) as error:
         raise InputError(f"cannot read {path}: {error}; --force starts again") from None
     if different:
@@ -106,25 +104,3 @@ def _join(folder: Path, frames: int) -> None:
             whole.setdefault(name, []).append(text)
     for name, texts in whole.items():
         write_bytes(folder / name, "".join(texts).encode())
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Makes the folder if need be, and keeps a second process from writing the same data set."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    except FileExistsError:
-        raise InputError(f"{folder} is a file; give another name") from None
-    except OSError as error:
-        raise InputError(f"cannot make the folder {folder}: {error.strerror}") from None
-    try:
-        with suppress(OSError):  # of a file system without locks
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise InputError(f"another process is writing {folder}; wait for it or end "
-                                 "it") from None
-        yield
-    finally:
-        os.close(descriptor)

@@ -1,0 +1,67 @@
+"""Figures of the report, drawn with Matplotlib."""
+
+from __future__ import annotations
+
+from io import BytesIO
+
+from lidar_perception.reproduction.experiment import Figure, Line
+
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")  # Okabe and Ito, 2008
+GREY = "#888888"
+COLUMNS = 3  # panels side by side
+
+
+def draw(figure: Figure, kind: str = "svg", *, dark: bool = False) -> bytes:
+    """The figure as svg or png: panels side by side, one legend below. The same figure gives the
+    same bytes."""
+    import matplotlib
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure as Canvas
+
+    back, front, grid = ("#16181c", "#d8dade", "#34383f") if dark else ("white", "black", "#e3e3e3")
+    style = {"figure.facecolor": back, "axes.facecolor": back, "savefig.facecolor": back,
+             "text.color": front, "axes.labelcolor": front, "axes.edgecolor": GREY,
+             "xtick.color": front, "ytick.color": front, "grid.color": grid, "font.size": 9,
+             "legend.frameon": False, "svg.hashsalt": figure.name}
+    with matplotlib.rc_context(style):
+        columns = min(COLUMNS, len(figure.panels))
+        rows = -(-len(figure.panels) // columns)
+        canvas = Canvas(figsize=(3.7 * columns, 2.9 * rows + 0.5), dpi=130, layout="constrained")
+        FigureCanvasAgg(canvas)
+        axes = canvas.subplots(rows, columns, squeeze=False).ravel()
+        shown = {}
+        for panel, place in zip(figure.panels, axes):
+            for line, color in zip(panel.lines, _colors(panel.lines)):
+                shown.setdefault(line.label, _plot(place, line, color))
+            place.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
+            if "%" in panel.y_label:
+                place.set_ylim(0, 102)
+            place.grid(linewidth=0.6)
+            place.spines[["top", "right"]].set_visible(False)
+        for place in axes[len(figure.panels):]:
+            place.set_visible(False)
+        canvas.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=2 * columns)
+        stream = BytesIO()
+        metadata = {"Date": None} if kind == "svg" else {}
+        canvas.savefig(stream, format=kind, metadata=metadata)
+    return stream.getvalue()
+
+
+def _colors(lines: tuple[Line, ...]) -> list[str]:
+    """A colour for each full line; a dashed one has that of the line whose label begins its own."""
+    full = [line.label for line in lines if not line.dashed]
+    named = {label: COLORS[i % len(COLORS)] for i, label in enumerate(full)}
+    return [next((color for label, color in named.items() if line.label.startswith(label)), GREY)
+            for line in lines]
+
+
+def _plot(axes, line: Line, color: str):
+    x, y, low, high = ([float("nan") if v is None else v for v in values]
+                       for values in (line.x, line.y, line.low, line.high))
+    if len(low) and len(high):
+        axes.fill_between(x, low, high, color=color, alpha=0.15, linewidth=0)
+    style = dict(linestyle="--", marker="D", markerfacecolor="none") if line.dashed else dict(
+        marker="o", markersize=3)
+    if line.dashed and len(x) == 2 and x[0] == x[1]:
+        style["marker"] = ""  # an upright line marks a place on the x axis
+    return axes.plot(x, y, color=color, linewidth=1.4, **style)[0]

@@ -1,0 +1,110 @@
+"""The folder of a run: frames.jsonl holds what was asked for and then a record a line, so that a
+run that was stopped, at whatever moment, goes on where it was."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from io import BufferedWriter
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from lidar_perception.files import write_text
+from lidar_perception.resuming import differences, locked
+from lidar_perception.types import InputError
+
+NAME = "frames.jsonl"
+# All that a run and its report write.
+OURS = (NAME, "report.html", "report.md", "report.json", "tables/*.csv", "figures/*.png")
+SYNC_S = 1.0  # at most so much is lost when the machine stops
+
+
+class Journal:
+    """lines: name of a finished frame -> its record as JSON."""
+
+    def __init__(self, path: Path, plan: dict[str, Any], lines: dict[str, str],
+                 stream: BufferedWriter) -> None:
+        self.path, self.plan, self.lines = path, plan, lines
+        self._stream, self._synced = stream, monotonic()
+
+    def add(self, line: str) -> None:
+        """Write the record of one more frame."""
+        self.lines[json.loads(line)["frame"]] = line
+        try:
+            self._stream.write(line.encode() + b"\n")
+            self._stream.flush()
+            if monotonic() - self._synced > SYNC_S:
+                self.sync()
+        except OSError as error:
+            raise InputError(f"cannot write {self.path}: {error.strerror}; what is done stays, the "
+                             "same command goes on") from None
+
+    def sync(self) -> None:
+        os.fsync(self._stream.fileno())
+        self._synced = monotonic()
+
+    def sort(self, names: list[str]) -> None:
+        """Put the records of a finished run into the order of these names of all frames."""
+        ordered = [self.lines[name] for name in names if name in self.lines]
+        write_text(self.path, "\n".join([_head(self.plan), *ordered]))
+
+
+@contextmanager
+def journal(folder: Path, plan: dict[str, Any], *, force: bool = False) -> Iterator[Journal]:
+    """The journal of a run in a folder, which is made if need be. Frames that were skipped before
+    are not in it, so that they are tried again.
+
+    InputError if the folder holds a run of another plan, or something else, unless force, which
+    begins anew; or if another process writes there.
+    """
+    with locked(folder):
+        path = folder / NAME
+        lines = {} if force else _begun(folder, plan)
+        if force and path.exists():  # or what has our names there is somebody else's
+            for old in (old for pattern in OURS for old in folder.glob(pattern)):
+                old.unlink()
+        for old in folder.glob(f".{NAME}.*.tmp"):  # of a process that was killed while it wrote
+            old.unlink()
+        write_text(path, "\n".join([_head(plan), *lines.values()]))
+        with open(path, "ab") as stream:
+            opened = Journal(path, plan, lines, stream)
+            try:
+                yield opened
+            finally:
+                with suppress(OSError):  # of a disk that is full; add() has said so
+                    opened.sync()
+
+
+def _head(plan: dict[str, Any]) -> str:
+    return json.dumps({"plan": plan})
+
+
+def _begun(folder: Path, plan: dict[str, Any]) -> dict[str, str]:
+    """The records that a run of this plan has left in the folder."""
+    path = folder / NAME
+    if not path.exists():
+        if any(not old.name.startswith(f".{NAME}.") for old in folder.iterdir()):
+            raise InputError(f"{folder} exists already and holds no run of this command; give "
+                             "another name, or --force to write into it")
+        return {}
+    try:
+        head, *rest = path.read_text(errors="replace").split("\n")
+        before = json.loads(head)["plan"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"cannot read {path}: {error!r}; --force starts again") from None
+    if different := differences(before, json.loads(json.dumps(plan))):
+        raise InputError(f"{folder} was begun with {'; '.join(different)}; give another name, or "
+                         "start again with --force")
+    return {record["frame"]: line for line in rest[:-1] if (record := _record(line))}
+
+
+def _record(line: str) -> dict | None:
+    """The record of a line; None if it was cut, or the frame was skipped."""
+    with suppress(ValueError):
+        record = json.loads(line)
+        if isinstance(record, dict) and "frame" in record and "skipped" not in record:
+            return record
+    return None

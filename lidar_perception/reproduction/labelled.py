@@ -1,0 +1,57 @@
+"""One labelled frame as the experiments take it, and the seed of the paper's protocol."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidar_perception.camera import Camera
+from lidar_perception.candidates.seeds import Seed, seed_from_truth
+from lidar_perception.datasets.kitti import KittiFrame
+from lidar_perception.geometry import points_in_box
+from lidar_perception.pipeline import Segmented
+from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, InputError, LidarFrame
+
+VEHICLES = [CLASSES.index(name) for name in ("Car", "Van", "Truck", "Tram")]
+
+
+@dataclass(frozen=True)
+class Labelled:
+    """A frame with at least one pedestrian: pedestrians (M, 7) are their true boxes."""
+
+    frame: LidarFrame
+    camera: Camera
+    truth: GroundTruth
+
+    @property
+    def pedestrians(self) -> np.ndarray:
+        return self.truth.of_class(PEDESTRIAN)
+
+
+def load_labelled(frame: KittiFrame) -> Labelled:
+    """The frame read. InputError, naming the file, where one cannot be read, is empty or not
+    there, or where no Pedestrian is labelled."""
+    truth = frame.truth()  # first: most frames of KITTI end here
+    if truth is None:
+        raise InputError(f"{frame.points} has no labels; put them beside the scans")
+    if PEDESTRIAN not in truth.class_ids:
+        raise InputError("no Pedestrian is labelled; the paper leaves such frames out")
+    scan, camera = frame.load(), frame.calibration().camera()
+    if not camera.in_view(scan.xyz).any():
+        raise InputError(f"{frame.points} has no point in the camera's view; download it and its "
+                         "calibration again")
+    return Labelled(scan, camera, truth)
+
+
+def nearest_seed(segmented: Segmented, labelled: Labelled) -> Seed:
+    """The seed of the paper's protocol: the nearest labelled pedestrian. InputError where it has
+    too few points, or is on a vehicle, whose points would make the template."""
+    pedestrians = labelled.pedestrians
+    nearest = pedestrians[np.argmin(np.hypot(pedestrians[:, 0], pedestrians[:, 1]))]
+    for box, class_id in zip(labelled.truth.boxes, labelled.truth.class_ids):
+        if class_id in VEHICLES and points_in_box(nearest[None, :3], box).any():
+            x, y = nearest[:2]
+            raise InputError(f"the seed pedestrian at ({x:.1f}, {y:.1f}) m stands in a labelled "
+                             f"{CLASSES[class_id]}; mend the labels")
+    return seed_from_truth(segmented.xyz, segmented.ground, pedestrians)

@@ -1,0 +1,8 @@
+"""What paper A leaves open, each question measured (reproduce --study NAME)."""
+
+# name -> where its Experiment is; imported only when it is asked for
+STUDIES = {
+    name: f"lidar_perception.reproduction.studies.{name}:STUDY"
+    for name in ("configurations", "seeds", "morphology", "adaptive", "confidence", "far",
+                 "geometry", "density")
+}

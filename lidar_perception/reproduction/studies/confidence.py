@@ -1,0 +1,152 @@
+"""Question 4: a score for each candidate, so that precision and recall make a curve; and whether
+it means what it says."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.candidates.confidence import confidence, shape_features
+from lidar_perception.candidates.refine import group_points
+from lidar_perception.configurations import BEST, PAPER
+from lidar_perception.datasets.kitti import KittiFrame
+from lidar_perception.evaluation.matching import match_centres
+from lidar_perception.params import flatten, with_values
+from lidar_perception.pipeline import refined
+from lidar_perception.reproduction.experiment import (
+    Cell,
+    Experiment,
+    Figure,
+    Line,
+    Panel,
+    Section,
+    Table,
+)
+from lidar_perception.reproduction.labelled import load_labelled, nearest_seed
+from lidar_perception.reproduction.params import BootstrapParams
+from lidar_perception.reproduction.statistics import cells
+from lidar_perception.reproduction.variants import ANY_SCORE, segments_of
+from lidar_perception.types import Detections, InputError
+
+SCORES = {
+    "similarity, paper": with_values(PAPER, ANY_SCORE),
+    "similarity, best drawing": with_values(BEST, {**ANY_SCORE, "confidence.enabled": False}),
+    "confidence": with_values(BEST, ANY_SCORE),
+}
+SHAPE = "confidence without a seed"
+NAMES = (*SCORES, SHAPE)
+BINS = np.linspace(0, 1, 11)
+
+
+def measure(frames: list[KittiFrame], number: int) -> dict[str, Any]:
+    """The record: pedestrians, how many; scored: name -> [score, 1 hit | 0] of each candidate. A
+    hit is decided before the scores: each pedestrian has at most one candidate."""
+    labelled = load_labelled(frames[number])
+    segments, truth = segments_of(labelled), labelled.pedestrians
+    scored = {}
+    for name, params in SCORES.items():
+        try:
+            found = refined(segments(params), lambda s: nearest_seed(s, labelled), params).final
+        except InputError:
+            found = Detections.none()
+        scored[name] = _pairs(found.boxes, found.scores, truth)
+    s = segments(BEST)
+    everything = np.arange(1, len(s.boxes) + 1)
+    shape = shape_features(*group_points(s.xyz, s.cluster_ids, everything), s.boxes, BEST)
+    scored[SHAPE] = _pairs(s.boxes, confidence(shape), truth)
+    return {"frame": frames[number].name, "pedestrians": len(truth), "scored": scored}
+
+
+def _pairs(boxes: np.ndarray, scores: np.ndarray, truth: np.ndarray) -> list[list[float]]:
+    hits = np.isin(np.arange(len(boxes)), match_centres(boxes, truth)[0])
+    return [[round(float(s), 4), int(h)] for s, h in zip(scores, hits)]
+
+
+def sections(records: list[dict[str, Any]]) -> list[Section]:
+    """The report: ranking by each score, and calibration of the confidences."""
+    records = [r for r in records if "skipped" not in r]
+    truth = np.array([r["pedestrians"] for r in records], float)
+    rows, curves, calibration, lines = [], [], [], []
+    for name in NAMES:
+        scores, hits, frame = _flat([r["scored"][name] for r in records])
+        estimates = _intervals(scores, hits, frame, truth)
+        rows.append((name, *cells(estimates), str(int(hits.sum())), str(len(hits))))
+        precision, recall = precision_recall(hits[np.argsort(-scores, kind="stable")],
+                                             truth.sum())
+        curves.append(Line(name, tuple(100 * recall), tuple(100 * precision)))
+        if name.startswith("confidence"):
+            bins = reliability(scores, hits)
+            calibration += [(name, f"{BINS[k]:.1f}-{BINS[k + 1]:.1f}", *(
+                Cell(None if v is None else 100 * v) for v in row[:2]), str(row[2]))
+                for k, row in enumerate(bins)]
+            known = [row for row in bins if row[2]]
+            lines.append(Line(name, tuple(100 * row[0] for row in known),
+                              tuple(100 * row[1] for row in known)))
+    lines.append(Line("what it should be", (0, 100), (0, 100), dashed=True))
+    return [
+        Section("A score for each candidate",
+                f"{len(records)} frames with {int(truth.sum())} pedestrians. AP is the area under "
+                "the curve of precision over recall at a centre distance of 1.0 m; best F1 is over "
+                "all thresholds.",
+                (Table("average_precision", "Ranking", ("score", "AP [%]", "best F1 [%]", "hits",
+                                                        "candidates"), tuple(rows)),),
+                (Figure("precision_recall", "Precision over recall",
+                        (Panel("", "recall [%]", "precision [%]", tuple(curves)),)),)),
+        Section("Calibration", "Candidates by confidence: the mean of what they claim, and the "
+                "share that is a pedestrian.",
+                (Table("calibration", "Claimed and true", ("score", "bin", "claimed [%]",
+                                                           "true [%]", "candidates"),
+                       tuple(calibration)),),
+                (Figure("calibration", "Calibration",
+                        (Panel("", "claimed [%]", "true [%]", tuple(lines)),)),))]
+
+
+def precision_recall(hits: np.ndarray, truth: float) -> tuple[np.ndarray, np.ndarray]:
+    """Precision and recall (D,) after each of the candidates, best first: hits (D,) 0 | 1."""
+    tp = np.cumsum(hits)
+    return tp / np.maximum(np.arange(1, len(hits) + 1), 1), tp / max(truth, 1)
+
+
+def reliability(scores: np.ndarray, hits: np.ndarray) -> list[tuple]:
+    """(mean score, share of hits, candidates) for each of BINS; None where there are none."""
+    place = np.clip(np.searchsorted(BINS, scores, side="right") - 1, 0, len(BINS) - 2)
+    count = np.bincount(place, minlength=len(BINS) - 1)
+    sums = (np.bincount(place, weights=w, minlength=len(BINS) - 1) for w in (scores, hits))
+    return [(a / n, b / n, int(n)) if n else (None, None, 0) for a, b, n in zip(*sums, count)]
+
+
+def _flat(frames: list[list]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rows = [(*pair, i) for i, pairs in enumerate(frames) for pair in pairs]
+    scores, hits, frame = np.array(rows, float).reshape(-1, 3).T
+    return scores, hits, frame.astype(int)
+
+
+def _intervals(scores: np.ndarray, hits: np.ndarray, frame: np.ndarray, truth: np.ndarray,
+               params: BootstrapParams = BootstrapParams()) -> np.ndarray:
+    """(3, 2) AP and best F1 in percent with the ends of their intervals, frames drawn anew."""
+    if len(truth) == 0 or truth.sum() == 0 or len(scores) == 0:
+        return np.full((3, 2), np.nan)
+    order = np.argsort(-scores, kind="stable")
+    hits, frame = hits[order], frame[order]
+    last = np.append(np.diff(scores[order]) != 0, True)  # equal scores are accepted together
+
+    def figures(weight: np.ndarray) -> tuple[float, float]:
+        tp, all_found, everyone = np.cumsum(weight[frame] * hits), np.cumsum(weight[frame]), \
+            weight @ truth
+        tp, all_found = tp[last], all_found[last]
+        precision = np.divide(tp, all_found, out=np.zeros(len(tp)), where=all_found > 0)
+        f1 = 2 * tp / np.maximum(all_found + everyone, 1e-9)
+        return (100 * float(np.diff(tp, prepend=0.0) @ precision) / max(everyone, 1e-9),
+                100 * float(f1.max()))
+
+    rng, count = np.random.default_rng(params.seed), len(truth)
+    drawn = np.array([figures(np.bincount(rng.integers(count, size=count), minlength=count)
+                              .astype(float)) for _ in range(params.replicates)])
+    ends = np.percentile(drawn, [50 - 50 * params.level, 50 + 50 * params.level], axis=0)
+    return np.stack([figures(np.ones(count)), *ends])
+
+
+STUDY = Experiment("confidence", "Confidence of candidates",
+                   "Which score ranks candidates best, and does the confidence mean what it says?",
+                   measure, sections, {"paper": flatten(PAPER), "best": flatten(BEST)})

@@ -1,0 +1,48 @@
+"""Folders that are made in many steps: one process at a time, and gone on with only if the same is
+asked for as before."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from lidar_perception.types import InputError
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Makes the folder if need be, and keeps a second process from writing into it."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    except FileExistsError:
+        raise InputError(f"{folder} is a file; give another name") from None
+    except OSError as error:
+        raise InputError(f"cannot make the folder {folder}: {error.strerror}") from None
+    try:
+        with suppress(OSError):  # of a file system without locks
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise InputError(f"another process is writing {folder}; wait for it or end "
+                                 "it") from None
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def differences(before: dict[str, Any], asked: dict[str, Any]) -> list[str]:
+    """What is asked for otherwise than before: "frames 5, not 6". Dicts in dicts have dotted
+    names; what is only in `before` is passed over."""
+    found = []
+    for key, value in asked.items():
+        old = before.get(key)
+        if isinstance(value, dict) and isinstance(old, dict):
+            found += [f"{key}.{line}" for line in differences(old, value)]
+        elif old != value:
+            found.append(f"{key} {old!r}, not {value!r}")
+    return found
