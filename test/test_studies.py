@@ -106,6 +106,20 @@ def test_far_on_a_drive(tmp_path):
     assert 0 <= moving <= all_moving and 0 <= standing <= all_standing
 
 
+def test_confidence_over_scans_is_the_mean_of_the_log_odds():
+    shift = np.tile(np.eye(4), (3, 1, 1))
+    shift[:, 0, 3] = [0.0, 2.0, 4.0]  # the sensor drives 2 m from scan to scan
+    now = Found(boxes_at([(10, 0), (20, 5)]), np.array([0.5, 0.8]), 0.3)
+    earlier = [Found(boxes_at([(14.2, 0)]), np.array([0.9]), 0.3),
+               Found(boxes_at([(11.9, 0.3), (40, 0)]), np.array([0.1, 0.9]), 0.3)]
+    joined = far.persistent(now, earlier, shift)
+    assert joined.scores == pytest.approx([0.5, 0.8])  # 0.9 and 0.1 cancel; nothing near the other
+    assert far.persistent(now, [Found(np.zeros((0, 7)), np.zeros(0), 0.3)] * 2,
+                          shift).scores == pytest.approx([0.5, 0.8])
+    once = far.persistent(now, [earlier[0], earlier[0]], shift)
+    assert once.scores[0] > 0.5
+
+
 # --- parts ---------------------------------------------------------------------------------
 
 

@@ -156,7 +156,7 @@ def plain(value: Any) -> Any:
 
 
 def print_report(sections: list[Section], skipped: list[dict[str, Any]], console: Console,
-                 most_rows: int = 12) -> None:
+                 most_rows: int = 20) -> None:
     """The tables that fit on a screen, without intervals, and what was skipped."""
     for table in (table for section in sections for table in section.tables):
         if len(table.rows) <= most_rows:

@@ -1,5 +1,6 @@
 """Question 5: far pedestrians have few points. Does it help to add the scans before, moved by the
-odometry, and can moving people be told from standing things?"""
+odometry, or to average the confidence over them, and can moving people be told from standing
+things?"""
 
 from __future__ import annotations
 
@@ -7,6 +8,7 @@ import functools
 from typing import Any
 
 import numpy as np
+from scipy.special import expit, logit
 
 from lidar_perception.candidates.accumulation import accumulate, aligned, velocities
 from lidar_perception.candidates.boxes import snap_to_ground
@@ -20,13 +22,26 @@ from lidar_perception.params import flatten, with_values
 from lidar_perception.pipeline import Segmented, cluster_obstacles, segment
 from lidar_perception.reproduction.experiment import Cell, Experiment, Section, Table
 from lidar_perception.reproduction.labelled import Labelled, load_labelled, nearest_seed
-from lidar_perception.reproduction.variants import Found, found_with, score, sections
+from lidar_perception.reproduction.variants import (
+    Found,
+    found_with,
+    score,
+    sections,
+    seed_of,
+)
 from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
 
 SCANS = (2, 3, 5)
 FROM = 20.0         # metres; nearer, one scan has points enough and motion would smear
-NAMES = ("one scan", *(f"{n} scans" for n in SCANS), f"{SCANS[-1]} scans, moving ones aligned")
+NEAR_AGAIN = 1.0    # metres, between a candidate and itself a scan earlier, without its own motion
+ADDED = tuple(f"{n} scans added" for n in SCANS)
+ALIGNED = f"{SCANS[-1]} scans added, moving ones aligned"
+AUTOMATIC = with_values(BEST, {"seed.source": "automatic"})
+PERSISTENT = {f"confidence over {SCANS[-1]} scans": BEST,
+              f"automatic seed, confidence over {SCANS[-1]} scans": AUTOMATIC}
+NAMES = ("one scan", *ADDED, ALIGNED, "automatic seed, one scan", *PERSISTENT)
 TRULY_MOVES = 0.5   # m/s
+LEAST = 1e-3        # of a probability, so that its odds are finite
 
 
 def measure(frames: list[KittiFrame], number: int) -> dict[str, Any]:
@@ -41,25 +56,48 @@ def measure(frames: list[KittiFrame], number: int) -> dict[str, Any]:
     single = segment(labelled.frame, labelled.camera, BEST)
     seed = functools.partial(nearest_seed, single, labelled)
     found = {NAMES[0]: found_with(single, seed, BEST)}
+    earlier = [segment(f.load(), labelled.camera, BEST) for f in before]
+    for name, params in PERSISTENT.items():
+        own = functools.partial(seed_of, single, labelled, params)
+        now = found_with(single, own, params)
+        if params is AUTOMATIC:
+            found["automatic seed, one scan"] = now
+        found[name] = persistent(now, [found_with(s, own, params) for s in earlier], poses)
     motion = [0, 0, 0, 0]
-    for many in SCANS:
+    for many, name in zip(SCANS, ADDED):
         points = accumulate(obstacles[-many:], poses[-many:], ages[-many:], FROM)
         # So many more points stand for the same surface.
         params = with_values(BEST, {"resolution.azimuth_step":
                                     BEST.resolution.azimuth_step / many})
         merged = _segmented(points.xyz, labelled, single)
-        found[f"{many} scans"] = _joined(found[NAMES[0]], found_with(merged, seed, params))
+        found[name] = _joined(found[NAMES[0]], found_with(merged, seed, params))
         if many == SCANS[-1]:
             inside = labelled.camera.in_view(points.xyz)
             kept = type(points)(points.xyz[inside], points.age[inside])
             speed = velocities(kept, merged.cluster_ids)
             moved = aligned(kept, merged.cluster_ids, speed)
             sharp = _with_boxes(moved, merged.cluster_ids, single)
-            found[NAMES[-1]] = _joined(found[NAMES[0]], found_with(sharp, seed, params))
+            found[ALIGNED] = _joined(found[NAMES[0]], found_with(sharp, seed, params))
             motion = _told_apart(sharp.boxes, speed, labelled, before, poses)
     truth = labelled.pedestrians
     return {"frame": frames[number].name, "motion": motion,
             "variants": {name: score(one, truth) for name, one in found.items()}}
+
+
+def persistent(now: Found, earlier: list[Found], poses: np.ndarray) -> Found:
+    """The candidates with the mean of their log-odds over scans: of each scan the nearest
+    candidate, moved by the poses (S, 4, 4), the newest last; where none is near, nothing speaks
+    against it that it does not say itself."""
+    odds = [logit(np.clip(now.scores, LEAST, 1 - LEAST))]
+    for found, pose in zip(earlier, np.linalg.inv(poses[-1]) @ poses[:-1]):
+        moved = found.boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+        far = np.linalg.norm(now.boxes[:, None, :2] - moved[None, :, :2], axis=2)
+        if far.size == 0:
+            continue
+        nearest = far.argmin(axis=1)
+        then = logit(np.clip(found.scores[nearest], LEAST, 1 - LEAST))
+        odds.append(np.where(far.min(axis=1) <= NEAR_AGAIN, then, odds[0]))
+    return now._replace(scores=expit(np.mean(odds, axis=0)))
 
 
 def _scans_before(frames: list[KittiFrame], number: int, count: int) -> list[KittiFrame]:
