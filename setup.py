@@ -50,7 +50,8 @@ setup(
     install_requires=[
         "click>=8.1", "cloth-simulation-filter>=1.1.5", "jinja2>=3.1", "matplotlib>=3.7",
         "mcap>=1.2", "numba>=0.59", "numpy>=1.26", "pypatchworkpp>=1.0", "pyyaml>=6", "rich>=13",
-        "rosbags>=0.11.6", "scikit-learn>=1.3", "scipy>=1.11", "threadpoolctl>=3.1", "torch>=2.2",
+        "rosbags>=0.11.6", "safetensors>=0.4", "scikit-learn>=1.3", "scipy>=1.11",
+        "threadpoolctl>=3.1", "torch>=2.2",
         "zstandard>=0.21",
     ],
     extras_require={
@@ -59,6 +60,7 @@ setup(
                  "setuptools>=70.1", "shapely>=2.0"],
         "distributed": ["distributed>=2024.1"],
         "odometry": ["kiss-icp>=1.2"],
+        "onnx": ["onnx>=1.16", "onnxruntime>=1.18", "onnxscript>=0.2", "torch>=2.6"],
         "benchmark": ["dbscan>=1.0", "opencv-python-headless>=4.8"],
     },
     entry_points={"console_scripts": [

@@ -6,6 +6,7 @@ names, such as ground.cloth.resolution.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from collections.abc import Iterator
@@ -87,8 +88,17 @@ def flatten(params: Any) -> dict[str, Any]:
 
 
 def parameter_fields(params: Any) -> dict[str, dataclasses.Field]:
-    """{'clustering.dbscan.eps': Field, ...}: defaults and metadata, named as in flatten."""
-    return {name: f for name, _, f in _walk(params)}
+    """{'clustering.dbscan.eps': Field, ...}: metadata, and params' values as defaults, named as in
+    flatten."""
+    return {name: _with_default(f, value) for name, value, f in _walk(params)}
+
+
+def _with_default(f: dataclasses.Field, value: Any) -> dataclasses.Field:
+    if f.default == value:
+        return f
+    changed = copy.copy(f)
+    changed.default = value
+    return changed
 
 
 def with_values(params: Any, values: dict[str, Any]) -> Any:

@@ -22,6 +22,16 @@ def data() -> Path:
     return DATA
 
 
+@pytest.fixture
+def one_thread():
+    """torch with one thread: small networks are slower with more, and wait for busy cores."""
+    import torch
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="session")
 def drive_bag(tmp_path_factory) -> Path:
     """A bag of a simulated drive: clouds, labels, camera."""

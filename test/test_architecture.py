@@ -19,7 +19,8 @@ ROS = {"rclpy", "ament_index_python", "launch", "launch_ros", "sensor_msgs", "st
 MAX_LINES = 400
 
 # Each list is what the files of a folder may import; a dotted name includes all inside it.
-SHARED = [f"lidar_perception.{name}" for name in ("types", "geometry", "params", "files")]
+SHARED = [f"lidar_perception.{name}"
+          for name in ("types", "geometry", "params", "files", "rotated_iou")]
 ALGORITHMS = [f"lidar_perception.{name}" for name in ("ground", "clustering", "candidates")]
 NUMERIC = ["numpy", "scipy", "numba", "sklearn", "pypatchworkpp"]
 
@@ -75,8 +76,8 @@ def public_functions(tree):
 
 def test_there_are_sources_to_look_at():
     assert len(files_in("msg_utils")) >= 5
-    for folder in ("ground", "clustering", "candidates", "nodes", "cli", "datasets", "evaluation",
-                   "reproduction"):
+    for folder in ("ground", "clustering", "candidates", "detection", "nodes", "cli", "datasets",
+                   "evaluation", "reproduction"):
         assert len(files_in(f"lidar_perception/{folder}")) >= 2
 
 
@@ -117,8 +118,16 @@ def test_algorithms_import_numbers_and_the_shared_files_only(name):
     assert strangers(name, NUMERIC + SHARED + ALGORITHMS) == []
 
 
+@pytest.mark.parametrize("name", files_in("lidar_perception/detection"))
+def test_detectors_import_torch_and_the_algorithms(name):
+    tensors = ["torch", "safetensors", "onnx", "onnxruntime", "onnxscript"]
+    own = ["lidar_perception.detection", "lidar_perception.param_fields"]
+    assert strangers(name, NUMERIC + tensors + SHARED + ALGORITHMS + own) == []
+
+
 @pytest.mark.parametrize("name, allowed", [
     ("lidar_perception/types.py", []),
+    ("lidar_perception/rotated_iou.py", ["numba"]),
     ("lidar_perception/geometry.py", []),
     ("lidar_perception/files.py", ["lidar_perception.types"]),
     ("lidar_perception/topics.py", []),
@@ -138,7 +147,8 @@ def test_the_shared_files_are_leaves(name, allowed):
 @pytest.mark.parametrize("name", files_in("lidar_perception/datasets",
                                           "lidar_perception/simulation"))
 def test_data_sources_know_no_algorithm(name):
-    above = [*ALGORITHMS, "lidar_perception.pipeline", "lidar_perception.evaluation"]
+    above = [*ALGORITHMS, "lidar_perception.detection", "lidar_perception.pipeline",
+             "lidar_perception.evaluation"]
     assert [m for m in imports(TREES[name]) if within(m, above)] == []
 
 
@@ -196,6 +206,11 @@ def test_no_source_is_longer_than_a_reader_can_hold(name):
     ("lidar_perception.pipeline", "torch matplotlib sklearn rosbags rich click"),
     ("msg_utils.point_cloud2", "numba torch matplotlib scipy rosbags lidar_perception"),
     ("msg_utils.markers", "numba torch matplotlib scipy rosbags lidar_perception"),
+    ("lidar_perception.detection.config", "numba torch matplotlib scipy sklearn rich click"),
+    ("lidar_perception.detection.detector_params", "numba torch matplotlib scipy numpy click"),
+    ("lidar_perception.detection.expert", "torch matplotlib sklearn rosbags rich click"),
+    ("lidar_perception.detection.detector", "onnx onnxruntime matplotlib sklearn rich click"),
+    ("lidar_perception.cli.weights", "numba torch matplotlib scipy"),
     ("lidar_perception.evaluation.candidates", "torch matplotlib sklearn click"),
     ("lidar_perception.evaluation.detection", "torch matplotlib sklearn rich click"),
     ("lidar_perception.reproduction.stm_cpa", "torch matplotlib sklearn click jinja2 distributed"),

@@ -32,6 +32,7 @@ from lidar_perception.reproduction.stm_cpa import (
     cpa_everywhere,
     measure,
     overlaps,
+    search,
     stage_counts,
 )
 from lidar_perception.types import InputError
@@ -129,7 +130,8 @@ def test_no_cpa_is_stage_2_and_near_clusters_never_have_any(measured):
         assert len(record["cpa"]) == NUMBERS.cpa_steps + 1
     for k in range(1, NUMBERS.cpa_steps + 1):
         assert total(measured, "cpa", k, "tp")[0] == total(measured, "cpa", 0, "tp")[0]
-    assert total(measured, "cpa", 8, "tp").sum() > total(measured, "cpa", 0, "tp").sum()
+    without, much = (total(measured, "cpa", k, "tp") for k in (0, NUMBERS.cpa_steps))
+    assert much[2] > without[2]  # beyond the 30 m of the final stage
 
 
 def test_two_steps_of_cpa_are_the_final_stage_from_15_to_30_m(refined):
@@ -162,6 +164,13 @@ def test_the_search_at_the_papers_setting_is_stage_1(refined, measured):
     assert compared >= 4
 
 
+@pytest.mark.parametrize("moved, hits", [(0.3, True), (0.7, False)])
+def test_hits_of_the_search_are_nearer_than_those_of_the_stages(refined, moved, hits):
+    labelled, segmented, seed, _ = refined[0]
+    counts = search(segmented, seed, labelled.pedestrians + [0, 0, moved, 0, 0, 0, 0])
+    assert (np.sum(counts, axis=(0, 2))[0] > 0) == hits
+
+
 def test_kept_are_those_that_both_hit():
     truth = np.zeros((3, 7))
     truth[:, 0], truth[:, 3:6] = [5, 20, 40], 1
@@ -177,6 +186,8 @@ def test_overlaps_of_boxes_that_are_known():
     assert (hits, shares) == (2, [2, 2, 2, 2]) and bev == pytest.approx(2, abs=1e-5)
     assert space == pytest.approx(1.0, abs=1e-5)
     assert overlaps(truth[:0], truth) == [0, 0, 0, 0, 0, 0, 0]
+    low = truth + [0, 0, -0.8, 0, 0, -1.6, 0]  # the lowest fifth of each
+    assert overlaps(low, truth)[1:5] == [2, 0, 2, 2]
     away = truth + [0.8, 0, 0, 0, 0, 0, 0]  # a ninth is shared
     hits, *shares, _, _ = overlaps(away, truth)
     assert (hits, shares) == (2, [2, 0, 2, 0])
@@ -231,6 +242,8 @@ def test_the_tables_hold_what_the_records_count(measured):
     final = dict(zip(tables["table_9"].header[1:], tables["table_9"].rows[2][1:]))
     steps = [cell.value for name, cell in final.items() if "total" not in name]
     assert final["total [ms]"].value == pytest.approx(sum(steps))
+    assert sum(steps) == pytest.approx(np.mean([sum(r["ms"].values()) - r["ms"]["stm_all"]
+                                                - r["ms"]["confidence"] for r in measured]))
     assert len(tables["table_5"].rows) == 9 and len(tables["table_4"].rows) == 15
 
 

@@ -325,6 +325,7 @@ BROKEN = {
     "calib/000006.txt": lambda b: b[:200],
     "calib/000007.txt": lambda b: re.sub(rb"(Tr_velo_to_cam:).*", rb"\1" + b" 0" * 12, b),
     "velodyne/000008.bin": None,
+    "calib/000009.txt": lambda b: re.sub(rb"(R0_rect:) \S+", rb"\1 -1", b),  # mirrored
 }
 
 

@@ -96,7 +96,7 @@ def _pose(path: Path, rectify: np.ndarray, velodyne: np.ndarray) -> np.ndarray:
     pose = _homogeneous(rectify) @ _homogeneous(velodyne)
     turn = pose[:3, :3]
     if not (np.isfinite(pose).all() and np.allclose(turn @ turn.T, np.eye(3), atol=MOST_SKEW)
-            and True):
+            and np.linalg.det(turn) > 0):
         raise InputError(f"the pose of the LiDAR in {path} is no rotation; download KITTI's "
                          "calibration again")
     return pose

@@ -18,7 +18,7 @@ from numba import njit
 
 from lidar_perception.evaluation.average_precision import at_recall, averages, recall_thresholds
 from lidar_perception.evaluation.camera_objects import CameraObjects
-from lidar_perception.evaluation.rotated_iou import bev_and_3d_iou
+from lidar_perception.rotated_iou import bev_and_3d_iou
 from lidar_perception.types import CLASSES
 
 SCORED = ("Car", "Pedestrian", "Cyclist")

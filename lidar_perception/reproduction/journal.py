@@ -98,7 +98,7 @@ def _begun(folder: Path, plan: dict[str, Any]) -> dict[str, str]:
     if different := differences(before, json.loads(json.dumps(plan))):
         raise InputError(f"{folder} was begun with {'; '.join(different)}; give another name, or "
                          "start again with --force")
-    return {record["frame"]: line for line in rest[:-1] if (record := _record(line))}
+    return {record["frame"]: line for line in rest if (record := _record(line))}
 
 
 def _record(line: str) -> dict | None:

@@ -18,7 +18,6 @@ from lidar_perception.evaluation.matching import (
     match_centres,
     range_bins,
 )
-from lidar_perception.evaluation.rotated_iou import bev_and_3d_iou
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.params import PipelineParams, flatten, with_values
 from lidar_perception.pipeline import Segmented, cluster_obstacles, segment
@@ -26,6 +25,7 @@ from lidar_perception.reproduction.experiment import Experiment
 from lidar_perception.reproduction.labelled import load_labelled, nearest_seed
 from lidar_perception.reproduction.params import StmCpaParams
 from lidar_perception.reproduction.stm_cpa_tables import sections
+from lidar_perception.rotated_iou import bev_and_3d_iou
 from lidar_perception.types import InputError
 
 NUMBERS = StmCpaParams()

@@ -1,0 +1,63 @@
+"""import-weights and export: networks from other projects, and for other runtimes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from lidar_perception.terminal import console
+
+
+@click.command("import-weights")
+@click.argument("source", type=click.Path(path_type=Path), metavar="FILE.pth")
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FILE",
+              help="Checkpoint to write (.safetensors).")
+@click.option("--classes", metavar="A,B,C", default="",
+              help="Classes in the order of training. Default: the project's own order for KITTI.")
+@click.option("--half", is_flag=True, help="Store the weights of layers as float16.")
+def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:
+    """Turn PointPillars weights of OpenPCDet or mmdetection3d (1.x) into a checkpoint.
+
+    Networks for KITTI with pillars of 0.16 m. The file is read as weights only; nothing in it is
+    run. What the projects read differently (anchors, headings, points of a pillar) is converted.
+
+    \b
+    Examples:
+      lidar-perception import-weights pointpillar_7728.pth --out pointpillars.safetensors
+      lidar-perception import-weights car.pth --classes Car --out car.safetensors
+    """
+    from lidar_perception.detection.checkpoint import Header, save_checkpoint
+    from lidar_perception.detection.import_weights import import_weights as converted
+    names = tuple(name.strip() for name in classes.split(",") if name.strip())
+    config, network, project = converted(source, names)
+    save_checkpoint(out, network, Header(config, {"imported from": project, "file": source.name}),
+                    half)
+    console.print(f"{out}: PointPillars of {project} for {', '.join(config.classes)}")
+
+
+@click.group()
+def export() -> None:
+    """Write a network for another runtime."""
+
+
+@export.command()
+@click.argument("weights", type=click.Path(path_type=Path), metavar="WEIGHTS")
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FILE",
+              help="File to write (.onnx).")
+def onnx(weights: Path, out: Path) -> None:
+    """Write a checkpoint of any version, size and classes as ONNX (needs the extra [onnx]).
+
+    The graph takes points sorted into pillars and gives the raw outputs at every anchor; its
+    metadata says the rest. The detector reads the file in the place of a checkpoint.
+
+    \b
+    Examples:
+      lidar-perception export onnx v4.safetensors --out v4.onnx
+    """
+    from lidar_perception.detection.checkpoint import load_network
+    from lidar_perception.detection.onnx_network import export_onnx
+    header, network = load_network(weights)
+    export_onnx(network.eval(), header, out)
+    config = header.config
+    console.print(f"{out}: {config.version} {config.size} for {', '.join(config.classes)}")

@@ -1,0 +1,1 @@
+"""Learned detectors: EG-PointPillars (paper B), from a cloud to boxes."""

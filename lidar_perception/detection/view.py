@@ -1,0 +1,40 @@
+"""From a sensor's frame to what a network sees of it, and back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lidar_perception.detection.config import SENSOR_HEIGHT, NetworkConfig
+from lidar_perception.ground.segment import level
+from lidar_perception.params import SensorPoseParams
+from lidar_perception.types import Detections, LidarFrame
+
+
+def visible(frame: LidarFrame, config: NetworkConfig,
+            pose: SensorPoseParams = SensorPoseParams()) -> tuple[np.ndarray, LidarFrame]:
+    """places (M,) int64 of the frame's points in the network's range, and the frame of these, its
+    coordinates levelled and as from SENSOR_HEIGHT. Points that are not finite are left out."""
+    shift = np.float32(pose.height - SENSOR_HEIGHT)
+    xyz = level(frame.xyz, pose)
+    with np.errstate(invalid="ignore"):
+        inside = np.ones(len(xyz), bool)
+        for axis, offset in enumerate((0, 0, shift)):
+            values = xyz[:, axis]
+            inside &= (values >= config.low[axis] - offset) & (values < config.high[axis] - offset)
+    places = np.flatnonzero(inside)
+    seen = frame.take(places)
+    return places, replace(seen, xyz=xyz.take(places, axis=0) + np.array([0, 0, shift], np.float32))
+
+
+def in_sensor_frame(found: Detections, pose: SensorPoseParams) -> Detections:
+    """Boxes as from a level sensor at SENSOR_HEIGHT, to those of a sensor with this pose."""
+    boxes = found.boxes.copy()
+    boxes[:, 2] -= pose.height - SENSOR_HEIGHT
+    if pose.roll or pose.pitch:
+        back = level(np.eye(3, dtype=np.float32), pose).T
+        heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], axis=1) @ back[:2]
+        boxes[:, :3] = boxes[:, :3] @ back
+        boxes[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
+    return Detections(boxes, found.class_ids, found.scores)

@@ -1,0 +1,87 @@
+"""Small networks and detectors, and a scene of two objects, for the tests of detection."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from lidar_perception.detection.checkpoint import Header
+from lidar_perception.detection.config import NetworkConfig, network_config
+from lidar_perception.detection.detector import CPU, Detector, TorchNetwork
+from lidar_perception.detection.detector_params import DetectorParams
+from lidar_perception.detection.pointpillars import make_network
+from lidar_perception.params import with_values
+from lidar_perception.types import Detections, LidarFrame
+
+# A car across and a pedestrian, standing on the ground 1.73 m below [x y z l w h yaw].
+BOXES = torch.tensor([[6.0, 1.5, -0.95, 3.9, 1.7, 1.5, 1.2], [3.0, -2.5, -0.86, 0.8, 0.7, 1.7, -2]])
+LABELS = torch.tensor([0, 1])
+
+
+def tiny(version: str = "v0", **changes) -> NetworkConfig:
+    """Any version on 32 x 32 pillars with a few channels."""
+    small = dict(low=(0.0, -5.12, -3.0), high=(10.24, 5.12, 1.0), cell=0.32, pillar_channels=8,
+                 map_channels=(4, 8), block_channels=(8, 12, 16), block_layers=(1, 1, 1),
+                 deconv_channels=8, fpn_channels=8)
+    return network_config(version, "compact", **{**small, **changes})
+
+
+def two_objects(seed: int = 0) -> np.ndarray:
+    """(N, 4) float32 [x y z intensity]: flat ground with the surfaces of BOXES on it."""
+    rng = np.random.default_rng(seed)
+    parts = [rng.uniform([0, -5, -1.74], [10, 5, -1.72], (3000, 3))]
+    for x, y, z, length, width, height, yaw in BOXES.tolist():
+        flat = rng.uniform(-0.5, 0.5, (300, 3))
+        side = rng.integers(0, 2, 300)
+        flat[np.arange(300), side] = np.sign(flat[np.arange(300), side]) / 2
+        flat *= [length, width, height]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        parts.append(np.column_stack([x + cos * flat[:, 0] - sin * flat[:, 1],
+                                      y + sin * flat[:, 0] + cos * flat[:, 1], z + flat[:, 2]]))
+    xyz = np.concatenate(parts)
+    return np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32)
+
+
+def lively(config, seed=0) -> torch.nn.Module:
+    """A network in inference mode whose norms and head are not at their first values."""
+    torch.manual_seed(seed)
+    network = make_network(config).eval()
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
+            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
+            torch.nn.init.normal_(module.bias, std=0.3)
+            module.running_mean.normal_(std=0.3)
+            module.running_var.uniform_(0.5, 2)
+    torch.nn.init.normal_(network.head.scores.weight, std=0.3)
+    torch.nn.init.constant_(network.head.scores.bias, -1.0)
+    torch.nn.init.normal_(network.head.codes.weight, std=0.1)
+    return network.requires_grad_(False)
+
+
+def frame(seed: int = 0) -> LidarFrame:
+    """The two objects, and points behind and far away."""
+    points = two_objects(seed)
+    points = np.concatenate([points, points[::7] * [-1, 1, 1, 1], points[::9] + [50, 0, 0, 0]])
+    points = points.astype(np.float32)
+    return LidarFrame(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
+
+
+def eager(params: DetectorParams = DetectorParams(), score: float = 0.25) -> DetectorParams:
+    """Parameters with which random weights find something."""
+    names = ("car", "pedestrian", "cyclist", "other")
+    return with_values(params, {**{f"detection.scores.{n}": score for n in names},
+                                "detection.nms.iou": 0.2})
+
+
+def random_detector(version: str = "v0", params: DetectorParams | None = None,
+                    **changes) -> Detector:
+    """With random weights."""
+    config = tiny(version, **changes)
+    return Detector(TorchNetwork(lively(config)), Header(config), CPU, params or eager())
+
+
+def same(a: Detections, b: Detections, atol: float = 0.0) -> bool:
+    """Whether both say the same, in the same order."""
+    return (len(a) == len(b) and np.array_equal(a.class_ids, b.class_ids)
+            and np.allclose(a.boxes, b.boxes, rtol=0, atol=atol)
+            and np.allclose(a.scores, b.scores, rtol=0, atol=atol))

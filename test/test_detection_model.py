@@ -1,0 +1,429 @@
+"""Laws of the parts of PointPillars: pillars, anchors, boxes, targets, losses, NMS, the network."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from detection_samples import BOXES, LABELS, lively, tiny, two_objects
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidar_perception.detection.anchors import anchor_classes, make_anchors
+from lidar_perception.detection.box_coder import decode, encode
+from lidar_perception.detection.config import (
+    ANCHORS,
+    SIZES,
+    VERSIONS,
+    from_json,
+    network_config,
+    require_same,
+    to_json,
+)
+from lidar_perception.detection.losses import detection_loss
+from lidar_perception.detection.nms import suppressed
+from lidar_perception.detection.pillars import first_of_each, make_pillars
+from lidar_perception.detection.pointpillars import Outputs, fused, make_network
+from lidar_perception.detection.targets import (
+    BACKGROUND,
+    IGNORED,
+    assign,
+    nearest_axis_iou,
+    stacked,
+)
+from lidar_perception.geometry import wrap_angle
+from lidar_perception.types import InputError
+
+few = settings(deadline=None, max_examples=25, database=None)
+seeds = st.integers(0, 2**32 - 1)
+pytestmark = pytest.mark.usefixtures("one_thread")
+each_version = pytest.mark.parametrize("version", VERSIONS)
+
+
+def some_points(config, count=600, seed=0, margin=0.0) -> torch.Tensor:
+    """Points all over the range, grown by margin; a few in each pillar they touch."""
+    rng = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor(config.low) - margin, torch.tensor(config.high) + margin
+    points = torch.rand(count, config.point_columns, generator=rng)
+    points[:, :3] = low + points[:, :3] * (high - low)
+    near = points[:count - count // 2, :2]
+    points[count // 2:, :2] = near + 0.002 * ((low + high)[:2] / 2 - near)
+    return points
+
+
+def some_map(config, seed=0) -> torch.Tensor | None:
+    rng = torch.Generator().manual_seed(seed)
+    return (torch.randint(0, 2, (1, 3, *config.grid), generator=rng, dtype=torch.uint8)
+            if config.pseudo_map else None)
+
+
+def some_boxes(seed, count=20, spread=6.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(-spread, spread, (count, 3)),
+                            rng.uniform(0.4, 5, (count, 3)), rng.uniform(-7, 7, count)])
+
+
+# configs
+
+@each_version
+@pytest.mark.parametrize("size", SIZES)
+def test_a_config_survives_json(version, size):
+    config = network_config(version, size, classes=("Cyclist", "Car"))
+    assert from_json(to_json(config)) == config
+    assert config.classes == ("Cyclist", "Car") and config.grid == (496, 432)
+
+
+def test_versions_are_those_of_the_paper():
+    switches = {v: [s[k] for k in ("remove_ground", "cluster_ids", "pseudo_map", "neck")]
+                for v, s in VERSIONS.items()}
+    assert switches == {"v0": [False, False, False, "deconv"], "v1": [True, False, False, "fpn"],
+                        "v2": [True, True, False, "fpn"], "v3": [False, True, False, "fpn"],
+                        "v4": [True, False, True, "fpn"]}
+
+
+def test_the_full_baseline_has_as_many_weights_as_pointpillars():
+    # 4.8 million: Lang et al. with three classes, six anchors and a direction
+    counted = sum(p.numel() for p in make_network(network_config("v0", "full")).parameters())
+    by_hand = (9 * 64 + 2 * 64                                                 # points
+               + sum(9 * a * b + n * 9 * b * b + 2 * b * (n + 1)               # blocks
+                     for a, b, n in ((64, 64, 3), (64, 128, 5), (128, 256, 5)))
+               + sum(c * 128 * s * s + 2 * 128 for c, s in ((64, 1), (128, 2), (256, 4)))
+               + 385 * 6 * (3 + 7 + 2))                                        # head
+    assert counted == by_hand
+
+
+@pytest.mark.parametrize("change, words", [
+    (dict(version="v9"), "no 'v9'"), (dict(classes=("Dog",)), "Dog"), (dict(classes=()), "class"),
+    (dict(cell=0.17), "cannot be divided"), (dict(zero_row=True), "max_points")])
+def test_a_config_that_cannot_be_is_refused(change, words):
+    with pytest.raises(InputError, match=words):
+        network_config(**{"version": "v1", **change})
+
+
+def test_another_network_is_refused_with_both_values():
+    with pytest.raises(InputError, match=r"f\.st .*version is v4, asked for was v2"):
+        require_same(network_config("v4"), network_config("v2"), "f.st")
+
+
+# pillars
+
+def test_pillars_know_their_points():
+    config = tiny("v0")
+    points = some_points(config, margin=1.0)
+    points[3, 0], points[4, 2], points[5, 3] = torch.nan, torch.inf, torch.nan
+    pillars = make_pillars([points], config)
+    low, high = torch.tensor(config.low), torch.tensor(config.high)
+    inside = ((points[:, :3] >= low) & (points[:, :3] < high)).all(1) & points.isfinite().all(1)
+    assert torch.equal(pillars.points, points[inside]) and 0 < inside.sum() < len(points) - 3
+    height, width = config.grid
+    assert pillars.cells.min() >= 0 and pillars.cells.max() < height * width
+    for cell in pillars.cells.unique():
+        members = pillars.cells == cell
+        xyz, offsets = pillars.points[members][:, :3], pillars.offsets[members]
+        middle = low[:2] + (torch.stack([cell % width, cell // width]) + 0.5) * config.cell
+        torch.testing.assert_close(offsets[:, :3], xyz - xyz.mean(0), atol=1e-5, rtol=0)
+        torch.testing.assert_close(offsets[:, 3:], xyz[:, :2] - middle, atol=1e-5, rtol=0)
+        assert offsets[:, 3:].abs().max() <= config.cell / 2 + 1e-5
+
+
+@few
+@given(seeds, st.integers(1, 5))
+def test_the_first_points_of_each_pillar_are_those_of_a_loop(seed, most):
+    cells = torch.from_numpy(np.random.default_rng(seed).integers(0, 9, 50))
+    counts, kept = {}, []
+    for i, cell in enumerate(cells.tolist()):
+        counts[cell] = counts.get(cell, 0) + 1
+        if counts[cell] <= most:
+            kept.append(i)
+    assert first_of_each(cells, most).tolist() == kept
+
+
+def test_the_order_of_the_points_makes_no_difference():
+    config = tiny("v0")
+    network, points = lively(config), some_points(config)
+    image = network.pillar_net(make_pillars([points], config))
+    shuffled = network.pillar_net(make_pillars([points[torch.randperm(len(points))]], config))
+    torch.testing.assert_close(shuffled, image, atol=1e-5, rtol=1e-5)
+    assert image.max() > 0
+
+
+def test_moving_the_points_by_a_pillar_moves_the_image_by_a_cell():
+    config = tiny("v0", low=(0.0, -4.0, -3.0), high=(8.0, 4.0, 1.0), cell=0.25)
+    network = lively(config)
+    network.pillar_net.linear.weight[:, :2] = 0  # x and y themselves
+    points = (some_points(config) * 64).round() / 64  # so that moving is exact
+    points = points[(points[:, 0] < 7.5) & (points[:, 1] < 3.5)]
+    image = network.pillar_net(make_pillars([points], config))
+    for axis, (rows, columns) in ((0, (0, 1)), (1, (1, 0))):
+        moved = points.clone()
+        moved[:, axis] += 0.25
+        shifted = network.pillar_net(make_pillars([moved], config))
+        torch.testing.assert_close(shifted, image.roll((rows, columns), (2, 3)), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("middle_z", [False, True])
+def test_limited_pillars_are_those_of_padded_code(middle_z):
+    config = tiny("v0", max_points=2, zero_row=True, middle_z=middle_z)
+    network, points = lively(config), some_points(config, 900)
+    net, low = network.pillar_net, torch.tensor(config.low)
+    image = net(make_pillars([points], config))[0]
+    expected = torch.zeros_like(image)
+    cells = ((points[:, :2] - low[:2]) / config.cell).floor().long()
+    for column, row in set(map(tuple, cells.tolist())):
+        members = points[(cells == torch.tensor([column, row])).all(1)][:2]
+        rows = torch.zeros(2, 9 + middle_z)  # filled up with zeros, which take part in the maximum
+        middle = [*(low[:2] + (torch.tensor([column, row]) + 0.5) * config.cell), -1.0]
+        rows[:len(members)] = torch.cat([members, members[:, :3] - members[:, :3].mean(0),
+                                         (members[:, :3] - torch.tensor(middle))[:, :2 + middle_z]],
+                                        dim=1)
+        expected[:, row, column] = torch.relu(net.norm(net.linear(rows))).max(0).values
+    torch.testing.assert_close(image, expected, atol=1e-5, rtol=1e-5)
+
+
+# the network
+
+@each_version
+@pytest.mark.parametrize("changes", [{}, dict(fusion="concat"), dict(block_strides=(1, 2, 2))])
+def test_every_version_gives_an_output_for_every_anchor(version, changes):
+    config = tiny(version, **changes)
+    count = len(make_anchors(config))
+    assert count == config.head_grid[0] * config.head_grid[1] * 6
+    out = make_network(config)(make_pillars([some_points(config), some_points(config, 9)], config),
+                               torch.cat([some_map(config)] * 2) if config.pseudo_map else None)
+    assert [tuple(t.shape) for t in out] == [(2, count, 3), (2, count, 7), (2, count, 2)]
+    assert torch.sigmoid(out.logits).mean().item() == pytest.approx(0.01, rel=0.2)  # untrained
+
+
+@each_version
+def test_a_batch_of_two_is_two_clouds(version):
+    config = tiny(version)
+    network = lively(config)
+    clouds = [some_points(config, 300, 1), some_points(config, 500, 2)]
+    maps = [some_map(config, 1), some_map(config, 2)]
+    both = network(make_pillars(clouds, config),
+                   torch.cat(maps) if config.pseudo_map else None)
+    for i in range(2):
+        alone = network(make_pillars(clouds[i:i + 1], config), maps[i])
+        for one, batch in zip(alone, both):
+            torch.testing.assert_close(one[0], batch[i], atol=2e-5, rtol=1e-4)
+    assert not torch.allclose(both.logits[0], both.logits[1], atol=1e-3)
+
+
+@each_version
+def test_folding_the_norms_changes_nothing(version):
+    config = tiny(version)
+    network = lively(config)
+    pillars, cluster_map = make_pillars([some_points(config)], config), some_map(config)
+    folded = fused(network)
+    for a, b in zip(network(pillars, cluster_map), folded(pillars, cluster_map)):
+        torch.testing.assert_close(a, b, atol=2e-5, rtol=1e-4)
+    assert not [m for m in folded.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+
+
+def test_boxes_at_some_anchors_are_those_of_all():
+    config = tiny("v1")
+    network = lively(config)
+    features = network.features(make_pillars([some_points(config)], config))
+    out, some = network.head(features), torch.tensor([0, 5, 17, 100, 1535])
+    codes, directions = network.head.boxes_at(features, some)
+    torch.testing.assert_close(codes, out.codes[0, some], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(directions, out.directions[0, some], atol=1e-5, rtol=1e-4)
+    assert torch.equal(network.head.logits(features), out.logits)
+
+
+# anchors and boxes
+
+def test_anchors_lie_in_rows_along_y_then_x_then_class_then_yaw():
+    config = tiny("v0")
+    anchors = make_anchors(config)
+    height, width = config.head_grid
+    grid = anchors.view(height, width, 3, 2, 7)
+    assert torch.equal(anchor_classes(config).view(height, width, 3, 2)[2, 3].T,
+                       torch.arange(3).expand(2, 3))
+    torch.testing.assert_close(grid[0, :, 0, 0, 0], (torch.arange(width) + 0.5) * 0.64)
+    torch.testing.assert_close(grid[:, 0, 0, 0, 1], -5.12 + (torch.arange(height) + 0.5) * 0.64)
+    for i, spec in enumerate(ANCHORS):
+        assert grid[1, 1, i, :, 3:6].tolist() == [pytest.approx(spec.size)] * 2
+        assert grid[1, 1, i, 0, 2] - spec.size[2] / 2 == pytest.approx(-1.73)  # on the ground
+    ends = make_anchors(tiny("v0", anchors_at="ends")).view(height, width, 3, 2, 7)
+    assert (ends[0, 0, 0, 0, :2].tolist(), ends[-1, -1, 0, 0, :2].tolist()) == (
+        [0.0, pytest.approx(-5.12)], [pytest.approx(10.24), pytest.approx(5.12)])
+
+
+@few
+@given(seeds, st.sampled_from([0.0, np.pi / 4, 0.78539, -np.pi / 2]))
+def test_decoding_undoes_encoding(seed, offset):
+    boxes = torch.from_numpy(some_boxes(seed))
+    anchors = torch.from_numpy(some_boxes(seed ^ 1))
+    codes, bins = encode(boxes, anchors, offset)
+    turned = codes.clone()
+    turned[:, 6] += np.pi  # the direction is in the bins alone
+    for given_codes in codes, turned:
+        back = decode(given_codes, bins, anchors, offset)
+        torch.testing.assert_close(back[:, :6], boxes[:, :6], atol=1e-9, rtol=1e-9)
+        away = torch.remainder(back[:, 6] - boxes[:, 6] + np.pi, 2 * np.pi) - np.pi
+        assert away.abs().max() < 1e-9 and back[:, 6].abs().max() <= np.pi
+    assert torch.equal(encode(anchors, anchors, offset)[0], torch.zeros(20, 7, dtype=torch.float64))
+
+
+# targets
+
+def test_the_overlap_of_boxes_along_the_axes_is_the_usual_one():
+    a = torch.tensor([[0, 0, 0, 4.0, 2, 1, 0.0]])
+    b = torch.tensor([[1, 0, 0, 2.0, 4, 1, np.pi / 2 + 0.1], [9, 0, 0, 1, 1, 1, 0]])
+    assert nearest_axis_iou(a, b)[0].tolist() == [pytest.approx(6 / 10), 0.0]
+
+
+def test_targets_are_those_of_a_plain_reading():
+    config = tiny("v0")
+    anchors, classes = make_anchors(config), anchor_classes(config)
+    rng = np.random.default_rng(3)
+    sizes = torch.tensor([a.size for a in config.anchors])
+    labels = torch.from_numpy(rng.integers(0, 3, 8))
+    boxes = torch.from_numpy(np.column_stack([
+        rng.uniform(1, 9, 8), rng.uniform(-4, 4, 8), np.full(8, -1.0), np.zeros((8, 3)),
+        rng.uniform(-4, 4, 8)])).float()
+    boxes[:, 3:6] = sizes[labels] * 1.05
+    found = assign(anchors, config, boxes, labels)
+    overlap = nearest_axis_iou(anchors, boxes).numpy()
+    for i in range(len(anchors)):
+        spec = config.anchors[classes[i]]
+        mine = [j for j in range(8) if labels[j] == classes[i]]
+        forced = [j for j in mine if overlap[i, j] > 0 and
+                  overlap[i, j] == overlap[(classes == labels[j]).numpy(), j].max()]
+        best = max(mine, key=lambda j: overlap[i, j], default=None)
+        if forced or (best is not None and overlap[i, best] >= spec.matched):
+            target = forced[0] if forced else best
+            assert found.labels[0, i] == classes[i]
+            codes, bins = encode(boxes[target][None], anchors[i][None], config.direction_offset)
+            torch.testing.assert_close(found.codes[0, i], codes[0])
+            assert found.bins[0, i] == bins[0]
+        elif best is not None and overlap[i, best] >= spec.unmatched:
+            assert found.labels[0, i] == IGNORED
+        else:
+            assert found.labels[0, i] == BACKGROUND and not found.codes[0, i].any()
+    assert {*found.labels.unique().tolist()} == {IGNORED, BACKGROUND, *labels.tolist()}
+
+
+def test_every_object_has_an_anchor_and_the_order_of_objects_makes_no_difference():
+    config = tiny("v0")
+    anchors = make_anchors(config)
+    there = assign(anchors, config, BOXES, LABELS)
+    back = assign(anchors, config, BOXES.flip(0), LABELS.flip(0))
+    for a, b in zip(there, back):
+        assert torch.equal(a, b)
+    positive = there.labels[0] >= 0
+    decoded = decode(there.codes[0, positive], there.bins[0, positive], anchors[positive],
+                     config.direction_offset)
+    for box, label in zip(BOXES, LABELS):
+        near = (decoded - box).abs().amax(1) < 1e-4
+        assert near.any() and (there.labels[0, positive][near] == label).all()
+
+
+def test_objects_without_size_and_no_objects_leave_background():
+    config = tiny("v0")
+    broken = BOXES.clone()
+    broken[0, 3], broken[1, 0] = 0, torch.nan
+    for boxes, labels in (broken, LABELS), (BOXES[:0], LABELS[:0]):
+        assert (assign(make_anchors(config), config, boxes, labels).labels == BACKGROUND).all()
+
+
+# losses
+
+def outputs_of(targets, classes=3, sure=12.0):
+    """Outputs that are just right."""
+    logits = torch.full((*targets.labels.shape, classes), -sure)
+    directions = torch.nn.functional.one_hot(targets.bins, 2).float() * 2 * sure
+    positive = targets.labels >= 0
+    logits[positive] += torch.nn.functional.one_hot(
+        targets.labels[positive], classes) * 2 * sure
+    return Outputs(logits, targets.codes.clone(), directions)
+
+
+def test_what_is_right_costs_nothing_and_what_is_wrong_costs():
+    config = tiny("v0")
+    targets = assign(make_anchors(config), config, BOXES, LABELS)
+    right = outputs_of(targets)
+    assert detection_loss(right, targets).total < 1e-4
+    turned = right._replace(codes=right.codes + torch.tensor([0, 0, 0, 0, 0, 0, np.pi]))
+    assert detection_loss(turned, targets).boxes < 1e-6  # the direction is another loss
+    assert detection_loss(right._replace(directions=-right.directions), targets).directions > 1
+    assert detection_loss(right._replace(codes=right.codes + 0.3), targets).boxes > 0.1
+    assert detection_loss(right._replace(logits=-right.logits), targets).classes > 1
+
+
+def test_losses_are_means_over_clouds_and_do_not_see_what_is_ignored():
+    config = tiny("v0")
+    anchors = make_anchors(config)
+    one, none = (assign(anchors, config, BOXES[:n], LABELS[:n]) for n in (2, 0))
+    torch.manual_seed(0)
+    out = Outputs(*(torch.randn(1, len(anchors), n) for n in (3, 7, 2)))
+    both = detection_loss(Outputs(*(torch.cat([t, t]) for t in out)), stacked([one, none]))
+    for a, b, mean in zip(detection_loss(out, one), detection_loss(out, none), both):
+        torch.testing.assert_close((a + b) / 2, mean)
+    changed = out.logits.clone()
+    changed[one.labels == IGNORED] += 5
+    assert (one.labels == IGNORED).any()
+    torch.testing.assert_close(detection_loss(out._replace(logits=changed), one).total,
+                               detection_loss(out, one).total)
+
+
+# non-maximum suppression
+
+def reference_iou(a, b):
+    (one, first), (two, second) = (
+        (((box[0], box[1]), (box[3], box[4]), np.degrees(box[6])), box[3] * box[4])
+        for box in (a, b))
+    kind, region = cv2.rotatedRectangleIntersection(one, two)
+    shared = cv2.contourArea(cv2.convexHull(region)) if kind else 0.0
+    return shared / (first + second - shared)
+
+
+@few
+@given(seeds, st.booleans())
+def test_suppression_is_that_of_a_slow_loop(seed, across):
+    rng = np.random.default_rng(seed)
+    boxes = some_boxes(seed, 30, spread=4)
+    scores, labels, limit = rng.permutation(30) / 30, rng.integers(0, 3, 30), 0.2
+    kept, sure = [], True
+    for i in np.argsort(-scores):
+        overlaps = [reference_iou(boxes[i], boxes[j]) for j in kept
+                    if across or labels[i] == labels[j]]
+        sure &= all(abs(o - limit) > 1e-3 for o in overlaps)  # the reference is in float32
+        if all(o <= limit for o in overlaps):
+            kept.append(i)
+    if sure:
+        assert suppressed(boxes, scores, labels, limit, across).tolist() == kept
+    assert suppressed(boxes[:0], scores[:0], labels[:0], limit).tolist() == []
+
+
+def test_a_tiny_network_learns_two_objects():
+    config = tiny("v0", block_channels=(16, 24, 24), deconv_channels=16, pillar_channels=16)
+    torch.manual_seed(0)
+    network = make_network(config)
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
+            module.momentum = 0.1
+    anchors = make_anchors(config)
+    targets = assign(anchors, config, BOXES, LABELS)
+    points = torch.from_numpy(two_objects())
+    optimizer = torch.optim.AdamW(network.parameters())
+    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 0.02, total_steps=400)
+    for _ in range(400):
+        losses = detection_loss(network(make_pillars([points], config)), targets)
+        optimizer.zero_grad()
+        losses.total.backward()
+        optimizer.step()
+        rate.step()
+    with torch.no_grad():
+        out = fused(network)(make_pillars([points], config))
+    scores = torch.sigmoid(out.logits[0])
+    for box, label in zip(BOXES, LABELS):
+        best = scores[:, label].argmax()
+        found = decode(out.codes[0, best][None], out.directions[0, best].argmax()[None],
+                       anchors[best][None], config.direction_offset)[0]
+        assert scores[best, label] > 0.9
+        torch.testing.assert_close(found[:6], box[:6], atol=0.2, rtol=0)
+        assert abs(wrap_angle((found[6] - box[6]).item())) < 0.2
+    assert (scores.amax(1) > 0.5).sum() <= 2 * (targets.labels >= 0).sum()
