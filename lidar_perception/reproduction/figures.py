@@ -26,7 +26,9 @@ def draw(figure: Figure, kind: str = "svg", *, dark: bool = False) -> bytes:
     with matplotlib.rc_context(style):
         columns = min(COLUMNS, len(figure.panels))
         rows = -(-len(figure.panels) // columns)
-        canvas = Canvas(figsize=(3.7 * columns, 2.9 * rows + 0.5), dpi=130, layout="constrained")
+        beside = columns == 1  # one panel leaves room for the legend
+        size = (8.0, 3.4) if beside else (3.7 * columns, 2.9 * rows + 0.5)
+        canvas = Canvas(figsize=size, dpi=130, layout="constrained")
         FigureCanvasAgg(canvas)
         axes = canvas.subplots(rows, columns, squeeze=False).ravel()
         shown = {}
@@ -40,7 +42,8 @@ def draw(figure: Figure, kind: str = "svg", *, dark: bool = False) -> bytes:
             place.spines[["top", "right"]].set_visible(False)
         for place in axes[len(figure.panels):]:
             place.set_visible(False)
-        canvas.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=2 * columns)
+        canvas.legend(shown.values(), shown.keys(), ncols=1 if beside else 2 * columns,
+                      loc="outside right upper" if beside else "outside lower center")
         stream = BytesIO()
         metadata = {"Date": None} if kind == "svg" else {}
         canvas.savefig(stream, format=kind, metadata=metadata)
