@@ -41,7 +41,7 @@ class Kind:
     lamp: float = 3.0                 # rates for each side
     tree: float = 4.0
     clutter: float = 4.0
-    walkers: float = 1.5
+    walkers: float = 3.3
     standers: float = 0.12
     seats: float = 0.05
     riders: float = 0.3
@@ -49,20 +49,20 @@ class Kind:
 
 KINDS = {
     "city": Kind(0.28, {"facade": 0.4, "garden": 0.2, "verge": 0.4}, cycle=0.25, parking=0.65,
-                 across=0.15, walk=(2.0, 4.5), rails=0.05, clutter=7, walkers=2.2, standers=0.17,
+                 across=0.15, walk=(2.0, 4.5), rails=0.05, clutter=7, walkers=4.8, standers=0.17,
                  riders=0.5, crossing=(45, 100)),
     "residential": Kind(0.30, {"garden": 0.8, "facade": 0.1, "verge": 0.1}, lane=(2.8, 3.2),
                         parking=0.5, walk=(1.5, 2.4), speed=(2.0, 9.0), headway=12.0, tree=3.0,
-                        stands=0.1, walkers=0.6, standers=0.05, seats=0.02, riders=0.3),
+                        stands=0.1, walkers=1.3, standers=0.05, seats=0.02, riders=0.3),
     "arterial": Kind(0.20, {"verge": 0.8, "facade": 0.1, "wild": 0.1}, lane=(3.2, 3.7),
                      beside=(0, 2), oncoming=(1, 3), rails=0.4, cycle=0.4, parking=0.15,
                      walk=(2.0, 3.5), crossing=(90, 200), speed=(5.0, 14.0), headway=3.0,
-                     tree=5.0, walkers=0.6, riders=0.5),
+                     tree=5.0, walkers=1.3, riders=0.5),
     "country": Kind(0.13, {"wild": 1.0}, walk=(0.0, 0.0), curb=0.0, crossing=(150, 400),
                     speed=(7.0, 14.0), stands=0.05, headway=5.0, lamp=0.5, tree=0.0, clutter=1.0,
-                    walkers=0.1, standers=0.0, seats=0.0, riders=0.2),
+                    walkers=0.2, standers=0.0, seats=0.0, riders=0.2),
     "zone": Kind(0.09, {"facade": 0.6, "square": 0.4}, walk=(4.0, 8.0), curb=0.03, rails=0.1,
-                 speed=(0.5, 3.5), stands=0.4, headway=40.0, tree=3.0, clutter=8.0, walkers=6.0,
+                 speed=(0.5, 3.5), stands=0.4, headway=40.0, tree=3.0, clutter=8.0, walkers=13.2,
                  standers=0.5, seats=0.3, riders=1.5, crossing=(40, 80), parking=0.1),
 }
 
