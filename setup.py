@@ -61,6 +61,7 @@ setup(
         "distributed": ["distributed>=2024.1"],
         "odometry": ["kiss-icp>=1.2"],
         "onnx": ["onnx>=1.16", "onnxruntime>=1.18", "onnxscript>=0.2", "torch>=2.6"],
+        "train": ["tensorboard>=2.15"],
         "benchmark": ["dbscan>=1.0", "opencv-python-headless>=4.8"],
     },
     entry_points={"console_scripts": [

@@ -76,8 +76,8 @@ def public_functions(tree):
 
 def test_there_are_sources_to_look_at():
     assert len(files_in("msg_utils")) >= 5
-    for folder in ("ground", "clustering", "candidates", "detection", "nodes", "cli", "datasets",
-                   "evaluation", "reproduction"):
+    for folder in ("ground", "clustering", "candidates", "detection", "training", "nodes", "cli",
+                   "datasets", "evaluation", "reproduction"):
         assert len(files_in(f"lidar_perception/{folder}")) >= 2
 
 
@@ -125,6 +125,16 @@ def test_detectors_import_torch_and_the_algorithms(name):
     assert strangers(name, NUMERIC + tensors + SHARED + ALGORITHMS + own) == []
 
 
+SHARED_TRAINING = [f"lidar_perception.training.{name}" for name in (
+    "params", "schedule", "ranks", "log", "run", "loop", "augment", "database", "data")]
+
+
+@pytest.mark.parametrize("module", SHARED_TRAINING)
+def test_what_all_networks_train_with_knows_none_of_them(module):
+    own = [*SHARED_TRAINING, "lidar_perception.param_fields", "lidar_perception.terminal"]
+    assert strangers(f"{module.replace('.', '/')}.py", [*NUMERIC, "torch", *SHARED, *own]) == []
+
+
 @pytest.mark.parametrize("name, allowed", [
     ("lidar_perception/types.py", []),
     ("lidar_perception/rotated_iou.py", ["numba"]),
@@ -147,8 +157,8 @@ def test_the_shared_files_are_leaves(name, allowed):
 @pytest.mark.parametrize("name", files_in("lidar_perception/datasets",
                                           "lidar_perception/simulation"))
 def test_data_sources_know_no_algorithm(name):
-    above = [*ALGORITHMS, "lidar_perception.detection", "lidar_perception.pipeline",
-             "lidar_perception.evaluation"]
+    above = [*ALGORITHMS, "lidar_perception.detection", "lidar_perception.training",
+             "lidar_perception.pipeline", "lidar_perception.evaluation"]
     assert [m for m in imports(TREES[name]) if within(m, above)] == []
 
 
@@ -210,6 +220,8 @@ def test_no_source_is_longer_than_a_reader_can_hold(name):
     ("lidar_perception.detection.detector_params", "numba torch matplotlib scipy numpy click"),
     ("lidar_perception.detection.expert", "torch matplotlib sklearn rosbags rich click"),
     ("lidar_perception.detection.detector", "onnx onnxruntime matplotlib sklearn rich click"),
+    ("lidar_perception.training.params", "numba torch matplotlib scipy numpy rich click"),
+    ("lidar_perception.cli.train", "numba torch matplotlib scipy"),
     ("lidar_perception.cli.weights", "numba torch matplotlib scipy"),
     ("lidar_perception.evaluation.candidates", "torch matplotlib sklearn click"),
     ("lidar_perception.evaluation.detection", "torch matplotlib sklearn rich click"),

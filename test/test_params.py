@@ -24,13 +24,16 @@ from lidar_perception.params import (
     parameter_fields,
     with_values,
 )
+from lidar_perception.training import params as training_params
+from lidar_perception.training.params import PointPillarsTraining
 from lidar_perception.types import InputError
 
 # Those of the modules imported here; other tests may have imported more.
 GROUPS = [group for group in Params.__subclasses__()
-          if group.__module__ in (module.__name__, DetectorParams.__module__)]
+          if group.__module__ in (module.__name__, DetectorParams.__module__,
+                                 training_params.__name__)]
 COMPOSITES = [PipelineParams, GroundNodeParams, ClusteringNodeParams, RefinementNodeParams,
-              DetectorParams]
+              DetectorParams, PointPillarsTraining]
 FIELDS = [pytest.param(group, f, id=f"{group.__name__}.{f.name}")
           for group in GROUPS for f in dataclasses.fields(group) if f.metadata]
 
@@ -76,7 +79,7 @@ def config(tmp_path, text: str, params=None):
 
 
 def test_every_group_of_the_module_is_tested():
-    public = [v for each in (module, detector_params) for v in vars(each).values()
+    public = [v for each in (module, detector_params, training_params) for v in vars(each).values()
               if isinstance(v, type) and dataclasses.is_dataclass(v)]
     assert {*public} == {*GROUPS, *COMPOSITES}
 

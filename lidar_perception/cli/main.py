@@ -16,6 +16,7 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
     "reproduce": ("reproduce.reproduce", "Measure every table of the STM-CPA paper."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),
     "simulate": ("simulate.simulate", "Write simulated scans as a bag or a data set."),
+    "train": ("train.train", "Train a network on KITTI folders or simulated streets."),
     "import-weights": ("weights.import_weights", "Read PointPillars weights of other projects."),
     "export": ("weights.export", "Write a network for another runtime."),
     "info": ("info.info", "Say what is in a bag."),

@@ -1,0 +1,162 @@
+"""train: networks from labelled or simulated scenes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import click
+
+from lidar_perception import __version__
+from lidar_perception.cli.options import parameter_options
+from lidar_perception.terminal import console
+from lidar_perception.training.params import DataParams, PointPillarsTraining
+from lidar_perception.types import InputError
+
+SIM = "sim"
+FIRST_STREET, FIRST_VALIDATION_STREET = 10_000_000, 20_000_000  # far from what anybody else takes
+
+
+@click.group()
+def train() -> None:
+    """Train a network."""
+
+
+@train.command()
+@click.option("--data", multiple=True, required=True, metavar="DIR|sim",
+              help="What to train on: a KITTI folder, or simulated streets; may be repeated to mix "
+              "them.")
+@click.option("--val", multiple=True, metavar="DIR|sim",
+              help="What to validate on. Default: frames held out of --data, and other simulated "
+              "streets.")
+@click.option("--split", type=click.Path(path_type=Path), metavar="FILE",
+              help="Train on the frames of the KITTI folder that are named in this file, one a "
+              "line.")
+@click.option("--val-split", type=click.Path(path_type=Path), metavar="FILE",
+              help="Likewise the frames to validate on.")
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR",
+              help="Folder for best.safetensors, last.safetensors, logs and the state.")
+@click.option("--resume", is_flag=True, help="Go on with the run in --out, if there is one.")
+@click.option("--init", type=click.Path(path_type=Path), metavar="FILE",
+              help="Begin with the weights of this checkpoint.")
+@click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N.")
+@click.option("--jobs", type=click.IntRange(0), default=2, show_default=True,
+              help="Processes that prepare scenes; 0: none but this one. The result is the same.")
+@parameter_options(PointPillarsTraining())
+def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
+                 val_split: Path | None, out: Path, resume: bool, init: Path | None, device: str,
+                 jobs: int, params: PointPillarsTraining) -> None:
+    """PointPillars and EG-PointPillars, on KITTI folders, simulated streets, or both.
+
+    The best weights so far, by AP on what is validated on, lie in OUT/best.safetensors. Ctrl-C
+    saves and stops; --resume goes on, also after a kill. Several GPUs: torchrun.
+
+    \b
+    Examples:
+      lidar-perception train pointpillars --version v4 --data sim --data-cache scans --out v4
+      lidar-perception train pointpillars --data /data/kitti/object --split train.txt \\
+          --val-split val.txt --epochs 80 --out v4 --resume
+      torchrun --nproc-per-node 4 -m lidar_perception.cli.main train pointpillars --size full \\
+          --data sim --out v4
+    """
+    from lidar_perception.detection.config import network_config
+    from lidar_perception.detection.detector import chosen_device
+    from lidar_perception.training.data import Batches, RawScenes, Stream
+    from lidar_perception.training.database import cut_objects
+    from lidar_perception.training.loop import may_begin
+    from lidar_perception.training.loop import train as run
+    from lidar_perception.training.pointpillars import JudgedScenes, Preparation, make_task
+    from lidar_perception.training.ranks import joined, rank, wait, world
+    may_begin(out, resume)
+    config = network_config(params.version, params.size)
+    sources, held_out = training_scenes(data, val, split, val_split, params)
+    with joined(chosen_device(device)) as place:
+        database = None
+        counts = params.augment.cars, params.augment.pedestrians, params.augment.cyclists
+        if any(counts) and params.data.database_scans:
+            database = out / "objects.npz"
+            if rank() == 0 and not (resume and database.is_file()):
+                raw = Stream(sources, None, params.seed)
+                scenes = RawScenes(raw).some(params.data.database_scans, jobs)
+                cut_objects(scenes, config.classes, params.data.least_points).save(database)
+            wait()
+        stream = Stream(sources, Preparation(config, params.augment, params.data.least_points,
+                                             database), params.seed)
+        batches = Batches(stream, params.batch, jobs, rank(), world())
+        about = {"data": list(data), "scenes": len(stream), "validation": list(val) or "held out",
+                 "validation_scenes": sum(map(len, held_out)), "init": str(init or "")}
+        task = make_task(config, params, batches, JudgedScenes(held_out), out, place, about,
+                         commit(), init)
+        progress = run(task, params, out, place, resume)
+        if rank() > 0:
+            return
+    if batches.skipped:
+        console.print(f"{len(batches.skipped)} scenes could not be used, such as: "
+                      f"{next(iter(batches.skipped))}", soft_wrap=True)
+    if progress.skipped:
+        console.print(f"{progress.skipped} of {progress.step} steps were skipped: not finite")
+    if progress.best is not None:
+        console.print(f"{out / 'best.safetensors'}: score {progress.best:.2f} at step "
+                      f"{progress.best_step}", soft_wrap=True)
+    if progress.stopped:
+        console.print(f"stopped at step {progress.step}; --resume goes on", soft_wrap=True)
+        sys.exit(130)
+
+
+def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
+                    val_split: Path | None, params: PointPillarsTraining) -> tuple[tuple, tuple]:
+    """Sources to train on and to validate on. InputError for what is not there, or an option that
+    would not be used."""
+    from lidar_perception.training.scenes import KittiScenes, kitti_names, random_split
+    settings = params.data
+    folders = [Path(name) for name in data if name != SIM]
+    val_folders = [Path(name) for name in val if name != SIM] or ([] if val else folders)
+    if split is not None and len(folders) != 1:
+        raise InputError("--split names frames of one KITTI folder in --data; give one")
+    if val_split is not None and len(val_folders) != 1:
+        raise InputError("--val-split names frames of one KITTI folder; give one in --val")
+    train_on, judge_on = [], []
+    for folder in folders:
+        names, held = kitti_names(folder, split), ()
+        if val_split is not None and folder in val_folders:
+            held = kitti_names(folder, val_split)
+            names = tuple(name for name in names if name not in set(held))
+        elif not val:
+            names, held = random_split(names, settings.val_share, params.seed)
+        if not names:
+            raise InputError(f"{folder}: no frame is left to train on")
+        train_on.append(KittiScenes(folder, names, settings.view))
+        if held:
+            judge_on.append(KittiScenes(folder, held, settings.view))
+    for folder in val_folders if val else ():
+        if folder not in folders or val_split is None:
+            judge_on.append(KittiScenes(folder, kitti_names(folder, val_split), settings.view))
+    if SIM in data:
+        train_on.append(_streets(FIRST_STREET, settings.scans, settings.people, settings))
+    if SIM in (val or data):
+        judge_on.append(_streets(FIRST_VALIDATION_STREET, settings.val_scans, settings.val_people,
+                                 settings))
+    return tuple(train_on), tuple(judge_on)
+
+
+def _streets(first: int, scans: int, people: float, settings: DataParams):
+    from lidar_perception.simulation.scene import Streets
+    from lidar_perception.simulation.sensor import sensor_named
+    from lidar_perception.training.scenes import SimulatedScenes
+    sensor_named(settings.sensor)  # InputError here, not in a worker
+    return SimulatedScenes(first, scans, settings.sensor, Streets(people=people),
+                           Path(settings.cache) if settings.cache else None, settings.cache_gb)
+
+
+def commit() -> str:
+    """The commit of this checkout, with + if files differ from it; the version if it is none."""
+    folder = Path(__file__).resolve().parents[2]
+    try:
+        head, changes = (subprocess.run(["git", "-C", str(folder), *words], capture_output=True,
+                                        text=True, check=True, timeout=20).stdout.strip()
+                         for words in (("rev-parse", "HEAD"),
+                                       ("status", "--porcelain", "--untracked-files=no")))
+    except (OSError, subprocess.SubprocessError):
+        return __version__
+    return head + ("+" if changes else "")

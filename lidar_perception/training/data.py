@@ -1,0 +1,141 @@
+"""Scenes to batches: an endless stream whose n-th element depends on n and the seed alone.
+
+So neither the number of worker processes nor a stop in between changes what is learned from.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import count, islice
+from typing import Any, NamedTuple
+
+import numba
+import numpy as np
+import torch
+from torch.utils.data import DataLoader
+
+from lidar_perception.terminal import errors
+from lidar_perception.training.augment import Scene
+from lidar_perception.types import InputError
+
+AHEAD = 4  # batches that each worker prepares in advance
+
+
+class Item(NamedTuple):
+    """What prepare made of a scene, and why others were skipped."""
+
+    sample: Any
+    skipped: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Stream:
+    """stream[n], n = 0, 1, ...: every scene of all sources once an epoch, in an order of its own;
+    prepare(scene, rng) makes the sample.
+
+    A scene that cannot be read or prepared (InputError) is skipped, and the next one in the order
+    taken. InputError if none can be used.
+    """
+
+    sources: tuple[Any, ...]
+    prepare: Callable[[Scene, np.random.Generator], Any]
+    seed: int = 0
+
+    def __len__(self) -> int:
+        """Scenes of an epoch."""
+        return sum(map(len, self.sources))
+
+    def scene(self, place: int) -> Scene:
+        """Scene `place` of all sources behind one another."""
+        for source in self.sources:
+            if place < len(source):
+                return source.scene(place)
+            place -= len(source)
+        raise IndexError(place)
+
+    def __getitem__(self, n: int) -> Item:
+        epoch, place = divmod(n, len(self))
+        order = np.random.default_rng([self.seed, epoch]).permutation(len(self))
+        skipped = []
+        for offset in range(len(self)):
+            rng = np.random.default_rng([self.seed, n, offset])
+            try:
+                sample = self.prepare(self.scene(int(order[(place + offset) % len(self)])), rng)
+                return Item(sample, tuple(skipped))
+            except InputError as error:
+                skipped.append(str(error))
+        raise InputError(f"none of the {len(self)} scenes can be used ({skipped[0]})")
+
+
+@dataclass
+class Batches:
+    """batches(step): lists of `size` samples, of that step and all later ones. jobs: worker
+    processes, 0 for none. rank, world: which of several processes this is. skipped: the reasons so
+    far, each said once."""
+
+    stream: Stream
+    size: int
+    jobs: int = 0
+    rank: int = 0
+    world: int = 1
+    skipped: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def epoch(self) -> int:
+        """Steps of one pass over the data, at least 1."""
+        return max(1, round(len(self.stream) / (self.size * self.world)))
+
+    def numbers(self, step: int) -> Iterator[list[int]]:
+        """Elements of the stream for each step from `step` on."""
+        for i in count(step):
+            first = (i * self.world + self.rank) * self.size
+            yield list(range(first, first + self.size))
+
+    def __call__(self, step: int) -> Iterator[list[Any]]:
+        for items in loaded(self.stream, self.numbers(step), self.jobs):
+            for reason in (r for item in items for r in item.skipped):
+                if reason not in self.skipped:
+                    errors.print(f"skipped: {reason}", soft_wrap=True)
+                self.skipped[reason] = self.skipped.get(reason, 0) + 1
+            yield [item.sample for item in items]
+
+
+def loaded(items: Any, numbers: Iterator[Sequence[int]], jobs: int) -> Iterator[list[Any]]:
+    """[items[n] for n in each], in order, made by so many processes; 0 makes them here."""
+    if jobs == 0:
+        yield from ([items[n] for n in each] for each in numbers)
+        return
+    # Processes that were forked from one with threads may hang, so a fresh one is forked.
+    context = torch.multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([__name__])
+    yield from DataLoader(items, batch_sampler=numbers, num_workers=jobs, collate_fn=list,
+                          multiprocessing_context=context, worker_init_fn=_begin_work,
+                          prefetch_factor=AHEAD)
+
+
+def _begin_work(_: int) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process ends its workers
+    numba.set_num_threads(1)
+
+
+@dataclass(frozen=True)
+class RawScenes:
+    """scenes[n]: an Item of the n-th scene of all sources as it is, None if it cannot be used."""
+
+    stream: Stream
+
+    def __getitem__(self, n: int) -> Item:
+        try:
+            return Item(self.stream.scene(n))
+        except InputError as error:
+            return Item(None, (str(error),))
+
+    def some(self, most: int, jobs: int) -> Iterator[Scene]:
+        """At most so many, drawn by the stream's seed; what cannot be used is left out."""
+        chosen = np.random.default_rng(self.stream.seed).permutation(len(self.stream))[:most]
+        numbers = ([int(n)] for n in chosen)
+        for item, in islice(loaded(self, numbers, jobs), len(chosen)):
+            if item.sample is not None:
+                yield item.sample

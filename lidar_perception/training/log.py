@@ -1,0 +1,90 @@
+"""Logs of a training run: CSV files, and TensorBoard where it is installed."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any, TextIO
+
+from lidar_perception.files import write_text
+from lidar_perception.types import InputError
+
+
+class Table:
+    """A CSV file with a column step; rows are appended and flushed. Its columns are those of the
+    first row."""
+
+    def __init__(self, path: Path, step: int):
+        """Rows after `step`, of a run that was killed after its last save, are removed."""
+        self.path, self.columns = path, None
+        self.stream: TextIO | None = None
+        rows = _rows(path)
+        if rows:
+            self.columns = rows[0]
+            kept = [rows[0]] + [row for row in rows[1:]
+                                if len(row) == len(rows[0]) and int(row[0]) <= step]
+            text = io.StringIO()
+            csv.writer(text, lineterminator="\n").writerows(kept)
+            write_text(path, text.getvalue())
+
+    def add(self, step: int, values: dict[str, float]) -> None:
+        """Append a row. InputError where it cannot be written."""
+        try:
+            if self.stream is None:
+                self.path.parent.mkdir(parents=True, exist_ok=True)
+                self.stream = open(self.path, "a", encoding="utf-8")
+            writer = csv.writer(self.stream, lineterminator="\n")
+            if self.columns is None:
+                self.columns = ["step", *values]
+                writer.writerow(self.columns)
+            writer.writerow([step, *(_shown(values.get(name)) for name in self.columns[1:])])
+            self.stream.flush()
+        except OSError as error:
+            raise InputError(f"cannot write {self.path}: {error.strerror}") from None
+
+    def close(self) -> None:
+        if self.stream is not None:
+            self.stream.close()
+
+
+def _shown(value: Any) -> str:
+    return "" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _rows(path: Path) -> list[list[str]]:
+    if not path.is_file():
+        return []
+    try:
+        with open(path, newline="", encoding="utf-8") as stream:
+            rows = list(csv.reader(stream))
+        return [row for i, row in enumerate(rows) if i == 0 or (row and row[0].isdigit())]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"cannot read {path}: {error}; move it away") from None
+
+
+class Log:
+    """log.csv (losses), validation.csv (metrics) and TensorBoard's events in a folder."""
+
+    def __init__(self, folder: Path, step: int):
+        self.tables = {"loss": Table(folder / "log.csv", step),
+                       "validation": Table(folder / "validation.csv", step)}
+        self.board = None
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            return
+        self.board = SummaryWriter(folder / "tensorboard", purge_step=step + 1 if step else None)
+
+    def add(self, kind: str, step: int, values: dict[str, float]) -> None:
+        """kind: loss or validation."""
+        self.tables[kind].add(step, values)
+        for name, value in values.items() if self.board is not None else ():
+            if value is not None:
+                self.board.add_scalar(f"{kind}/{name}", value, step)
+
+    def close(self) -> None:
+        for table in self.tables.values():
+            table.close()
+        if self.board is not None:
+            self.board.close()

@@ -1,0 +1,160 @@
+"""The training loop of every network of the package.
+
+A network brings a Task; the loop brings one-cycle AdamW, mixed precision, gradient clipping, the
+average of the weights, validation, logs, and a state on disk from which a killed run goes on.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from lidar_perception.files import remove_temporaries, write_bytes
+from lidar_perception.terminal import errors, progress
+from lidar_perception.training.log import Log
+from lidar_perception.training.params import LoopParams
+from lidar_perception.training.ranks import any_of, rank, wait
+from lidar_perception.training.run import Progress, Run, Task
+from lidar_perception.types import InputError
+
+STATE = "last.pt"
+
+
+def train(task: Task, params: LoopParams, out: Path, device: torch.device = torch.device("cpu"),
+          resume: bool = False) -> Progress:
+    """Train until the steps are done or a signal (SIGINT, SIGTERM) comes; the state is saved then.
+
+    In out: STATE, for resuming; log.csv, validation.csv, and whatever task.keep writes. The same
+    task and seed give the same weights on the CPU, whether the run was interrupted or not.
+    InputError if out holds a run and resume is not asked for, or one of other settings, if nothing
+    can be written, or if the loss stays not finite. resume without a run in out begins one.
+    """
+    path = may_begin(out, resume)
+    torch.manual_seed(params.seed + rank())
+    run = Run(task, params, device)
+    if path.exists():
+        run.load(_read(path, run.asked()))
+    wait()  # until all have read what rank 0 is going to replace
+    if rank() == 0:
+        out.mkdir(parents=True, exist_ok=True)
+        remove_temporaries(out)
+    log = Log(out, run.progress.step) if rank() == 0 else None
+    begun = time.monotonic() - run.progress.seconds
+    try:
+        with _signals() as stop, progress() as bar:
+            line = bar.add_task("training", total=run.steps, completed=run.progress.step,
+                                visible=rank() == 0)
+            batches = iter(task.batches(run.progress.step))
+            while True:
+                if any_of(stop.is_set(), device):
+                    run.progress.stopped = True
+                    _save(path, run)
+                    break
+                if run.due():
+                    _save(path, run)  # as validation takes its time
+                    _validate(run, log)
+                    _save(path, run)
+                if run.progress.step >= run.steps:
+                    break
+                row = run.step(next(batches))
+                step = run.progress.step
+                run.progress.seconds = time.monotonic() - begun
+                bar.update(line, completed=step)
+                if row is not None:
+                    bar.update(line, description=f"loss {row['loss']:.3f} lr {row['lr']:.1e}")
+                    if log is not None and step % params.log_steps == 0:
+                        log.add("loss", step, {**row, "skipped": run.progress.skipped,
+                                               "seconds": run.progress.seconds})
+                if step % params.save_steps == 0 and not run.due():
+                    _save(path, run)
+    finally:
+        if log is not None:
+            log.close()
+    return run.progress
+
+
+def may_begin(out: Path, resume: bool) -> Path:
+    """The state's path in out. InputError if there is one, and resume is not asked for."""
+    path = out / STATE
+    if path.exists() and not resume:
+        raise InputError(f"{out} holds a training run already; give --resume to go on with it, or "
+                         "another --out")
+    return path
+
+
+def _validate(run: Run, log: Log | None) -> None:
+    """Score the averaged weights, in rank 0, and keep them if they are the best so far, or the
+    last."""
+    progress = run.progress
+    progress.validated = progress.step
+    if rank() == 0:
+        metrics = run.task.validate(run.average.module)
+        log.add("validation", progress.step, metrics)
+        shown = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
+        errors.print(f"step {progress.step}: {shown}", soft_wrap=True)
+        better = progress.best is None or metrics["score"] > progress.best
+        if better:
+            progress.best, progress.best_step = metrics["score"], progress.step
+        record = {**vars(progress), "metrics": metrics}
+        if better:
+            run.task.keep("best", run.average.module, record)
+        if progress.step == run.steps:
+            run.task.keep("last", run.average.module, record)
+    wait()
+
+
+def _save(path: Path, run: Run) -> None:
+    if rank() == 0:
+        content = io.BytesIO()
+        torch.save(run.state(), content)
+        write_bytes(path, content.getbuffer())
+    wait()
+
+
+def _read(path: Path, asked: dict[str, Any]) -> dict[str, Any]:
+    """The state in path. InputError if it is broken, or of a run of other settings."""
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+        before = state["asked"]
+    except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise InputError(f"cannot read {path}: {reason}; remove it to start again") from None
+    different = [f"{name} {before.get(name)!r}, not {value!r}" for name, value in asked.items()
+                 if before.get(name) != value]
+    if different:
+        raise InputError(f"{path} is of a run with {'; '.join(different[:3])}; resume it with the "
+                         "same settings, or give another --out")
+    return state
+
+
+@contextmanager
+def _signals() -> Iterator[threading.Event]:
+    """An event that the first SIGINT or SIGTERM sets; a second one ends the process as usual."""
+    event = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield event
+        return
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in numbers}
+
+    def note(number: int, _: Any) -> None:
+        event.set()
+        signal.signal(number, before[number])
+        errors.print("stopping after this step; once more to stop at once")
+
+    for number in numbers:
+        signal.signal(number, note)
+    try:
+        yield event
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

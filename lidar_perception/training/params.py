@@ -1,0 +1,121 @@
+"""Parameters of training: flags and docs are made from these fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from lidar_perception.param_fields import Params, flatten, param
+
+INDIFFERENT = ("log_steps", "save_steps", "most_skipped", "data.cache", "data.cache_gb")
+PAPER_SHARE = 751 / 7518  # of the frames that paper B holds out
+
+
+@dataclass(frozen=True)
+class LoopParams(Params):
+    """How long, how fast, and how often something is written."""
+
+    steps: int = param(0, "Steps of the optimizer. 0: as many as the epochs have.", low=0,
+                       high=10**9)
+    epochs: float = param(80.0, "Passes over the data, if steps is 0.", low=0.001, high=1e5)
+    batch: int = param(4, "Scenes of a step, on each device.", low=1, high=4096)
+    lr: float = param(0.003, "Greatest learning rate.", low=1e-9, high=10.0)
+    warm_share: float = param(0.4, "Share of the steps in which the learning rate rises; it falls "
+                              "in the others.", low=0.01, high=0.99)
+    weight_decay: float = param(0.01, "Weight decay of AdamW.", low=0.0, high=1.0)
+    clip: float = param(10.0, "Longest gradient; longer ones are shortened. 0 leaves them.",
+                        low=0.0, high=1e6)
+    ema: float = param(0.999, "Share of the averaged weights that a step keeps; the average is "
+                       "what is validated and saved. 0: the weights themselves.", low=0.0,
+                       high=0.999999)
+    amp: str = param("auto", "Number format of the forward pass on CUDA; auto: bf16 where the "
+                     "device has it, else fp16. The CPU uses float32.",
+                     choices=("auto", "bf16", "fp16", "off"))
+    validate_epochs: float = param(5.0, "Validate after so many epochs, if validate_steps is 0.",
+                                   low=0.001, high=1e5)
+    validate_steps: int = param(0, "Validate after so many steps.", low=0, high=10**9)
+    save_steps: int = param(200, "Save what a resumed run needs after so many steps.", low=1,
+                            high=10**9)
+    log_steps: int = param(10, "Log the losses of every so manieth step.", low=1, high=10**6)
+    most_skipped: int = param(50, "Give up after so many steps in a row whose loss or gradient is "
+                              "not finite.", low=1, high=10**6)
+    seed: int = param(0, "Seed of the weights, the order of the scenes and their augmentation.",
+                      low=0, high=2**31 - 1)
+
+    def decisive(self) -> dict[str, Any]:
+        """{dotted name: value} of what a run cannot change while it is interrupted."""
+        return {name: value for name, value in flatten(self).items() if name not in INDIFFERENT}
+
+    def total_steps(self, epoch: int) -> int:
+        """Steps in all, if an epoch has so many."""
+        return self.steps or max(1, round(self.epochs * epoch))
+
+    def validation_steps(self, epoch: int) -> int:
+        """Steps from one validation to the next."""
+        return self.validate_steps or max(1, round(self.validate_epochs * epoch))
+
+
+@dataclass(frozen=True)
+class AugmentParams(Params):
+    """How scenes are changed. 0 switches a change off."""
+
+    cars: int = param(10, "Cars of other scenes are put in until there are so many.", low=0,
+                      high=100)
+    pedestrians: int = param(8, "Likewise pedestrians.", low=0, high=100)
+    cyclists: int = param(8, "Likewise cyclists.", low=0, high=100)
+    object_turn: float = param(0.157, "Each object is turned by up to this.", unit="rad", low=0.0,
+                               high=3.1416)
+    object_shift: float = param(0.25, "Each object is shifted along x and y; standard deviation.",
+                                unit="m", low=0.0, high=5.0)
+    flip: float = param(0.5, "Chance that left and right are swapped.", low=0.0, high=1.0)
+    turn: float = param(0.785, "The scene is turned about the sensor by up to this; one that is "
+                        "labelled all around by anything, unless this is 0.", unit="rad", low=0.0,
+                        high=3.1416)
+    scale: float = param(0.05, "The scene grows or shrinks by up to this share.", low=0.0, high=0.5)
+    dropout: float = param(0.3, "Up to this share of the points is left out.", low=0.0, high=0.99)
+    intensity: float = param(0.15, "Intensities are multiplied by 1 plus or minus up to this, and "
+                             "raised or lowered by up to half of it.", low=0.0, high=1.0)
+    height: float = param(0.1, "The sensor is raised or lowered by up to this.", unit="m", low=0.0,
+                          high=2.0)
+
+
+@dataclass(frozen=True)
+class DataParams(Params):
+    """Which scenes."""
+
+    scans: int = param(4000, "Simulated scans of an epoch, each of a street of its own.", low=1,
+                       high=10**7)
+    val_scans: int = param(200, "Simulated scans of a validation, of other streets.", low=1,
+                           high=10**6)
+    sensor: str = param("hdl64e", "Sensor of the simulated scans: the name of a preset, or "
+                        "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE. It is mounted at 1.73 m.")
+    people: float = param(3.0, "How many times as many pedestrians and cyclists as in KITTI the "
+                          "streets to train on have.", low=0.0, high=100.0)
+    val_people: float = param(1.0, "Likewise the streets to validate on.", low=0.0, high=100.0)
+    cache: str = param("", "Folder for simulated scans, which take half a second to make. Empty: "
+                       "none.")
+    cache_gb: float = param(20.0, "Nothing more is put there from this size on.", unit="GB",
+                            low=0.0, high=1e6)
+    val_share: float = param(PAPER_SHARE, "Share of the KITTI frames to validate on, drawn by the "
+                             "seed, where neither --val nor --split is given.", low=0.0,
+                             high=0.9)
+    view: bool = param(True, "Use the points in KITTI's image only, as its labels end there.")
+    least_points: int = param(5, "An object with fewer points need not be found, nor missed.",
+                              low=1, high=1000)
+    database_scans: int = param(2000, "Objects to put into other scenes come from so many scenes, "
+                                "at most.", low=0, high=10**6)
+
+
+@dataclass(frozen=True)
+class PointPillarsTraining(LoopParams):
+    """Everything that train pointpillars can be told."""
+
+    version: str = param("v4", "EG-PointPillars version; v0 is PointPillars.",
+                         choices=("v0", "v1", "v2", "v3", "v4"))
+    size: str = param("compact", "full: the paper's network, for a GPU. compact: for two CPU "
+                      "cores.", choices=("full", "compact"))
+    score: str = param("bev", "What the best weights are best at: bev, the mean AP from above at "
+                       "the overlaps 0.5 / 0.25 / 0.25, or map, the mean AP in space at 0.7 / 0.5 "
+                       "/ 0.5; both moderate, R40.", choices=("bev", "map"))
+    augment: AugmentParams = AugmentParams()
+    data: DataParams = DataParams()

@@ -1,0 +1,219 @@
+"""What PointPillars brings to the training loop: its samples, loss, validation and checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lidar_perception import __version__
+from lidar_perception.detection.anchors import make_anchors
+from lidar_perception.detection.checkpoint import Header, load_network, save_checkpoint
+from lidar_perception.detection.config import NetworkConfig
+from lidar_perception.detection.detector import Detector, TorchNetwork
+from lidar_perception.detection.detector_params import DetectorParams
+from lidar_perception.detection.expert import network_input
+from lidar_perception.detection.losses import detection_loss
+from lidar_perception.detection.pillars import make_pillars
+from lidar_perception.detection.pointpillars import PointPillars, make_network
+from lidar_perception.detection.targets import (
+    BACKGROUND,
+    IGNORED,
+    Targets,
+    assign,
+    nearest_axis_iou,
+    stacked,
+)
+from lidar_perception.detection.view import visible
+from lidar_perception.evaluation.detection import DetectionReport
+from lidar_perception.evaluation.kitti_protocol import NEIGHBOURS
+from lidar_perception.geometry import points_in_box
+from lidar_perception.param_fields import flatten, with_values
+from lidar_perception.training.augment import Scene, augmented
+from lidar_perception.training.data import Batches, Item, loaded
+from lidar_perception.training.database import Database, with_objects
+from lidar_perception.training.params import AugmentParams, PointPillarsTraining
+from lidar_perception.training.run import Task
+from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
+
+# Boxes of low score cost precision only where recall has ended; fewer of them are quicker.
+VALIDATED = with_values(DetectorParams(), {
+    **{f"detection.scores.{name}": 0.1 for name in ("car", "pedestrian", "cyclist", "other")},
+    "detection.warm_up": False})
+LIKE = {other: name for name, other in NEIGHBOURS.items()}  # Van: Car, Person_sitting: Pedestrian
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One scene for the network: points and cluster_map as in expert.NetworkInput; boxes (M, 7)
+    float32, labels (M,) int64 into the config's classes; counted (M,) bool: to be found, the others
+    may be found or not."""
+
+    points: np.ndarray
+    cluster_map: np.ndarray | None
+    boxes: np.ndarray
+    labels: np.ndarray
+    counted: np.ndarray
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """scene, rng -> Sample: augmented, cropped to what the network sees, with the experts' columns.
+    database: file of objects to put in, or None."""
+
+    config: NetworkConfig
+    augment: AugmentParams
+    least_points: int = 5
+    database: Path | None = None
+
+    @cached_property
+    def _objects(self) -> Database | None:
+        return None if self.database is None else Database.load(self.database)
+
+    def __getstate__(self) -> dict:
+        return {k: v for k, v in self.__dict__.items() if k != "_objects"}
+
+    def __call__(self, scene: Scene, rng: np.random.Generator) -> Sample:
+        """InputError if the network would see no point."""
+        if self._objects is not None:
+            scene = with_objects(scene, self._objects, self.augment, rng)
+        scene = augmented(scene, self.augment, rng)
+        frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
+        _, seen = visible(frame, self.config)
+        inputs = network_input(seen, self.config)
+        if len(inputs.points) < 2:
+            raise InputError("a scene has no point where the network looks")
+        boxes, labels, counted = self._objects_to_find(scene, seen.xyz)
+        return Sample(inputs.points, inputs.cluster_map, boxes, labels, counted)
+
+    def _objects_to_find(self, scene: Scene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
+        low, high = np.array(self.config.low), np.array(self.config.high)
+        names = [CLASSES[i] for i in scene.class_ids]
+        labels = np.array([self._label(LIKE.get(name, name)) for name in names], np.int64)
+        within = ((scene.boxes[:, :2] >= low[:2]) & (scene.boxes[:, :2] < high[:2])).all(axis=1)
+        kept = np.flatnonzero(within & (labels >= 0))
+        counted = [bool(scene.wanted[i]) and names[i] not in LIKE
+                   and points_in_box(xyz, scene.boxes[i]).sum() >= self.least_points
+                   for i in kept]
+        return scene.boxes[kept].astype(np.float32), labels[kept], np.array(counted, bool)
+
+    def _label(self, name: str) -> int:
+        return self.config.classes.index(name) if name in self.config.classes else -1
+
+
+def targets_of(sample: Sample, anchors: Tensor, config: NetworkConfig) -> Targets:
+    """The targets of one sample. Anchors on objects that are not counted are neither object nor
+    background."""
+    boxes = torch.from_numpy(sample.boxes).to(anchors.device)
+    labels = torch.from_numpy(sample.labels).to(anchors.device)
+    counted = torch.from_numpy(sample.counted).to(anchors.device)
+    targets = assign(anchors, config, boxes[counted], labels[counted])
+    found = targets.labels[0]
+    kinds = torch.arange(len(anchors), device=anchors.device).view(-1, len(config.anchors),
+                                                                   len(config.yaws))
+    for index, spec in enumerate(config.anchors):
+        others = boxes[~counted & (labels == index)]
+        if len(others):
+            mine = kinds[:, index].reshape(-1)
+            near = nearest_axis_iou(anchors[mine], others).max(dim=1).values >= spec.unmatched
+            near &= found[mine] == BACKGROUND
+            found[mine[near]] = IGNORED
+    return targets
+
+
+def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
+    """loss(network, samples) -> total, parts, as the loop wants it."""
+    anchors = make_anchors(config, device)
+
+    def loss(network: nn.Module, samples: Sequence[Sample]) -> tuple[Tensor, dict[str, Tensor]]:
+        pillars = make_pillars([torch.from_numpy(s.points).to(device) for s in samples], config)
+        maps = None
+        if config.pseudo_map:
+            maps = torch.from_numpy(np.stack([s.cluster_map for s in samples])).to(device)
+        targets = stacked([targets_of(sample, anchors, config) for sample in samples])
+        losses = detection_loss(network(pillars, maps), targets)
+        return losses.total, {"classes": losses.classes.detach(), "boxes": losses.boxes.detach(),
+                              "directions": losses.directions.detach()}
+
+    return loss
+
+
+@dataclass(frozen=True)
+class JudgedScenes:
+    """scenes[n]: an Item of the n-th Judged of all sources, None if it cannot be read."""
+
+    sources: tuple[Any, ...]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.sources))
+
+    def __getitem__(self, n: int) -> Item:
+        for source in self.sources:
+            if n < len(source):
+                try:
+                    return Item(source.judged(n))
+                except InputError as error:
+                    return Item(None, (str(error),))
+            n -= len(source)
+        raise IndexError(n)
+
+
+def score_detector(detector: Callable[[LidarFrame], Detections], scenes: JudgedScenes,
+                   jobs: int = 0) -> DetectionReport:
+    """The detector on every scene, by KITTI's protocol."""
+    report = DetectionReport()
+    for item, in loaded(scenes, ([n] for n in range(len(scenes))), jobs):
+        report.skipped += item.skipped
+        if item.sample is not None:
+            name, frame, truth, calibration = item.sample
+            report.add(name, truth, detector(frame), calibration)
+    return report
+
+
+def metrics_of(content: dict[str, Any], score: str, classes: Sequence[str]) -> dict[str, float]:
+    """score, the mean over the classes with objects, and each class's AP from above at the relaxed
+    overlaps and in space at the strict ones (moderate, R40); NaN without objects. content is that
+    of a DetectionReport."""
+    metrics: dict[str, float] = {}
+    for name in classes:
+        for row in "bev_relaxed", "3d":
+            value = content["ap"].get(name, {}).get(row, {}).get("moderate")
+            metrics[f"{name}_{row}"] = float("nan") if value is None else value["r40"]
+    row = "bev_relaxed" if score == "bev" else "3d"
+    known = [v for name in classes if not np.isnan(v := metrics[f"{name}_{row}"])]
+    return {"score": float(np.mean(known)) if known else 0.0, **metrics}
+
+
+def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batches,
+              validation: JudgedScenes, out: Path, device: torch.device, about: dict[str, Any],
+              commit: str = "", init: Path | None = None) -> Task:
+    """The task of training a network of a config. about: what the header says of the data; a
+    resumed run must have the same. init: checkpoint of the same config to begin with. Weights are
+    written to out/best.safetensors and out/last.safetensors."""
+    torch.manual_seed(params.seed)
+    network = make_network(config) if init is None else load_network(init, config)[1]
+    network = network.to(device, memory_format=torch.channels_last)
+
+    def validate(module: PointPillars) -> dict[str, float]:
+        detector = Detector(TorchNetwork(module, device), Header(config), device, VALIDATED)
+        content = score_detector(detector, validation, batches.jobs).content()
+        return metrics_of(content, params.score, config.classes)
+
+    def keep(name: str, module: PointPillars, record: dict[str, Any]) -> None:
+        training = {**about, "seed": params.seed, "steps": record["step"],
+                    "seconds": round(record["seconds"]), "steps_skipped": record["skipped"],
+                    "scenes_skipped": len(batches.skipped), "batch": params.batch * batches.world,
+                    "params": flatten(params), "version": __version__}
+        metrics = {key: None if np.isnan(value) else round(value, 3)
+                   for key, value in record.get("metrics", {}).items()}
+        save_checkpoint(out / f"{name}.safetensors", module,
+                        Header(config, training, metrics, commit))
+
+    return Task(network, make_loss(config, device), batches, validate, keep, batches.epoch,
+                about)

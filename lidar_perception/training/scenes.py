@@ -1,0 +1,186 @@
+"""Where labelled scenes come from: KITTI folders, and simulated streets with a cache on disk.
+
+A source has a length, scene(i) to train on, and judged(i) to validate on. It can be sent to other
+processes: files are opened where they are read.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+from zipfile import BadZipFile
+
+import numpy as np
+
+from lidar_perception import __version__
+from lidar_perception.datasets.kitti import KittiFrame, open_kitti
+from lidar_perception.datasets.kitti_calibration import KittiCalibration
+from lidar_perception.files import write_bytes
+from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels, worth_a_label
+from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.scene import ANY, Streets
+from lidar_perception.simulation.sensor import Sensor, sensor_named
+from lidar_perception.training.augment import Scene
+from lidar_perception.types import GroundTruth, InputError, LidarFrame
+
+HEIGHT = 1.73  # m: simulated sensors are mounted as KITTI's
+
+
+class Judged(NamedTuple):
+    """A frame to validate on, as evaluate detection takes it."""
+
+    name: str
+    frame: LidarFrame
+    truth: GroundTruth
+    calibration: KittiCalibration
+
+
+@dataclass(frozen=True)
+class KittiScenes:
+    """The frames of a KITTI folder with these names. view: the points in the image only, as the
+    labels end there."""
+
+    root: Path
+    names: tuple[str, ...]
+    view: bool = True
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @cached_property
+    def _frames(self) -> dict[str, KittiFrame]:
+        return {frame.name: frame for frame in open_kitti(self.root)}
+
+    def __getstate__(self) -> dict:
+        return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # open where it is read
+
+    def scene(self, i: int) -> Scene:
+        """InputError naming the file that cannot be used."""
+        _, frame, truth, calibration = self.judged(i)
+        points = np.column_stack([frame.xyz, frame.intensity])
+        if self.view:
+            points = points[calibration.camera().in_view(frame.xyz)]
+        return Scene(points, truth.boxes, truth.class_ids, np.ones(len(truth), bool))
+
+    def judged(self, i: int) -> Judged:
+        """The whole scan. InputError naming the file that cannot be used."""
+        frame = self._frames[self.names[i]]
+        truth = frame.truth()
+        if truth is None:
+            raise InputError(f"{frame.points} has no labels")
+        return Judged(frame.name, frame.load(), truth, frame.calibration())
+
+
+def kitti_names(root: Path, split: Path | None = None) -> tuple[str, ...]:
+    """The names of the frames of a KITTI folder, or of those that a split file names, one a line.
+    InputError names what is not there."""
+    known = {frame.name: None for frame in open_kitti(root)}
+    if split is None:
+        return tuple(known)
+    try:
+        names = tuple(dict.fromkeys(split.read_text().split()))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the split {split}: {error}") from None
+    if not names:
+        raise InputError(f"{split} names no frame; it needs one a line, such as 000000")
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(f"{split} names the frame {unknown[0]} ({len(unknown)} such), which is "
+                         f"not in {root}")
+    return names
+
+
+def random_split(names: tuple[str, ...], share: float,
+                 seed: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """names to train on and to validate on, drawn by the seed, each in the order given; both have
+    one at least. InputError if there are not two."""
+    if len(names) < 2:
+        raise InputError("one frame cannot be split into frames to train and to validate on; give "
+                         "--val")
+    held = min(max(round(share * len(names)), 1), len(names) - 1)
+    chosen = set(np.random.default_rng(seed).choice(len(names), held, replace=False).tolist())
+    return (tuple(name for i, name in enumerate(names) if i not in chosen),
+            tuple(name for i, name in enumerate(names) if i in chosen))
+
+
+@dataclass(frozen=True)
+class SimulatedScenes:
+    """The first scan of each of the streets first .. first + count - 1. cache: folder for scans,
+    or None; from cache_gb on nothing is added to it."""
+
+    first: int
+    count: int
+    sensor: str = "hdl64e"
+    streets: Streets = ANY
+    cache: Path | None = None
+    cache_gb: float = 20.0
+
+    def __len__(self) -> int:
+        return self.count
+
+    @cached_property
+    def _sensor(self) -> Sensor:
+        return replace(sensor_named(self.sensor), height=HEIGHT)
+
+    def scene(self, i: int) -> Scene:
+        """With the labels all around."""
+        frame, truth = self.scan(i)
+        return Scene(np.column_stack([frame.xyz, frame.intensity]), truth.boxes, truth.class_ids,
+                     worth_a_label(truth), around=True)
+
+    def judged(self, i: int) -> Judged:
+        """With the labels that KITTI would have: in the image of a camera that looks ahead."""
+        frame, truth = self.scan(i)
+        return Judged(f"street {self.first + i}", frame, kitti_labels(truth), FORWARD_CAMERA)
+
+    def scan(self, i: int) -> tuple[LidarFrame, GroundTruth]:
+        """The frame and all its objects, from the cache if they are there."""
+        path = self._path(i)
+        if path is not None and path.is_file():
+            try:
+                return _read_scan(path)
+            except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+                path.unlink(missing_ok=True)  # it is made again
+        scan = scan_at(self.first + i, 0, self._sensor, self.streets)
+        if path is not None and _size(path.parent) < self.cache_gb * 1e9:
+            _write_scan(path, scan.frame, scan.truth)
+        return scan.frame, scan.truth
+
+    def _path(self, i: int) -> Path | None:
+        if self.cache is None:
+            return None
+        # One folder, so that its size is soon known; the name says all that the scan depends on.
+        made = hashlib.sha1(repr((self._sensor, tuple(self.streets), __version__)).encode())
+        return self.cache / f"{made.hexdigest()[:12]}_{self.first + i:08}.npz"
+
+
+EXTRAS = ("track_id", "truncated", "occluded", "num_points", "visible")
+
+
+def _write_scan(path: Path, frame: LidarFrame, truth: GroundTruth) -> None:
+    content = io.BytesIO()
+    extras = {name: np.array([e[name] for e in truth.extras]) for name in EXTRAS}
+    np.savez(content, xyz=frame.xyz, intensity=frame.intensity, boxes=truth.boxes,
+             class_ids=truth.class_ids, **extras)
+    write_bytes(path, content.getbuffer())
+
+
+def _read_scan(path: Path) -> tuple[LidarFrame, GroundTruth]:
+    with np.load(path) as arrays:
+        columns = [arrays[name].tolist() for name in EXTRAS]
+        extras = [dict(zip(EXTRAS, row)) for row in zip(*columns)]
+        return (LidarFrame(arrays["xyz"], arrays["intensity"]),
+                GroundTruth.of(arrays["boxes"], arrays["class_ids"], extras))
+
+
+def _size(folder: Path) -> int:
+    """Bytes of the files in a folder; 0 where there is none."""
+    try:
+        with os.scandir(folder) as entries:
+            return sum(entry.stat().st_size for entry in entries if entry.is_file())
+    except OSError:
+        return 0

@@ -1,0 +1,185 @@
+"""Laws of augmentation, and of objects that are put into other scenes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidar_perception.geometry import points_in_box, wrap_angle
+from lidar_perception.rotated_iou import bev_iou
+from lidar_perception.training.augment import (
+    Scene,
+    augmented,
+    brightened,
+    flipped,
+    raised,
+    scaled,
+    thinned,
+    turned,
+    with_moved_objects,
+)
+from lidar_perception.training.database import Database, cut_objects, with_objects
+from lidar_perception.training.params import AugmentParams
+from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
+
+few = settings(deadline=None, max_examples=25, database=None)
+seeds = st.integers(0, 2**32 - 1)
+CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
+STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, object_turn=0, object_shift=0, flip=0,
+                      turn=0, scale=0, dropout=0, intensity=0, height=0)
+
+
+def random_scene(seed: int, around: bool = False) -> Scene:
+    """Ground, and up to a dozen boxes full of points that do not touch."""
+    rng = np.random.default_rng(seed)
+    boxes, ids = np.zeros((0, 7)), []
+    for _ in range(rng.integers(0, 13)):
+        kind = rng.choice([CAR, PEDESTRIAN, CYCLIST])
+        size = {CAR: (4, 1.7, 1.5), PEDESTRIAN: (0.8, 0.7, 1.7), CYCLIST: (1.8, 0.6, 1.7)}[kind]
+        box = np.array([*rng.uniform(-18, 18, 2), size[2] / 2 - 1.73, *size, rng.uniform(-3, 3)])
+        if not bev_iou(box[None] + [0, 0, 0, 0.1, 0.1, 0, 0], boxes).any():
+            boxes, ids = np.concatenate([boxes, box[None]]), [*ids, kind]
+    parts = [rng.uniform([-20, -20, -1.75], [20, 20, -1.73], (800, 3))]
+    for box in boxes:
+        flat = rng.uniform(-0.48, 0.48, (rng.integers(3, 30), 3)) * box[3:6]
+        cos, sin = np.cos(box[6]), np.sin(box[6])
+        parts.append(flat @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) + box[:3])
+    xyz = np.concatenate(parts)
+    points = np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32)
+    return Scene(points, boxes, np.array(ids, int), np.ones(len(ids), bool), around)
+
+
+def members(scene: Scene, margin: float = 0.0) -> np.ndarray:
+    """(M, N) bool: which points are in which box."""
+    return np.array([points_in_box(scene.points[:, :3], box, margin) for box in scene.boxes],
+                    bool).reshape(len(scene.boxes), len(scene.points))
+
+
+def touching(boxes: np.ndarray) -> bool:
+    return bool((bev_iou(boxes, boxes) - np.eye(len(boxes)) > 1e-9).any())
+
+
+# augmentation
+
+@few
+@given(seeds)
+def test_points_in_a_box_stay_in_it(seed):
+    scene, rng = random_scene(seed), np.random.default_rng(seed)
+    before = members(scene)
+    for changed in (flipped(scene), turned(scene, rng.uniform(-4, 4)),
+                    scaled(scene, rng.uniform(0.8, 1.2)), raised(scene, rng.uniform(-1, 1)),
+                    brightened(scene, rng.uniform(0.5, 1.5), rng.uniform(-0.3, 0.3)),
+                    with_moved_objects(scene, 0.5, 0.5, rng)):
+        assert changed.points.dtype == np.float32 and changed.points.shape == scene.points.shape
+        assert not (before & ~members(changed, margin=2e-4)).any()
+        np.testing.assert_allclose(changed.boxes[:, 3:6] / scene.boxes[:, 3:6],
+                                   (changed.boxes[:1, 3:4] / scene.boxes[:1, 3:4]).sum() or 1)
+        assert touching(changed.boxes) is False
+
+
+@few
+@given(seeds)
+def test_whole_scenes_move_as_one(seed):
+    scene = random_scene(seed)
+    for changed in flipped(scene), turned(scene, 2.0), raised(scene, 0.4):
+        assert np.array_equal(members(changed, 1e-3).sum(axis=1), members(scene, 1e-3).sum(axis=1))
+
+
+@few
+@given(seeds, st.floats(-7, 7))
+def test_changes_are_undone_by_their_inverses(seed, angle):
+    scene = random_scene(seed)
+    for back in (flipped(flipped(scene)), turned(turned(scene, angle), -angle),
+                 scaled(scaled(scene, 1.25), 0.8), raised(raised(scene, 0.5), -0.5)):
+        np.testing.assert_allclose(back.points, scene.points, atol=1e-4)
+        np.testing.assert_allclose(back.boxes[:, :6], scene.boxes[:, :6], atol=1e-9)
+        np.testing.assert_allclose(wrap_angle(back.boxes[:, 6] - scene.boxes[:, 6]), 0, atol=1e-9)
+
+
+def test_a_turn_takes_what_is_ahead_to_the_left():
+    scene = Scene(np.array([[5, 0, 1, 0.5]], np.float32), np.array([[5.0, 0, 1, 4, 2, 1, 0.1]]),
+                  np.array([CAR]), np.ones(1, bool))
+    changed = turned(scene, np.pi / 2)
+    np.testing.assert_allclose(changed.points, [[0, 5, 1, 0.5]], atol=1e-6)
+    np.testing.assert_allclose(changed.boxes, [[0, 5, 1, 4, 2, 1, 0.1 + np.pi / 2]], atol=1e-9)
+
+
+@few
+@given(seeds, st.floats(0, 0.99))
+def test_thinning_leaves_a_part_of_the_points_in_their_order(seed, share):
+    scene = random_scene(seed)
+    left = thinned(scene, share, np.random.default_rng(seed))
+    assert (len(left.points) == len(scene.points)) or share > 0
+    assert abs(len(left.points) - (1 - share) * len(scene.points)) < 6 * len(scene.points)**0.5
+    places = iter(scene.points.tolist())
+    assert all(point in places for point in left.points.tolist())
+
+
+@few
+@given(seeds)
+def test_intensities_stay_intensities_and_nothing_else_changes(seed):
+    scene = random_scene(seed)
+    changed = brightened(scene, 1.4, 0.2)
+    assert changed.points[:, 3].min() >= 0 and changed.points[:, 3].max() <= 1
+    assert np.array_equal(changed.points[:, :3], scene.points[:, :3])
+
+
+@few
+@given(seeds, st.booleans())
+def test_the_same_rng_gives_the_same_scene_and_zeros_change_nothing(seed, around):
+    scene = random_scene(seed, around)
+    kept = scene.points.copy(), scene.boxes.copy()
+    once, twice = (augmented(scene, AugmentParams(), np.random.default_rng(seed)) for _ in "ab")
+    assert np.array_equal(once.points, twice.points) and np.array_equal(once.boxes, twice.boxes)
+    assert np.array_equal(scene.points, kept[0]) and np.array_equal(scene.boxes, kept[1])
+    same = augmented(scene, STILL, np.random.default_rng(seed))
+    np.testing.assert_allclose(same.points, scene.points, atol=1e-5)
+    np.testing.assert_allclose(same.boxes, scene.boxes, atol=1e-9)
+
+
+# objects of other scenes
+
+@few
+@given(seeds)
+def test_objects_that_are_put_in_touch_nothing_and_keep_their_points(seed):
+    database = cut_objects([random_scene(seed + k) for k in range(1, 6)],
+                           ("Car", "Pedestrian", "Cyclist"), 5)
+    scene, rng = random_scene(seed), np.random.default_rng(seed)
+    params = AugmentParams(cars=4, pedestrians=4, cyclists=0)
+    fuller = with_objects(scene, database, params, rng)
+    old, count = len(scene.boxes), len(fuller.boxes)
+    assert not touching(fuller.boxes)
+    assert np.array_equal(fuller.boxes[:old], scene.boxes)
+    assert len(fuller.class_ids) == len(fuller.wanted) == count
+    for kind, most in ((CAR, 4), (PEDESTRIAN, 4), (CYCLIST, 0)):
+        here = (fuller.class_ids == kind).sum()
+        assert here <= max(most, (scene.class_ids == kind).sum())
+    inside = members(fuller, 1e-3).sum(axis=1)
+    assert (inside[:old] == members(scene, 1e-3).sum(axis=1)).all()
+    sizes = np.diff(database.first)
+    for box, number in zip(fuller.boxes[old:], inside[old:]):
+        origin = np.flatnonzero((database.boxes[:, :2] == box[:2]).all(axis=1))
+        assert number == sizes[origin[0]] >= 5
+    again = with_objects(scene, database, params, np.random.default_rng(seed))
+    assert np.array_equal(again.points, fuller.points)
+
+
+def test_objects_survive_their_file_and_a_broken_file_is_named(tmp_path):
+    database = cut_objects([random_scene(k) for k in range(4)], ("Car", "Pedestrian"), 5)
+    assert len(database) > 0 and set(database.class_ids) <= {CAR, PEDESTRIAN}
+    database.save(tmp_path / "objects.npz")
+    back = Database.load(tmp_path / "objects.npz")
+    assert all(np.array_equal(v, getattr(back, k)) for k, v in vars(database).items())
+    (tmp_path / "objects.npz").write_bytes(b"PK")
+    with pytest.raises(InputError, match=r"objects\.npz"):
+        Database.load(tmp_path / "objects.npz")
+    assert len(cut_objects([], ("Car",), 5)) == 0
+
+
+def test_where_there_is_no_ground_nothing_is_put():
+    database = cut_objects([random_scene(k) for k in range(4)], ("Car",), 5)
+    empty = Scene(np.zeros((0, 4), np.float32), np.zeros((0, 7)), np.zeros(0, int),
+                  np.zeros(0, bool))
+    assert len(with_objects(empty, database, AugmentParams(), np.random.default_rng(0)).boxes) == 0
