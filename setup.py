@@ -8,7 +8,7 @@ from setuptools import find_packages, setup
 
 NAME = "lidar_perception"
 NODES = ["bag_player", "bag_recorder", "ground_segmentation", "clustering",
-         "candidate_refinement", "evaluator", "perception"]
+         "candidate_refinement", "evaluator", "perception", "pointpillars_detector"]
 
 
 def node_executables() -> list[str]:
@@ -39,7 +39,8 @@ setup(
     maintainer_email="maintainers@lidar-perception.invalid",
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "msg_utils*"]),
-    package_data={NAME: ["nodes/*.xml", "candidates/*.json", "reproduction/*.html"]},
+    package_data={NAME: ["nodes/*.xml", "candidates/*.json", "reproduction/*.html",
+                         "detection/weights/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

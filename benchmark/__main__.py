@@ -1,5 +1,6 @@
 """lidar benchmark: our candidate pipeline beside a plain reading of paper A, each algorithm beside
-its peers, and the graph of nodes over DDS, in one run on one machine."""
+its peers, every version of EG-PointPillars, and the graph of nodes over DDS, in one run on one
+machine."""
 
 from __future__ import annotations
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from benchmark import clustering, ground, peers
 from benchmark.candidates import compare, print_comparison
+from benchmark.detection import measure_detection, print_detection
 from benchmark.graph import measure_graph, print_graph
 from benchmark.rows import print_ground, print_measured, print_planes
 from benchmark.simulation import measure_simulation
@@ -50,7 +52,8 @@ FEW = 3              # frames with a pedestrian, below which those without serve
 def main(kitti: Path, semantic_kitti: Path | None, json_file: Path | None, repeat: int,
          count: int, graph: bool) -> None:
     """Time our candidate pipeline beside a plain scikit-learn + OpenCV reading of the paper, and
-    each algorithm beside its peers. Peers that are not installed are left out.
+    each algorithm beside its peers, and the steps of every version of EG-PointPillars. Peers that
+    are not installed are left out.
 
     \b
     Example:
@@ -69,7 +72,11 @@ def main(kitti: Path, semantic_kitti: Path | None, json_file: Path | None, repea
     print_comparison(content["candidates"])
     in_view = [points_in_view(f, camera, ViewParams(enabled=True))[1].xyz
                for f, camera in _with_camera(kitti, frames, count)]
-    content |= _measure(in_view, _full_scans(open_kitti(kitti), count), repeat)
+    scans = _full_scans(open_kitti(kitti), count)
+    content |= _measure(in_view, scans, repeat)
+    if scans:
+        content["detection"] = measure_detection(scans, repeat)
+        print_detection(content["detection"])
     if labelled:
         content["ground_scores"] = ground.measure_labelled(labelled, repeat)
         print_ground(content["ground_scores"])

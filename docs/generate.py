@@ -1,5 +1,5 @@
-"""Makes docs/nodes/*.md from the parameter dataclasses and config/best.param.yaml from
-configurations.py: python docs/generate.py
+"""Makes docs/nodes/*.md from the parameter dataclasses, config/best.param.yaml from
+configurations.py and config/pointpillars.param.yaml from the detector's: python docs/generate.py
 
 test/test_docs.py holds that the pages are up to date and the topics those of the running nodes.
 """
@@ -13,8 +13,10 @@ import yaml
 
 from lidar_perception import params
 from lidar_perception.configurations import BEST_VALUES
+from lidar_perception.detection.detector_params import DetectorParams
 
-BEST = Path(__file__).parents[1] / "config/best.param.yaml"
+CONFIG = Path(__file__).parents[1] / "config"
+BEST, POINTPILLARS = CONFIG / "best.param.yaml", CONFIG / "pointpillars.param.yaml"
 FOLDER = Path(__file__).parent / "nodes"
 CLOUD, MARKERS = "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray"
 STRING_TIMES = "std_msgs/Float64"
@@ -31,11 +33,12 @@ SEED_IN = [
     ("/clicked_point", "geometry_msgs/PointStamped", "A point on a pedestrian, for `seed.source` "
      "click, in the frame of the cloud."),
 ]
+DETECTIONS_3D = ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, where "
+                 "vision_msgs is installed.")
 CANDIDATES_OUT = [
     ("~/output/detections", MARKERS, "The candidates (STM + CPA); an empty array still carries the "
      "stamp."),
-    ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, where vision_msgs is "
-     "installed."),
+    DETECTIONS_3D,
     ("~/debug/stage1", MARKERS, "Clusters of the seed's height; made only while subscribed."),
     ("~/debug/stage2", MARKERS, "After STM without CPA; made only while subscribed."),
     ("~/debug/height_ms, stm_ms, cpa_ms, confidence_ms", STRING_TIMES, "Time of each "
@@ -84,6 +87,24 @@ NODES: dict[str, dict[str, Any]] = {
                   "made only while subscribed."),
                  ("~/output/boxes", MARKERS, "Cluster boxes; made only while subscribed."),
                  *CANDIDATES_OUT]),
+    "pointpillars_detector": dict(
+        params=DetectorParams(),
+        what="Finds cars, pedestrians and cyclists: PointPillars and the four versions of "
+             "EG-PointPillars, see [detection](../detection.md). Loads and warms up before it "
+             "subscribes. Without weights it says so in a diagnostic and publishes nothing. Warns "
+             "if nothing can be found (the cloud is out of range, has no intensity, all of it is "
+             "ground ...), if CUDA is asked for and missing or out of memory, and if height or "
+             "intensity do not fit; where every score is below its threshold the diagnostic has "
+             "the best ones. Files: `launch/pointpillars.launch.py`, "
+             "`config/pointpillars.param.yaml`.",
+        inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The columns "
+                 "`ground` and `cluster_id` are used where they are there; what else the version "
+                 "needs is computed.")],
+        outputs=[("~/output/detections", MARKERS, "Boxes with class and score; an empty array "
+                  "still carries the stamp."),
+                 DETECTIONS_3D,
+                 ("~/debug/preprocess_ms, experts_ms, network_ms, postprocess_ms", STRING_TIMES,
+                  "Time of each step.")]),
     "evaluator": dict(
         params=params.EvaluatorParams(),
         what="Scores detections against ground truth by the protocol of the STM-CPA paper.",
@@ -128,15 +149,31 @@ def page(name: str) -> str:
 
 def best() -> str:
     """The parameter file of the configuration `best`, for nodes."""
+    return _parameter_file("The configuration `best` (lidar_perception/configurations.py), for "
+                           "nodes", BEST_VALUES)
+
+
+def pointpillars() -> str:
+    """The parameter file of the detector's graph: its experts' numbers for the nodes that find
+    ground and clusters."""
+    shared = (params.GroundNodeParams(), params.ClusteringNodeParams())
+    defaults = {key: value for group in shared for key, value in params.flatten(group).items()}
+    values = {key: value for key, value in params.flatten(DetectorParams()).items()
+              if key in defaults and value != defaults[key]}
+    return _parameter_file("The detector's experts (detection/detector_params.py), for the nodes "
+                           "that find ground and clusters", values)
+
+
+def _parameter_file(what: str, values: dict[str, Any]) -> str:
     tree: dict[str, Any] = {}
-    for key, value in BEST_VALUES.items():
+    for key, value in values.items():
         *groups, name = key.split(".")
         place = tree
         for group in groups:
             place = place.setdefault(group, {})
         place[name] = list(value) if isinstance(value, tuple) else value
-    return ("# The configuration `best` (lidar_perception/configurations.py), for nodes; made by "
-            "docs/generate.py.\n# Every parameter with its unit, range and default: docs/nodes/.\n"
+    return (f"# {what}; made by docs/generate.py.\n"
+            "# Every parameter with its unit, range and default: docs/nodes/.\n"
             + yaml.safe_dump({"/**": {"ros__parameters": tree}}, sort_keys=False))
 
 
@@ -162,3 +199,4 @@ if __name__ == "__main__":
     for name in NODES:
         (FOLDER / f"{name}.md").write_text(page(name))
     BEST.write_text(best())
+    POINTPILLARS.write_text(pointpillars())

@@ -79,9 +79,14 @@ def spread(values: np.ndarray | int, places: np.ndarray, msg: Any, dtype: str) -
 
 
 def column(msg: Any, name: str, places: np.ndarray) -> np.ndarray | None:
-    """(N,) values of a field at places (N,); None where the cloud has no such field."""
+    """(N,) values of a field at places (N,); None where the cloud has no such field. InputError if
+    it holds more than one number a point."""
     points = to_array(msg)
-    return points[name].take(places) if name in (points.dtype.names or ()) else None
+    if name not in (points.dtype.names or ()):
+        return None
+    if points.dtype[name].shape:
+        raise InputError(f"field '{name}' has count > 1; a single number is needed")
+    return points[name].take(places)
 
 
 def camera_of(info: Any, transform: Any) -> Camera:

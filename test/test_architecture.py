@@ -218,6 +218,7 @@ def test_no_source_is_longer_than_a_reader_can_hold(name):
     ("msg_utils.markers", "numba torch matplotlib scipy rosbags lidar_perception"),
     ("lidar_perception.detection.config", "numba torch matplotlib scipy sklearn rich click"),
     ("lidar_perception.detection.detector_params", "numba torch matplotlib scipy numpy click"),
+    ("lidar_perception.detection.weights_file", "numba torch matplotlib scipy click"),
     ("lidar_perception.detection.expert", "torch matplotlib sklearn rosbags rich click"),
     ("lidar_perception.detection.detector", "onnx onnxruntime matplotlib sklearn rich click"),
     ("lidar_perception.training.params", "numba torch matplotlib scipy numpy rich click"),

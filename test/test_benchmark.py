@@ -13,6 +13,7 @@ from samples import object_folder, scene, walker_label
 
 from benchmark import ground, peers, plain_euclidean
 from benchmark.clustering import dbscan_times, measure_dbscan, same_clusters
+from benchmark.detection import measure_detection, print_detection
 from benchmark.rows import print_ground, print_measured, row, target_text, value_text
 from benchmark.timing import Clock, in_child, interleaved
 from lidar_perception.clustering.euclidean import euclidean
@@ -105,6 +106,20 @@ def test_ground_scores_do_without_the_libraries(nothing_installed, capsys):
     print_ground(json.loads(json.dumps(content)))
     assert capsys.readouterr().out.count("not installed") == 2 * len(content["protocols"])
     assert content["methods"]["cloth"]["protocols"]["with vegetation"]["f1"] > 0.9
+
+
+def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsys):
+    points = scene()
+    content = measure_detection([LidarFrame(points[:, :3], points[:, 3])] * 2, 1, ("compact",))
+    print_detection(json.loads(json.dumps(content)))
+    shown = capsys.readouterr().out
+    versions = content["sizes"]["compact"]["versions"]
+    assert list(versions) == ["v0", "v1", "v2", "v3", "v4"] and versions["v0"]["to_v0"] == 1.0
+    for name, found in versions.items():
+        assert sum(found["share"].values()) == pytest.approx(1.0)
+        assert found["ms"]["network"] > 0 and found["ms"]["postprocess"] > 0
+        assert name in shown and found["to_v0"] == found["total_ms"] / versions["v0"]["total_ms"]
+    assert versions["v4"]["ms"]["experts"] > versions["v0"]["ms"]["experts"]  # v0 has none
 
 
 def test_the_command_writes_what_it_measured(nothing_installed, tmp_path):

@@ -74,6 +74,8 @@ def test_versions_see_what_the_paper_says():
 def test_numbers_of_clusters_keep_their_order():
     assert renumbered(np.array([7, 0, 3, 7, -1, 9])).tolist() == [2, 0, 1, 2, 0, 3]
     assert renumbered(np.zeros(0, np.uint32)).tolist() == []
+    large = np.array([2**31 - 1, 0, 7, 2**31 - 1, -5, 2**62])  # no table of that length is made
+    assert renumbered(large).tolist() == [2, 0, 1, 2, 0, 3]
 
 
 def test_the_map_is_that_of_a_plain_loop_over_cells():
@@ -172,6 +174,7 @@ def test_intensity_is_scaled_and_may_be_left_out():
     assert "no intensity" in detector.problem
     detector.params = with_values(detector.params, {"detection.intensity_scale": 0.0})
     assert same(detector(scan), without) and detector.problem is None
+    assert same(detector(replace(scan, intensity=None)), without) and detector.problem is None
 
 
 @pytest.mark.parametrize("xyz, words", [
@@ -190,6 +193,23 @@ def test_ground_alone_has_no_detections_and_a_reason():
     detector, scan = random_detector("v4"), frame()
     assert len(detector(scan, np.ones(len(scan), bool))) == 0
     assert "ground.sensor_pose" in detector.problem
+
+
+def test_where_nothing_passes_the_best_scores_are_said():
+    detector, scan = random_detector("v4", eager(score=0.0)), frame()
+    found = detector(scan)
+    assert detector.best == {}
+    highest = {name: float(found.scores[found.class_ids == CLASSES.index(name)].max())
+               for name in detector.config.classes if CLASSES.index(name) in found.class_ids}
+    detector.params = eager(score=1.0)
+    assert len(detector(scan)) == 0 and detector.problem is None
+    assert list(detector.best) == list(detector.config.classes)
+    assert max(detector.best.values()) == pytest.approx(max(highest.values()))
+    assert all(detector.best[name] >= score - 1e-6 for name, score in highest.items())
+    for parameter in detector.network.network.head.parameters():
+        parameter.fill_(np.nan)
+    detector(scan)
+    assert "NaN" in detector.problem
 
 
 def test_many_points_and_broken_ones_are_no_trouble():

@@ -200,6 +200,7 @@ def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
                               header=header_message(0, frame_id, bag_message))
         peer.send(click, clicked, click.get_subscription_count, "a subscriber of the click")
         peer.send(talker, good_cloud, lambda w=words: w in peer.message_of("perception"), words)
+    peer.wait(lambda: len(from_marker_array(found[-1])), "candidates, which may come late")
     objects = from_marker_array(found[-1])
     assert np.linalg.norm(objects.boxes[:, :2] - nearest[:2], axis=1).min() < 1.0
     assert set(objects.labels) == {"Pedestrian"} and objects.frame_id == "velodyne"

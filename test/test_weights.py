@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from detection_samples import eager, frame, lively, random_detector, same, tiny
 
 from lidar_perception.cli.main import cli
-from lidar_perception.detection import detector as detector_module
+from lidar_perception.detection import weights_file as weights_module
 from lidar_perception.detection.checkpoint import (
     Header,
     load_network,
@@ -111,7 +111,7 @@ def test_a_full_disk_leaves_the_last_checkpoint(saved, monkeypatch):
 
 
 def test_weights_that_do_not_come_with_the_package_are_asked_for(tmp_path, monkeypatch):
-    monkeypatch.setattr(detector_module, "WEIGHTS", tmp_path)
+    monkeypatch.setattr(weights_module, "WEIGHTS", tmp_path)
     with pytest.raises(InputError, match="no weights for v4 compact"):
         load_detector("", "cpu")
     wanted = with_values(eager(), {"detection.version": "v1"})
@@ -119,6 +119,11 @@ def test_weights_that_do_not_come_with_the_package_are_asked_for(tmp_path, monke
     save_checkpoint(tmp_path / "pointpillars_v1_compact.safetensors", lively(config),
                     Header(config))
     assert same(load_detector("", "cpu", wanted)(frame()), random_detector("v1")(frame()))
+    named = with_values(eager(), {"detection.weights": str(
+        tmp_path / "pointpillars_v1_compact.safetensors")})
+    assert same(load_detector("", "cpu", named)(frame()), random_detector("v1")(frame()))
+    with pytest.raises(InputError, match="no checkpoint /nowhere"):
+        load_detector("", "cpu", with_values(eager(), {"detection.weights": "/nowhere"}))
 
 
 # export

@@ -17,17 +17,16 @@ from lidar_perception.detection.anchors import make_anchors
 from lidar_perception.detection.box_coder import decode
 from lidar_perception.detection.checkpoint import Header, load_network
 from lidar_perception.detection.config import SENSOR_HEIGHT
-from lidar_perception.detection.detector_params import DetectionParams, DetectorParams
+from lidar_perception.detection.detector_params import STEPS, DetectorParams
 from lidar_perception.detection.expert import NetworkInput, network_input
 from lidar_perception.detection.nms import suppressed
 from lidar_perception.detection.pillars import Pillars, make_pillars
 from lidar_perception.detection.pointpillars import PointPillars, fused
 from lidar_perception.detection.view import in_sensor_frame, visible
+from lidar_perception.detection.weights_file import weights_file
 from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
 
 CPU = torch.device("cpu")
-STEPS = ("preprocess", "experts", "network", "postprocess")
-WEIGHTS = Path(__file__).parent / "weights"
 
 # logits (A, K), and codes (M, 7) and directions (M, 2) at anchors (M,)
 Prediction = tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]
@@ -53,7 +52,8 @@ class Detector:
     """detector(frame) -> Detections, in the frame's own coordinates.
 
     params may be replaced at any time. After each call ms holds the time of each of STEPS (on CUDA
-    after synchronisation), and problem why nothing, or little, can be found in this frame, or None.
+    after synchronisation), problem why nothing, or little, can be found in this frame, or None, and
+    best, where no score reached its threshold, the highest score of each class.
     """
 
     def __init__(self, network: Any, header: Header, device: torch.device,
@@ -63,6 +63,7 @@ class Detector:
         self.anchors = make_anchors(self.config, device)
         self.ms: dict[str, float] = dict.fromkeys(STEPS, 0.0)
         self.problem: str | None = None
+        self.best: dict[str, float] = {}
         self.fallback: str | None = None  # why the CPU took over
 
     def __call__(self, frame: LidarFrame, ground: np.ndarray | None = None,
@@ -85,7 +86,7 @@ class Detector:
             None if cluster_ids is None else cluster_ids.take(places),
             self.params.ground, self.params.clustering)
         t2 = perf_counter()
-        self.problem = self._problem(frame, seen, inputs) or self.fallback
+        self.problem, self.best = self._problem(frame, seen, inputs) or self.fallback, {}
         if len(inputs.points) == 0:
             self.ms = dict(zip(STEPS, ((t1 - t0) * 1e3, (t2 - t1) * 1e3, 0.0, 0.0)))
             return Detections.none()
@@ -123,6 +124,8 @@ class Detector:
         limits = logits.new_tensor([_logit(settings.scores.of_class(name))
                                     for name in self.config.classes])
         chosen = torch.nonzero((logits >= limits).any(dim=1))[:, 0]
+        if len(chosen) == 0:
+            self._nothing_found(logits)
         best, kinds = logits[chosen].max(dim=1)
         valid = torch.nonzero(best >= limits[kinds])[:, 0]
         if len(valid) > settings.nms.candidates:
@@ -137,6 +140,13 @@ class Detector:
         ids = np.array([CLASSES.index(name) for name in self.config.classes])
         return Detections.of(boxes[kept], ids[kinds[kept]], scores[kept])
 
+    def _nothing_found(self, logits: Tensor) -> None:
+        scores = torch.sigmoid(logits.amax(dim=0)).tolist()
+        self.best = dict(zip(self.config.classes, scores))
+        if any(map(math.isnan, scores)):
+            self.problem = ("the network's scores are not numbers (NaN); the weights or the "
+                            "intensity are broken")
+
     def _problem(self, frame: LidarFrame, seen: LidarFrame, inputs: NetworkInput) -> str | None:
         if len(frame) == 0:
             return "the cloud is empty or has no finite point"
@@ -148,7 +158,7 @@ class Detector:
         if len(inputs.points) == 0:
             return ("every point in the network's range is ground; is the sensor mounted at "
                     "another height or angle? set ground.sensor_pose")
-        if frame.intensity is None:
+        if frame.intensity is None and self.params.detection.intensity_scale:
             return "the cloud has no intensity, which the network was trained with; it reads zeros"
         return None
 
@@ -205,23 +215,11 @@ def chosen_device(name: str = "auto") -> torch.device:
     return device
 
 
-def weights_file(params: DetectionParams) -> Path:
-    """The file that comes with the package, for params' version and size. InputError if there is
-    none."""
-    version = "v4" if params.version == "auto" else params.version
-    size = "compact" if params.size == "auto" else params.size
-    path = WEIGHTS / f"pointpillars_{version}_{size}.safetensors"
-    if not path.is_file():
-        raise InputError(f"no weights for {version} {size} come with the package; name a "
-                         "checkpoint with detection.weights")
-    return path
-
-
 def load_detector(path: str | Path = "", device: str = "auto",
                   params: DetectorParams = DetectorParams()) -> Detector:
-    """A detector from a checkpoint (.safetensors), an exported network (.onnx), or, with an empty
-    path, the weights that come with the package. InputError where they are missing, or not of the
-    version and size that params ask for, or device is not there."""
+    """A detector from a checkpoint (.safetensors) or an exported network (.onnx); with an empty
+    path the one that params name, or else the one that comes with the package. InputError where it
+    is missing, or not of the version and size that params ask for, or device is not there."""
     path = Path(path) if str(path) not in ("", ".") else weights_file(params.detection)
     if params.detection.threads:
         torch.set_num_threads(params.detection.threads)

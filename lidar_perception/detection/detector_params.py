@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from lidar_perception.param_fields import Params, param
 from lidar_perception.params import ClusteringParams, DbscanParams, GroundParams, InputParams
 
+STEPS = ("preprocess", "experts", "network", "postprocess")  # of which each has its time
+
 
 @dataclass(frozen=True)
 class ScoreParams(Params):
@@ -48,7 +50,8 @@ class DetectionParams(Params):
     device: str = param("auto", "cpu, cuda or cuda:N; auto: CUDA where there is one.", fixed=True)
     threads: int = param(0, "CPU threads of the network; fewer leave room for other programs. "
                          "0 takes one for each core.", low=0, high=1024, fixed=True)
-    cpu_fallback: bool = param(True, "Go on with the CPU when CUDA runs out of memory.")
+    cpu_fallback: bool = param(True, "Go on with the CPU when CUDA runs out of memory; a node also "
+                               "where there is no CUDA at all.")
     warm_up: bool = param(True, "Run once on made-up points before the first cloud.", fixed=True)
     intensity_scale: float = param(1.0, "Factor on the intensity (0..1) before the network, for a "
                                    "sensor that reports more or less than the one trained on; 0 "

@@ -19,6 +19,7 @@ from lidar_perception.ground.segment import segment_ground
 from lidar_perception.params import ClusteringParams, GroundParams, SensorPoseParams
 from lidar_perception.types import CLASSES, LidarFrame
 
+SPARSE = 16  # largest number of a cluster, in points, up to which a table of all numbers is made
 MAP_CLASSES = ("Car", "Cyclist", "Pedestrian")  # channels: vehicle, two-wheeler, pedestrian
 
 
@@ -68,6 +69,9 @@ def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | 
 def renumbered(cluster_ids: np.ndarray) -> np.ndarray:
     """(N,) int32: the ids above 0 as 1..K in their order; 0 and below become 0."""
     ids = np.maximum(np.asarray(cluster_ids, np.int64), 0)
+    if ids.max(initial=0) > SPARSE * (len(ids) + 1):  # of another program, whose numbers are large
+        _, ids = np.unique(np.append(ids, 0), return_inverse=True)
+        ids = ids[:-1]
     place = np.zeros(int(ids.max(initial=0)) + 1, np.int32)
     place[ids] = 1
     place[0] = 0

@@ -24,26 +24,30 @@ NODES = {  # executable -> class; the module has the executable's name
     "candidate_refinement": "CandidateRefinement",
     "evaluator": "Evaluator",
     "perception": "Perception",
+    "pointpillars_detector": "PointPillarsDetector",
 }
 
 
-PARAMS = {  # executable -> its parameters, in params.py
-    "bag_player": "PlayerParams",
-    "bag_recorder": "RecorderParams",
-    "ground_segmentation": "GroundNodeParams",
-    "clustering": "ClusteringNodeParams",
-    "candidate_refinement": "RefinementNodeParams",
-    "evaluator": "EvaluatorParams",
-    "perception": "PipelineParams",
+PARAMS = {  # executable -> its parameters
+    "bag_player": "params.PlayerParams",
+    "bag_recorder": "params.RecorderParams",
+    "ground_segmentation": "params.GroundNodeParams",
+    "clustering": "params.ClusteringNodeParams",
+    "candidate_refinement": "params.RefinementNodeParams",
+    "evaluator": "params.EvaluatorParams",
+    "perception": "params.PipelineParams",
+    "pointpillars_detector": "detection.detector_params.DetectorParams",
 }
 
 
 def help_text(name: str) -> str:
     """What --help prints: how to start the node, and its parameters."""
-    from lidar_perception import params
+    from lidar_perception.params import parameter_fields
+    module, _, params = PARAMS[name].rpartition(".")
+    params = getattr(importlib.import_module(f"lidar_perception.{module}"), params)
     lines = [f"Usage: {name} --ros-args [-p PARAMETER:=VALUE] [-r FROM:=TO] [--params-file YAML]",
              "", "Parameters:"]
-    for key, f in params.parameter_fields(getattr(params, PARAMS[name])()).items():
+    for key, f in parameter_fields(params()).items():
         default = list(f.default) if isinstance(f.default, tuple) else f.default
         unit = f" {f.metadata['unit']}" if f.metadata["unit"] else ""
         lines += [f"  {key} (default {default!r}{unit})", f"      {f.metadata['doc']}"]
@@ -102,6 +106,7 @@ def run(name: str, arguments: list[str]) -> int:
     # other's way.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # for torch, which takes more than one
     use_large_shared_memory()
     from lidar_perception.nodes.stopping import Stop
     stop = Stop(STOP_SIGNALS)

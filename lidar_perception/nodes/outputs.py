@@ -1,9 +1,9 @@
-"""Publishing the candidates of a frame, shared by candidate_refinement and perception."""
+"""Publishing what was found in a frame, shared by the nodes that find objects."""
 
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from lidar_perception.clustering.shapes import class_by_diagonal
 from lidar_perception.datasets.bag import bag_message, encode
 from lidar_perception.messages import detection_markers
 from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
-from lidar_perception.types import CLASSES, InputError
+from lidar_perception.types import CLASSES, Detections, InputError
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys, to_marker_array
 from msg_utils.messages import message_class, ros_message
@@ -44,16 +44,25 @@ def _size_classes(boxes: np.ndarray) -> list[dict]:
     return [{"size_class": CLASSES[i]} if i >= 0 else {} for i in ids]
 
 
-class CandidateOutputs:
-    """~/output/detections (and ~/output/detections_3d where vision_msgs is installed), the earlier
-    stages under ~/debug/stage1 and ~/debug/stage2, and the time of each step."""
+class DetectionMarkers:
+    """A topic with detections as markers."""
 
-    def __init__(self, node: LidarNode, steps: tuple[str, ...] = ("height", "stm", "cpa")):
-        self.node = node
-        self.markers = {"stage1": node.output("~/debug/stage1", MARKERS),
-                        "stage2": node.output("~/debug/stage2", MARKERS),
-                        "final": node.output("detections", MARKERS)}
-        self.shown: dict[str, Any] = dict.fromkeys(self.markers, ())
+    def __init__(self, node: LidarNode, topic: str):
+        self.publisher = node.output(topic, MARKERS)
+        self.shown: Any = ()
+
+    def publish(self, header: Any, detections: Detections) -> None:
+        message = detection_markers(detections, header, bag_message, self.shown)
+        self.shown = marker_keys(message)
+        self.publisher.publish(encode(message))
+
+
+class DetectionOutputs:
+    """~/output/detections (and ~/output/detections_3d where vision_msgs is installed), and the time
+    of each step."""
+
+    def __init__(self, node: LidarNode, steps: tuple[str, ...]):
+        self.markers = DetectionMarkers(node, "detections")
         self.detections_3d = None
         if importlib.util.find_spec("vision_msgs"):
             self.detections_3d = node.create_publisher(
@@ -61,6 +70,28 @@ class CandidateOutputs:
                 RELIABLE)
         self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE)
                            for step in steps}
+
+    def publish(self, header: Any, found: Detections, ms: Mapping[str, float]) -> None:
+        """Publish what was found, and the times of the steps that are known."""
+        self.markers.publish(header, found)
+        if self.detections_3d is not None and self.detections_3d.get_subscription_count():
+            self.detections_3d.publish(to_detection_array(
+                found.boxes, [CLASSES[i] for i in found.class_ids], found.scores, make=ros_message,
+                header=header_message(to_ns(header.stamp), header.frame_id, ros_message)))
+        for step, publisher in self.step_times.items():
+            if step in ms:
+                publisher.publish(Float64(data=ms[step]))
+
+
+class CandidateOutputs:
+    """The candidates as detections, and the earlier stages under ~/debug/stage1 and
+    ~/debug/stage2."""
+
+    def __init__(self, node: LidarNode, steps: tuple[str, ...] = ("height", "stm", "cpa")):
+        self.node = node
+        self.stages = {stage: DetectionMarkers(node, f"~/debug/{stage}")
+                       for stage in ("stage1", "stage2")}
+        self.final = DetectionOutputs(node, steps)
 
     def publish(self, header: Any, find: Callable[[], Candidates],
                 problem: str | None = None) -> None:
@@ -70,20 +101,10 @@ class CandidateOutputs:
             candidates = find()
         except InputError as error:
             candidates, problem = Candidates.none(), problem or str(error)
-        for stage, publisher in self.markers.items():
-            if stage == "final" or publisher.get_subscription_count():
-                message = detection_markers(getattr(candidates, stage), header, bag_message,
-                                            self.shown[stage])
-                self.shown[stage] = marker_keys(message)
-                publisher.publish(encode(message))
-        if self.detections_3d is not None and self.detections_3d.get_subscription_count():
-            final = candidates.final
-            self.detections_3d.publish(to_detection_array(
-                final.boxes, [CLASSES[i] for i in final.class_ids], final.scores, make=ros_message,
-                header=header_message(to_ns(header.stamp), header.frame_id, ros_message)))
-        for step, publisher in self.step_times.items():
-            if step in candidates.ms:
-                publisher.publish(Float64(data=candidates.ms[step]))
+        for stage, markers in self.stages.items():
+            if markers.publisher.get_subscription_count():
+                markers.publish(header, getattr(candidates, stage))
+        self.final.publish(header, candidates.final, candidates.ms)
         self._diagnose(candidates, problem)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:

@@ -1,0 +1,110 @@
+"""Every version and size of EG-PointPillars on this machine's device: the time of each step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from rich.table import Table
+
+from benchmark.timing import spread
+from lidar_perception.detection.checkpoint import Header
+from lidar_perception.detection.config import SIZES, VERSIONS, network_config
+from lidar_perception.detection.detector import Detector, TorchNetwork, chosen_device
+from lidar_perception.detection.detector_params import STEPS, DetectorParams
+from lidar_perception.detection.pointpillars import make_network
+from lidar_perception.machine import cpu_name
+from lidar_perception.params import with_values
+from lidar_perception.terminal import console, track
+from lidar_perception.types import LidarFrame
+
+PAPER_TO_V0 = {"v0": 1.0, "v1": 1.06, "v2": 1.86, "v3": 2.48, "v4": 3.54}  # paper B, RTX 4090
+TARGET = 1.6      # of v4 to v0, less than
+CANDIDATES = 200  # anchors that pass, as in a street
+FEW = 3           # scans for full on a CPU, where a frame takes half a second
+
+
+def measure_detection(scans: list[LidarFrame], repeat: int,
+                      sizes: Sequence[str] = tuple(SIZES)) -> dict:
+    """Medians over whole scans, each `repeat` times, versions taken in turn. Weights are random:
+    time depends on them only by what passes the thresholds, which are set to let CANDIDATES
+    anchors through."""
+    device = chosen_device()
+    name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
+    content = {"device": name, "threads": torch.get_num_threads(), "sizes": {}}
+    for size in sizes:
+        chosen = spread(scans, FEW) if (size, device.type) == ("full", "cpu") else scans
+        detectors = {version: _random_detector(version, size, device, chosen[0])
+                     for version in VERSIONS}
+        content["sizes"][size] = {
+            "frames": len(chosen), "points": float(np.median([len(s) for s in chosen])),
+            "versions": _medians(detectors, chosen, repeat, f"PointPillars {size}")}
+    return content
+
+
+def _medians(detectors: dict[str, Detector], scans: list[LidarFrame], repeat: int,
+             title: str) -> dict[str, dict]:
+    ms = {version: np.zeros((len(scans), repeat, len(STEPS))) for version in detectors}
+    for i, scan in enumerate(track(scans, title, len(scans))):
+        for j in range(repeat):
+            for version, detector in detectors.items():
+                detector(scan)
+                ms[version][i, j] = [detector.ms[step] for step in STEPS]
+    found = {}
+    for version, runs in ms.items():
+        steps = np.median(np.median(runs, axis=1), axis=0)
+        total = float(np.median(np.median(runs.sum(axis=2), axis=1)))
+        found[version] = {"ms": dict(zip(STEPS, steps.tolist())), "total_ms": total,
+                          "share": dict(zip(STEPS, (steps / steps.sum()).tolist())),
+                          "to_v0": total / found["v0"]["total_ms"] if found else 1.0,
+                          "paper_to_v0": PAPER_TO_V0[version]}
+    return found
+
+
+class Heard:
+    """A network that keeps its last logits (A, K)."""
+
+    def __init__(self, network: TorchNetwork):
+        self.network = network
+        self.logits: torch.Tensor | None = None
+
+    def __call__(self, pillars, maps):
+        prediction = self.network(pillars, maps)
+        self.logits = prediction[0]
+        return prediction
+
+
+def _random_detector(version: str, size: str, device: torch.device, scan: LidarFrame) -> Detector:
+    """Warmed up, with thresholds that CANDIDATES anchors pass in this scan."""
+    config = network_config(version, size)
+    torch.manual_seed(0)
+    heard = Heard(TorchNetwork(make_network(config).eval(), device))
+    detector = Detector(heard, Header(config), device)
+    detector.warm_up()
+    detector(scan)
+    best = torch.sigmoid(heard.logits.amax(dim=1))
+    least = float(best.topk(min(CANDIDATES, len(best))).values[-1])
+    detector.params = with_values(DetectorParams(), {
+        f"detection.scores.{name}": least for name in ("car", "pedestrian", "cyclist", "other")})
+    detector.network = heard.network
+    detector(scan)
+    return detector
+
+
+def print_detection(content: dict) -> None:
+    """A table for each size, with each step's share."""
+    for size, measured in content["sizes"].items():
+        table = Table(title=f"EG-PointPillars {size}, ms a frame ({measured['frames']} scans, "
+                            f"{measured['points']:.0f} points) on {content['device']}, "
+                            f"{content['threads']} CPU threads, random weights")
+        for name in ("version", *STEPS, "total", "to v0", "paper's"):
+            table.add_column(name, justify="left" if name == "version" else "right")
+        for version, found in measured["versions"].items():
+            table.add_row(version, *(f"{found['ms'][step]:.1f} ({100 * found['share'][step]:.0f} %)"
+                                     for step in STEPS), f"{found['total_ms']:.1f}",
+                          f"{found['to_v0']:.2f}", f"{found['paper_to_v0']:.2f}")
+        console.print(table)
+        ratio = measured["versions"]["v4"]["to_v0"]
+        console.print(f"v4 takes {ratio:.2f} of the time of v0, target < {TARGET}: "
+                      + ("met" if ratio < TARGET else "[red]not met[/red]"))

@@ -1,0 +1,27 @@
+"""Where the weights are, found without loading torch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lidar_perception.detection.detector_params import DetectionParams
+from lidar_perception.types import InputError
+
+WEIGHTS = Path(__file__).parent / "weights"
+
+
+def weights_file(params: DetectionParams) -> Path:
+    """The file that params name, or else the one that comes with the package for their version and
+    size. InputError if it is not there."""
+    if params.weights:
+        path = Path(params.weights)
+        if not path.is_file():
+            raise InputError(f"there is no checkpoint {path}; name another with detection.weights")
+        return path
+    version = "v4" if params.version == "auto" else params.version
+    size = "compact" if params.size == "auto" else params.size
+    path = WEIGHTS / f"pointpillars_{version}_{size}.safetensors"
+    if not path.is_file():
+        raise InputError(f"no weights for {version} {size} come with the package; name a "
+                         "checkpoint with detection.weights")
+    return path
