@@ -23,7 +23,7 @@ BEST_VALUES = {
     "stm.shifts": 2,
     "cpa.steps": 0,                # points drawn in their true size need no copies
     "confidence.enabled": True,
-    "confidence.threshold": 0.3,
+    "confidence.threshold": 0.25,
 }
 PAPER = with_values(PipelineParams(), PAPER_VALUES)
 BEST = with_values(PAPER, BEST_VALUES)

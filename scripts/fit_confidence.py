@@ -1,9 +1,8 @@
 """Fit candidates/confidence.json to simulated scans: two additive models of log-odds, one from the
 shape of a cluster, one from its likeness to a seed, too.
 
-    lidar-perception simulate --format kitti --frames 150 --people 3 --seed 6000 --out first
-    lidar-perception simulate --format kitti --frames 274 --people 3 --seed 7000 --out second
-    python scripts/fit_confidence.py first second
+    lidar-perception simulate --format kitti --frames 400 --people 2 --seed 6000 --out scans
+    python scripts/fit_confidence.py scans
 
 Pedestrians are weighted so that they are as far away as in KITTI's training set (paper A, Table 1).
 """
