@@ -8,7 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidar_perception.candidates.boxes import height_matches
+from lidar_perception.candidates.refine import group_points
 from lidar_perception.candidates.seeds import Seed, load_seed
+from lidar_perception.candidates.silhouette import cpa_scales, silhouettes
 from lidar_perception.datasets.kitti import KittiFrame
 from lidar_perception.evaluation.matching import RANGE_NAMES, counts_by_range, match_centres
 from lidar_perception.params import PipelineParams, flatten, with_values
@@ -124,6 +127,22 @@ def found_with(segmented: Segmented, seed: Callable[[], Seed], params: PipelineP
         return NOTHING
     return Found(all_.boxes, all_.scores, (params.confidence if params.confidence.enabled
                                            else params.stm).threshold)
+
+
+def clusters_as_tall(segmented: Segmented, seeds: Sequence[Seed], params: PipelineParams
+                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """boxes (K, 7) of the clusters whose height is that of one of the seeds, and their points
+    (N, 3) and start (K + 1,) as silhouettes() takes them."""
+    tall = [height_matches(segmented.boxes, seed.height, params.height) for seed in seeds]
+    kept = np.flatnonzero(np.any(tall, axis=0))
+    return segmented.boxes[kept], *group_points(segmented.xyz, segmented.cluster_ids, kept + 1)
+
+
+def with_copies(boxes: np.ndarray, points: np.ndarray, start: np.ndarray, params: PipelineParams
+                ) -> np.ndarray:
+    """(K, 80) silhouettes of such clusters with CPA as params has it."""
+    scales = cpa_scales(np.hypot(boxes[:, 0], boxes[:, 1]), params.cpa)
+    return silhouettes(points, start, scales, boxes[:, 2] - boxes[:, 5] / 2, params)
 
 
 def by_settings(variants: Mapping[str, PipelineParams], labelled: Labelled,

@@ -6,8 +6,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lidar_perception.candidates.boxes import height_matches
-from lidar_perception.candidates.refine import group_points
 from lidar_perception.candidates.seeds import Seed
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
@@ -20,7 +18,7 @@ from lidar_perception.configurations import PAPER
 from lidar_perception.params import PipelineParams, flatten
 from lidar_perception.pipeline import Segmented
 from lidar_perception.reproduction.labelled import Labelled, nearest_seed
-from lidar_perception.reproduction.variants import NOTHING, Found, study
+from lidar_perception.reproduction.variants import NOTHING, Found, clusters_as_tall, study
 from lidar_perception.types import InputError
 
 MOST_STEPS = 8
@@ -54,9 +52,7 @@ def find(labelled: Labelled, segments: Callable[[PipelineParams], Segmented]
         seed = nearest_seed(segmented, labelled)
     except InputError:
         return dict.fromkeys(NAMES, NOTHING)
-    kept = np.flatnonzero(height_matches(segmented.boxes, seed.height, PAPER.height))
-    boxes = segmented.boxes[kept]
-    points, start = group_points(segmented.xyz, segmented.cluster_ids, kept + 1)
+    boxes, points, start = clusters_as_tall(segmented, [seed], PAPER)
     ranges = np.hypot(boxes[:, 0], boxes[:, 1])
     band = (ranges >= PAPER.cpa.min_range) & (ranges < PAPER.cpa.max_range)
     steps = {

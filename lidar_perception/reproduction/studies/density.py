@@ -8,15 +8,21 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lidar_perception.candidates.boxes import height_matches
-from lidar_perception.candidates.refine import group_points
 from lidar_perception.candidates.seeds import MIN_POINTS, Seed
 from lidar_perception.candidates.silhouette import cpa_scales, silhouettes, similarity
 from lidar_perception.configurations import BEST, PAPER
 from lidar_perception.params import PipelineParams, flatten, with_values
 from lidar_perception.pipeline import Segmented
 from lidar_perception.reproduction.labelled import Labelled, nearest_seed
-from lidar_perception.reproduction.variants import NOTHING, Found, found_with, seed_of, study
+from lidar_perception.reproduction.variants import (
+    NOTHING,
+    Found,
+    clusters_as_tall,
+    found_with,
+    seed_of,
+    study,
+    with_copies,
+)
 from lidar_perception.types import InputError
 
 SPREAD = with_values(PAPER, {"stm.spread": True, "stm.dilations": 0, "cpa.steps": 0})
@@ -64,12 +70,10 @@ def find(labelled: Labelled, segments: Callable[[PipelineParams], Segmented]
         seed = nearest_seed(segmented, labelled)
     except InputError:
         return found | dict.fromkeys((THINNED, KERNEL), NOTHING)
-    kept = np.flatnonzero(height_matches(segmented.boxes, seed.height, PAPER.height))
-    boxes = segmented.boxes[kept]
-    points, start = group_points(segmented.xyz, segmented.cluster_ids, kept + 1)
+    boxes, points, start = clusters_as_tall(segmented, [seed], PAPER)
     ranges = np.hypot(boxes[:, 0], boxes[:, 1])
     scales = cpa_scales(ranges, PAPER.cpa)
-    images = silhouettes(points, start, scales)
+    images = with_copies(boxes, points, start, PAPER)
     own = np.hypot(*seed.xyz[:, :2].mean(axis=0))
     alike = np.zeros((2, len(boxes)))
     for k, r in enumerate(ranges):

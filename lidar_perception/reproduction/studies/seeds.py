@@ -8,17 +8,23 @@ from collections.abc import Callable
 
 import numpy as np
 
-from lidar_perception.candidates.boxes import height_matches
-from lidar_perception.candidates.refine import group_points
 from lidar_perception.candidates.seeds import MIN_POINTS, Seed, seed_from_click, seed_from_points
-from lidar_perception.candidates.silhouette import cpa_scales, silhouettes, similarity
+from lidar_perception.candidates.silhouette import similarity
 from lidar_perception.configurations import BEST, PAPER
 from lidar_perception.geometry import points_in_box
 from lidar_perception.params import PipelineParams, flatten, with_values
 from lidar_perception.pipeline import Segmented
 from lidar_perception.reproduction.labelled import Labelled, nearest_seed
 from lidar_perception.reproduction.studies.bank import FRONT, SIDE, template_bank
-from lidar_perception.reproduction.variants import NOTHING, Found, found_with, seed_of, study
+from lidar_perception.reproduction.variants import (
+    NOTHING,
+    Found,
+    clusters_as_tall,
+    found_with,
+    seed_of,
+    study,
+    with_copies,
+)
 from lidar_perception.types import InputError
 
 NEAR = 20.0         # metres; who clicks picks somebody near
@@ -77,12 +83,8 @@ def _found_with_several(segmented: Segmented, seeds: list[Seed], params: Pipelin
     of any of them."""
     if not seeds:
         return NOTHING
-    tall = [height_matches(segmented.boxes, seed.height, params.height) for seed in seeds]
-    kept = np.flatnonzero(np.any(tall, axis=0))
-    boxes = segmented.boxes[kept]
-    points, start = group_points(segmented.xyz, segmented.cluster_ids, kept + 1)
-    scales = cpa_scales(np.hypot(boxes[:, 0], boxes[:, 1]), params.cpa)
-    images = silhouettes(points, start, scales, boxes[:, 2] - boxes[:, 5] / 2, params)
+    boxes, points, start = clusters_as_tall(segmented, seeds, params)
+    images = with_copies(boxes, points, start, params)
     alike = np.stack([similarity(images, seed.silhouette(params), params.stm) for seed in seeds])
     return Found(boxes, combine(alike), params.stm.threshold)
 
@@ -92,11 +94,8 @@ def _banked(segmented: Segmented, seed: Seed, params: PipelineParams, views: tup
     """Candidates by their likeness to the simulated pedestrian of their own range, seen from one
     of the views; the seed gives the height."""
     bank = template_bank()
-    kept = np.flatnonzero(height_matches(segmented.boxes, seed.height, params.height))
-    boxes = segmented.boxes[kept]
-    points, start = group_points(segmented.xyz, segmented.cluster_ids, kept + 1)
-    scales = cpa_scales(np.hypot(boxes[:, 0], boxes[:, 1]), params.cpa)
-    images = silhouettes(points, start, scales, boxes[:, 2] - boxes[:, 5] / 2, params)
+    boxes, points, start = clusters_as_tall(segmented, [seed], params)
+    images = with_copies(boxes, points, start, params)
     ranges = np.array(sorted({r for r, _ in bank}))
     nearest = np.abs(np.hypot(boxes[:, 0], boxes[:, 1])[:, None] - ranges).argmin(axis=1)
     alike = np.zeros(len(boxes))
