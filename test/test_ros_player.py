@@ -81,18 +81,18 @@ def test_a_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
 
 def test_pause_step_resume_and_rate(processes, peer, text_bag):
     heard = peer.listen("/text", TEXT)
-    start(processes, text_bag, start_paused=True)
+    start(processes, text_bag, start_paused=True, rate=0.02)  # 85 s for what is left to the end
     request = Trigger.Request()
     for expected in (["0"], ["0", "1"], ["0", "1", "2"]):
         assert peer.call("/bag_player/step", Trigger, request).success
         peer.wait(lambda n=len(expected): len(heard) >= n, "the stepped message")
         assert texts(heard) == expected
-    rate = Parameter(name="rate", value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE,
-                                                       double_value=50.0))
-    set_rate = SetParameters.Request(parameters=[rate])
-    assert peer.call("/bag_player/set_parameters", SetParameters, set_rate).results[0].successful
     assert peer.call("/bag_player/resume", Trigger, request).success
     assert not peer.call("/bag_player/step", Trigger, request).success  # only while paused
+    rate = Parameter(name="rate", value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE,
+                                                       double_value=5.0))
+    set_rate = SetParameters.Request(parameters=[rate])
+    assert peer.call("/bag_player/set_parameters", SetParameters, set_rate).results[0].successful
     peer.wait(lambda: len(heard) == 20, "the rest")
     assert texts(heard) == [str(i) for i in range(20)]
 
