@@ -25,15 +25,27 @@ WRITES_LONG = ("from time import sleep\nawake.wait(); stop.closing(); sleep(7)\n
 ENDS_BY_ITSELF = "stop.closing(); stop.closed(2); hang()"
 
 
-@pytest.mark.parametrize("rest, code, output", [
-    (WORK_HANGS, 0, ""), (TEARDOWN_HANGS, 3, ""), (WRITES_LONG, 0, "written\n"),
-    (ENDS_BY_ITSELF, 2, "")])
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_ends_whatever_hangs(rest, code, output, number):
-    with subprocess.Popen([sys.executable, "-c", PROGRAM.format(rest=rest)], text=True,
-                          stdout=subprocess.PIPE) as process:
+CASES = {"work": (WORK_HANGS, 0, ""), "teardown": (TEARDOWN_HANGS, 3, ""),
+         "writing": (WRITES_LONG, 0, "written\n"), "by itself": (ENDS_BY_ITSELF, 2, "")}
+NUMBERS = (signal.SIGINT, signal.SIGTERM)
+
+
+@pytest.fixture(scope="module")
+def ended():
+    """(case, signal) -> exit code and what it wrote; all at once, as some take seconds."""
+    running = {(name, number): subprocess.Popen([sys.executable, "-c", PROGRAM.format(rest=rest)],
+                                                text=True, stdout=subprocess.PIPE)
+               for name, (rest, _, _) in CASES.items() for number in NUMBERS}
+    for (name, number), process in running.items():
         assert process.stdout.readline() == "ready\n"
-        if rest != ENDS_BY_ITSELF:
+        if name != "by itself":
             process.send_signal(number)
-        assert process.stdout.read() == output
-        assert process.wait(timeout=20) == code
+    return {key: (process.communicate(timeout=30)[0], process.returncode)
+            for key, process in running.items()}
+
+
+@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize("number", NUMBERS)
+def test_ends_whatever_hangs(ended, name, number):
+    _, code, output = CASES[name]
+    assert ended[name, number] == (output, code)

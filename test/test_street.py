@@ -15,7 +15,7 @@ from lidar_perception.simulation.terrain import surface_height
 from lidar_perception.types import CLASSES, InputError
 
 SEEDS = range(5)
-EVERY = [(kind, seed) for kind in KINDS for seed in SEEDS]
+EVERY = [(kind, seed) for kind in KINDS for seed in SEEDS[:3]]
 HEIGHT = 1.73
 SITTING, CAR, PEDESTRIAN, CYCLIST = (
     CLASSES.index(name) for name in ("Person_sitting", "Car", "Pedestrian", "Cyclist"))
