@@ -91,9 +91,15 @@ def score(found: Found, truth: np.ndarray) -> dict[str, list]:
                       found.threshold)
     accepted = found.accepted
     counts = counts_by_range(accepted, truth, match_centres(accepted, truth))
-    hits = np.isin(np.arange(len(found.boxes)), match_centres(found.boxes, truth)[0])
     return {**{name: count.tolist() for name, count in zip(COUNTS, counts)},
-            "ranked": [[round(float(s), 4), int(h)] for s, h in zip(found.scores, hits)]}
+            "ranked": ranked(found.boxes, found.scores, truth)}
+
+
+def ranked(boxes: np.ndarray, scores: np.ndarray, truth: np.ndarray) -> list[list[float]]:
+    """[score, 1 hit | 0] of each of the boxes (K, 7), matched with true ones (M, 7) before the
+    scores are looked at: each pedestrian has at most one hit."""
+    hits = np.isin(np.arange(len(boxes)), match_centres(boxes, truth)[0])
+    return [[round(float(s), 4), int(h)] for s, h in zip(scores, hits)]
 
 
 def segments_of(labelled: Labelled) -> Callable[[PipelineParams], Segmented]:

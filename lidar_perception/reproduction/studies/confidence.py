@@ -11,7 +11,6 @@ from lidar_perception.candidates.confidence import confidence, shape_features
 from lidar_perception.candidates.refine import group_points
 from lidar_perception.configurations import BEST, PAPER
 from lidar_perception.datasets.kitti import KittiFrame
-from lidar_perception.evaluation.matching import match_centres
 from lidar_perception.params import flatten, with_values
 from lidar_perception.pipeline import refined
 from lidar_perception.reproduction.experiment import (
@@ -26,7 +25,7 @@ from lidar_perception.reproduction.experiment import (
 from lidar_perception.reproduction.labelled import load_labelled, nearest_seed
 from lidar_perception.reproduction.params import BootstrapParams
 from lidar_perception.reproduction.statistics import cells
-from lidar_perception.reproduction.variants import ANY_SCORE, segments_of
+from lidar_perception.reproduction.variants import ANY_SCORE, ranked, segments_of
 from lidar_perception.types import Detections, InputError
 
 SCORES = {
@@ -50,17 +49,12 @@ def measure(frames: list[KittiFrame], number: int) -> dict[str, Any]:
             found = refined(segments(params), lambda s: nearest_seed(s, labelled), params).final
         except InputError:
             found = Detections.none()
-        scored[name] = _pairs(found.boxes, found.scores, truth)
+        scored[name] = ranked(found.boxes, found.scores, truth)
     s = segments(BEST)
     everything = np.arange(1, len(s.boxes) + 1)
     shape = shape_features(*group_points(s.xyz, s.cluster_ids, everything), s.boxes, BEST)
-    scored[SHAPE] = _pairs(s.boxes, confidence(shape), truth)
+    scored[SHAPE] = ranked(s.boxes, confidence(shape), truth)
     return {"frame": frames[number].name, "pedestrians": len(truth), "scored": scored}
-
-
-def _pairs(boxes: np.ndarray, scores: np.ndarray, truth: np.ndarray) -> list[list[float]]:
-    hits = np.isin(np.arange(len(boxes)), match_centres(boxes, truth)[0])
-    return [[round(float(s), 4), int(h)] for s, h in zip(scores, hits)]
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
