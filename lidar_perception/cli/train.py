@@ -39,7 +39,7 @@ def train() -> None:
               help="Folder for best.safetensors, last.safetensors, logs and the state.")
 @click.option("--resume", is_flag=True, help="Go on with the run in --out, if there is one.")
 @click.option("--init", type=click.Path(path_type=Path), metavar="FILE",
-              help="Begin with the weights of this checkpoint.")
+              help="Begin with the weights of this checkpoint, as far as they fit.")
 @click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N.")
 @click.option("--jobs", type=click.IntRange(0), default=2, show_default=True,
               help="Processes that prepare scenes; 0: none but this one. The result is the same.")
@@ -66,7 +66,12 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
     from lidar_perception.training.database import cut_objects
     from lidar_perception.training.loop import may_begin
     from lidar_perception.training.loop import train as run
-    from lidar_perception.training.pointpillars import JudgedScenes, Preparation, make_task
+    from lidar_perception.training.pointpillars import (
+        JudgedScenes,
+        Preparation,
+        make_task,
+        narrowed,
+    )
     from lidar_perception.training.ranks import joined, rank, wait, world
     may_begin(out, resume)
     config = network_config(params.version, params.size)
@@ -81,7 +86,8 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
                 scenes = RawScenes(raw).some(params.data.database_scans, jobs)
                 cut_objects(scenes, config.classes, params.data.least_points).save(database)
             wait()
-        stream = Stream(sources, Preparation(config, params.augment, params.data.least_points,
+        seen = narrowed(config, params.ahead, params.aside)
+        stream = Stream(sources, Preparation(seen, params.augment, params.data.least_points,
                                              database), params.seed)
         batches = Batches(stream, params.batch, jobs, rank(), world())
         about = {"data": list(data), "scenes": len(stream), "validation": list(val) or "held out",
@@ -133,20 +139,22 @@ def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | N
         if folder not in folders or val_split is None:
             judge_on.append(KittiScenes(folder, kitti_names(folder, val_split), settings.view))
     if SIM in data:
-        train_on.append(_streets(FIRST_STREET, settings.scans, settings.people, settings))
+        train_on.append(_streets(FIRST_STREET, settings.scans, settings.people, settings,
+                                 settings.street_scans))
     if SIM in (val or data):
         judge_on.append(_streets(FIRST_VALIDATION_STREET, settings.val_scans, settings.val_people,
                                  settings))
     return tuple(train_on), tuple(judge_on)
 
 
-def _streets(first: int, scans: int, people: float, settings: DataParams):
+def _streets(first: int, scans: int, people: float, settings: DataParams, per_street: int = 1):
     from lidar_perception.simulation.scene import Streets
     from lidar_perception.simulation.sensor import sensor_named
     from lidar_perception.training.scenes import SimulatedScenes
     sensor_named(settings.sensor)  # InputError here, not in a worker
     return SimulatedScenes(first, scans, settings.sensor, Streets(people=people),
-                           Path(settings.cache) if settings.cache else None, settings.cache_gb)
+                           Path(settings.cache) if settings.cache else None, settings.cache_gb,
+                           per_street)
 
 
 def commit() -> str:

@@ -91,6 +91,33 @@ def load_network(path: str | Path,
     return header, network
 
 
+def adopt(network: PointPillars, path: str | Path) -> tuple[int, int]:
+    """Begin with the weights of a checkpoint of any version, size and classes: each layer of the
+    same name and shape is taken, of a convolution with other inputs those that both have (new ones
+    begin at 0); the rest stays as it is. How many tensors were taken, and of how many. InputError
+    as load_network, and where nothing fits."""
+    _, tensors = _read(Path(path), weights=True)
+    state = network.state_dict()
+    taken = 0
+    for name, value in state.items():
+        found = tensors.get(name)
+        if found is None or found.ndim != value.ndim:
+            continue
+        if found.shape == value.shape:
+            value.copy_(found)
+        elif value.ndim == 4 and found.shape[0] == value.shape[0] and (
+                found.shape[2:] == value.shape[2:]):
+            common = min(found.shape[1], value.shape[1])
+            value.zero_()
+            value[:, :common] = found[:, :common]
+        else:
+            continue
+        taken += 1
+    if not taken:
+        raise InputError(f"no layer of {path} fits the network that is to be trained")
+    return taken, len(state)
+
+
 def _read(path: Path, weights: bool = False) -> tuple[Header, dict[str, torch.Tensor]]:
     if not path.is_file():
         raise InputError(f"there is no checkpoint {path}")

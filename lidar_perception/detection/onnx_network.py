@@ -28,13 +28,13 @@ OUTPUTS = ["logits", "codes", "directions"]
 class OneCloud(nn.Module):
     """The network for one cloud, with tensors only."""
 
-    def __init__(self, network: PointPillars):
+    def __init__(self, network: PointPillars, grid: tuple[int, int]):
         super().__init__()
-        self.network = network
+        self.network, self.grid = network, grid
 
     def forward(self, points: Tensor, offsets: Tensor, cells: Tensor,
                 cluster_map: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
-        return tuple(self.network(Pillars(points, offsets, cells, 1), cluster_map))
+        return tuple(self.network(Pillars(points, offsets, cells, 1, self.grid), cluster_map))
 
 
 def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None:
@@ -59,8 +59,8 @@ def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            OneCloud(fused(network)).eval(), tuple(inputs.values()), dynamo=True, verbose=False,
-            opset_version=OPSET, input_names=list(inputs), output_names=OUTPUTS,
+            OneCloud(fused(network), config.grid).eval(), tuple(inputs.values()), dynamo=True,
+            verbose=False, opset_version=OPSET, input_names=list(inputs), output_names=OUTPUTS,
             dynamic_shapes=free)
     model = program.model_proto
     onnx.helper.set_model_props(model, {KEY: header.text()})

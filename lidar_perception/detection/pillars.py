@@ -17,13 +17,14 @@ class Pillars(NamedTuple):
     points (N, 4 or 5) float32 [x y z intensity (id)], offsets (N, 5 or 6) float32
     [x_c y_c z_c x_p y_p (z_p)], metres: from the mean of the pillar's points and from its middle
     (Lang et al., Section 2.1).
-    cells (N,) int64 into B * H * W, row by row, rows along y. Clouds may be empty.
+    cells (N,) int64 into B * H * W, row by row, rows along y; grid is (H, W). Clouds may be empty.
     """
 
     points: Tensor
     offsets: Tensor
     cells: Tensor
     batch: int
+    grid: tuple[int, int]
 
 
 def make_pillars(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillars:
@@ -52,7 +53,7 @@ def make_pillars(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillars:
     sums = counted.new_zeros(len(clouds) * height * width, 4).index_add_(0, cells, counted)[cells]
     offsets = torch.cat([middle - sums[:, :3] / sums[:, 3:],
                          middle[:, :config.offset_columns - 3]], dim=1)
-    return Pillars(points, offsets, cells, len(clouds))
+    return Pillars(points, offsets, cells, len(clouds), config.grid)
 
 
 def first_of_each(cells: Tensor, count: int) -> Tensor:

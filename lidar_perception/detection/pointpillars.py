@@ -63,7 +63,7 @@ class PillarNet(nn.Module):
             points = torch.cat([points[:, :4], points[:, 4:] * self.config.id_scale], dim=1)
         inputs = torch.cat([points, pillars.offsets], dim=1)       # (N, 9 to 11)
         values = functional.relu(self.norm(self.linear(inputs)))   # (N, C)
-        height, width = self.config.grid
+        height, width = pillars.grid
         count = pillars.batch * height * width
         image = values.new_zeros(count, values.shape[1])           # (B * H * W, C), empty is 0
         if self.config.zero_row:

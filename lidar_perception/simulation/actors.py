@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numba import njit
 
 from lidar_perception.simulation.shapes.thing import Thing, rigid
 from lidar_perception.simulation.solids import extents
@@ -64,26 +65,51 @@ def meet(one: np.ndarray, many: np.ndarray, seconds: float, gap: float = 0.0) ->
     """(M,) bool: whether footprint one (8,) comes within gap metres of each of many (M, 8) at any
     time in 0 .. seconds. Exact for gap 0: convex shapes that slide along straight lines touch
     while their shadows on the normals of all sides do."""
-    one = np.broadcast_to(one, many.shape)
-    times = np.sort(np.clip(np.concatenate(
-        [one[:, START:], many[:, START:], np.tile([0.0, seconds], (len(many), 1))], axis=1),
-        0.0, seconds), axis=1)
-    apart = centres(many, times) - centres(one, times)  # (M, 6, 2), straight in between
-    angles = np.stack([f[:, HEADING] + turn for f in (one, many) for turn in (0.0, np.pi / 2)], 1)
-    normals = np.stack([np.cos(angles), np.sin(angles)], axis=-1)  # (M, 4, 2)
-    reach = gap + sum(
-        f[:, None, half] * np.abs(np.cos(angles - f[:, None, HEADING] - turn))
-        for f in (one, many) for half, turn in ((LENGTH, 0.0), (WIDTH, np.pi / 2)))
-    shadow = np.einsum("mtd,mnd->mnt", apart, normals)
-    near, change = shadow[..., :-1], np.diff(shadow, axis=-1)
-    still = np.abs(change) < 1e-9
-    slope = np.where(still, 1.0, change)
-    ends = np.stack([(-reach[..., None] - near) / slope, (reach[..., None] - near) / slope])
-    inside = np.abs(near) <= reach[..., None]
-    enter = np.where(still, np.where(inside, 0.0, 2.0), ends.min(axis=0))
-    leave = np.where(still, np.where(inside, 1.0, -1.0), ends.max(axis=0))
-    first, last = enter.max(axis=1), leave.min(axis=1)  # (M, 5), shares of each straight piece
-    return (np.maximum(first, 0.0) <= np.minimum(last, 1.0)).any(axis=1)
+    return _meet(np.ascontiguousarray(one), np.ascontiguousarray(many), seconds, gap)
+
+
+@njit(cache=True, nogil=True)
+def _meet(one, many, seconds, gap):
+    met = np.zeros(len(many), np.bool_)
+    times = np.empty(6)
+    for m in range(len(many)):
+        other = many[m]
+        times[:] = (one[START], one[STOP], other[START], other[STOP], 0.0, seconds)
+        for i in range(6):
+            times[i] = min(max(times[i], 0.0), seconds)
+        times.sort()
+        for i in range(5):  # straight in between
+            x, y = _apart(one, other, times[i])
+            next_x, next_y = _apart(one, other, times[i + 1])
+            enter, leave = 0.0, 1.0  # shares of this piece
+            for side in range(4):
+                angle = (one if side < 2 else other)[HEADING] + side % 2 * np.pi / 2
+                cos, sin = np.cos(angle), np.sin(angle)
+                reach = gap
+                for f in (one, other):
+                    turned = angle - f[HEADING]
+                    reach += f[LENGTH] * abs(np.cos(turned)) + f[WIDTH] * abs(np.sin(turned))
+                near = x * cos + y * sin
+                change = (next_x - x) * cos + (next_y - y) * sin
+                if abs(change) >= 1e-9:
+                    one_end, other_end = (-reach - near) / change, (reach - near) / change
+                    enter = max(enter, min(one_end, other_end))
+                    leave = min(leave, max(one_end, other_end))
+                elif abs(near) > reach:
+                    enter = 2.0
+            met[m] |= enter <= leave
+    return met
+
+
+@njit(cache=True, nogil=True)
+def _apart(one, other, t):
+    """From the centre of one to that of the other at time t."""
+    way = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
+    other_way = other[SPEED] * min(max(t - other[START], 0.0), other[STOP] - other[START])
+    return (other[X] + np.cos(other[HEADING]) * other_way
+            - one[X] - np.cos(one[HEADING]) * way,
+            other[Y] + np.sin(other[HEADING]) * other_way
+            - one[Y] - np.sin(one[HEADING]) * way)
 
 
 class Room:

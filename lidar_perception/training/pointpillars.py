@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from lidar_perception import __version__
 from lidar_perception.detection.anchors import make_anchors
-from lidar_perception.detection.checkpoint import Header, load_network, save_checkpoint
+from lidar_perception.detection.checkpoint import Header, adopt, save_checkpoint
 from lidar_perception.detection.config import NetworkConfig
 from lidar_perception.detection.detector import Detector, TorchNetwork
 from lidar_perception.detection.detector_params import DetectorParams
@@ -26,6 +26,7 @@ from lidar_perception.detection.targets import (
     BACKGROUND,
     IGNORED,
     Targets,
+    anchors_near,
     assign,
     nearest_axis_iou,
     stacked,
@@ -35,6 +36,7 @@ from lidar_perception.evaluation.detection import DetectionReport
 from lidar_perception.evaluation.kitti_protocol import NEIGHBOURS
 from lidar_perception.geometry import points_in_box
 from lidar_perception.param_fields import flatten, with_values
+from lidar_perception.terminal import errors
 from lidar_perception.training.augment import Scene, augmented
 from lidar_perception.training.data import Batches, Item, loaded
 from lidar_perception.training.database import Database, with_objects
@@ -107,6 +109,23 @@ class Preparation:
         return self.config.classes.index(name) if name in self.config.classes else -1
 
 
+def narrowed(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig:
+    """The config with a range that ends so far ahead and to each side, metres, made longer to whole
+    cells of the coarsest map, and at most as far as before; 0 leaves it."""
+    step = config.cell * np.prod(config.block_strides)
+
+    def whole(length: float) -> float:
+        return float(np.ceil(round(length / step, 6)) * step)
+
+    x, y = whole(ahead), whole(aside)
+    low, high = list(config.low), list(config.high)
+    if ahead:
+        high[0] = min(high[0], low[0] + x)
+    if aside:
+        low[1], high[1] = max(low[1], -y), min(high[1], y)
+    return replace(config, low=tuple(low), high=tuple(high))
+
+
 def targets_of(sample: Sample, anchors: Tensor, config: NetworkConfig) -> Targets:
     """The targets of one sample. Anchors on objects that are not counted are neither object nor
     background."""
@@ -115,12 +134,10 @@ def targets_of(sample: Sample, anchors: Tensor, config: NetworkConfig) -> Target
     counted = torch.from_numpy(sample.counted).to(anchors.device)
     targets = assign(anchors, config, boxes[counted], labels[counted])
     found = targets.labels[0]
-    kinds = torch.arange(len(anchors), device=anchors.device).view(-1, len(config.anchors),
-                                                                   len(config.yaws))
     for index, spec in enumerate(config.anchors):
         others = boxes[~counted & (labels == index)]
-        if len(others):
-            mine = kinds[:, index].reshape(-1)
+        mine = anchors_near(anchors, config, others, index)
+        if len(mine):
             near = nearest_axis_iou(anchors[mine], others).max(dim=1).values >= spec.unmatched
             near &= found[mine] == BACKGROUND
             found[mine[near]] = IGNORED
@@ -194,10 +211,15 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
               validation: JudgedScenes, out: Path, device: torch.device, about: dict[str, Any],
               commit: str = "", init: Path | None = None) -> Task:
     """The task of training a network of a config. about: what the header says of the data; a
-    resumed run must have the same. init: checkpoint of the same config to begin with. Weights are
-    written to out/best.safetensors and out/last.safetensors."""
+    resumed run must have the same. init: checkpoint to begin with, see checkpoint.adopt. Weights
+    are written to out/best.safetensors and out/last.safetensors."""
     torch.manual_seed(params.seed)
-    network = make_network(config) if init is None else load_network(init, config)[1]
+    network = make_network(config)
+    if init is not None:
+        taken, count = adopt(network, init)
+        if taken < count:
+            errors.print(f"{taken} of {count} tensors are of {init}, the others begin at random",
+                         soft_wrap=True)
     network = network.to(device, memory_format=torch.channels_last)
 
     def validate(module: PointPillars) -> dict[str, float]:
@@ -215,5 +237,6 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
         save_checkpoint(out / f"{name}.safetensors", module,
                         Header(config, training, metrics, commit))
 
-    return Task(network, make_loss(config, device), batches, validate, keep, batches.epoch,
+    seen = narrowed(config, params.ahead, params.aside)
+    return Task(network, make_loss(seen, device), batches, validate, keep, batches.epoch,
                 about)

@@ -153,7 +153,9 @@ class Run:
 
 
 def _format(amp: str, device: torch.device) -> torch.dtype | None:
-    if device.type != "cuda" or amp == "off":
+    if device.type == "cpu":
+        return FORMATS["bf16"] if amp == "bf16" else None
+    if amp == "off":
         return None
     if amp == "auto":
         amp = "bf16" if torch.cuda.is_bf16_supported() else "fp16"

@@ -22,7 +22,7 @@ from lidar_perception.datasets.kitti import KittiFrame, open_kitti
 from lidar_perception.datasets.kitti_calibration import KittiCalibration
 from lidar_perception.files import write_bytes
 from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels, worth_a_label
-from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.drive import longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Streets
 from lidar_perception.simulation.sensor import Sensor, sensor_named
 from lidar_perception.training.augment import Scene
@@ -109,8 +109,9 @@ def random_split(names: tuple[str, ...], share: float,
 
 @dataclass(frozen=True)
 class SimulatedScenes:
-    """The first scan of each of the streets first .. first + count - 1. cache: folder for scans,
-    or None; from cache_gb on nothing is added to it."""
+    """count scans of the streets first, first + 1, ..., of each so many, spread over its drive. To
+    make a street takes longer than to scan it. cache: folder for scans, or None; from cache_gb on
+    nothing is added to it."""
 
     first: int
     count: int
@@ -118,9 +119,15 @@ class SimulatedScenes:
     streets: Streets = ANY
     cache: Path | None = None
     cache_gb: float = 20.0
+    per_street: int = 1
 
     def __len__(self) -> int:
         return self.count
+
+    def _at(self, i: int) -> tuple[int, int]:
+        """Street and frame of scan i."""
+        street, part = divmod(i, self.per_street)
+        return self.first + street, part * longest_drive(self._sensor) // self.per_street
 
     @cached_property
     def _sensor(self) -> Sensor:
@@ -135,7 +142,8 @@ class SimulatedScenes:
     def judged(self, i: int) -> Judged:
         """With the labels that KITTI would have: in the image of a camera that looks ahead."""
         frame, truth = self.scan(i)
-        return Judged(f"street {self.first + i}", frame, kitti_labels(truth), FORWARD_CAMERA)
+        street, part = self._at(i)
+        return Judged(f"street {street} frame {part}", frame, kitti_labels(truth), FORWARD_CAMERA)
 
     def scan(self, i: int) -> tuple[LidarFrame, GroundTruth]:
         """The frame and all its objects, from the cache if they are there."""
@@ -145,7 +153,7 @@ class SimulatedScenes:
                 return _read_scan(path)
             except (OSError, ValueError, KeyError, EOFError, BadZipFile):
                 path.unlink(missing_ok=True)  # it is made again
-        scan = scan_at(self.first + i, 0, self._sensor, self.streets)
+        scan = scan_at(*self._at(i), self._sensor, self.streets)
         if path is not None and _size(path.parent) < self.cache_gb * 1e9:
             _write_scan(path, scan.frame, scan.truth)
         return scan.frame, scan.truth
@@ -155,7 +163,8 @@ class SimulatedScenes:
             return None
         # One folder, so that its size is soon known; the name says all that the scan depends on.
         made = hashlib.sha1(repr((self._sensor, tuple(self.streets), __version__)).encode())
-        return self.cache / f"{made.hexdigest()[:12]}_{self.first + i:08}.npz"
+        street, part = self._at(i)
+        return self.cache / f"{made.hexdigest()[:12]}_{street:08}_{part:03}.npz"
 
 
 EXTRAS = ("track_id", "truncated", "occluded", "num_points", "visible")
