@@ -157,8 +157,9 @@ class EuclideanParams(Params):
     """Adaptive Euclidean clustering (paper C, Eq. 6 to 11)."""
 
     threshold: str = param("local", "global: one distance for the whole cloud (Eq. 6). local: one "
-                           "for each point, from its neighbours (Eq. 11).",
-                           choices=("global", "local"))
+                           "for each point, from its neighbours (Eq. 11). fixed: `distance`.",
+                           choices=("global", "local", "fixed"))
+    distance: float = param(0.5, "The threshold, if it is fixed.", unit="m", low=0.001, high=10.0)
     alpha: float = param(1.2, "Factor of the distance threshold (Eq. 6 and 11).",
                          low=0.01, high=100.0)
     beta: float = param(0.5, "MinPts = beta ln N: points within the threshold, itself included, "

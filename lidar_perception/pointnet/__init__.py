@@ -1,0 +1,1 @@
+"""Paper C's detector: clusters of a cloud, classified and boxed by an improved PointNet."""
