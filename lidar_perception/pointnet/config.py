@@ -52,11 +52,11 @@ class PointNetConfig:
     radii: tuple[float, ...] = (0.1, 0.2, 0.4)
     neighbours: tuple[int, ...] = (8, 12, 16)
     coarse_radius: float = 1.2
-    coarse_neighbours: int = 12
+    coarse_neighbours: int = 8
     point_channels: tuple[int, ...] = (32, 64)
-    group_channels: tuple[int, ...] = (32, 48)
+    group_channels: tuple[int, ...] = (32, 32)
     local_channels: int = 128
-    global_channels: int = 256
+    global_channels: int = 128
     head_channels: tuple[int, ...] = (256, 128)
     yaw_bins: int = 12
     sizes: tuple[tuple[float, ...], ...] = tuple(MEAN_SIZES.values())

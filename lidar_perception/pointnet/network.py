@@ -6,7 +6,9 @@
                  shallow features, skipped over (Eq. 16) ----------------+
 
 B clusters, N points, M centroids, k neighbours, C channels. A cluster with fewer than N points is
-filled up with its own, which `valid` is False for: they are nobody's neighbours.
+filled up with its own, which change no maximum; `valid` is False for them, so that they are nobody's
+neighbours. Of neighbours out of reach the nearest one, which is the centroid itself, takes the
+place.
 """
 
 from __future__ import annotations
@@ -50,11 +52,6 @@ def mlp(*channels: int) -> nn.Sequential:
     return nn.Sequential(*(LinearNormRelu(a, b) for a, b in zip(channels, channels[1:])))
 
 
-def largest(values: Tensor, valid: Tensor) -> Tensor:
-    """(..., C): the largest of values (..., n, C) >= 0 that are valid (..., n); 0 where none is."""
-    return (values * valid[..., None]).amax(dim=-2)
-
-
 def nearest(centres: Tensor, xyz: Tensor, valid: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """squared (B, M, k) rising, and places (B, M, k), of the nearest of xyz (B, N, 3) to each
     centre (B, M, 3), inf where no valid one is left; k = count."""
@@ -86,16 +83,15 @@ class LocalNet(nn.Module):
     def forward(self, points: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
         xyz, centres = points[..., :3], points[:, :count, :3]
         squared, places = nearest(centres, xyz, valid, max(k for _, k in self.groups))
-        near = taken(points, places)                                       # (B, M, k, 5)
-        around = near[..., :3] - centres[:, :, None]
         scales, density = [], []
         for (radius, k), net in zip(self.groups, self.nets):
             within = squared[..., :k] <= radius * radius                   # (B, M, k)
-            rows = torch.cat([around[..., :k, :] / radius, near[..., :k, 3:]], dim=-1)
-            scales.append(largest(net(rows), within))                      # (B, M, C)
+            near = taken(points, torch.where(within, places[..., :k], places[..., :1]))
+            around = (near[..., :3] - centres[:, :, None]) / radius        # (B, M, k, 3)
+            scales.append(net(torch.cat([around, near[..., 3:]], dim=-1)).amax(dim=2))
             density.append(within.sum(dim=-1) / (k * radius))
         weights = torch.stack(density, dim=-1)                             # (B, M, scales)
-        weights = weights / weights.sum(dim=-1, keepdim=True).clamp(min=1e-6) * len(self.groups)
+        weights = weights / weights.sum(dim=-1, keepdim=True) * len(self.groups)
         scales = [scale * weights[..., i:i + 1] for i, scale in enumerate(scales)]
         return self.join(torch.cat([*scales, features[:, :count]], dim=-1))  # (B, M, C)
 
@@ -111,9 +107,9 @@ class CoarseNet(nn.Module):
     def forward(self, xyz: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
         centres = xyz[:, :count]
         squared, places = nearest(centres, xyz, valid, self.neighbours)
-        around = taken(xyz, places) - centres[:, :, None]
-        rows = torch.cat([around / self.radius, taken(features, places)], dim=-1)
-        return largest(self.net(rows), squared <= self.radius**2)          # (B, M', C)
+        places = torch.where(squared <= self.radius**2, places, places[..., :1])
+        around = (taken(xyz, places) - centres[:, :, None]) / self.radius
+        return self.net(torch.cat([around, taken(features, places)], dim=-1)).amax(dim=2)
 
 
 class PointNet(nn.Module):
@@ -135,7 +131,7 @@ class PointNet(nn.Module):
             self.coarse = CoarseNet(local, wide, config.coarse_radius, config.coarse_neighbours)
             found += wide
         if config.mrg or not config.groups:
-            self.raw = mlp(shallow, local, wide)
+            self.raw = mlp(shallow, wide)
             found += wide
         if config.skip:
             found += shallow + (local if config.groups else 0)
@@ -149,21 +145,20 @@ class PointNet(nn.Module):
     def forward(self, points: Tensor, valid: Tensor, context: Tensor) -> Outputs:
         config = self.config
         features = self.points(points)                                     # (B, N, C)
-        found, shallow = [], [largest(features, valid)]
+        found, shallow = [], [features.amax(dim=1)]
+        # Where points lie densely grouped features say more, else those of single points (Eq. 17).
+        dense = valid.float().mean(dim=1, keepdim=True)                    # (B, 1)
         if self.local is not None:
             local = self.local(points, features, valid, config.centroids)  # (B, M, C)
-            real = valid[:, :config.centroids]
-            found.append(largest(self.fine(local), real))                  # (B, C)
-            shallow.append(largest(local, real))
+            found.append(self.fine(local).amax(dim=1))                     # (B, C)
+            shallow.append(local.amax(dim=1))
         if self.coarse is not None:
-            centroids = points[:, :config.centroids, :3]
+            centroids, real = points[:, :config.centroids, :3], valid[:, :config.centroids]
             coarse = self.coarse(centroids, local, real, config.coarse)    # (B, M', C)
-            # Where points lie densely the grouped features say more, else the raw ones (Eq. 17).
-            dense = valid.float().mean(dim=1, keepdim=True)                # (B, 1)
-            found.append(largest(coarse, valid[:, :config.coarse]) * (0.5 + dense))
+            found.append(coarse.amax(dim=1) * (0.5 + dense))
         if self.raw is not None:
-            raw = largest(self.raw(features), valid)
-            found.append(raw * (1.5 - dense) if self.coarse is not None else raw)
+            raw = self.raw(features).amax(dim=1)
+            found.append(raw * (1.5 - dense) if config.mrg else raw)
         if config.skip:
             found += shallow
         x = self.head(torch.cat([*found, context], dim=1))
