@@ -102,27 +102,27 @@ def counts(*arguments) -> tuple[list, list]:
 
 def test_what_is_held_out_is_not_trained_on(tmp_path):
     root = object_folder(tmp_path, count=5)
-    params = PointPillarsTraining(data=DataParams(scans=7, val_scans=2, val_share=0.4))
+    params = DataParams(scans=7, val_scans=2, val_share=0.4)
     folder = str(root)
-    (train_on, *_), (held, *_) = training_scenes((folder,), (), None, None, params)
+    (train_on, *_), (held, *_) = training_scenes((folder,), (), None, None, params, 0)
     assert (len(train_on), len(held)) == (3, 2) and not {*train_on.names} & {*held.names}
-    assert counts((folder, "sim"), (), None, None, params) == ([3, 7], [2, 2])
-    assert counts((folder,), ("sim",), None, None, params) == ([5], [2])
-    assert counts(("sim",), (folder,), None, None, params) == ([7], [5])
-    streets, = training_scenes(("sim",), (), None, None, params)[0]
-    others, = training_scenes(("sim",), (), None, None, params)[1]
+    assert counts((folder, "sim"), (), None, None, params, 0) == ([3, 7], [2, 2])
+    assert counts((folder,), ("sim",), None, None, params, 0) == ([5], [2])
+    assert counts(("sim",), (folder,), None, None, params, 0) == ([7], [5])
+    streets, = training_scenes(("sim",), (), None, None, params, 0)[0]
+    others, = training_scenes(("sim",), (), None, None, params, 0)[1]
     assert streets.first + streets.count <= others.first
     ours, theirs = write(tmp_path / "a", "000000\n000001\n"), write(tmp_path / "b", "000001\n")
-    (train_on,), (held,) = training_scenes((folder,), (folder,), ours, theirs, params)
+    (train_on,), (held,) = training_scenes((folder,), (folder,), ours, theirs, params, 0)
     assert (train_on.names, held.names) == (("000000",), ("000001",))
-    (train_on,), (held,) = training_scenes((folder,), (), None, theirs, params)
+    (train_on,), (held,) = training_scenes((folder,), (), None, theirs, params, 0)
     assert len(train_on) == 4 and held.names == ("000001",)
     with pytest.raises(InputError, match="--split"):
-        training_scenes(("sim",), (), ours, None, params)
+        training_scenes(("sim",), (), ours, None, params, 0)
     with pytest.raises(InputError, match="--val-split"):
-        training_scenes(("sim",), (), None, theirs, params)
+        training_scenes(("sim",), (), None, theirs, params, 0)
     with pytest.raises(InputError, match="no frame is left"):
-        training_scenes((folder,), (folder,), theirs, theirs, params)
+        training_scenes((folder,), (folder,), theirs, theirs, params, 0)
 
 
 @pytest.mark.parametrize("arguments, reason", [

@@ -4,18 +4,52 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Sized
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.terminal import console
-from lidar_perception.training.params import DataParams, PointPillarsTraining
+from lidar_perception.training.params import DataParams, PointNetTraining, PointPillarsTraining
 from lidar_perception.types import InputError
+
+if TYPE_CHECKING:
+    from lidar_perception.training.data import Batches
+    from lidar_perception.training.run import Progress
 
 SIM = "sim"
 FIRST_STREET, FIRST_VALIDATION_STREET = 10_000_000, 20_000_000  # far from what anybody else takes
+
+SCENES_AND_RUN = (
+    click.option("--data", multiple=True, required=True, metavar="DIR|sim",
+                 help="What to train on: a KITTI folder, or simulated streets; may be repeated to "
+                 "mix them."),
+    click.option("--val", multiple=True, metavar="DIR|sim",
+                 help="What to validate on. Default: frames held out of --data, and other "
+                 "simulated streets."),
+    click.option("--split", type=click.Path(path_type=Path), metavar="FILE",
+                 help="Train on the frames of the KITTI folder that are named in this file, one a "
+                 "line."),
+    click.option("--val-split", type=click.Path(path_type=Path), metavar="FILE",
+                 help="Likewise the frames to validate on."),
+    click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR",
+                 help="Folder for best.safetensors, last.safetensors, logs and the state."),
+    click.option("--resume", is_flag=True, help="Go on with the run in --out, if there is one."),
+    click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N."),
+    click.option("--jobs", type=click.IntRange(0), default=2, show_default=True,
+                 help="Processes that prepare scenes; 0: none but this one. The result is the "
+                 "same."),
+)
+
+
+def scene_options(command):
+    """What every network is told of its scenes and of the run."""
+    for option in reversed(SCENES_AND_RUN):
+        command = option(command)
+    return command
 
 
 @click.group()
@@ -24,29 +58,13 @@ def train() -> None:
 
 
 @train.command()
-@click.option("--data", multiple=True, required=True, metavar="DIR|sim",
-              help="What to train on: a KITTI folder, or simulated streets; may be repeated to mix "
-              "them.")
-@click.option("--val", multiple=True, metavar="DIR|sim",
-              help="What to validate on. Default: frames held out of --data, and other simulated "
-              "streets.")
-@click.option("--split", type=click.Path(path_type=Path), metavar="FILE",
-              help="Train on the frames of the KITTI folder that are named in this file, one a "
-              "line.")
-@click.option("--val-split", type=click.Path(path_type=Path), metavar="FILE",
-              help="Likewise the frames to validate on.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR",
-              help="Folder for best.safetensors, last.safetensors, logs and the state.")
-@click.option("--resume", is_flag=True, help="Go on with the run in --out, if there is one.")
+@scene_options
 @click.option("--init", type=click.Path(path_type=Path), metavar="FILE",
               help="Begin with the weights of this checkpoint, as far as they fit.")
-@click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N.")
-@click.option("--jobs", type=click.IntRange(0), default=2, show_default=True,
-              help="Processes that prepare scenes; 0: none but this one. The result is the same.")
 @parameter_options(PointPillarsTraining())
 def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
-                 val_split: Path | None, out: Path, resume: bool, init: Path | None, device: str,
-                 jobs: int, params: PointPillarsTraining) -> None:
+                 val_split: Path | None, out: Path, resume: bool, device: str, jobs: int,
+                 init: Path | None, params: PointPillarsTraining) -> None:
     """PointPillars and EG-PointPillars, on KITTI folders, simulated streets, or both.
 
     The best weights so far, by AP on what is validated on, lie in OUT/best.safetensors. Ctrl-C
@@ -75,28 +93,82 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
     from lidar_perception.training.ranks import joined, rank, wait, world
     may_begin(out, resume)
     config = network_config(params.version, params.size)
-    sources, held_out = training_scenes(data, val, split, val_split, params)
+    sources, held_out = training_scenes(data, val, split, val_split, params.data, params.seed)
     with joined(chosen_device(device)) as place:
         database = None
         counts = params.augment.cars, params.augment.pedestrians, params.augment.cyclists
-        if any(counts) and params.data.database_scans:
+        if any(counts) and params.augment.database_scans:
             database = out / "objects.npz"
             if rank() == 0 and not (resume and database.is_file()):
                 raw = Stream(sources, None, params.seed)
-                scenes = RawScenes(raw).some(params.data.database_scans, jobs)
+                scenes = RawScenes(raw).some(params.augment.database_scans, jobs)
                 cut_objects(scenes, config.classes, params.data.least_points).save(database)
             wait()
         seen = narrowed(config, params.ahead, params.aside)
         stream = Stream(sources, Preparation(seen, params.augment, params.data.least_points,
                                              database), params.seed)
         batches = Batches(stream, params.batch, jobs, rank(), world())
-        about = {"data": list(data), "scenes": len(stream), "validation": list(val) or "held out",
-                 "validation_scenes": sum(map(len, held_out)), "init": str(init or "")}
+        about = {**about_data(data, val, stream, held_out), "init": str(init or "")}
         task = make_task(config, params, batches, JudgedScenes(held_out), out, place, about,
                          commit(), init)
         progress = run(task, params, out, place, resume)
         if rank() > 0:
             return
+    tell(progress, batches, out)
+
+
+@train.command()
+@scene_options
+@parameter_options(PointNetTraining())
+def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
+             val_split: Path | None, out: Path, resume: bool, device: str, jobs: int,
+             params: PointNetTraining) -> None:
+    """The cluster network of paper C, on KITTI folders, simulated streets, or both.
+
+    Scenes are cut into clusters by the package's own ground and clustering; with --data-cache the
+    clusters are kept, too. The best weights so far lie in OUT/best.safetensors, their scores
+    calibrated on what is validated on.
+
+    \b
+    Examples:
+      lidar-perception train pointnet --data sim --data-cache scans --out pointnet
+      lidar-perception train pointnet --data /data/kitti/object --split train.txt \\
+          --val-split val.txt --epochs 20 --out pointnet --resume
+    """
+    from lidar_perception.detection.detector import chosen_device
+    from lidar_perception.pointnet.config import pointnet_config
+    from lidar_perception.training.cut_scenes import CutScenes
+    from lidar_perception.training.data import Batches, Stream
+    from lidar_perception.training.loop import may_begin
+    from lidar_perception.training.loop import train as run
+    from lidar_perception.training.pointnet import ClusterPreparation, JudgedCuts, make_task
+    from lidar_perception.training.ranks import joined, rank, world
+    may_begin(out, resume)
+    config = pointnet_config(params.network)
+    cache = Path(params.data.cache) / "clusters" if params.data.cache else None
+    sources, held_out = (
+        tuple(CutScenes(source, config, params.data.least_points, cache) for source in scenes)
+        for scenes in training_scenes(data, val, split, val_split, params.data, params.seed))
+    with joined(chosen_device(device)) as place:
+        stream = Stream(sources, ClusterPreparation(config, params.augment), params.seed)
+        batches = Batches(stream, params.batch, jobs, rank(), world())
+        task = make_task(config, params, batches, JudgedCuts(held_out), out, place,
+                         about_data(data, val, stream, held_out), commit())
+        progress = run(task, params, out, place, resume)
+        if rank() > 0:
+            return
+    tell(progress, batches, out)
+
+
+def about_data(data: tuple[str, ...], val: tuple[str, ...], stream: Sized,
+               held_out: tuple[Sized, ...]) -> dict[str, Any]:
+    """What a header says of the scenes."""
+    return {"data": list(data), "scenes": len(stream), "validation": list(val) or "held out",
+            "validation_scenes": sum(map(len, held_out))}
+
+
+def tell(progress: Progress, batches: Batches, out: Path) -> None:
+    """Say how a run ended; a stopped one ends the process."""
     if batches.skipped:
         console.print(f"{len(batches.skipped)} scenes could not be used, such as: "
                       f"{next(iter(batches.skipped))}", soft_wrap=True)
@@ -111,11 +183,11 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
 
 
 def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
-                    val_split: Path | None, params: PointPillarsTraining) -> tuple[tuple, tuple]:
+                    val_split: Path | None, settings: DataParams,
+                    seed: int) -> tuple[tuple, tuple]:
     """Sources to train on and to validate on. InputError for what is not there, or an option that
     would not be used."""
     from lidar_perception.training.scenes import KittiScenes, kitti_names, random_split
-    settings = params.data
     folders = [Path(name) for name in data if name != SIM]
     val_folders = [Path(name) for name in val if name != SIM] or ([] if val else folders)
     if split is not None and len(folders) != 1:
@@ -129,7 +201,7 @@ def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | N
             held = kitti_names(folder, val_split)
             names = tuple(name for name in names if name not in set(held))
         elif not val:
-            names, held = random_split(names, settings.val_share, params.seed)
+            names, held = random_split(names, settings.val_share, seed)
         if not names:
             raise InputError(f"{folder}: no frame is left to train on")
         train_on.append(KittiScenes(folder, names, settings.view))

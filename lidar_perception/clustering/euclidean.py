@@ -4,7 +4,8 @@ The equations are missing from the text of the paper; this is our reading of wha
 
 - Threshold d_i of point i. global: alpha times the mean distance of all N points to their nearest
   other point (Eq. 6). local: alpha times the mean distance to the other points within `radius`
-  (Eq. 11). 0 where there is none. fixed: `distance`, as in plain Euclidean clustering. Rounded to float32, so that no order of summation matters.
+  (Eq. 11). 0 where there is none. Rounded to float32, so that no order of summation matters.
+  fixed: `distance`, as in plain Euclidean clustering.
 - A point leads if beta ln N points (MinPts, Eq. 7) or more, itself included, lie within its d_i.
 - Two leaders within the threshold of one of them are linked (Eq. 8); clusters are the connected
   sets. Any other point follows the nearest leader whose threshold reaches it (of leaders equally

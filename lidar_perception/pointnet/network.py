@@ -6,14 +6,15 @@
                  shallow features, skipped over (Eq. 16) ----------------+
 
 B clusters, N points, M centroids, k neighbours, C channels. A cluster with fewer than N points is
-filled up with its own, which change no maximum; `valid` is False for them, so that they are nobody's
-neighbours. Of neighbours out of reach the nearest one, which is the centroid itself, takes the
-place.
+filled up with its own, which change no maximum; `valid` is False for them, so that they are
+nobody's neighbours. Of neighbours out of reach the nearest one, which is the centroid itself, takes
+the place.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -49,7 +50,7 @@ class LinearNormRelu(nn.Sequential):
 
 def mlp(*channels: int) -> nn.Sequential:
     """Layers from each width to the next."""
-    return nn.Sequential(*(LinearNormRelu(a, b) for a, b in zip(channels, channels[1:])))
+    return nn.Sequential(*(LinearNormRelu(a, b) for a, b in pairwise(channels)))
 
 
 def nearest(centres: Tensor, xyz: Tensor, valid: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -139,8 +140,9 @@ class PointNet(nn.Module):
         self.head = mlp(found + CONTEXT, *config.head_channels)
         self.classes = nn.Linear(config.head_channels[-1], kinds + 1)
         self.box = nn.Linear(config.head_channels[-1], 6 + 2 * bins)
-        # What calibration found: scores are softmax(logits / temperature).
+        # What calibration found: probabilities are softmax(logits / temperature + offsets).
         self.register_buffer("temperature", torch.ones(1))
+        self.register_buffer("offsets", torch.zeros(kinds + 1))
 
     def forward(self, points: Tensor, valid: Tensor, context: Tensor) -> Outputs:
         config = self.config
@@ -166,6 +168,11 @@ class PointNet(nn.Module):
         bins = config.yaw_bins
         return Outputs(self.classes(x), box[:, :3], box[:, 3:6], box[:, 6:6 + bins],
                        box[:, 6 + bins:])
+
+
+    def probabilities(self, logits: Tensor) -> Tensor:
+        """(B, K + 1), calibrated."""
+        return torch.softmax(logits.float() / self.temperature + self.offsets, dim=1)
 
 
 def make_pointnet(config: PointNetConfig) -> PointNet:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from lidar_perception.detection.detector_params import NmsParams
+from lidar_perception.detection.nms import suppressed
 from lidar_perception.pointnet.box_head import decode
-from lidar_perception.pointnet.clusters import Clusters, network_input
+from lidar_perception.pointnet.clusters import ClusterInput, Clusters, network_input
+from lidar_perception.pointnet.config import PointNetConfig
 from lidar_perception.pointnet.network import Outputs, PointNet
+from lidar_perception.types import CLASSES, Detections
 
 CHUNK = 256  # clusters at a time: bounds the memory, and the caches like it
 
@@ -30,23 +35,40 @@ class Predictions:
         return self.probabilities[np.arange(len(self.kinds)), self.kinds]
 
 
+def found(predictions: Predictions, config: PointNetConfig, least: Sequence[float],
+          nms: NmsParams = NmsParams()) -> Detections:
+    """The boxes whose score is at least `least` of their class, (C,), the best of those that
+    overlap."""
+    chosen = np.flatnonzero(predictions.scores >= np.asarray(least)[predictions.kinds])
+    chosen = chosen[np.argsort(-predictions.scores[chosen], kind="stable")][:nms.candidates]
+    boxes, scores = predictions.boxes[chosen], predictions.scores[chosen]
+    kinds = predictions.kinds[chosen]
+    kept = suppressed(boxes, scores, kinds, nms.iou, nms.across_classes)[:nms.max_boxes]
+    ids = np.array([CLASSES.index(name) for name in config.classes])
+    return Detections.of(boxes[kept], ids[kinds[kept]], scores[kept])
+
+
 @torch.inference_mode()
 def predict(network: PointNet, clusters: Clusters, seed: int = 0, chunk: int = CHUNK
             ) -> Predictions:
     """What the network, in eval mode, makes of each cluster. K may be 0."""
-    config, device = network.config, network.temperature.device
+    config, classes = network.config, len(network.config.classes)
+    if len(clusters) == 0:
+        return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64),
+                           np.zeros((0, 7), np.float32))
     inputs = network_input(clusters, config.points, seed)
-    parts = []
-    for begin in range(0, len(clusters), chunk):
+    outputs = outputs_of(network, inputs, chunk)
+    probabilities = network.probabilities(outputs.logits).cpu().numpy()
+    kinds = probabilities[:, :classes].argmax(axis=1)
+    return Predictions(probabilities, kinds, decode(outputs, inputs, config, kinds))
+
+
+@torch.inference_mode()
+def outputs_of(network: PointNet, inputs: ClusterInput, chunk: int = CHUNK) -> Outputs:
+    """The network's outputs for one cluster or more."""
+    device, parts = network.temperature.device, []
+    for begin in range(0, len(inputs.points), chunk):
         part = slice(begin, begin + chunk)
         parts.append(network(*(torch.from_numpy(x[part]).to(device) for x in
                                (inputs.points, inputs.valid, inputs.context))))
-    classes = len(config.classes)
-    if not parts:
-        return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64),
-                           np.zeros((0, 7), np.float32))
-    outputs = Outputs(*(torch.cat(column) for column in zip(*parts)))
-    probabilities = torch.softmax(outputs.logits.float() / network.temperature, dim=1)
-    probabilities = probabilities.cpu().numpy()
-    kinds = probabilities[:, :classes].argmax(axis=1)
-    return Predictions(probabilities, kinds, decode(outputs, inputs, config, kinds))
+    return Outputs(*(torch.cat(column) for column in zip(*parts)))

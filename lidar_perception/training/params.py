@@ -64,6 +64,8 @@ class AugmentParams(Params):
                       high=100)
     pedestrians: int = param(8, "Likewise pedestrians.", low=0, high=100)
     cyclists: int = param(8, "Likewise cyclists.", low=0, high=100)
+    database_scans: int = param(2000, "Those objects come from so many scenes, at most.", low=0,
+                                high=10**6)
     object_turn: float = param(0.157, "Each object is turned by up to this.", unit="rad", low=0.0,
                                high=3.1416)
     object_shift: float = param(0.25, "Each object is shifted along x and y; standard deviation.",
@@ -102,10 +104,8 @@ class DataParams(Params):
                              "seed, where neither --val nor --split is given.", low=0.0,
                              high=0.9)
     view: bool = param(True, "Use the points in KITTI's image only, as its labels end there.")
-    least_points: int = param(5, "An object with fewer points need not be found, nor missed.",
-                              low=1, high=1000)
-    database_scans: int = param(2000, "Objects to put into other scenes come from so many scenes, "
-                                "at most.", low=0, high=10**6)
+    least_points: int = param(5, "An object, or a cluster, with fewer points is not learned "
+                              "from.", low=1, high=1000)
 
 
 @dataclass(frozen=True)
@@ -124,4 +124,38 @@ class PointPillarsTraining(LoopParams):
                        "the overlaps 0.5 / 0.25 / 0.25, or map, the mean AP in space at 0.7 / 0.5 "
                        "/ 0.5; both moderate, R40.", choices=("bev", "map"))
     augment: AugmentParams = AugmentParams()
+    data: DataParams = DataParams()
+
+
+@dataclass(frozen=True)
+class ClusterAugmentParams(Params):
+    """Which clusters of a scene are learned from, and how they are changed. 0 switches a change
+    off."""
+
+    objects: int = param(24, "Clusters of each class taken of a scene, at most.", low=1, high=1000)
+    background: int = param(40, "Clusters of background, at most.", low=0, high=10_000)
+    box_shift: float = param(0.15, "Points around an object are cut at its box, moved by about "
+                             "this; standard deviation.", unit="m", low=0.0, high=2.0)
+    farther: float = param(1.5, "Some clusters are moved away, to up to 1 plus this times their "
+                           "range, and lose points as they would.", low=0.0, high=10.0)
+    dropout: float = param(0.9, "Of half the clusters up to this share of the points is left out.",
+                           low=0.0, high=0.99)
+    noise: float = param(0.03, "Points are moved by up to about this; standard deviation.",
+                         unit="m", low=0.0, high=1.0)
+    scale: float = param(0.05, "Clusters grow or shrink by up to this share.", low=0.0, high=0.5)
+    flip: float = param(0.5, "Chance that left and right are swapped.", low=0.0, high=1.0)
+    intensity: float = param(0.2, "Intensities are multiplied by 1 plus or minus up to this.",
+                             low=0.0, high=1.0)
+    height: float = param(0.15, "The sensor is raised or lowered by up to this.", unit="m",
+                          low=0.0, high=2.0)
+
+
+@dataclass(frozen=True)
+class PointNetTraining(LoopParams):
+    """Everything that train pointnet can be told."""
+
+    network: str = param("improved", "improved: paper C's. pointnet, pointnet2: plain PointNet and "
+                         "PointNet++ (single-scale grouping), to compare with.",
+                         choices=("improved", "pointnet", "pointnet2"))
+    augment: ClusterAugmentParams = ClusterAugmentParams()
     data: DataParams = DataParams()

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidar_perception import __version__
 from lidar_perception.detection.anchors import make_anchors
 from lidar_perception.detection.checkpoint import Header, adopt, save_checkpoint
 from lidar_perception.detection.config import NetworkConfig
@@ -35,12 +34,13 @@ from lidar_perception.detection.view import visible
 from lidar_perception.evaluation.detection import DetectionReport
 from lidar_perception.evaluation.kitti_protocol import NEIGHBOURS
 from lidar_perception.geometry import points_in_box
-from lidar_perception.param_fields import flatten, with_values
+from lidar_perception.param_fields import with_values
 from lidar_perception.terminal import errors
 from lidar_perception.training.augment import Scene, augmented
 from lidar_perception.training.data import Batches, Item, loaded
 from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
+from lidar_perception.training.record import metrics_of, record_of, rounded
 from lidar_perception.training.run import Task
 from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
 
@@ -193,20 +193,6 @@ def score_detector(detector: Callable[[LidarFrame], Detections], scenes: JudgedS
     return report
 
 
-def metrics_of(content: dict[str, Any], score: str, classes: Sequence[str]) -> dict[str, float]:
-    """score, the mean over the classes with objects, and each class's AP from above at the relaxed
-    overlaps and in space at the strict ones (moderate, R40); NaN without objects. content is that
-    of a DetectionReport."""
-    metrics: dict[str, float] = {}
-    for name in classes:
-        for row in "bev_relaxed", "3d":
-            value = content["ap"].get(name, {}).get(row, {}).get("moderate")
-            metrics[f"{name}_{row}"] = float("nan") if value is None else value["r40"]
-    row = "bev_relaxed" if score == "bev" else "3d"
-    known = [v for name in classes if not np.isnan(v := metrics[f"{name}_{row}"])]
-    return {"score": float(np.mean(known)) if known else 0.0, **metrics}
-
-
 def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batches,
               validation: JudgedScenes, out: Path, device: torch.device, about: dict[str, Any],
               commit: str = "", init: Path | None = None) -> Task:
@@ -228,14 +214,9 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
         return metrics_of(content, params.score, config.classes)
 
     def keep(name: str, module: PointPillars, record: dict[str, Any]) -> None:
-        training = {**about, "seed": params.seed, "steps": record["step"],
-                    "seconds": round(record["seconds"]), "steps_skipped": record["skipped"],
-                    "scenes_skipped": len(batches.skipped), "batch": params.batch * batches.world,
-                    "params": flatten(params), "version": __version__}
-        metrics = {key: None if np.isnan(value) else round(value, 3)
-                   for key, value in record.get("metrics", {}).items()}
-        save_checkpoint(out / f"{name}.safetensors", module,
-                        Header(config, training, metrics, commit))
+        header = Header(config, record_of(params, batches, record, about),
+                        rounded(record.get("metrics", {})), commit)
+        save_checkpoint(out / f"{name}.safetensors", module, header)
 
     seen = narrowed(config, params.ahead, params.aside)
     return Task(network, make_loss(seen, device), batches, validate, keep, batches.epoch,

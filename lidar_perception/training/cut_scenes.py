@@ -1,0 +1,141 @@
+"""Scenes to labelled clusters, cut by the package's own ground and clustering, with a cache.
+
+So a network sees the errors that it will see later: objects in pieces, objects merged, background.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from lidar_perception import __version__
+from lidar_perception.clustering.cluster import cluster
+from lidar_perception.files import write_bytes
+from lidar_perception.geometry import points_in_box
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.pointnet.clusters import Clusters, clusters_of
+from lidar_perception.pointnet.config import PointNetConfig
+from lidar_perception.training.augment import Scene, grown
+from lidar_perception.types import CLASSES, LidarFrame
+
+UNKNOWN = -1                     # a label of which nothing is to be learned
+SURE, UNSURE = 0.5, 0.15         # from this share of its points in a box on a cluster is an object,
+BORDER, AROUND = 0.05, 0.3       # below that one background; m: around boxes
+NEITHER = ("Van", "Person_sitting", "Tram", "Truck")  # look like a class, and are none
+
+
+@dataclass(frozen=True)
+class CutScene:
+    """K clusters with labels (K,) int64 into the config's classes, their number for background,
+    UNKNOWN for what is neither; boxes (K, 7) float64 of the objects, 0 where there is none.
+    loose (K,) bool: not made by clustering but all around an object that is not ground."""
+
+    clusters: Clusters
+    labels: np.ndarray
+    boxes: np.ndarray
+    loose: np.ndarray
+
+
+@dataclass(frozen=True)
+class CutScenes:
+    """scene(i): the clusters of a scene of `scenes`, as a network of the config is to see them, of
+    least_points or more. cache: folder for them, or None."""
+
+    scenes: Any
+    config: PointNetConfig
+    least_points: int = 5
+    cache: Path | None = None
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def judged(self, i: int) -> Any:
+        """The scan that it is cut from, with what evaluation needs."""
+        return self.scenes.judged(i)
+
+    def scene(self, i: int) -> CutScene:
+        """InputError naming the file that cannot be used."""
+        path = self._path(i)
+        if path is not None and path.is_file():
+            try:
+                return _read(path)
+            except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+                path.unlink(missing_ok=True)  # it is made again
+        made = cut(self.scenes.scene(i), self.config, self.least_points)
+        if path is not None:
+            _write(path, made)
+        return made
+
+    def _path(self, i: int) -> Path | None:
+        if self.cache is None:
+            return None
+        made = (self.scenes, self.config.ground, self.config.clustering, self.config.classes,
+                self.least_points, __version__)
+        return self.cache / f"{hashlib.sha1(repr(made).encode()).hexdigest()[:12]}_{i:08}.npz"
+
+
+def cut(scene: Scene, config: PointNetConfig, least_points: int) -> CutScene:
+    """The clusters of a scene, and after them the points around each object that is wanted."""
+    frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
+    obstacles = np.flatnonzero(~segment_ground(frame, config.ground))
+    rest = frame.take(obstacles)
+    clusters = clusters_of(rest, cluster(rest.xyz, config.clustering), least_points)
+    labels, owners = labelled(clusters, scene, config)
+    boxes = np.zeros((len(clusters), 7))
+    boxes[owners >= 0] = scene.boxes[owners[owners >= 0]]
+    ids, around = np.zeros(len(rest), np.int64), []
+    for i in np.flatnonzero(scene.wanted):
+        name = CLASSES[scene.class_ids[i]]
+        inside = points_in_box(rest.xyz, scene.boxes[i], AROUND) & (ids == 0)
+        if name in config.classes and inside.sum() >= least_points:
+            around.append(i)
+            ids[inside] = len(around)
+    loose = clusters_of(rest, ids)
+    kinds = [config.classes.index(CLASSES[scene.class_ids[i]]) for i in around]
+    both = Clusters(np.concatenate([clusters.points, loose.points]),
+                    np.concatenate([clusters.first, clusters.first[-1] + loose.first[1:]]),
+                    np.concatenate([clusters.ids, np.full(len(loose), -1)]))
+    return CutScene(both, np.concatenate([labels, np.array(kinds, np.int64)]),
+                    np.concatenate([boxes, scene.boxes[around].reshape(-1, 7)]),
+                    np.arange(len(both)) >= len(clusters))
+
+
+def labelled(clusters: Clusters, scene: Scene, config: PointNetConfig
+             ) -> tuple[np.ndarray, np.ndarray]:
+    """labels (K,) int64 of clusters, see CutScene, and owners (K,) int64: which box of the scene
+    each is of, -1 for none."""
+    number = np.repeat(np.arange(len(clusters)), clusters.sizes)
+    share, owners = np.zeros(len(clusters)), np.full(len(clusters), -1)
+    sizes = np.maximum(clusters.sizes, 1)
+    for i, box in enumerate(grown(scene.boxes, BORDER)):
+        inside = points_in_box(clusters.points[:, :3], box)
+        part = np.bincount(number[inside], minlength=len(clusters)) / sizes
+        more = part > share
+        share[more], owners[more] = part[more], i
+    names = [CLASSES[kind] for kind in scene.class_ids]
+    kinds = np.array([config.classes.index(name) if name in config.classes else
+                      UNKNOWN if name in NEITHER else len(config.classes) for name in names]
+                     + [len(config.classes)], np.int64)
+    labels = np.where(share >= SURE, kinds[owners], UNKNOWN)
+    labels[share < UNSURE] = len(config.classes)
+    owners[(labels == UNKNOWN) | (labels == len(config.classes))] = -1
+    return labels, owners
+
+
+def _write(path: Path, scene: CutScene) -> None:
+    content = io.BytesIO()
+    np.savez(content, **vars(scene.clusters), labels=scene.labels, boxes=scene.boxes,
+             loose=scene.loose)
+    write_bytes(path, content.getbuffer())
+
+
+def _read(path: Path) -> CutScene:
+    with np.load(path) as arrays:
+        return CutScene(Clusters(arrays["points"], arrays["first"], arrays["ids"]),
+                        arrays["labels"], arrays["boxes"], arrays["loose"])

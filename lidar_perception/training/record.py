@@ -1,0 +1,43 @@
+"""What is written about a training run, in a checkpoint and in the log."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from lidar_perception import __version__
+from lidar_perception.param_fields import flatten
+from lidar_perception.training.data import Batches
+from lidar_perception.training.params import LoopParams
+
+
+def record_of(params: LoopParams, batches: Batches, record: dict[str, Any],
+              about: dict[str, Any]) -> dict[str, Any]:
+    """What the header says of the training. record: what the loop gives keep; about: of the
+    data."""
+    return {**about, "seed": params.seed, "steps": record["step"],
+            "seconds": round(record["seconds"]), "steps_skipped": record["skipped"],
+            "scenes_skipped": len(batches.skipped), "batch": params.batch * batches.world,
+            "params": flatten(params), "version": __version__}
+
+
+def rounded(metrics: dict[str, float]) -> dict[str, float | None]:
+    """For JSON: NaN as None."""
+    return {key: None if math.isnan(value) else round(value, 3) for key, value in metrics.items()}
+
+
+def metrics_of(content: dict[str, Any], score: str, classes: Sequence[str]) -> dict[str, float]:
+    """score, the mean over the classes with objects, and each class's AP from above at the relaxed
+    overlaps and in space at the strict ones (moderate, R40); NaN without objects. content is that
+    of a DetectionReport."""
+    metrics: dict[str, float] = {}
+    for name in classes:
+        for row in "bev_relaxed", "3d":
+            value = content["ap"].get(name, {}).get(row, {}).get("moderate")
+            metrics[f"{name}_{row}"] = float("nan") if value is None else value["r40"]
+    row = "bev_relaxed" if score == "bev" else "3d"
+    known = [v for name in classes if not np.isnan(v := metrics[f"{name}_{row}"])]
+    return {"score": float(np.mean(known)) if known else 0.0, **metrics}
