@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from lidar_perception.cli.clusters import clusters
 from lidar_perception.cli.detection import detection
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.cli.segmentation import segmentation
@@ -87,5 +88,6 @@ def candidates(kitti: Path | None, bag: Path | None, json_file: Path | None, png
         console.print(f"picture: {png}")
 
 
+evaluate.add_command(clusters)
 evaluate.add_command(detection)
 evaluate.add_command(segmentation)

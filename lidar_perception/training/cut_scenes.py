@@ -16,25 +16,23 @@ import numpy as np
 
 from lidar_perception import __version__
 from lidar_perception.clustering.cluster import cluster
+from lidar_perception.evaluation.clusters import labelled
 from lidar_perception.files import write_bytes
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.pointnet.clusters import Clusters, clusters_of
 from lidar_perception.pointnet.config import PointNetConfig
-from lidar_perception.training.augment import Scene, grown
+from lidar_perception.training.augment import Scene
 from lidar_perception.types import CLASSES, LidarFrame
 
-UNKNOWN = -1                     # a label of which nothing is to be learned
-SURE, UNSURE = 0.5, 0.15         # from this share of its points in a box on a cluster is an object,
-BORDER, AROUND = 0.05, 0.3       # below that one background; m: around boxes
-NEITHER = ("Van", "Person_sitting", "Tram", "Truck")  # look like a class, and are none
+AROUND = 0.3  # m: points so near to an object are looked at, too
 
 
 @dataclass(frozen=True)
 class CutScene:
-    """K clusters with labels (K,) int64 into the config's classes, their number for background,
-    UNKNOWN for what is neither; boxes (K, 7) float64 of the objects, 0 where there is none.
-    loose (K,) bool: not made by clustering but all around an object that is not ground."""
+    """K clusters with labels (K,) int64 of evaluation.clusters.labelled; boxes (K, 7) float64 of
+    the objects, 0 where there is none. loose (K,) bool: not made by clustering but all around an
+    object that is not ground."""
 
     clusters: Clusters
     labels: np.ndarray
@@ -86,7 +84,7 @@ def cut(scene: Scene, config: PointNetConfig, least_points: int) -> CutScene:
     obstacles = np.flatnonzero(~segment_ground(frame, config.ground))
     rest = frame.take(obstacles)
     clusters = clusters_of(rest, cluster(rest.xyz, config.clustering), least_points)
-    labels, owners = labelled(clusters, scene, config)
+    labels, owners = labelled(clusters, scene.boxes, scene.class_ids, config.classes)
     boxes = np.zeros((len(clusters), 7))
     boxes[owners >= 0] = scene.boxes[owners[owners >= 0]]
     ids, around = np.zeros(len(rest), np.int64), []
@@ -104,28 +102,6 @@ def cut(scene: Scene, config: PointNetConfig, least_points: int) -> CutScene:
     return CutScene(both, np.concatenate([labels, np.array(kinds, np.int64)]),
                     np.concatenate([boxes, scene.boxes[around].reshape(-1, 7)]),
                     np.arange(len(both)) >= len(clusters))
-
-
-def labelled(clusters: Clusters, scene: Scene, config: PointNetConfig
-             ) -> tuple[np.ndarray, np.ndarray]:
-    """labels (K,) int64 of clusters, see CutScene, and owners (K,) int64: which box of the scene
-    each is of, -1 for none."""
-    number = np.repeat(np.arange(len(clusters)), clusters.sizes)
-    share, owners = np.zeros(len(clusters)), np.full(len(clusters), -1)
-    sizes = np.maximum(clusters.sizes, 1)
-    for i, box in enumerate(grown(scene.boxes, BORDER)):
-        inside = points_in_box(clusters.points[:, :3], box)
-        part = np.bincount(number[inside], minlength=len(clusters)) / sizes
-        more = part > share
-        share[more], owners[more] = part[more], i
-    names = [CLASSES[kind] for kind in scene.class_ids]
-    kinds = np.array([config.classes.index(name) if name in config.classes else
-                      UNKNOWN if name in NEITHER else len(config.classes) for name in names]
-                     + [len(config.classes)], np.int64)
-    labels = np.where(share >= SURE, kinds[owners], UNKNOWN)
-    labels[share < UNSURE] = len(config.classes)
-    owners[(labels == UNKNOWN) | (labels == len(config.classes))] = -1
-    return labels, owners
 
 
 def _write(path: Path, scene: CutScene) -> None:
