@@ -226,6 +226,7 @@ def test_no_source_is_longer_than_a_reader_can_hold(name):
     ("lidar_perception.cli.weights", "numba torch matplotlib scipy"),
     ("lidar_perception.evaluation.candidates", "torch matplotlib sklearn click"),
     ("lidar_perception.evaluation.detection", "torch matplotlib sklearn rich click"),
+    ("lidar_perception.evaluation.nuscenes", "torch matplotlib sklearn rich click rosbags"),
     ("lidar_perception.reproduction.stm_cpa", "torch matplotlib sklearn click jinja2 distributed"),
     ("lidar_perception.cli.reproduce", "numba torch matplotlib scipy sklearn jinja2 distributed"),
     ("lidar_perception.cli.main", "numba torch matplotlib scipy sklearn rosbags"),

@@ -9,6 +9,7 @@ import click
 
 from lidar_perception.cli.clusters import clusters
 from lidar_perception.cli.detection import detection
+from lidar_perception.cli.nuscenes import nuscenes
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.cli.segmentation import segmentation
 from lidar_perception.configurations import PAPER
@@ -90,4 +91,5 @@ def candidates(kitti: Path | None, bag: Path | None, json_file: Path | None, png
 
 evaluate.add_command(clusters)
 evaluate.add_command(detection)
+evaluate.add_command(nuscenes)
 evaluate.add_command(segmentation)

@@ -1,0 +1,124 @@
+"""Boxes as nuScenes has them: in the global frame, with a velocity and an attribute.
+
+Caesar et al., CVPR 2020. The global frame is that of a city's map: x east, y north, z up, metres.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+# The ten classes of the detection task.
+NAMES = ("car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle",
+         "bicycle", "traffic_cone", "barrier")
+# The labels' categories that belong to them; the others, such as animals, are of no class.
+CATEGORIES = {
+    "vehicle.car": "car", "vehicle.truck": "truck", "vehicle.bus.bendy": "bus",
+    "vehicle.bus.rigid": "bus", "vehicle.trailer": "trailer",
+    "vehicle.construction": "construction_vehicle", "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian", "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian", "vehicle.motorcycle": "motorcycle",
+    "vehicle.bicycle": "bicycle", "movable_object.trafficcone": "traffic_cone",
+    "movable_object.barrier": "barrier"}
+ATTRIBUTES = ("pedestrian.moving", "pedestrian.sitting_lying_down", "pedestrian.standing",
+              "cycle.with_rider", "cycle.without_rider", "vehicle.moving", "vehicle.parked",
+              "vehicle.stopped")
+WITH_RIDER = ATTRIBUTES.index("cycle.with_rider")
+
+
+@dataclass(frozen=True)
+class GlobalBoxes:
+    """K boxes in the global frame, float64 unless said otherwise.
+
+    centres (K, 3) metres; sizes (K, 3) [l w h]; rotations (K, 4) quaternions [w x y z]; kinds (K,)
+    int into NAMES, -1 = none of them; attributes (K,) int into ATTRIBUTES, -1 = none; velocities
+    (K, 2) m/s, NaN = not known; scores (K,), 0 for labels; points (K,) int returns of LiDAR and
+    radar inside, -1 = not counted, as in detections.
+    """
+
+    centres: np.ndarray
+    sizes: np.ndarray
+    rotations: np.ndarray
+    kinds: np.ndarray
+    attributes: np.ndarray
+    velocities: np.ndarray
+    scores: np.ndarray
+    points: np.ndarray
+
+    @staticmethod
+    def of(centres, sizes, rotations, kinds, attributes=-1, velocities=np.nan, scores=0.0,
+           points=-1) -> GlobalBoxes:
+        """Boxes with dtypes and shapes put right; the columns with a default may be scalars."""
+        centres = np.asarray(centres, np.float64).reshape(-1, 3)
+        count = len(centres)
+
+        def column(values, kind, *shape):
+            return np.broadcast_to(np.asarray(values, kind), (count, *shape)).copy()
+
+        return GlobalBoxes(centres, np.asarray(sizes, np.float64).reshape(count, 3),
+                           np.asarray(rotations, np.float64).reshape(count, 4),
+                           column(kinds, np.int32), column(attributes, np.int32),
+                           column(velocities, np.float64, 2), column(scores, np.float64),
+                           column(points, np.int32))
+
+    @staticmethod
+    def none() -> GlobalBoxes:
+        return GlobalBoxes.of((), (), (), ())
+
+    @staticmethod
+    def together(parts: list[GlobalBoxes]) -> GlobalBoxes:
+        """All boxes behind one another."""
+        parts = parts or [GlobalBoxes.none()]
+        return GlobalBoxes(*(np.concatenate([getattr(part, field.name) for part in parts])
+                             for field in dataclasses.fields(GlobalBoxes)))
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    def __getitem__(self, index) -> GlobalBoxes:
+        """The boxes under a mask, slice or index array."""
+        return GlobalBoxes(*(getattr(self, field.name)[index]
+                             for field in dataclasses.fields(self)))
+
+    @property
+    def yaws(self) -> np.ndarray:
+        """(K,) radians: where the boxes' lengths point, seen from above."""
+        forward = matrices(self.rotations)[:, :, 0]
+        return np.arctan2(forward[:, 1], forward[:, 0])
+
+
+def matrices(rotations: np.ndarray) -> np.ndarray:
+    """(K, 3, 3) of quaternions (K, 4) [w x y z] of any length but 0."""
+    if len(rotations) == 0:
+        return np.zeros((0, 3, 3))
+    return Rotation.from_quat(np.roll(rotations, -1, axis=-1)).as_matrix()
+
+
+def quaternions(rotations: np.ndarray) -> np.ndarray:
+    """(K, 4) [w x y z] of rotation matrices (K, 3, 3)."""
+    if len(rotations) == 0:
+        return np.zeros((0, 4))
+    return np.roll(Rotation.from_matrix(rotations).as_quat(), 1, axis=-1)
+
+
+def in_frame(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
+    """(K, 7) float64 [x y z l w h yaw] in the frame whose pose (4, 4) leads to the global one. A
+    box that leans in that frame, as the vehicle does on a slope, is set upright."""
+    turn, origin = pose[:3, :3], pose[:3, 3]
+    forward = matrices(boxes.rotations)[:, :, 0] @ turn
+    yaws = np.arctan2(forward[:, 1], forward[:, 0])
+    return np.column_stack([(boxes.centres - origin) @ turn, boxes.sizes, yaws])
+
+
+def in_global(boxes: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Centres (K, 3), sizes (K, 3) and rotations (K, 4) in the global frame of boxes (K, 7); the
+    other way round of in_frame."""
+    boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
+    yaw, zero = boxes[:, 6], np.zeros(len(boxes))
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    upright = np.stack([cos, -sin, zero, sin, cos, zero, zero, zero, zero + 1], axis=1)
+    return (boxes[:, :3] @ pose[:3, :3].T + pose[:3, 3], boxes[:, 3:6].copy(),
+            quaternions(pose[:3, :3] @ upright.reshape(-1, 3, 3)))

@@ -1,0 +1,95 @@
+"""The tables of nuScenes: JSON lists of rows, read row by row.
+
+Those of trainval have more than a gigabyte, of which a LiDAR needs a hundredth. So a table is
+never held whole: rows are decoded one after the other out of a buffer, and the reader keeps what
+it wants.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.types import InputError
+
+CHUNK = 2**22        # characters read at a time; no row is longer
+SPACE = " \t\r\n,"
+
+
+class Tables:
+    """ROOT/VERSION/*.json. InputError where the folder is not there."""
+
+    def __init__(self, root: str | Path, version: str):
+        self.root, self.version = Path(root), version
+        self.folder = self.root / version
+        if not self.root.is_dir():
+            raise InputError(f"{root} is not a folder; give the folder of a nuScenes download")
+        if not version or not self.folder.is_dir():
+            there = sorted(path.parent.name for path in self.root.glob("*/sample_data.json"))
+            raise InputError(f"{root} has no folder {version or 'without a name'}; " + (
+                f"its versions are: {', '.join(there)}" if there else
+                "give the folder that holds v1.0-mini or v1.0-trainval, and samples"))
+
+    def path(self, table: str) -> Path:
+        return self.folder / f"{table}.json"
+
+    def rows(self, table: str, *fields: str) -> Iterator[tuple]:
+        """The values of two fields or more, row by row. InputError for a table that is missing,
+        cut or damaged, and for a row without a field."""
+        for number, row in enumerate(self._decoded(table)):
+            try:
+                yield tuple([row[field] for field in fields])
+            except (KeyError, TypeError):
+                missing = next(f for f in fields if not isinstance(row, dict) or f not in row)
+                raise InputError(f"{self.path(table)}: row {number} has no {missing}; is it a "
+                                 "table of nuScenes? download it again") from None
+
+    def _decoded(self, table: str) -> Iterator[Any]:
+        path, decode = self.path(table), json.JSONDecoder().raw_decode
+        try:
+            with open(path, encoding="utf-8") as stream:
+                text = stream.read(CHUNK).lstrip()
+                if text[:1] != "[":
+                    raise InputError(f"{path} is no list of rows; download the tables of "
+                                     f"{self.version} again")
+                text, place, ended = text[1:], 0, False
+                while True:
+                    while place < len(text) and text[place] in SPACE:
+                        place += 1
+                    if place < len(text) and text[place] == "]":
+                        return
+                    try:
+                        row, place = decode(text, place)
+                        yield row
+                        continue
+                    except ValueError as error:  # the row goes on in the next chunk, or is broken
+                        if ended or len(text) - place > 2 * CHUNK:
+                            raise InputError(f"{path} is cut or damaged ({error}); download the "
+                                             f"tables of {self.version} again") from None
+                    more = stream.read(CHUNK)
+                    text, place, ended = text[place:] + more, 0, not more
+        except OSError as error:
+            raise InputError(f"cannot read the table {path}: {error.strerror}; unpack the "
+                             f"metadata of {self.version} there") from None
+        except UnicodeDecodeError as error:
+            raise InputError(f"{path} is damaged ({error}); download the tables of {self.version} "
+                             "again") from None
+
+    def numbers(self, table: str, field: str, values: list, width: int) -> np.ndarray:
+        """(K, width) float64 of a field's values. InputError where one is not that many finite
+        numbers."""
+        try:
+            column = np.array(values, np.float64).reshape(len(values), -1)
+        except (ValueError, TypeError):
+            column = np.zeros((len(values), 0))
+        if len(values) == 0:
+            return np.zeros((0, width))
+        if column.shape[1] != width or not np.isfinite(column).all() or (
+                field == "rotation" and not np.any(column, axis=1).all()):
+            wanted = "a quaternion" if field == "rotation" else f"{width} finite numbers"
+            raise InputError(f"{self.path(table)}: a {field} is not {wanted}; download it again")
+        return column
