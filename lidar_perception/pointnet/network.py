@@ -56,8 +56,8 @@ def mlp(*channels: int) -> nn.Sequential:
 def nearest(centres: Tensor, xyz: Tensor, valid: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """squared (B, M, k) rising, and places (B, M, k), of the nearest of xyz (B, N, 3) to each
     centre (B, M, 3), inf where no valid one is left; k = count."""
-    squared = (centres.square().sum(-1)[:, :, None] + xyz.square().sum(-1)[:, None]
-               - 2 * centres @ xyz.transpose(1, 2)).clamp_(min=0)          # (B, M, N)
+    # Differences, not a matrix product: a point is at no distance from itself in any format.
+    squared = (centres[:, :, None] - xyz[:, None]).square().sum(dim=-1)    # (B, M, N)
     squared = squared.masked_fill(~valid[:, None], torch.inf)
     return squared.topk(count, dim=2, largest=False)
 
