@@ -1,4 +1,4 @@
-"""Fixtures of more than one file: a simulated bag, and a peer on a private ROS domain."""
+"""Fixtures of more than one file: bags, data sets, and a peer on a private ROS domain."""
 
 from __future__ import annotations
 
@@ -33,7 +33,18 @@ def one_thread():
 
 
 @pytest.fixture(scope="session")
-def drive_bag(tmp_path_factory) -> Path:
+def streets():
+    """Each simulated street is made once in a session: it takes a second, and never changes."""
+    from functools import cache
+
+    from lidar_perception.simulation import drive
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(drive, "_street", cache(drive._street.__wrapped__))
+        yield
+
+
+@pytest.fixture(scope="session")
+def drive_bag(streets, tmp_path_factory) -> Path:
     """A bag of a simulated drive: clouds, labels, camera."""
     from lidar_perception.datasets.to_bag import write_bag
     from lidar_perception.simulation.scene import CROWDED
@@ -41,6 +52,69 @@ def drive_bag(tmp_path_factory) -> Path:
     path = tmp_path_factory.mktemp("drive") / "drive"
     write_bag(path, simulated_scans(33, FRAMES, streets=CROWDED))
     return path
+
+
+@pytest.fixture(scope="session")
+def written(tmp_path_factory) -> Path:
+    """The bag of bag_samples.scans(); tests copy what they change."""
+    from bag_samples import scans
+
+    from lidar_perception.datasets.to_bag import write_bag
+    path = tmp_path_factory.mktemp("bags") / "drive"
+    assert write_bag(path, scans()) == 3
+    return path
+
+
+@pytest.fixture
+def tiny_sensor(monkeypatch):
+    """The command knows the sensor of simulate_samples."""
+    from simulate_samples import TINY
+
+    from lidar_perception.simulation.sensor import SENSORS
+    monkeypatch.setitem(SENSORS, "tiny", TINY)
+
+
+@pytest.fixture(scope="session")
+def made(streets, tmp_path_factory) -> Path:
+    """A folder of layout -> a data set of five frames that was made in one go."""
+    from simulate_samples import TINY, run
+
+    from lidar_perception.simulation.dataset import LAYOUTS
+    from lidar_perception.simulation.sensor import SENSORS
+    root = tmp_path_factory.mktemp("made")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(SENSORS, "tiny", TINY)
+        for layout in LAYOUTS:
+            assert run(root / layout, layout, 5, 1, "--streets-of", 2).exit_code == 0
+    return root
+
+
+@pytest.fixture(scope="session")
+def crowds(tmp_path_factory) -> Path:
+    """A KITTI folder of people."""
+    from reproduction_samples import COUNT
+    from samples import crowd_folder
+    return crowd_folder(tmp_path_factory.mktemp("kitti"), COUNT)
+
+
+@pytest.fixture(scope="session")
+def whole(crowds, tmp_path_factory) -> Path:
+    """The folder of a run of the paper's experiment on the crowds that nothing has stopped; beside
+    it, what the command said."""
+    from reproduction_samples import command
+    from samples import write
+    out = tmp_path_factory.mktemp("whole") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", "160")
+        write(out.parent / "said", command("--kitti", crowds, "--out", out, "--jobs", 1))
+    return out
+
+
+@pytest.fixture
+def few(tmp_path) -> Path:
+    """Five scans for the small experiment."""
+    from samples import object_folder
+    return object_folder(tmp_path / "few", count=5)
 
 
 @pytest.fixture(scope="session")

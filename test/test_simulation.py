@@ -1,23 +1,27 @@
 """Laws of the simulated drive."""
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 
 from lidar_perception.geometry import box_corners, points_in_box
+from lidar_perception.simulation import drive as drives
 from lidar_perception.simulation.drive import drive, truth
 from lidar_perception.simulation.raycast import cast
 from lidar_perception.simulation.returns import measure
-from lidar_perception.simulation.scene import CROWDED, make_scene
+from lidar_perception.simulation.scene import ANY, CROWDED
 from lidar_perception.simulation.sensor import HDL64E, STILL
 from lidar_perception.simulation.terrain import surface_height
 from lidar_perception.types import CLASSES, PEDESTRIAN
 
 COARSE = replace(HDL64E, azimuth_step=float(np.radians(0.5)))
 EXACT = replace(COARSE, range_noise=0.0, dropout=0.0, divergence=0.0)
-street = cache(make_scene)
+pytestmark = pytest.mark.usefixtures("streets")
+
+
+def street(seed):
+    return drives._street(seed, ANY)
 
 
 def scan(seed, t, sensor=COARSE):
@@ -33,9 +37,9 @@ def test_same_seed_same_bytes():
     def content(seed):
         return [(f.xyz.tobytes(), f.intensity.tobytes(), f.stamp_ns, t.boxes.tobytes(), t.extras)
                 for f, t in drive(seed, 2, COARSE)]
-    first = content(3)
-    assert first == content(3)
-    assert all(a[0] != b[0] for a, b in zip(first, content(4)))
+    first = content(0)
+    assert first == content(0)
+    assert all(a[0] != b[0] for a, b in zip(first, content(1)))
 
 
 def test_a_longer_drive_starts_like_a_shorter_one():
@@ -61,7 +65,7 @@ def test_frames_are_as_promised():
 
 
 @pytest.mark.parametrize("t", [0.0, 3.9])
-@pytest.mark.parametrize("seed", [0, 5])
+@pytest.mark.parametrize("seed", [0, 2])
 def test_points_of_an_object_lie_in_its_box(seed, t):
     _, moment, hits, xyz, owner = scan(seed, t)
     semantic = measure(hits, COARSE, STILL, np.random.default_rng(0)).semantic
@@ -122,7 +126,7 @@ def test_scans_look_like_those_of_the_real_sensor():
     """Numbers of KITTI's scans: 109 000 to 127 000 points, and on a pedestrian in full view
     about 27 000 over the square of its range."""
     density, labels = [], set()
-    for seed in range(3):
+    for seed in (0, 33):
         frame, found = next(drive(seed, 1, streets=CROWDED))
         assert 95_000 < len(frame) < 135_000
         assert 0.15 < frame.intensity.mean() < 0.4

@@ -14,8 +14,9 @@ from lidar_perception.simulation.street import KINDS
 from lidar_perception.simulation.terrain import surface_height
 from lidar_perception.types import CLASSES, InputError
 
-SEEDS = range(5)
-EVERY = [(kind, seed) for kind in KINDS for seed in SEEDS[:3]]
+SEEDS = range(3)
+EVERY = [(kind, seed) for kind in KINDS for seed in SEEDS]
+TIMES = (0.0, 4.0, 8.0, 12.0, 16.0)
 HEIGHT = 1.73
 SITTING, CAR, PEDESTRIAN, CYCLIST = (
     CLASSES.index(name) for name in ("Person_sitting", "Car", "Pedestrian", "Cyclist"))
@@ -57,10 +58,10 @@ def content(scene):
 
 
 def test_same_seed_same_street():
-    first = content(make_scene(3))
-    assert first == content(make_scene(3))
-    assert all(a != b for a, b in zip(first, content(make_scene(4))))
-    assert make_scene(3).kind in KINDS
+    drawn = make_scene(3)
+    first = content(drawn)
+    assert first == content(make_scene(3, drawn.kind))
+    assert all(a != b for a, b in zip(first, content(scene_of(drawn.kind, 0))))
 
 
 @pytest.mark.parametrize("kind, seed", EVERY)
@@ -155,12 +156,12 @@ def test_streets_hold_what_kitti_labels():
     found = np.zeros((len(KINDS), len(CLASSES)))
     for i, kind in enumerate(KINDS):
         for seed in SEEDS:
-            for t in (0.0, 8.0, 16.0):
+            for t in TIMES:
                 m = scene_of(kind, seed).at(t, HEIGHT)
                 seen = ((np.abs(np.arctan2(m.boxes[:, 1], m.boxes[:, 0])) < np.radians(40))
                         & (np.hypot(*m.boxes[:, :2].T) < 30))
                 found[i] += np.bincount(m.class_ids[seen], minlength=len(CLASSES))
-    mean = share @ found / (3 * len(SEEDS))
+    mean = share @ found / (len(TIMES) * len(SEEDS))
     assert share.sum() == pytest.approx(1.0)
     assert 1.0 < mean[CAR] < 4.5
     assert 0.2 < mean[PEDESTRIAN] < 1.5
@@ -170,7 +171,7 @@ def test_streets_hold_what_kitti_labels():
 
 def test_as_many_people_as_asked_for():
     def people(factor):
-        labels = [a.thing.label for a in scene_of("city", 0, factor).actors]
+        labels = [a.thing.label for a in scene_of("residential", 0, factor).actors]
         return sum(label in ("Pedestrian", "Person_sitting", "Cyclist") for label in labels)
     assert people(0.0) == 0 < people(1.0) < people(4.0) / 2
 

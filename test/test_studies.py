@@ -89,7 +89,7 @@ def test_far_needs_scans_before(frames):
         far.measure(frames, 0)
 
 
-def test_far_on_a_drive(tmp_path):
+def test_far_on_a_drive(streets, tmp_path):
     pytest.importorskip("kiss_icp", reason="needs kiss-icp, the extra [odometry]")
     made = CliRunner().invoke(simulate, ["--format", "kitti-tracking", "--frames", "5", "--seed",
                                          "33", "--street", "zone", "--people", "3", "--jobs", "1",

@@ -139,12 +139,12 @@ def test_simulated_scans_are_the_same_from_the_cache(tmp_path, monkeypatch):
 
 
 def test_simulated_scenes_are_labelled_as_people_would():
-    source = SimulatedScenes(11, 1, SENSOR)
+    source = SimulatedScenes(7, 1, SENSOR)
     _, truth = source.scan(0)
     scene = source.scene(0)
     seen = [e["visible"] >= 0.15 and e["num_points"] >= 5 for e in truth.extras]
     assert scene.around and scene.wanted.tolist() == seen and 0 < sum(seen) < len(seen)
-    assert drive.scan_at(11, 0, source._sensor).frame.xyz.shape == scene.points[:, :3].shape
+    assert drive.scan_at(7, 0, source._sensor).frame.xyz.shape == scene.points[:, :3].shape
     assert source._sensor.height == 1.73
 
 

@@ -1,0 +1,137 @@
+"""Laws of seeds: from truth, from a click, from a file."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from candidate_samples import GROUND_Z, PEOPLE, boxes_at, person, scene
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidar_perception.candidates.seeds import (
+    Seed,
+    load_seed,
+    save_seed,
+    seed_from_click,
+    seed_from_points,
+    seed_from_truth,
+)
+from lidar_perception.candidates.silhouette import to_pixels
+from lidar_perception.clustering.shapes import oriented_boxes
+from lidar_perception.geometry import points_in_box
+from lidar_perception.types import InputError
+
+few = settings(deadline=None, max_examples=40, database=None)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def test_seed_from_truth_is_the_nearest_pedestrians_points_that_are_not_ground():
+    xyz = scene()
+    ground = xyz[:, 2] < GROUND_Z + 0.4  # takes the feet too
+    boxes = boxes_at(PEOPLE[[2, 0, 1]])
+    inside = points_in_box(xyz, boxes[1])
+    assert (inside & ground).any()
+    seed = seed_from_truth(xyz, ground, boxes)
+    np.testing.assert_array_equal(seed.xyz, xyz[inside & ~ground])
+    assert seed.height == 1.8 and seed.floor == pytest.approx(boxes[1, 2] - 0.9)
+    with_ground = seed_from_points(xyz[inside], boxes[1])
+    assert (with_ground.silhouette() != seed.silhouette()).any()
+
+
+def test_seed_from_truth_needs_a_pedestrian_with_ten_points():
+    xyz = person(6, 0, count=9).astype(np.float32)
+    none = np.zeros(9, bool)
+    with pytest.raises(InputError, match="no Pedestrian"):
+        seed_from_truth(xyz, none, np.zeros((0, 7)))
+    with pytest.raises(InputError, match="has 9 points"):
+        seed_from_truth(xyz, none, boxes_at([[6, 0]]))
+    more = np.concatenate([xyz, xyz[:1]])
+    assert seed_from_truth(more, np.zeros(10, bool), boxes_at([[6, 0]])).height == 1.8
+    with pytest.raises(InputError, match="has 0 points"):
+        seed_from_truth(more, np.ones(10, bool), boxes_at([[6, 0]]))
+
+
+def clicked_scene():
+    xyz = np.concatenate([person(6, 0), person(8, 3, seed=1)]).astype(np.float32)
+    labels = np.repeat(np.int32([1, 2]), 400)
+    return xyz, labels, oriented_boxes(xyz, labels, "axis_aligned")
+
+
+def test_seed_from_click_is_the_nearest_clusters():
+    xyz, labels, boxes = clicked_scene()
+    for k, click in ((1, [6, 0.2, -1]), (2, [8.5, 3, 0]), (1, [6, 1.2, -1]), (2, [8, 1.8, -1])):
+        seed = seed_from_click(np.array(click), xyz, labels, boxes, 2.0)
+        np.testing.assert_array_equal(seed.xyz, xyz[labels == k])
+        assert seed.height == boxes[k - 1, 5]
+        assert seed.floor == pytest.approx(boxes[k - 1, 2] - boxes[k - 1, 5] / 2)
+
+
+def test_seed_from_click_takes_no_noise_point_however_near():
+    xyz, labels, boxes = clicked_scene()
+    xyz = np.concatenate([np.float32([[7, 1.5, -1]]), xyz])
+    labels = np.concatenate([np.int32([0]), labels])
+    with pytest.raises(InputError, match="nearest cluster is"):
+        seed_from_click(np.array([7, 1.5, -1]), xyz, labels, boxes, 0.5)
+
+
+def test_seed_from_click_needs_a_cluster_within_the_radius():
+    xyz, labels, boxes = clicked_scene()
+    edge = np.array([xyz[:, 0].min() - 1.0, 0, -1])
+    seed_from_click(edge, xyz, labels, boxes, 1.5)
+    with pytest.raises(InputError, match=r"within 0\.9 m"):
+        seed_from_click(edge, xyz, labels, boxes, 0.9)
+    with pytest.raises(InputError, match="no clusters"):
+        seed_from_click(edge, xyz, np.zeros_like(labels), boxes[:0], 2.0)
+
+
+@few
+@given(seeds, st.integers(1, 30_000), st.integers(10, 300))
+def test_load_seed_is_the_inverse_of_save_seed(tmp_path_factory, seed, tenth_mm, count):
+    rng = np.random.default_rng(seed)
+    xyz = np.float32(np.round(rng.uniform(-90, 90, (count, 3)), 4))
+    path = tmp_path_factory.mktemp("seed") / "folder/template.json"
+    save_seed(Seed(xyz, -1.7321, tenth_mm / 10_000), path)
+    loaded = load_seed(path)
+    np.testing.assert_array_equal(loaded.xyz, xyz)
+    assert (loaded.floor, loaded.height) == (-1.7321, tenth_mm / 10_000)
+
+
+POINTS = [[5.0, 0.1 * i, -1.0] for i in range(10)]
+GOOD = {"height_m": 1.7, "floor_m": -1.7, "points_m": POINTS}
+
+
+def changed(**values):
+    return json.dumps({**GOOD, **values})
+
+
+@pytest.mark.parametrize("text", [
+    "", "not JSON", "[]", "{}", "null", "3", '"text"', json.dumps({"height_m": 1.7}),
+    json.dumps({"points_m": POINTS}), changed(height_m="tall"), changed(height_m=None),
+    changed(height_m=0), changed(height_m=-1.7), changed(height_m=float("nan")),
+    changed(floor_m=None), changed(floor_m=float("inf")), changed(points_m=None),
+    changed(points_m=7), changed(points_m=[]), changed(points_m=POINTS[:9]),
+    changed(points_m=[[1.0, 2.0]] * 10), changed(points_m=[*POINTS, [1.0]]),
+    changed(points_m=[*POINTS, [1.0, 2.0, "x"]]), changed(points_m=[*POINTS, [1, 2, float("nan")]]),
+])
+def test_a_bad_template_is_an_input_error_that_names_the_file(tmp_path, text):
+    path = tmp_path / "bad.json"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"bad\.json"):
+        load_seed(path)
+
+
+def test_a_template_that_cannot_be_read_is_an_input_error_that_names_it(tmp_path):
+    binary = tmp_path / "binary.json"
+    binary.write_bytes(b"\xff\xfe\x00\x81")
+    for path in (tmp_path / "missing.json", tmp_path, binary):
+        with pytest.raises(InputError, match=path.name):
+            load_seed(path)
+
+
+def test_the_default_template_is_a_pedestrian():
+    seed = load_seed()
+    assert 1.4 < seed.height < 2.1
+    pixels = to_pixels(seed.silhouette())
+    assert pixels[0].any() and pixels[-1].any() and pixels[:, 0].any() and pixels[:, -1].any()
