@@ -8,7 +8,8 @@ from setuptools import find_packages, setup
 
 NAME = "lidar_perception"
 NODES = ["bag_player", "bag_recorder", "ground_segmentation", "clustering",
-         "candidate_refinement", "evaluator", "perception", "pointpillars_detector"]
+         "candidate_refinement", "evaluator", "perception", "pointpillars_detector",
+         "pointnet_detector"]
 
 
 def node_executables() -> list[str]:
@@ -40,7 +41,7 @@ setup(
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "msg_utils*"]),
     package_data={NAME: ["nodes/*.xml", "candidates/*.json", "reproduction/*.html",
-                         "detection/weights/*"]},
+                         "detection/weights/*", "pointnet/weights/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -7,12 +7,12 @@ from rich.table import Table
 
 from benchmark import plain_stm_cpa
 from lidar_perception.candidates.refine import STAGES
+from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.configurations import BEST, PAPER
 from lidar_perception.datasets.recording import Recorded
 from lidar_perception.evaluation.candidates import pedestrians
 from lidar_perception.pipeline import (
     Segmented,
-    cluster_obstacles,
     find_candidates,
     grounded_boxes,
     refined,

@@ -11,9 +11,10 @@ from rich.table import Table
 from benchmark.timing import spread
 from lidar_perception.detection.checkpoint import Header
 from lidar_perception.detection.config import SIZES, VERSIONS, network_config
-from lidar_perception.detection.detector import Detector, TorchNetwork, chosen_device
+from lidar_perception.detection.detector import Detector, TorchNetwork
 from lidar_perception.detection.detector_params import STEPS, DetectorParams
 from lidar_perception.detection.pointpillars import make_network
+from lidar_perception.devices import chosen_device
 from lidar_perception.machine import cpu_name
 from lidar_perception.params import with_values
 from lidar_perception.terminal import console, track

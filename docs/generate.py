@@ -1,5 +1,6 @@
 """Makes docs/nodes/*.md from the parameter dataclasses, config/best.param.yaml from
-configurations.py and config/pointpillars.param.yaml from the detector's: python docs/generate.py
+configurations.py, and config/pointpillars.param.yaml and config/pointnet.param.yaml from the
+detectors': python docs/generate.py
 
 test/test_docs.py holds that the pages are up to date and the topics those of the running nodes.
 """
@@ -14,9 +15,11 @@ import yaml
 from lidar_perception import params
 from lidar_perception.configurations import BEST_VALUES
 from lidar_perception.detection.detector_params import DetectorParams
+from lidar_perception.pointnet.params import PointNetDetectorParams
 
 CONFIG = Path(__file__).parents[1] / "config"
-BEST, POINTPILLARS = CONFIG / "best.param.yaml", CONFIG / "pointpillars.param.yaml"
+BEST, POINTPILLARS, POINTNET = (CONFIG / f"{name}.param.yaml"
+                                for name in ("best", "pointpillars", "pointnet"))
 FOLDER = Path(__file__).parent / "nodes"
 CLOUD, MARKERS = "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray"
 STRING_TIMES = "std_msgs/Float64"
@@ -35,6 +38,11 @@ SEED_IN = [
 ]
 DETECTIONS_3D = ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, where "
                  "vision_msgs is installed.")
+BOXES_OUT = [
+    ("~/output/detections", MARKERS, "Boxes with class and score; an empty array still carries the "
+     "stamp."),
+    DETECTIONS_3D,
+]
 CANDIDATES_OUT = [
     ("~/output/detections", MARKERS, "The candidates (STM + CPA); an empty array still carries the "
      "stamp."),
@@ -100,11 +108,24 @@ NODES: dict[str, dict[str, Any]] = {
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The columns "
                  "`ground` and `cluster_id` are used where they are there; what else the version "
                  "needs is computed.")],
-        outputs=[("~/output/detections", MARKERS, "Boxes with class and score; an empty array "
-                  "still carries the stamp."),
-                 DETECTIONS_3D,
+        outputs=[*BOXES_OUT,
                  ("~/debug/preprocess_ms, experts_ms, network_ms, postprocess_ms", STRING_TIMES,
                   "Time of each step.")]),
+    "pointnet_detector": dict(
+        params=PointNetDetectorParams(),
+        what="Finds cars, pedestrians and cyclists among the clusters of the whole cloud: each is "
+             "classified and gets a box, see [pointnet](../pointnet.md). Loads and warms up before "
+             "it subscribes. Without weights it says so in a diagnostic and publishes nothing. "
+             "Warns if nothing can be found (no clusters, all of them too small, no intensity "
+             "...), if CUDA is asked for and missing or out of memory, and if height or intensity "
+             "do not fit; where every score is below its threshold the diagnostic has the best "
+             "ones. Files: `launch/pointnet.launch.py`, `config/pointnet.param.yaml`.",
+        inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The column "
+                 "`cluster_id` is used where it is there, or else the column `ground`; what is "
+                 "missing is computed.")],
+        outputs=[*BOXES_OUT,
+                 ("~/debug/preprocess_ms, ground_ms, clustering_ms, network_ms, postprocess_ms",
+                  STRING_TIMES, "Time of each step.")]),
     "evaluator": dict(
         params=params.EvaluatorParams(),
         what="Scores detections against ground truth by the protocol of the STM-CPA paper.",
@@ -154,14 +175,24 @@ def best() -> str:
 
 
 def pointpillars() -> str:
-    """The parameter file of the detector's graph: its experts' numbers for the nodes that find
-    ground and clusters."""
+    """The parameter file of the PointPillars detector's graph."""
+    return _shared_numbers("The detector's experts (detection/detector_params.py)",
+                           DetectorParams())
+
+
+def pointnet() -> str:
+    """The parameter file of the PointNet detector's graph."""
+    return _shared_numbers("The ground and clusters of pointnet/params.py",
+                           PointNetDetectorParams())
+
+
+def _shared_numbers(what: str, detector: Any) -> str:
+    """A detector's numbers for the nodes that find ground and clusters."""
     shared = (params.GroundNodeParams(), params.ClusteringNodeParams())
     defaults = {key: value for group in shared for key, value in params.flatten(group).items()}
-    values = {key: value for key, value in params.flatten(DetectorParams()).items()
+    values = {key: value for key, value in params.flatten(detector).items()
               if key in defaults and value != defaults[key]}
-    return _parameter_file("The detector's experts (detection/detector_params.py), for the nodes "
-                           "that find ground and clusters", values)
+    return _parameter_file(f"{what}, for the nodes that find ground and clusters", values)
 
 
 def _parameter_file(what: str, values: dict[str, Any]) -> str:
@@ -200,3 +231,4 @@ if __name__ == "__main__":
         (FOLDER / f"{name}.md").write_text(page(name))
     BEST.write_text(best())
     POINTPILLARS.write_text(pointpillars())
+    POINTNET.write_text(pointnet())

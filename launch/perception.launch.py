@@ -5,37 +5,11 @@
 
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
-
-from launch import LaunchDescription
 from lidar_perception.nodes.graph import SINGLE, STAGES
-from lidar_perception.topics import POINTS
+from lidar_perception.nodes.launching import graph_launch
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "perception.param.yaml"
 
 
-def nodes(context):
-    value = {k: context.perform_substitution(LaunchConfiguration(k))
-             for k in ("points", "config", "single", "use_sim_time", "log_level")}
-    graph = SINGLE if value["single"] == "true" else STAGES
-    return [Node(
-        package="lidar_perception", executable=name, name=name, output="screen",
-        parameters=[value["config"], {"use_sim_time": value["use_sim_time"] == "true"}],
-        remappings=[(a, value["points"] if b == POINTS else b) for a, b in remap.items()],
-        ros_arguments=["--log-level", value["log_level"]],
-    ) for name, remap in graph.items()]
-
-
 def generate_launch_description():
-    return LaunchDescription([
-        DeclareLaunchArgument("points", default_value=POINTS, description="The cloud's topic."),
-        DeclareLaunchArgument("config", default_value=str(CONFIG), description="Parameter file."),
-        DeclareLaunchArgument("single", default_value="false", choices=["true", "false"],
-                              description="All stages in one process."),
-        DeclareLaunchArgument("use_sim_time", default_value="false", choices=["true", "false"],
-                              description="Take the time from /clock."),
-        DeclareLaunchArgument("log_level", default_value="info", description="debug, info, ..."),
-        OpaqueFunction(function=nodes),
-    ])
+    return graph_launch(STAGES, SINGLE, CONFIG, "All stages in one process.")

@@ -25,12 +25,11 @@ from lidar_perception.candidates.seeds import (
     seed_from_points,
     seed_from_truth,
 )
-from lidar_perception.clustering.cluster import cluster
+from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.params import (
-    ClusteringParams,
     PipelineParams,
     SeedParams,
     ViewParams,
@@ -71,15 +70,6 @@ def points_in_view(frame: LidarFrame, camera: Camera | None,
                          "and the LiDAR-to-camera transform, or set view.enabled to false")
     places = np.flatnonzero(camera.in_view(frame.xyz))
     return places, frame.take(places)
-
-
-def cluster_obstacles(xyz: np.ndarray, ground: np.ndarray,
-                      params: ClusteringParams) -> np.ndarray:
-    """(M,) int32 cluster ids of the points (M, 3) that are not ground; ground has 0."""
-    labels = np.zeros(len(xyz), np.int32)
-    obstacles = np.flatnonzero(~ground)
-    labels[obstacles] = cluster(xyz.take(obstacles, axis=0), params)
-    return labels
 
 
 def grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray,

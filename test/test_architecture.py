@@ -76,8 +76,8 @@ def public_functions(tree):
 
 def test_there_are_sources_to_look_at():
     assert len(files_in("msg_utils")) >= 5
-    for folder in ("ground", "clustering", "candidates", "detection", "training", "nodes", "cli",
-                   "datasets", "evaluation", "reproduction"):
+    for folder in ("ground", "clustering", "candidates", "detection", "pointnet", "training",
+                   "nodes", "cli", "datasets", "evaluation", "reproduction"):
         assert len(files_in(f"lidar_perception/{folder}")) >= 2
 
 
@@ -118,11 +118,23 @@ def test_algorithms_import_numbers_and_the_shared_files_only(name):
     assert strangers(name, NUMERIC + SHARED + ALGORITHMS) == []
 
 
+NETWORKS = [f"lidar_perception.{name}" for name in ("checkpoint", "devices", "param_fields")]
+
+
 @pytest.mark.parametrize("name", files_in("lidar_perception/detection"))
 def test_detectors_import_torch_and_the_algorithms(name):
     tensors = ["torch", "safetensors", "onnx", "onnxruntime", "onnxscript"]
-    own = ["lidar_perception.detection", "lidar_perception.param_fields"]
+    own = ["lidar_perception.detection", *NETWORKS]
     assert strangers(name, NUMERIC + tensors + SHARED + ALGORITHMS + own) == []
+
+
+@pytest.mark.parametrize("name", files_in("lidar_perception/pointnet"))
+def test_pointnet_imports_of_the_other_detector_what_is_not_its_network(name):
+    shared = [f"lidar_perception.detection.{module}" for module in (
+        "detector_params", "network_detector", "nms", "view", "weights_file")]
+    own = ["lidar_perception.pointnet", *NETWORKS, *shared]
+    algorithms = [m for m in ALGORITHMS if not m.endswith("candidates")]
+    assert strangers(name, NUMERIC + ["torch"] + SHARED + algorithms + own) == []
 
 
 SHARED_TRAINING = [f"lidar_perception.training.{name}" for name in (
@@ -144,6 +156,11 @@ def test_what_all_networks_train_with_knows_none_of_them(module):
     ("lidar_perception/machine.py", []),
     ("lidar_perception/processes.py", ["lidar_perception.types"]),
     ("lidar_perception/resuming.py", ["lidar_perception.types"]),
+    ("lidar_perception/checkpoint.py", ["torch", "safetensors", "lidar_perception.files",
+                                        "lidar_perception.types"]),
+    ("lidar_perception/devices.py", ["torch", "lidar_perception.types"]),
+    ("lidar_perception/detectors.py", ["lidar_perception.checkpoint", "lidar_perception.detection",
+                                       "lidar_perception.pointnet", "lidar_perception.types"]),
     ("lidar_perception/reproduction/paper.py", ["lidar_perception.params"]),
     ("lidar_perception/param_fields.py", []),
     ("lidar_perception/params.py", ["lidar_perception.param_fields"]),
@@ -157,7 +174,8 @@ def test_the_shared_files_are_leaves(name, allowed):
 @pytest.mark.parametrize("name", files_in("lidar_perception/datasets",
                                           "lidar_perception/simulation"))
 def test_data_sources_know_no_algorithm(name):
-    above = [*ALGORITHMS, "lidar_perception.detection", "lidar_perception.training",
+    above = [*ALGORITHMS, "lidar_perception.detection", "lidar_perception.pointnet",
+             "lidar_perception.detectors", "lidar_perception.training",
              "lidar_perception.pipeline", "lidar_perception.evaluation"]
     assert [m for m in imports(TREES[name]) if within(m, above)] == []
 
@@ -219,6 +237,10 @@ def test_no_source_is_longer_than_a_reader_can_hold(name):
     ("lidar_perception.detection.config", "numba torch matplotlib scipy sklearn rich click"),
     ("lidar_perception.detection.detector_params", "numba torch matplotlib scipy numpy click"),
     ("lidar_perception.detection.weights_file", "numba torch matplotlib scipy click"),
+    ("lidar_perception.pointnet.config", "numba torch matplotlib scipy sklearn rich click"),
+    ("lidar_perception.pointnet.params", "numba torch matplotlib scipy sklearn rich click"),
+    ("lidar_perception.pointnet.weights_file", "numba torch matplotlib scipy click"),
+    ("lidar_perception.pointnet.detector", "onnx onnxruntime matplotlib sklearn rich click"),
     ("lidar_perception.detection.expert", "torch matplotlib sklearn rosbags rich click"),
     ("lidar_perception.detection.detector", "onnx onnxruntime matplotlib sklearn rich click"),
     ("lidar_perception.training.params", "numba torch matplotlib scipy numpy rich click"),

@@ -9,6 +9,7 @@ from detection_samples import BOXES, LABELS, lively, tiny, two_objects
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from lidar_perception.checkpoint import require_same
 from lidar_perception.detection.anchors import make_anchors
 from lidar_perception.detection.box_coder import decode
 from lidar_perception.detection.config import (
@@ -16,7 +17,6 @@ from lidar_perception.detection.config import (
     VERSIONS,
     from_json,
     network_config,
-    require_same,
     to_json,
 )
 from lidar_perception.detection.losses import detection_loss

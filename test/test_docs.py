@@ -42,7 +42,8 @@ def test_pages_are_made_from_the_code(generate, name):
 
 
 @pytest.mark.parametrize("name", ["ground_segmentation", "clustering", "candidate_refinement",
-                                  "perception", "evaluator", "pointpillars_detector"])
+                                  "perception", "evaluator", "pointpillars_detector",
+                                  "pointnet_detector"])
 def test_documented_topics_are_the_nodes_own(generate, name, domain):
     rclpy = pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     from rclpy.context import Context
@@ -85,19 +86,19 @@ def test_the_parameter_file_of_best_is_made_from_the_code(generate):
     assert read_config(Path("best"), PipelineParams()) == BEST_VALUES
 
 
-def test_the_experts_nodes_get_the_numbers_of_the_detector(generate):
+@pytest.mark.parametrize("network", ["pointpillars", "pointnet"])
+def test_the_nodes_before_a_detector_get_its_numbers(generate, network):
     from lidar_perception.cli.options import read_config
-    from lidar_perception.detection.detector_params import DetectorParams
     from lidar_perception.params import (
         ClusteringNodeParams,
         GroundNodeParams,
         PipelineParams,
         with_values,
     )
-    assert generate.POINTPILLARS.read_text() == generate.pointpillars(), \
-        "run: python docs/generate.py"
-    values = read_config(generate.POINTPILLARS, PipelineParams())
-    detector = DetectorParams()
+    file = getattr(generate, network.upper())
+    assert file.read_text() == getattr(generate, network)(), "run: python docs/generate.py"
+    values = read_config(file, PipelineParams())
+    detector = generate.NODES[f"{network}_detector"]["params"]
     for params in GroundNodeParams(), ClusteringNodeParams():
         known = parameter_fields(params)
         own = with_values(params, {k: v for k, v in values.items() if k in known})

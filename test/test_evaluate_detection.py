@@ -66,19 +66,17 @@ def detector(monkeypatch):
     was asked."""
     made = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
 
-    def load_detector(path, device="auto", params=None):
-        made.asked.append((str(path), device, params))
+    def open_detector(path, device="auto"):
+        made.asked.append((str(path), device))
 
-        def detect(frame, ground=None, cluster_ids=None):
+        def detect(frame):
             made.scans.append(frame)
             return made.find(frame)
         return detect
 
-    module = types.ModuleType("lidar_perception.detection.detector")
-    module.load_detector = load_detector
-    monkeypatch.setitem(sys.modules, "lidar_perception.detection",
-                        types.ModuleType("lidar_perception.detection"))
-    monkeypatch.setitem(sys.modules, "lidar_perception.detection.detector", module)
+    module = types.ModuleType("lidar_perception.detectors")
+    module.open_detector = open_detector
+    monkeypatch.setitem(sys.modules, "lidar_perception.detectors", module)
     return made
 
 
@@ -116,7 +114,7 @@ def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
     detector.find = lambda frame: truth_of(kitti)
     content, text = evaluate(tmp_path, "--kitti", kitti, "--weights", "v4.safetensors",
                              "--device", "cpu")
-    assert detector.asked == [("v4.safetensors", "cpu", None)] and len(detector.scans) == 2
+    assert detector.asked == [("v4.safetensors", "cpu")] and len(detector.scans) == 2
     assert len(detector.scans[0]) == len(open_kitti(kitti)[0].load())
     assert content["ms"] >= 0 and "ms a frame" in text
     for (_, row, _), cell in cells(content).items():

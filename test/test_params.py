@@ -24,16 +24,23 @@ from lidar_perception.params import (
     parameter_fields,
     with_values,
 )
+from lidar_perception.pointnet import params as pointnet_params
+from lidar_perception.pointnet.params import PointNetDetectorParams
 from lidar_perception.training import params as training_params
 from lidar_perception.training.params import PointPillarsTraining
 from lidar_perception.types import InputError
 
-# Those of the modules imported here; other tests may have imported more.
-GROUPS = [group for group in Params.__subclasses__()
-          if group.__module__ in (module.__name__, DetectorParams.__module__,
-                                 training_params.__name__)]
+MODULES = module, detector_params, pointnet_params, training_params  # tests may import more
+
+
+def groups_below(base: type) -> list[type]:
+    return [group for kind in base.__subclasses__() for group in (kind, *groups_below(kind))]
+
+
+GROUPS = [group for group in groups_below(Params)
+          if group.__module__ in [each.__name__ for each in MODULES]]
 COMPOSITES = [PipelineParams, GroundNodeParams, ClusteringNodeParams, RefinementNodeParams,
-              DetectorParams, PointPillarsTraining]
+              DetectorParams, PointNetDetectorParams, PointPillarsTraining]
 FIELDS = [pytest.param(group, f, id=f"{group.__name__}.{f.name}")
           for group in GROUPS for f in dataclasses.fields(group) if f.metadata]
 
@@ -79,8 +86,9 @@ def config(tmp_path, text: str, params=None):
 
 
 def test_every_group_of_the_module_is_tested():
-    public = [v for each in (module, detector_params, training_params) for v in vars(each).values()
-              if isinstance(v, type) and dataclasses.is_dataclass(v)]
+    public = [v for each in MODULES for v in vars(each).values()
+              if isinstance(v, type) and dataclasses.is_dataclass(v)
+              and v.__module__ in [m.__name__ for m in MODULES]]
     assert {*public} == {*GROUPS, *COMPOSITES}
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 
 import numpy as np
@@ -17,15 +16,16 @@ from std_msgs.msg import Float64
 from test_ros_bad_input import BAD, CLOUD, MARKERS, RELIABLE_IN, cloud
 
 from lidar_perception.cli.options import read_config
+from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.datasets.bag import bag_message
 from lidar_perception.detection.checkpoint import Header, save_checkpoint
 from lidar_perception.detection.detector import STEPS, load_detector
 from lidar_perception.detection.detector_params import DetectorParams
 from lidar_perception.messages import column, to_detections, to_frame
-from lidar_perception.nodes.graph import DETECTION
+from lidar_perception.nodes.graph import POINTPILLARS
 from lidar_perception.nodes.main import run
 from lidar_perception.params import PipelineParams, flatten, with_values
-from lidar_perception.pipeline import cluster_obstacles, segment
+from lidar_perception.pipeline import segment
 from lidar_perception.topics import POINTS
 from msg_utils.markers import box_pose, from_marker_array, pose_yaw
 from msg_utils.point_cloud2 import from_array
@@ -93,11 +93,11 @@ def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, 
     """The graph of three nodes with the experts' numbers, and a plain cloud straight to the
     detector, which then computes ground and clusters itself."""
     shared = read_config(EXPERTS, PipelineParams())
-    for node, remap in DETECTION.items():
+    for node, remap in POINTPILLARS.items():
         extra = {"~/output/detections": "/found"} if node == NODE else {}
         processes.start(node, {**remap, **extra}, {**shared, **(
             values(weights) if node == NODE else {})})
-    found, between = peer.listen("/found", MARKERS), DETECTION[NODE]["~/input/points"]
+    found, between = peer.listen("/found", MARKERS), POINTPILLARS[NODE]["~/input/points"]
     points = peer.listen(between, CLOUD)
     times = {step: [] for step in STEPS}
     for step, heard in times.items():
@@ -275,40 +275,3 @@ def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, pee
 def test_help_and_run_know_the_node(capsys):
     assert run(NODE, [NODE, "--help"]) == 0
     assert "detection.scores.pedestrian (default 0.3)" in capsys.readouterr().out
-
-
-def test_the_launch_file_is_sound(monkeypatch):
-    """What is launched, with stand-ins where launch and launch_ros are not installed."""
-    import sys
-    from types import ModuleType, SimpleNamespace
-
-    class Recorded(SimpleNamespace):
-        def __init__(self, *args, **options):
-            super().__init__(args=args, **options)
-
-    contents = {"launch": ("LaunchDescription",), "launch.actions": (
-        "DeclareLaunchArgument", "OpaqueFunction"), "launch.substitutions": (
-        "LaunchConfiguration",), "launch_ros": (), "launch_ros.actions": ("Node",)}
-    for name, names in contents.items():
-        module = ModuleType(name)
-        for kind in names:
-            setattr(module, kind, Recorded)
-        monkeypatch.setitem(sys.modules, name, module)
-    path = EXPERTS.parents[1] / "launch" / "pointpillars.launch.py"
-    spec = importlib.util.spec_from_file_location("launch_file", path)
-    launched = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(launched)
-    described = launched.generate_launch_description().args[0]
-    arguments = {a.args[0]: a.default_value for a in described if hasattr(a, "default_value")}
-
-    def nodes(**given):
-        context = SimpleNamespace(
-            perform_substitution=lambda s: {**arguments, **given}[s.args[0]])
-        return {n.executable: n for n in launched.nodes(context)}
-
-    graph = nodes(points="/cloud", weights="v4.safetensors")
-    assert list(graph) == list(DETECTION) and arguments["config"] == str(EXPERTS)
-    assert ("~/input/points", "/cloud") in graph["ground_segmentation"].remappings
-    assert graph[NODE].parameters[1]["detection.weights"] == "v4.safetensors"
-    assert list(nodes(single="true")) == [NODE]
-    assert "detection.weights" not in nodes()[NODE].parameters[1]

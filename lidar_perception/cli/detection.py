@@ -25,7 +25,7 @@ from lidar_perception.types import Detections, InputError
 @click.option("--results", type=click.Path(path_type=Path), metavar="DIR",
               help="Result files of any detector, in KITTI's format: DIR/000000.txt ...")
 @click.option("--weights", type=click.Path(path_type=Path), metavar="FILE",
-              help="Run the detector of this checkpoint.")
+              help="Run the detector of this checkpoint, PointPillars or PointNet.")
 @click.option("--device", default="auto", help="Where --weights run: auto, cpu, cuda. "
               "Default: auto.")
 @click.option("--split", type=click.Path(path_type=Path), metavar="FILE",
@@ -62,8 +62,8 @@ def detection(kitti: Path, results: Path | None, weights: Path | None, device: s
             raise InputError(f"{results} is not a folder; give the folder of the result files")
         work = score_results(frames, results, report)
     else:
-        from lidar_perception.detection.detector import load_detector
-        work = score_detector(frames, load_detector(weights, device), write_results, report)
+        from lidar_perception.detectors import open_detector
+        work = score_detector(frames, open_detector(weights, device), write_results, report)
     for _ in track(work, "evaluating", len(frames)):
         pass
     content = {"source": str(results or weights), **report.content()}

@@ -15,6 +15,7 @@ import numpy as np
 from rich.markup import escape
 
 from lidar_perception.cli.options import parameter_options
+from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.datasets.recording import Recording, open_recording
 from lidar_perception.datasets.semantickitti import SemanticFrame, open_semantic_kitti
 from lidar_perception.evaluation.segmentation import (
@@ -34,7 +35,7 @@ from lidar_perception.params import (
     GroundParams,
     ViewParams,
 )
-from lidar_perception.pipeline import cluster_obstacles, points_in_view
+from lidar_perception.pipeline import points_in_view
 from lidar_perception.terminal import console, errors, track
 from lidar_perception.types import InputError, LidarFrame
 

@@ -79,7 +79,7 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
           --data sim --out v4
     """
     from lidar_perception.detection.config import network_config
-    from lidar_perception.detection.detector import chosen_device
+    from lidar_perception.devices import chosen_device
     from lidar_perception.training.data import Batches, RawScenes, Stream
     from lidar_perception.training.database import cut_objects
     from lidar_perception.training.loop import may_begin
@@ -135,7 +135,7 @@ def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
       lidar-perception train pointnet --data /data/kitti/object --split train.txt \\
           --val-split val.txt --epochs 20 --out pointnet --resume
     """
-    from lidar_perception.detection.detector import chosen_device
+    from lidar_perception.devices import chosen_device
     from lidar_perception.pointnet.config import pointnet_config
     from lidar_perception.training.cut_scenes import CutScenes
     from lidar_perception.training.data import Batches, Stream

@@ -24,3 +24,12 @@ def cluster(xyz: np.ndarray, params: ClusteringParams = ClusteringParams()) -> n
     labels = np.zeros(len(xyz), np.int32)
     labels[usable] = METHODS[params.method](xyz[usable], params)
     return labels
+
+
+def cluster_obstacles(xyz: np.ndarray, ground: np.ndarray,
+                      params: ClusteringParams = ClusteringParams()) -> np.ndarray:
+    """(M,) int32 cluster ids of the points (M, 3) that are not ground (M,) bool; ground has 0."""
+    labels = np.zeros(len(xyz), np.int32)
+    obstacles = np.flatnonzero(~ground)
+    labels[obstacles] = cluster(xyz.take(obstacles, axis=0), params)
+    return labels

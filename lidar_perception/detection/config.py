@@ -179,13 +179,3 @@ def from_json(content: dict[str, Any], source: str = "the header") -> NetworkCon
         return NetworkConfig(**values)
     except (TypeError, ValueError, KeyError) as error:
         raise InputError(f"{source} describes no network: {error}") from None
-
-
-def require_same(found: NetworkConfig, wanted: NetworkConfig, source: str) -> None:
-    """InputError naming the first fields that differ, with both values."""
-    ours, theirs = to_json(wanted), to_json(found)
-    different = [name for name in ours if ours[name] != theirs[name]]
-    if different:
-        shown = "; ".join(f"{name} is {theirs[name]}, asked for was {ours[name]}"
-                          for name in different[:3])
-        raise InputError(f"{source} holds another network: {shown}")

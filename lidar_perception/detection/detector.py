@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -17,16 +16,22 @@ from lidar_perception.detection.anchors import make_anchors
 from lidar_perception.detection.box_coder import decode
 from lidar_perception.detection.checkpoint import Header, load_network
 from lidar_perception.detection.config import SENSOR_HEIGHT
-from lidar_perception.detection.detector_params import STEPS, DetectorParams
+from lidar_perception.detection.detector_params import STEPS, DetectionParams, DetectorParams
 from lidar_perception.detection.expert import NetworkInput, network_input
-from lidar_perception.detection.nms import suppressed
+from lidar_perception.detection.network_detector import NetworkDetector
+from lidar_perception.detection.nms import best_of_each, suppressed
 from lidar_perception.detection.pillars import Pillars, make_pillars
 from lidar_perception.detection.pointpillars import PointPillars, fused
-from lidar_perception.detection.view import in_sensor_frame, visible
+from lidar_perception.detection.view import (
+    in_sensor_frame,
+    made_up_frame,
+    require_columns,
+    visible,
+    with_intensity_scaled,
+)
 from lidar_perception.detection.weights_file import weights_file
-from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
-
-CPU = torch.device("cpu")
+from lidar_perception.devices import CPU, chosen_device
+from lidar_perception.types import Detections, InputError, LidarFrame
 
 # logits (A, K), and codes (M, 7) and directions (M, 2) at anchors (M,)
 Prediction = tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]
@@ -48,38 +53,30 @@ class TorchNetwork:
         return head.logits(features)[0], lambda anchors: head.boxes_at(features, anchors)
 
 
-class Detector:
-    """detector(frame) -> Detections, in the frame's own coordinates.
-
-    params may be replaced at any time. After each call ms holds the time of each of STEPS (on CUDA
-    after synchronisation), problem why nothing, or little, can be found in this frame, or None, and
-    best, where no score reached its threshold, the highest score of each class.
-    """
+class Detector(NetworkDetector):
+    """detector(frame) -> Detections, in the frame's own coordinates."""
 
     def __init__(self, network: Any, header: Header, device: torch.device,
                  params: DetectorParams = DetectorParams()):
-        self.network, self.header, self.params = network, header, params
-        self.config, self.device = header.config, device
+        super().__init__(header, device, params, STEPS)
+        self.network = network
         self.anchors = make_anchors(self.config, device)
-        self.ms: dict[str, float] = dict.fromkeys(STEPS, 0.0)
-        self.problem: str | None = None
-        self.best: dict[str, float] = {}
-        self.fallback: str | None = None  # why the CPU took over
+
+    @property
+    def settings(self) -> DetectionParams:
+        """The network's own group of params."""
+        return self.params.detection
 
     def __call__(self, frame: LidarFrame, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Detections:
         """The objects in a frame of N points. ground (N,) bool and cluster_ids (N,) int, 0 = none,
         are computed if the version needs them and they are None. InputError for columns of another
         length, and where CUDA has no memory left and the CPU may not take over."""
-        for name, column in ("ground", ground), ("cluster_ids", cluster_ids):
-            if column is not None and len(column) != len(frame):
-                raise InputError(f"{name} has {len(column)} values for {len(frame)} points")
+        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
         t0 = perf_counter()
         pose = self.params.ground.sensor_pose
         places, seen = visible(frame, self.config, pose)
-        if seen.intensity is not None:
-            seen = replace(seen, intensity=seen.intensity
-                           * np.float32(self.params.detection.intensity_scale))
+        seen = with_intensity_scaled(seen, self.settings.intensity_scale)
         t1 = perf_counter()
         inputs = network_input(
             seen, self.config, None if ground is None else ground.take(places).astype(bool),
@@ -91,11 +88,7 @@ class Detector:
             self.ms = dict(zip(STEPS, ((t1 - t0) * 1e3, (t2 - t1) * 1e3, 0.0, 0.0)))
             return Detections.none()
         with torch.inference_mode():
-            try:
-                t3, t4, found = self._predict(inputs)
-            except torch.cuda.OutOfMemoryError as error:
-                self._fall_back(error)
-                t3, t4, found = self._predict(inputs)
+            t3, t4, found = self.guarded(lambda: self._predict(inputs))
             found = in_sensor_frame(found, pose)
         t5 = perf_counter()
         self.ms = dict(zip(STEPS, (
@@ -109,23 +102,18 @@ class Detector:
         if inputs.cluster_map is not None:
             maps = torch.from_numpy(inputs.cluster_map)[None].to(self.device)
         pillars = make_pillars([points], self.config)
-        begun = self._now()
+        begun = self.now()
         logits, boxes_at = self.network(pillars, maps)
-        ended = self._now()
+        ended = self.now()
         return begun, ended, self._detections(logits, boxes_at)
 
-    def _now(self) -> float:
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-        return perf_counter()
-
     def _detections(self, logits: Tensor, boxes_at: Callable) -> Detections:
-        settings = self.params.detection
+        settings = self.settings
         limits = logits.new_tensor([_logit(settings.scores.of_class(name))
                                     for name in self.config.classes])
         chosen = torch.nonzero((logits >= limits).any(dim=1))[:, 0]
         if len(chosen) == 0:
-            self._nothing_found(logits)
+            self.nothing_passed(torch.sigmoid(logits.amax(dim=0)).tolist())
         best, kinds = logits[chosen].max(dim=1)
         valid = torch.nonzero(best >= limits[kinds])[:, 0]
         if len(valid) > settings.nms.candidates:
@@ -135,17 +123,7 @@ class Detector:
         boxes = decode(codes.float(), directions.argmax(dim=1), self.anchors[chosen],
                        self.config.direction_offset).cpu().numpy()
         scores, kinds = torch.sigmoid(best).cpu().numpy(), kinds.cpu().numpy()
-        nms = settings.nms
-        kept = suppressed(boxes, scores, kinds, nms.iou, nms.across_classes)[:nms.max_boxes]
-        ids = np.array([CLASSES.index(name) for name in self.config.classes])
-        return Detections.of(boxes[kept], ids[kinds[kept]], scores[kept])
-
-    def _nothing_found(self, logits: Tensor) -> None:
-        scores = torch.sigmoid(logits.amax(dim=0)).tolist()
-        self.best = dict(zip(self.config.classes, scores))
-        if any(map(math.isnan, scores)):
-            self.problem = ("the network's scores are not numbers (NaN); the weights or the "
-                            "intensity are broken")
+        return best_of_each(boxes, scores, kinds, self.config.classes, settings.nms)
 
     def _problem(self, frame: LidarFrame, seen: LidarFrame, inputs: NetworkInput) -> str | None:
         if len(frame) == 0:
@@ -158,35 +136,18 @@ class Detector:
         if len(inputs.points) == 0:
             return ("every point in the network's range is ground; is the sensor mounted at "
                     "another height or angle? set ground.sensor_pose")
-        if frame.intensity is None and self.params.detection.intensity_scale:
+        if frame.intensity is None and self.settings.intensity_scale:
             return "the cloud has no intensity, which the network was trained with; it reads zeros"
         return None
 
-    def move(self, device: torch.device) -> None:
-        """Run on another device from now on, or on the CPU if there is no memory left on it."""
-        self.device = device
-        try:
-            self.network.to(device)
-            self.anchors = make_anchors(self.config, device)
-        except torch.cuda.OutOfMemoryError as error:
-            self._fall_back(error)
-
-    def _fall_back(self, error: Exception) -> None:
-        if self.device == CPU or not self.params.detection.cpu_fallback:
-            raise InputError(f"no memory left on {self.device}; use the CPU or a smaller network"
-                             ) from error
-        self.fallback = self.problem = (f"{self.device} has no memory left, so the network runs on "
-                                        "the CPU; close other programs and start again")
-        self.move(CPU)
+    def place(self, device: torch.device) -> None:
+        """Bring network and anchors to a device."""
+        self.network.to(device)
+        self.anchors = make_anchors(self.config, device)
 
     def warm_up(self) -> None:
         """Run every part once on made-up points, so that what is compiled is compiled."""
-        rng = np.random.default_rng(0)
-        flat = rng.uniform(0, 40, (2000, 3)) * [1, 1, 0.001] - [0, 20, SENSOR_HEIGHT]
-        thing = rng.uniform(-0.5, 0.5, (400, 3)) + [8, 0, -0.8]
-        xyz = np.concatenate([flat, thing]).astype(np.float32)
-        xyz[:, 2] -= self.params.ground.sensor_pose.height - SENSOR_HEIGHT
-        self(LidarFrame(xyz, np.zeros(len(xyz), np.float32)))
+        self(made_up_frame(self.params.ground.sensor_pose))
         suppressed(np.ones((2, 7)), np.ones(2), np.zeros(2, int), 0.5)
 
 
@@ -194,25 +155,6 @@ def _logit(score: float) -> float:
     if score in (0.0, 1.0):
         return math.copysign(math.inf, score - 0.5)
     return math.log(score / (1 - score))
-
-
-def chosen_device(name: str = "auto") -> torch.device:
-    """The torch device of 'auto', 'cpu', 'cuda' or 'cuda:N'. InputError if it is not there."""
-    available = torch.cuda.is_available()
-    if name == "auto":
-        return torch.device("cuda" if available else "cpu")
-    try:
-        device = torch.device(name)
-        if device.type not in ("cpu", "cuda"):
-            raise RuntimeError
-    except RuntimeError:
-        raise InputError(f"there is no device {name!r}; choose auto, cpu, cuda or cuda:N") from None
-    if device.type == "cuda" and not (available and (device.index or 0)
-                                      < torch.cuda.device_count()):
-        raise InputError(f"device {name!r} is asked for but torch finds "
-                         f"{torch.cuda.device_count() if available else 'no'} CUDA device here; "
-                         "choose auto or cpu")
-    return device
 
 
 def load_detector(path: str | Path = "", device: str = "auto",

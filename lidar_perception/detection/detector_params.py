@@ -36,17 +36,11 @@ class NmsParams(Params):
 
 
 @dataclass(frozen=True)
-class DetectionParams(Params):
-    """Which network, where it runs, and what counts as found."""
+class NetworkParams(Params):
+    """Where a detector's network runs, and what counts as found."""
 
-    version: str = param("auto", "EG-PointPillars version: v0 (PointPillars), v1 ... v4. auto: "
-                         "what the weights are; v4 without weights.",
-                         choices=("auto", "v0", "v1", "v2", "v3", "v4"), fixed=True)
-    size: str = param("auto", "full: the paper's network, for a GPU. compact: for two CPU cores. "
-                      "auto: what the weights are; compact without weights.",
-                      choices=("auto", "full", "compact"), fixed=True)
-    weights: str = param("", "Checkpoint (.safetensors) or exported network (.onnx); empty: the "
-                         "one that comes with the package.", fixed=True)
+    weights: str = param("", "Checkpoint (.safetensors); empty: the one that comes with the "
+                         "package.", fixed=True)
     device: str = param("auto", "cpu, cuda or cuda:N; auto: CUDA where there is one.", fixed=True)
     threads: int = param(0, "CPU threads of the network; fewer leave room for other programs. "
                          "0 takes one for each core.", low=0, high=1024, fixed=True)
@@ -58,6 +52,20 @@ class DetectionParams(Params):
                                    "leaves the intensity out.", low=0.0, high=1000.0)
     scores: ScoreParams = ScoreParams()
     nms: NmsParams = NmsParams()
+
+
+@dataclass(frozen=True)
+class DetectionParams(NetworkParams):
+    """Which PointPillars, where it runs, and what counts as found."""
+
+    weights: str = param("", "Checkpoint (.safetensors) or exported network (.onnx); empty: the "
+                         "one that comes with the package.", fixed=True)
+    version: str = param("auto", "EG-PointPillars version: v0 (PointPillars), v1 ... v4. auto: "
+                         "what the weights are; v4 without weights.",
+                         choices=("auto", "v0", "v1", "v2", "v3", "v4"), fixed=True)
+    size: str = param("auto", "full: the paper's network, for a GPU. compact: for two CPU cores. "
+                      "auto: what the weights are; compact without weights.",
+                      choices=("auto", "full", "compact"), fixed=True)
 
 
 # The experts of paper B: Patchwork++ and DBSCAN, of which it gives no numbers. Ours, chosen on

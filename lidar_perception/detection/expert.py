@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from lidar_perception.clustering.cluster import cluster
+from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
 from lidar_perception.detection.config import SENSOR_HEIGHT, NetworkConfig
 from lidar_perception.detection.detector_params import EXPERT_CLUSTERING, EXPERT_GROUND
@@ -47,9 +47,7 @@ def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | 
         flat = replace(ground_params, sensor_pose=SensorPoseParams(height=SENSOR_HEIGHT))
         ground = segment_ground(seen, flat)
     if needs_clusters and cluster_ids is None:
-        cluster_ids = np.zeros(len(seen), np.int32)
-        obstacles = np.flatnonzero(~ground)
-        cluster_ids[obstacles] = cluster(seen.xyz.take(obstacles, axis=0), clustering)
+        cluster_ids = cluster_obstacles(seen.xyz, ground, clustering)
     if config.remove_ground:
         obstacles = np.flatnonzero(~np.asarray(ground, bool))
         seen = seen.take(obstacles)

@@ -9,7 +9,18 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from lidar_perception.detection.detector_params import NmsParams
 from lidar_perception.rotated_iou import bev_iou
+from lidar_perception.types import CLASSES, Detections
+
+
+def best_of_each(boxes: np.ndarray, scores: np.ndarray, kinds: np.ndarray,
+                 classes: tuple[str, ...], params: NmsParams) -> Detections:
+    """Detections, best first, of the boxes (N, 7) with scores (N,) that stay; kinds (N,) int are
+    places in classes."""
+    kept = suppressed(boxes, scores, kinds, params.iou, params.across_classes)[:params.max_boxes]
+    ids = np.array([CLASSES.index(name) for name in classes])
+    return Detections.of(boxes[kept], ids[kinds[kept]], scores[kept])
 
 
 def suppressed(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: float,

@@ -10,14 +10,18 @@ from lidar_perception.types import InputError
 WEIGHTS = Path(__file__).parent / "weights"
 
 
+def existing(path: str, parameter: str) -> Path:
+    """The file at path. InputError naming the parameter if there is none."""
+    if not Path(path).is_file():
+        raise InputError(f"there is no checkpoint {path}; name another with {parameter}")
+    return Path(path)
+
+
 def weights_file(params: DetectionParams) -> Path:
     """The file that params name, or else the one that comes with the package for their version and
     size. InputError if it is not there."""
     if params.weights:
-        path = Path(params.weights)
-        if not path.is_file():
-            raise InputError(f"there is no checkpoint {path}; name another with detection.weights")
-        return path
+        return existing(params.weights, "detection.weights")
     version = "v4" if params.version == "auto" else params.version
     size = "compact" if params.size == "auto" else params.size
     path = WEIGHTS / f"pointpillars_{version}_{size}.safetensors"

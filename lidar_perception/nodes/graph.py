@@ -31,13 +31,14 @@ STAGES = {
 # ... or all stages in one process.
 SINGLE = {"perception": {"~/input/points": POINTS, "~/input/ground_truth": TRUTH, **CAMERA}}
 
-# Cars, pedestrians and cyclists: a network that reads the columns of its experts' nodes ...
-DETECTION = {
-    **{node: STAGES[node] for node in ("ground_segmentation", "clustering")},
-    "pointpillars_detector": {"~/input/points": "/clustering/output/points"},
-}
-# ... or asks its own.
-SINGLE_DETECTION = {"pointpillars_detector": {"~/input/points": POINTS}}
+# Cars, pedestrians and cyclists: a network behind the nodes that find ground and clusters ...
+EXPERTS = {node: STAGES[node] for node in ("ground_segmentation", "clustering")}
+CLUSTERED = {"~/input/points": "/clustering/output/points"}
+POINTPILLARS = {**EXPERTS, "pointpillars_detector": CLUSTERED}
+POINTNET = {**EXPERTS, "pointnet_detector": CLUSTERED}
+# ... or alone, as it finds both itself.
+SINGLE_POINTPILLARS = {"pointpillars_detector": {"~/input/points": POINTS}}
+SINGLE_POINTNET = {"pointnet_detector": {"~/input/points": POINTS}}
 
 
 def result_topics(single: bool = False) -> dict[str, str]:

@@ -25,6 +25,7 @@ NODES = {  # executable -> class; the module has the executable's name
     "evaluator": "Evaluator",
     "perception": "Perception",
     "pointpillars_detector": "PointPillarsDetector",
+    "pointnet_detector": "PointNetDetector",
 }
 
 
@@ -37,6 +38,7 @@ PARAMS = {  # executable -> its parameters
     "evaluator": "params.EvaluatorParams",
     "perception": "params.PipelineParams",
     "pointpillars_detector": "detection.detector_params.DetectorParams",
+    "pointnet_detector": "pointnet.params.PointNetDetectorParams",
 }
 
 

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 
 from lidar_perception.detection.detector_params import NmsParams
-from lidar_perception.detection.nms import suppressed
+from lidar_perception.detection.nms import best_of_each
 from lidar_perception.pointnet.box_head import decode
 from lidar_perception.pointnet.clusters import ClusterInput, Clusters, network_input
 from lidar_perception.pointnet.config import PointNetConfig
 from lidar_perception.pointnet.network import Outputs, PointNet
-from lidar_perception.types import CLASSES, Detections
+from lidar_perception.types import Detections
 
 CHUNK = 256  # clusters at a time: bounds the memory, and the caches like it
 
@@ -34,6 +34,10 @@ class Predictions:
         """(K,) the probability of the likeliest class."""
         return self.probabilities[np.arange(len(self.kinds)), self.kinds]
 
+    def take(self, chosen: np.ndarray) -> Predictions:
+        """Those of the clusters at places (M,)."""
+        return Predictions(self.probabilities[chosen], self.kinds[chosen], self.boxes[chosen])
+
 
 def found(predictions: Predictions, config: PointNetConfig, least: Sequence[float],
           nms: NmsParams = NmsParams()) -> Detections:
@@ -41,11 +45,8 @@ def found(predictions: Predictions, config: PointNetConfig, least: Sequence[floa
     overlap."""
     chosen = np.flatnonzero(predictions.scores >= np.asarray(least)[predictions.kinds])
     chosen = chosen[np.argsort(-predictions.scores[chosen], kind="stable")][:nms.candidates]
-    boxes, scores = predictions.boxes[chosen], predictions.scores[chosen]
-    kinds = predictions.kinds[chosen]
-    kept = suppressed(boxes, scores, kinds, nms.iou, nms.across_classes)[:nms.max_boxes]
-    ids = np.array([CLASSES.index(name) for name in config.classes])
-    return Detections.of(boxes[kept], ids[kinds[kept]], scores[kept])
+    return best_of_each(predictions.boxes[chosen], predictions.scores[chosen],
+                        predictions.kinds[chosen], config.classes, nms)
 
 
 @torch.inference_mode()

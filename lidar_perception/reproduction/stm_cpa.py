@@ -9,6 +9,7 @@ import numpy as np
 from lidar_perception.candidates.boxes import height_matches, snap_to_ground
 from lidar_perception.candidates.refine import STAGES, Candidates, refine
 from lidar_perception.candidates.seeds import Seed
+from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.configurations import PAPER
 from lidar_perception.datasets.kitti import KittiFrame
@@ -20,7 +21,7 @@ from lidar_perception.evaluation.matching import (
 )
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.params import PipelineParams, flatten, with_values
-from lidar_perception.pipeline import Segmented, cluster_obstacles, segment
+from lidar_perception.pipeline import Segmented, segment
 from lidar_perception.reproduction.experiment import Experiment
 from lidar_perception.reproduction.labelled import load_labelled, nearest_seed
 from lidar_perception.reproduction.params import StmCpaParams

@@ -12,6 +12,7 @@ from scipy.special import expit, logit
 
 from lidar_perception.candidates.accumulation import accumulate, aligned, velocities
 from lidar_perception.candidates.boxes import snap_to_ground
+from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.configurations import BEST
 from lidar_perception.datasets.kitti import PERIOD_NS, KittiFrame
@@ -19,7 +20,7 @@ from lidar_perception.evaluation.matching import match_centres
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.params import flatten, with_values
-from lidar_perception.pipeline import Segmented, cluster_obstacles, segment
+from lidar_perception.pipeline import Segmented, segment
 from lidar_perception.reproduction.experiment import Cell, Experiment, Section, Table
 from lidar_perception.reproduction.labelled import Labelled, load_labelled, nearest_seed
 from lidar_perception.reproduction.variants import (

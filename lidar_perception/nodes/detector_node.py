@@ -1,0 +1,112 @@
+"""What the nodes with a network share: how it is loaded, run, and spoken of."""
+
+from __future__ import annotations
+
+import os
+import traceback
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from lidar_perception.messages import column, to_frame
+from lidar_perception.nodes.main import one_at_a_time
+from lidar_perception.nodes.outputs import DetectionOutputs
+from lidar_perception.nodes.runtime import CLOUD, ERROR, OK, WARN, LidarNode
+from lidar_perception.nodes.sensor_check import SensorCheck
+from lidar_perception.types import Detections, InputError, LidarFrame
+from msg_utils.stamps import to_ns
+
+
+class DetectorNode(LidarNode):
+    """~/input/points -> ~/output/detections. A node names its network's group of parameters, finds
+    its weights and loads the detector.
+
+    It loads the network before it subscribes. Without one it says why and publishes nothing, as an
+    empty array would mean that nothing is there.
+    """
+
+    group: ClassVar[str]  # of the parameters, a NetworkParams
+
+    def __init__(self, name: str, params: Any, steps: tuple[str, ...], **options: Any):
+        super().__init__(name, params, **options)
+        self.sensor = SensorCheck(self)
+        self.outputs = DetectionOutputs(self, steps)
+        self.report(WARN, "loading the network")
+        self.detector = self._loaded()
+        self.input("points", CLOUD, self.on_points)
+
+    def weights(self) -> Path:
+        """The file of the weights, found without loading torch. InputError if there is none."""
+        raise NotImplementedError
+
+    def load(self, weights: Path, device: str) -> Any:
+        """The detector with these weights, warmed up. InputError if they cannot be used."""
+        raise NotImplementedError
+
+    def name_of(self, config: Any) -> str:
+        """What a network's config is called."""
+        raise NotImplementedError
+
+    def _loaded(self) -> Any:
+        try:
+            detector = self._load()
+        except InputError as error:
+            self.report(ERROR, f"nothing is detected: {error}")
+            return None
+        except Exception as error:  # of torch and its drivers: the node lives to tell
+            self.get_logger().error(traceback.format_exc())
+            self.report(ERROR, "nothing is detected, as the network cannot be loaded: "
+                        f"{type(error).__name__}: {error}")
+            return None
+        config = detector.config
+        self.counts.update(network=f"{self.name_of(config)}, {' '.join(config.classes)}",
+                           device=str(detector.device))
+        self.report(WARN, detector.fallback or "waiting for input")
+        return detector
+
+    def _load(self) -> Any:
+        """The detector that the parameters ask for; on the CPU if CUDA is asked for and not there,
+        and the CPU may take over."""
+        chosen, missing = getattr(self.params, self.group), None
+        weights = self.weights()
+        import torch  # takes seconds, so it waits until there are weights
+
+        from lidar_perception.devices import chosen_device
+        # 0 leaves torch with what main.py sets in the environment, which is one.
+        torch.set_num_threads(chosen.threads or len(os.sched_getaffinity(0)))
+        device = chosen.device
+        if device.startswith("cuda") and chosen.cpu_fallback:
+            try:
+                chosen_device(device)
+            except InputError as error:
+                device, missing = "cpu", f"{error}; the CPU is used"
+        with one_at_a_time():
+            detector = self.load(weights, device)
+        detector.fallback = detector.fallback or missing
+        return detector
+
+    def on_points(self, msg: Any) -> None:
+        if self.detector is None:
+            return
+        with self.frame(to_ns(msg.header.stamp)):
+            frame, places = to_frame(msg, self.params.input.intensity_max)
+            ground, ids = column(msg, "ground", places), column(msg, "cluster_id", places)
+            with np.errstate(invalid="ignore"):  # NaN in a column of floats is no cluster
+                ids = None if ids is None else ids.astype(np.int32)
+            self.detector.params = self.params
+            found = self.detector(frame, ground=None if ground is None else ground > 0,
+                                  cluster_ids=ids)
+            self.outputs.publish(msg.header, found, self.detector.ms)
+        self._diagnose(frame, found)
+
+    def _diagnose(self, frame: LidarFrame, found: Detections) -> None:
+        problem = self.detector.problem or self.sensor.problem(frame)
+        self.counts.update(detections=len(found), device=str(self.detector.device))
+        self.counts["best scores"] = " ".join(
+            f"{name} {score:.2f}" for name, score in self.detector.best.items())
+        if problem:
+            self.report(WARN, problem)
+        else:
+            self.report(OK, "detecting" if len(found) else "nothing found: every score is below "
+                        f"its threshold in {self.group}.scores")

@@ -1,0 +1,33 @@
+"""~/input/points -> ~/output/detections: cars, pedestrians and cyclists among clusters."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lidar_perception.nodes.detector_node import DetectorNode
+from lidar_perception.pointnet.params import STEPS, PointNetDetectorParams
+from lidar_perception.pointnet.weights_file import weights_file
+
+if TYPE_CHECKING:
+    from lidar_perception.pointnet.config import PointNetConfig
+    from lidar_perception.pointnet.detector import PointNetDetector as Detector
+
+
+class PointNetDetector(DetectorNode):
+    """Reads the column `cluster_id`; without it the node finds ground and clusters itself."""
+
+    group = "pointnet"
+
+    def __init__(self, **options: Any):
+        super().__init__("pointnet_detector", PointNetDetectorParams(), STEPS, **options)
+
+    def weights(self) -> Path:
+        return weights_file(self.params.pointnet)
+
+    def load(self, weights: Path, device: str) -> Detector:
+        from lidar_perception.pointnet.detector import load_pointnet_detector
+        return load_pointnet_detector(weights, device, self.params)
+
+    def name_of(self, config: PointNetConfig) -> str:
+        return config.name

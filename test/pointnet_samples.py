@@ -1,0 +1,57 @@
+"""Small cluster networks and detectors for the tests of PointNet; scenes: detection_samples."""
+
+from __future__ import annotations
+
+import torch
+
+from lidar_perception.params import with_values
+from lidar_perception.pointnet.checkpoint import Header
+from lidar_perception.pointnet.config import PointNetConfig, pointnet_config
+from lidar_perception.pointnet.detector import PointNetDetector
+from lidar_perception.pointnet.network import CONTEXT, PointNet, make_pointnet
+from lidar_perception.pointnet.params import PointNetDetectorParams
+
+CPU = torch.device("cpu")
+SMALL = dict(points=32, centroids=12, coarse=4, neighbours=(4, 6, 8), coarse_neighbours=4,
+             point_channels=(8, 8), group_channels=(8, 8), local_channels=12, global_channels=16,
+             head_channels=(16,))
+
+
+def small(name: str = "improved", **changes) -> PointNetConfig:
+    """Any network with a few channels."""
+    return pointnet_config(name, **{**SMALL, **changes})
+
+
+def lively(config: PointNetConfig, seed: int = 0) -> PointNet:
+    """A network in inference mode whose norms have seen random clusters, so that its outputs differ
+    from cluster to cluster."""
+    torch.manual_seed(seed)
+    network = make_pointnet(config)
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm1d):
+            torch.nn.init.uniform_(module.weight, 0.5, 1.5)
+            torch.nn.init.normal_(module.bias, std=0.3)
+            module.momentum = 1.0
+    torch.nn.init.normal_(network.classes.weight, std=0.5)
+    clusters = (torch.randn(64, config.points, 5) * torch.tensor([2.0, 1, 1, 0.5, 1])
+                * torch.rand(64, 1, 5), torch.ones(64, config.points, dtype=torch.bool),
+                torch.rand(64, CONTEXT) * 2)
+    with torch.no_grad():
+        network(*clusters)  # which the norms remember
+        logits = network.eval()(*clusters).logits
+        network.classes.bias -= logits.mean(dim=0)  # no class is likelier than the others
+    return network.requires_grad_(False)
+
+
+def eager(params: PointNetDetectorParams = PointNetDetectorParams(),
+          score: float = 0.0) -> PointNetDetectorParams:
+    """Parameters with which random weights find something; with a score of 0 every cluster."""
+    return with_values(params, {f"pointnet.scores.{name}": score for name in (
+        "car", "pedestrian", "cyclist", "other")} | {"pointnet.nms.iou": 0.9})
+
+
+def random_detector(params: PointNetDetectorParams | None = None,
+                    **changes) -> PointNetDetector:
+    """With random weights."""
+    config = small(**changes)
+    return PointNetDetector(lively(config), Header(config), CPU, params or eager())
