@@ -11,7 +11,7 @@ from lidar_perception.pointnet import config as config_module
 from lidar_perception.pointnet.box_head import BoxTargets, cluster_loss, decode, encode
 from lidar_perception.pointnet.calibration import calibrate, calibration_error
 from lidar_perception.pointnet.clusters import Clusters, clusters_of, network_input
-from lidar_perception.pointnet.config import ABLATIONS, pointnet_config
+from lidar_perception.pointnet.config import ABLATIONS, NETWORKS, pointnet_config
 from lidar_perception.pointnet.network import Outputs, fused, make_pointnet, nearest
 from lidar_perception.pointnet.predict import found, predict
 from lidar_perception.types import InputError, LidarFrame
@@ -150,7 +150,7 @@ def test_groups_are_what_plain_loops_make_of_them(rng):
                 assert torch.allclose(local[b, c], wanted, atol=1e-4)
 
 
-@pytest.mark.parametrize("name", [*ABLATIONS, "pointnet2"])
+@pytest.mark.parametrize("name", NETWORKS)
 def test_points_that_fill_up_a_cluster_change_nothing(rng, name):
     net = network(name)
     clusters = blobs(rng, [10, 12, 2])
@@ -178,8 +178,8 @@ def test_every_switch_of_the_ablation_changes_the_network_or_the_clusters():
     assert len(known) == len(ABLATIONS)
     sizes = {name: sum(p.numel() for p in make_pointnet(config).parameters())
              for name, config in made.items()}
-    assert sizes["base"] == sizes["dynamic threshold"] < sizes["skip"] < sizes["MSG + skip"] < (
-        sizes["all"])
+    assert sizes["base"] == sizes["dynamic-threshold"] < sizes["skip"] < sizes["msg-skip"] < (
+        sizes["improved"])
     assert pointnet_config("pointnet").groups == ()
     assert len(pointnet_config("pointnet2").groups) == 1
     assert made["base"].clustering.euclidean.threshold == "fixed"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Sized
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from lidar_perception.training.run import Progress
 
 SIM = "sim"
+PAPER_ABLATION = (75.52, 80.15, 81.33, 83.44, 85.10, 86.33, 86.89, 88.96)  # paper C, Table 5
 FIRST_STREET, FIRST_VALIDATION_STREET = 10_000_000, 20_000_000  # far from what anybody else takes
 
 SCENES_AND_RUN = (
@@ -119,10 +121,12 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
 
 @train.command()
 @scene_options
+@click.option("--ablation", is_flag=True, help="Train every row of the paper's ablation, each into "
+              "a folder in --out, and show them side by side.")
 @parameter_options(PointNetTraining())
 def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
              val_split: Path | None, out: Path, resume: bool, device: str, jobs: int,
-             params: PointNetTraining) -> None:
+             ablation: bool, params: PointNetTraining) -> None:
     """The cluster network of paper C, on KITTI folders, simulated streets, or both.
 
     Scenes are cut into clusters by the package's own ground and clustering; with --data-cache the
@@ -134,30 +138,63 @@ def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
       lidar-perception train pointnet --data sim --data-cache scans --out pointnet
       lidar-perception train pointnet --data /data/kitti/object --split train.txt \\
           --val-split val.txt --epochs 20 --out pointnet --resume
+      lidar-perception train pointnet --ablation --data sim --data-cache scans --steps 1000 \\
+          --out ablation
     """
     from lidar_perception.devices import chosen_device
+    from lidar_perception.pointnet.config import ABLATIONS
+    from lidar_perception.training.ranks import joined, rank
+    scenes = training_scenes(data, val, split, val_split, params.data, params.seed)
+    with joined(chosen_device(device)) as place:
+        for name in ABLATIONS if ablation else (params.network,):
+            folder = out / name if ablation else out
+            if rank() == 0 and ablation:
+                console.print(f"{name}:", style="bold")
+            _train_pointnet(replace(params, network=name), data, val, scenes, folder, resume,
+                            place, jobs)
+        if ablation and rank() == 0:
+            print_ablation(out)
+
+
+def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[str, ...],
+                    scenes: tuple[tuple, tuple], out: Path, resume: bool, place: Any,
+                    jobs: int) -> None:
     from lidar_perception.pointnet.config import pointnet_config
     from lidar_perception.training.cut_scenes import CutScenes
     from lidar_perception.training.data import Batches, Stream
     from lidar_perception.training.loop import may_begin
     from lidar_perception.training.loop import train as run
     from lidar_perception.training.pointnet import ClusterPreparation, JudgedCuts, make_task
-    from lidar_perception.training.ranks import joined, rank, world
+    from lidar_perception.training.ranks import rank, world
     may_begin(out, resume)
     config = pointnet_config(params.network)
     cache = Path(params.data.cache) / "clusters" if params.data.cache else None
-    sources, held_out = (
-        tuple(CutScenes(source, config, params.data.least_points, cache) for source in scenes)
-        for scenes in training_scenes(data, val, split, val_split, params.data, params.seed))
-    with joined(chosen_device(device)) as place:
-        stream = Stream(sources, ClusterPreparation(config, params.augment), params.seed)
-        batches = Batches(stream, params.batch, jobs, rank(), world())
-        task = make_task(config, params, batches, JudgedCuts(held_out), out, place,
-                         about_data(data, val, stream, held_out), commit())
-        progress = run(task, params, out, place, resume)
-        if rank() > 0:
-            return
-    tell(progress, batches, out)
+    sources, held_out = (tuple(CutScenes(source, config, params.data.least_points, cache)
+                               for source in part) for part in scenes)
+    stream = Stream(sources, ClusterPreparation(config, params.augment), params.seed)
+    batches = Batches(stream, params.batch, jobs, rank(), world())
+    task = make_task(config, params, batches, JudgedCuts(held_out), out, place,
+                     about_data(data, val, stream, held_out), commit())
+    progress = run(task, params, out, place, resume)
+    if rank() == 0:
+        tell(progress, batches, out)
+
+
+def print_ablation(out: Path) -> None:
+    """The best of each row beside the paper's mAP on KITTI (Table 5)."""
+    from lidar_perception.evaluation.report import narrow_table
+    from lidar_perception.pointnet.checkpoint import read_header
+    from lidar_perception.pointnet.config import ABLATIONS
+    table = narrow_table("Ablation, simulated or KITTI frames validated on", "network", "paper mAP",
+                         "AP from above", "accuracy", "of objects")
+    for name, paper in zip(ABLATIONS, PAPER_ABLATION):
+        metrics = read_header(out / name / "best.safetensors").metrics
+        table.add_row(name, f"{paper:.2f}", *(
+            "-" if metrics.get(key) is None else f"{metrics[key]:.1f}"
+            for key in ("score", "accuracy", "object_accuracy")))
+    table.caption = ("AP from above: mean of Car, Pedestrian and Cyclist at the overlaps 0.5 / "
+                     "0.25 / 0.25, moderate, R40; best weights of each run.")
+    console.print(table)
 
 
 def about_data(data: tuple[str, ...], val: tuple[str, ...], stream: Sized,

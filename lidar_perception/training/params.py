@@ -155,7 +155,9 @@ class PointNetTraining(LoopParams):
     """Everything that train pointnet can be told."""
 
     network: str = param("improved", "improved: paper C's. pointnet, pointnet2: plain PointNet and "
-                         "PointNet++ (single-scale grouping), to compare with.",
-                         choices=("improved", "pointnet", "pointnet2"))
+                         "PointNet++ (single-scale grouping), to compare with. The others are rows "
+                         "of the paper's ablation.", choices=(
+                             "improved", "pointnet", "pointnet2", "base", "dynamic-threshold",
+                             "log-point-count", "skip", "msg-mrg", "msg-skip", "mrg-skip"))
     augment: ClusterAugmentParams = ClusterAugmentParams()
     data: DataParams = DataParams()
