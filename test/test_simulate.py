@@ -1,6 +1,7 @@
 """Laws of the command that makes data sets: neither a stop nor the number of processes changes a
 byte, and what is there is not touched."""
 
+import contextlib
 import errno
 import itertools
 import json
@@ -68,19 +69,30 @@ def test_a_data_set_that_failed_in_the_middle_is_marked_and_resumed(made, tmp_pa
     assert content(out) == content(made / layout)
 
 
-def start(out, frames, *more):
-    """The command in a process group of its own, once it has finished a few frames."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", SCRIPT, "simulate",
-         *arguments(out, "kitti-tracking", frames, 2, *more)],
-        cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, start_new_session=True, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-        # A shell lets what it starts in the background ignore SIGINT.
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
-    while len(list(out.glob(".parts/*.json"))) < 3:
-        assert process.poll() is None, process.stderr.read()
-        time.sleep(0.01)
-    return process
+@pytest.fixture
+def start():
+    """start(out, frames, ...): the command in a process group of its own, once it has finished a
+    few frames. Whatever happens, none of the group outlives the test."""
+    groups = []
+
+    def begun(out, frames, *more):
+        process = subprocess.Popen(
+            [sys.executable, "-c", SCRIPT, "simulate",
+             *arguments(out, "kitti-tracking", frames, 2, *more)],
+            cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, start_new_session=True,
+            text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            # A shell lets what it starts in the background ignore SIGINT.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+        groups.append(process.pid)
+        while len(list(out.glob(".parts/*.json"))) < 3:
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.01)
+        return process
+
+    yield begun
+    for group in groups:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(group, signal.SIGKILL)
 
 
 def wait_for_the_end(group):
@@ -95,9 +107,9 @@ def wait_for_the_end(group):
     pytest.fail("a process is still there")
 
 
-def test_after_a_kill_nothing_runs_on_and_it_goes_on_where_it_was(tmp_path):
-    out, frames = tmp_path / "set", 80
-    process = start(out, frames, "--streets-of", 50)
+def test_after_a_kill_nothing_runs_on_and_it_goes_on_where_it_was(start, tmp_path):
+    out, frames = tmp_path / "set", 40
+    process = start(out, frames, "--streets-of", 30)
     os.kill(process.pid, signal.SIGKILL)  # its children end by themselves
     process.wait()
     wait_for_the_end(process.pid)
@@ -105,15 +117,15 @@ def test_after_a_kill_nothing_runs_on_and_it_goes_on_where_it_was(tmp_path):
     assert (out / "INCOMPLETE").exists()
     (out / "training/velodyne/0000/.000299.bin.1.tmp").write_bytes(b"half")  # as a kill leaves it
     assert 3 <= len(list(out.glob(".parts/*.json"))) < frames
-    again = run(out, "kitti-tracking", frames, 1, "--streets-of", 50, "--resume")
+    again = run(out, "kitti-tracking", frames, 1, "--streets-of", 30, "--resume")
     assert again.exit_code == 0
-    assert run(tmp_path / "whole", "kitti-tracking", frames, 1, "--streets-of", 50).exit_code == 0
+    assert run(tmp_path / "whole", "kitti-tracking", frames, 1, "--streets-of", 30).exit_code == 0
     assert content(out) == content(tmp_path / "whole")
     assert len(open_kitti(out)) == frames
     assert len(list(out.glob("training/label_02/*.txt"))) == 2
 
 
-def test_two_writers_do_not_meet_and_ctrl_c_ends_all_processes(tmp_path):
+def test_two_writers_do_not_meet_and_ctrl_c_ends_all_processes(start, tmp_path):
     process = start(tmp_path / "set", 100_000)
     for more in (["--resume"], ["--force"], []):
         with pytest.raises(InputError, match="another process"):
