@@ -42,6 +42,17 @@ class Camera:
         """(N,) bool: points (N, 3) in front of the camera that fall into the image."""
         return _in_view(xyz, self.projection, self.width, self.height)
 
+    def in_regions(self, xyz: np.ndarray, regions: np.ndarray) -> np.ndarray:
+        """(N,) bool: points (N, 3) in front of the camera that fall into any of regions (R, 4)
+        [left top right bottom], pixels; the image's border does not matter."""
+        u, v, depth = (np.asarray(xyz, np.float64) @ self.projection[:, :3].T
+                       + self.projection[:, 3]).T
+        inside = np.zeros(len(xyz), bool)
+        for left, top, right, bottom in np.reshape(regions, (-1, 4)):
+            inside |= ((left * depth <= u) & (u < right * depth)
+                       & (top * depth <= v) & (v < bottom * depth))
+        return inside & (depth > 0)
+
 
 @njit(cache=True)
 def _in_view(xyz, projection, width, height):

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from samples import CALIBRATION
 from test_pointnet import SMALL, blobs
 
 from lidar_perception.evaluation.clusters import (
@@ -12,6 +15,8 @@ from lidar_perception.evaluation.clusters import (
     ClusterScores,
     labelled,
     point_labels,
+    uncared,
+    unknown_where,
 )
 from lidar_perception.geometry import points_in_box, wrap_angle
 from lidar_perception.pointnet.clusters import Clusters
@@ -29,7 +34,7 @@ from lidar_perception.training.pointnet import (
     make_loss,
     validated,
 )
-from lidar_perception.types import CLASSES, InputError
+from lidar_perception.types import CLASSES, GroundTruth, InputError, LidarFrame
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = pointnet_config(**SMALL)
@@ -78,6 +83,25 @@ def test_a_cluster_is_what_most_of_its_points_lie_in(rng):
     assert none[0].tolist() == [3] * 5 and none[1].tolist() == [-1] * 5
     points = point_labels(clusters.points[:, :3], BOXES, names, CONFIG.classes)
     assert points.reshape(5, 60).tolist() == [[k] * 60 for k in (0, 1, 2, UNKNOWN, 3)]
+
+
+def test_where_nothing_is_labelled_background_is_unknown(rng):
+    camera = CALIBRATION.camera()
+    xyz = np.column_stack([rng.uniform(-20, 40, 500), rng.uniform(-20, 20, (500, 2))])
+    xyz = xyz.astype(np.float32)
+    whole = np.array([0, 0, camera.width, camera.height])
+    assert np.array_equal(camera.in_regions(xyz, whole[None]), camera.in_view(xyz))
+    halves = np.array([[0, 0, 600, camera.height], [600, 0, camera.width, camera.height]])
+    assert np.array_equal(camera.in_regions(xyz, halves), camera.in_view(xyz))
+    assert not camera.in_regions(xyz, np.zeros((0, 4))).any()
+    clusters = in_boxes(rng, BOXES[:3], 10)
+    truth = GroundTruth.of(np.zeros((0, 7)), [], notes=(("DontCare", {"bbox": whole}),))
+    blind = uncared(truth, camera, clusters.points[:, :3])
+    assert blind.all() and not uncared(replace(truth, notes=()), camera,
+                                       clusters.points[:, :3]).any()
+    blind[:14] = False  # the first cluster, and four tenths of the second
+    assert unknown_where(np.array([3, 3, 3]), clusters, blind, 3).tolist() == [3, UNKNOWN, UNKNOWN]
+    assert unknown_where(np.array([0, 1, 2]), clusters, blind, 3).tolist() == [0, 1, 2]
 
 
 def test_scores_of_clusters_and_points_are_counted_by_hand(rng):
@@ -209,9 +233,6 @@ def test_a_network_learns_to_tell_clusters_apart(rng):
 
 
 def test_validation_reads_every_scene_and_calibrates(rng):
-    from samples import CALIBRATION
-
-    from lidar_perception.types import GroundTruth, LidarFrame
     scene = sample_scene(rng, 4)
     truth = GroundTruth.of(BOXES[:3], ids("Car", "Pedestrian", "Cyclist"),
                            [{"truncated": 0.0, "occluded": 0}] * 3)

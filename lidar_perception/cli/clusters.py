@@ -12,7 +12,14 @@ import numpy as np
 from rich.console import Console
 
 from lidar_perception.datasets.kitti import KittiFrame, open_kitti
-from lidar_perception.evaluation.clusters import ClusterScores, labelled, point_labels
+from lidar_perception.evaluation.clusters import (
+    UNKNOWN,
+    ClusterScores,
+    labelled,
+    point_labels,
+    uncared,
+    unknown_where,
+)
 from lidar_perception.evaluation.report import narrow_table, print_skipped
 from lidar_perception.files import write_text
 from lidar_perception.ground.segment import segment_ground
@@ -36,8 +43,8 @@ def clusters(kitti: Path, weights: Path | None, json_file: Path | None) -> None:
 
     Clusters are made as the network asks for. One is an object if half of its points or more lie
     in the object's box, and background if less than 15 percent lie in any; the others, and Van,
-    Truck, Tram and Person_sitting, do not count. Only points in the image count, as labels end
-    there.
+    Truck, Tram, Person_sitting and what lies in a DontCare region, do not count. Only points in
+    the image count, as labels end there.
 
     \b
     Example:
@@ -74,12 +81,16 @@ def _scored(frames: list[KittiFrame], network: Any, scores: ClusterScores) -> It
         if scan is not None:
             ids = cluster_obstacles(scan.xyz, segment_ground(scan, config.ground),
                                     config.clustering)
-            places = np.flatnonzero(frame.calibration().camera().in_view(scan.xyz))
+            camera, background = frame.calibration().camera(), len(config.classes)
+            places = np.flatnonzero(camera.in_view(scan.xyz))
             seen, ids = scan.take(places), ids[places]
             made = clusters_of(seen, ids)
             labels, _ = labelled(made, truth.boxes, truth.class_ids, config.classes)
-            scores.add(made, labels, predict(network, made), point_labels(
-                seen.xyz, truth.boxes, truth.class_ids, config.classes), ids)
+            labels = unknown_where(labels, made, uncared(truth, camera, made.points[:, :3]),
+                                   background)
+            points = point_labels(seen.xyz, truth.boxes, truth.class_ids, config.classes)
+            points[(points == background) & uncared(truth, camera, seen.xyz)] = UNKNOWN
+            scores.add(made, labels, predict(network, made), points, ids)
         yield
 
 

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.camera import Camera
 from lidar_perception.geometry import points_in_box
 from lidar_perception.pointnet.clusters import Clusters
 from lidar_perception.pointnet.predict import Predictions
-from lidar_perception.types import CLASSES
+from lidar_perception.types import CLASSES, GroundTruth
 
 UNKNOWN = -1              # a label of which nothing is said
 SURE, UNSURE = 0.5, 0.15  # a cluster with this share of its points in a box is that object, with
@@ -50,6 +51,21 @@ def point_labels(xyz: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
     for kind, box in zip(kinds_of(class_ids, classes), boxes):
         labels[points_in_box(xyz, box, BORDER)] = kind
     return labels
+
+
+def uncared(truth: GroundTruth, camera: Camera, xyz: np.ndarray) -> np.ndarray:
+    """(N,) bool: points (N, 3) in regions of the image where nothing is labelled (DontCare)."""
+    regions = [extra["bbox"] for name, extra in truth.notes if name == "DontCare"]
+    return camera.in_regions(xyz, np.array(regions, float))
+
+
+def unknown_where(labels: np.ndarray, clusters: Clusters, uncared: np.ndarray,
+                  background: int) -> np.ndarray:
+    """labels (K,) of clusters with UNKNOWN for background of which half of the points or more are
+    not cared for, uncared (P,) bool."""
+    number = np.repeat(np.arange(len(clusters)), clusters.sizes)
+    share = np.bincount(number, uncared, minlength=len(clusters)) / np.maximum(clusters.sizes, 1)
+    return np.where((labels == background) & (share >= 0.5), UNKNOWN, labels)
 
 
 def kinds_of(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
