@@ -131,7 +131,7 @@ def test_detectors_import_torch_and_the_algorithms(name):
 @pytest.mark.parametrize("name", files_in("lidar_perception/pointnet"))
 def test_pointnet_imports_of_the_other_detector_what_is_not_its_network(name):
     shared = [f"lidar_perception.detection.{module}" for module in (
-        "detector_params", "network_detector", "nms", "view", "weights_file")]
+        "config", "detector_params", "network_detector", "nms", "view", "weights_file")]
     own = ["lidar_perception.pointnet", *NETWORKS, *shared]
     algorithms = [m for m in ALGORITHMS if not m.endswith("candidates")]
     assert strangers(name, NUMERIC + ["torch"] + SHARED + algorithms + own) == []

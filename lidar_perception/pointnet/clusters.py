@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from lidar_perception.pointnet.config import SENSOR_HEIGHT
+from lidar_perception.detection.config import SENSOR_HEIGHT
 from lidar_perception.types import LidarFrame
 
 

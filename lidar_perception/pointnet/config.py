@@ -14,8 +14,6 @@ from typing import Any
 from lidar_perception.params import ClusteringParams, EuclideanParams, GroundParams
 from lidar_perception.types import CLASSES, InputError
 
-SENSOR_HEIGHT = 1.73  # m, KITTI's; the network sees every cloud as from this height
-
 # l w h in metres, means of KITTI's training labels (Geiger et al. 2012)
 MEAN_SIZES = {"Car": (3.88, 1.63, 1.53), "Pedestrian": (0.84, 0.66, 1.76),
               "Cyclist": (1.76, 0.60, 1.74)}

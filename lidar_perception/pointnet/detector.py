@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.detection.config import SENSOR_HEIGHT
 from lidar_perception.detection.network_detector import NetworkDetector
 from lidar_perception.detection.nms import suppressed
 from lidar_perception.detection.view import (
@@ -24,7 +25,6 @@ from lidar_perception.ground.segment import segment_ground
 from lidar_perception.params import SensorPoseParams
 from lidar_perception.pointnet.checkpoint import Header, load_pointnet
 from lidar_perception.pointnet.clusters import Clusters, clusters_of
-from lidar_perception.pointnet.config import SENSOR_HEIGHT
 from lidar_perception.pointnet.network import PointNet, fused
 from lidar_perception.pointnet.params import STEPS, PointNetDetectorParams, PointNetParams
 from lidar_perception.pointnet.predict import Predictions, found, predict

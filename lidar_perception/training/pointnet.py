@@ -13,13 +13,14 @@ import torch
 from torch import Tensor, nn
 
 from lidar_perception.datasets.kitti_calibration import KittiCalibration
+from lidar_perception.detection.config import SENSOR_HEIGHT
 from lidar_perception.evaluation.detection import DetectionReport
 from lidar_perception.geometry import points_in_box
 from lidar_perception.pointnet.box_head import BoxTargets, cluster_loss, encode
 from lidar_perception.pointnet.calibration import calibrate, calibration_error
 from lidar_perception.pointnet.checkpoint import Header, save_checkpoint
 from lidar_perception.pointnet.clusters import ClusterInput, Clusters, network_input
-from lidar_perception.pointnet.config import SENSOR_HEIGHT, PointNetConfig
+from lidar_perception.pointnet.config import PointNetConfig
 from lidar_perception.pointnet.network import PointNet, make_pointnet
 from lidar_perception.pointnet.predict import found, outputs_of, predict
 from lidar_perception.training.cut_scenes import CutScene, CutScenes
