@@ -16,6 +16,7 @@ from benchmark import clustering, ground, peers
 from benchmark.candidates import compare, print_comparison
 from benchmark.detection import measure_detection, print_detection
 from benchmark.graph import measure_graph, print_graph
+from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, print_planes
 from benchmark.simulation import measure_simulation
 from benchmark.timing import spread
@@ -52,8 +53,8 @@ FEW = 3              # frames with a pedestrian, below which those without serve
 def main(kitti: Path, semantic_kitti: Path | None, json_file: Path | None, repeat: int,
          count: int, graph: bool) -> None:
     """Time our candidate pipeline beside a plain scikit-learn + OpenCV reading of the paper, and
-    each algorithm beside its peers, and the steps of every version of EG-PointPillars. Peers that
-    are not installed are left out.
+    each algorithm beside its peers, and the steps of every version of EG-PointPillars and of the
+    PointNet detector. Peers that are not installed are left out.
 
     \b
     Example:
@@ -77,6 +78,8 @@ def main(kitti: Path, semantic_kitti: Path | None, json_file: Path | None, repea
     if scans:
         content["detection"] = measure_detection(scans, repeat)
         print_detection(content["detection"])
+        content["pointnet"] = measure_pointnet(scans, repeat)
+        print_pointnet(content["pointnet"])
     if labelled:
         content["ground_scores"] = ground.measure_labelled(labelled, repeat)
         print_ground(content["ground_scores"])

@@ -8,12 +8,15 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from click.testing import CliRunner
 from samples import object_folder, scene, walker_label
 
 from benchmark import ground, peers, plain_euclidean
 from benchmark.clustering import dbscan_times, measure_dbscan, same_clusters
 from benchmark.detection import measure_detection, print_detection
+from benchmark.plain_pointnet2 import ball, farthest
+from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, row, target_text, value_text
 from benchmark.timing import Clock, in_child, interleaved
 from lidar_perception.clustering.euclidean import euclidean
@@ -120,6 +123,19 @@ def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsy
         assert found["ms"]["network"] > 0 and found["ms"]["postprocess"] > 0
         assert name in shown and found["to_v0"] == found["total_ms"] / versions["v0"]["total_ms"]
     assert versions["v4"]["ms"]["experts"] > versions["v0"]["ms"]["experts"]  # v0 has none
+
+
+def test_the_cluster_network_is_timed_beside_a_plain_one(one_thread, capsys):
+    points = scene()
+    content = measure_pointnet([LidarFrame(points[:, :3], points[:, 3])] * 2, 1)
+    print_pointnet(json.loads(json.dumps(content)))
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in ("improved PointNet", "plain PointNet++", "clustering"))
+    assert content["clusters"] >= 1 and all(value > 0 for value in content["ms"].values())
+    # the peer groups as it should: what is near it finds, and points in any order are the same
+    xyz = torch.tensor([[[0.0, 0, 0], [5, 0, 0], [0.1, 0, 0], [0, 0.3, 0]]])
+    assert farthest(xyz, 3).tolist()[0][:2] == [0, 1]
+    assert ball(0.2, 2, xyz, xyz[:, :1]).tolist() == [[[0, 2]]]
 
 
 def test_the_command_writes_what_it_measured(nothing_installed, tmp_path):

@@ -1,0 +1,75 @@
+"""A plain reading of PointNet++ with single-scale grouping (Qi et al., NeurIPS 2017), as small
+repositories have it: farthest point sampling in a loop, ball query by sorting all distances, groups
+through 1 x 1 convolutions. It is a peer to time against, with the widths of our own network."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from lidar_perception.pointnet.config import PointNetConfig
+
+
+def farthest(xyz: Tensor, count: int) -> Tensor:
+    """(B, count) places of points (B, N, 3), each farthest from those before it."""
+    batch, size = xyz.shape[:2]
+    chosen = torch.zeros(batch, count, dtype=torch.long)
+    apart, last = torch.full((batch, size), 1e10), torch.zeros(batch, dtype=torch.long)
+    every = torch.arange(batch)
+    for i in range(count):
+        chosen[:, i] = last
+        apart = torch.minimum(apart, ((xyz - xyz[every, last][:, None]) ** 2).sum(-1))
+        last = apart.argmax(dim=1)
+    return chosen
+
+
+def ball(radius: float, count: int, xyz: Tensor, centres: Tensor) -> Tensor:
+    """(B, M, count) places of the first points within the radius of centres (B, M, 3)."""
+    size = xyz.shape[1]
+    places = torch.arange(size).expand(*centres.shape[:2], size).clone()
+    places[torch.cdist(centres, xyz) > radius] = size
+    places = places.sort(dim=-1).values[..., :count]
+    return torch.where(places == size, places[..., :1].clamp(max=size - 1), places)
+
+
+class SetAbstraction(nn.Module):
+    """Points in balls around some of them, each ball through layers and a maximum."""
+
+    def __init__(self, count: int, radius: float, neighbours: int, *channels: int):
+        super().__init__()
+        self.count, self.radius, self.neighbours = count, radius, neighbours
+        layers = []
+        for a, b in pairwise(channels):
+            layers += [nn.Conv2d(a, b, 1), nn.BatchNorm2d(b), nn.ReLU()]
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, xyz: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        every = torch.arange(len(xyz))[:, None]
+        centres = xyz[every, farthest(xyz, self.count)]
+        places = ball(self.radius, self.neighbours, xyz, centres)
+        rows = torch.cat([xyz[every[:, :, None], places] - centres[:, :, None],
+                          features[every[:, :, None], places]], dim=-1)
+        return centres, self.layers(rows.permute(0, 3, 2, 1)).amax(dim=2).transpose(1, 2)
+
+
+class PlainPointNet2(nn.Module):
+    """Points (B, N, 5) to (B, classes + 1) logits and (B, 6 + 2 Y) box numbers."""
+
+    def __init__(self, config: PointNetConfig):
+        super().__init__()
+        group, local, wide = config.group_channels, config.local_channels, config.global_channels
+        self.first = SetAbstraction(config.centroids, config.radii[-1], config.neighbours[-1],
+                                    5, *group, local)
+        self.second = SetAbstraction(config.coarse, config.coarse_radius,
+                                     config.coarse_neighbours, 3 + local, wide)
+        sizes, layers = (wide, *config.head_channels), []
+        for a, b in pairwise(sizes):
+            layers += [nn.Linear(a, b), nn.BatchNorm1d(b), nn.ReLU()]
+        self.head = nn.Sequential(*layers, nn.Linear(
+            sizes[-1], len(config.classes) + 1 + 6 + 2 * config.yaw_bins))
+
+    def forward(self, points: Tensor) -> Tensor:
+        xyz, features = self.first(points[..., :3], points[..., 3:])
+        return self.head(self.second(xyz, features)[1].amax(dim=1))

@@ -1,0 +1,83 @@
+"""Paper C's detector: the network beside PointNet++, and the steps of the whole detector."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from rich.table import Table
+
+from benchmark.plain_pointnet2 import PlainPointNet2
+from benchmark.timing import interleaved
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.pointnet.checkpoint import Header
+from lidar_perception.pointnet.clusters import Clusters, clusters_of, network_input
+from lidar_perception.pointnet.config import pointnet_config
+from lidar_perception.pointnet.detector import PointNetDetector
+from lidar_perception.pointnet.network import fused, make_pointnet
+from lidar_perception.pointnet.params import STEPS
+from lidar_perception.pointnet.predict import predict
+from lidar_perception.terminal import console
+from lidar_perception.types import LidarFrame
+
+COUNT = 100                  # clusters
+NETWORK, WHOLE = 40.0, 120.0  # ms, targets
+
+
+def measure_pointnet(scans: Sequence[LidarFrame], repeat: int) -> dict:
+    """Medians over whole scans. The networks have random weights, of which time does not depend,
+    and read COUNT clusters of a scan, or as many as it has."""
+    torch.manual_seed(0)
+    config = pointnet_config()
+    networks = {name: fused(make_pointnet(pointnet_config(name)))
+                for name in ("improved", "pointnet2", "pointnet")}
+    plain = PlainPointNet2(config).eval()
+    detector = PointNetDetector(make_pointnet(config), Header(config))
+    detector.warm_up()
+    rows, steps, counts = [], [], []
+    for scan in scans:
+        ids = cluster_obstacles(scan.xyz, segment_ground(scan, config.ground), config.clustering)
+        every = clusters_of(scan, ids, 5)
+        some = every.take(np.arange(min(COUNT, len(every))))
+        calls = {name: (lambda n=network, c=some: predict(n, c))
+                 for name, network in networks.items()}
+        calls["plain PointNet++ (SSG)"] = lambda c=some: _plain(plain, c, config.points)
+        calls["detector"] = lambda s=scan: detector(s)
+        interleaved(calls, 1)
+        ms, _ = interleaved(calls, repeat)
+        rows.append(ms)
+        steps.append([detector.ms[step] for step in STEPS])
+        counts.append((len(some), len(every), len(scan)))
+    middle = np.median(counts, axis=0)
+    return {"clusters": float(middle[0]), "all_clusters": float(middle[1]),
+            "points": float(middle[2]), "threads": torch.get_num_threads(), "scans": len(rows),
+            "ms": {name: float(np.median([row[name] for row in rows])) for name in rows[0]},
+            "steps": dict(zip(STEPS, np.median(steps, axis=0).tolist()))}
+
+
+@torch.inference_mode()
+def _plain(network: PlainPointNet2, clusters: Clusters, count: int) -> torch.Tensor:
+    return network(torch.from_numpy(network_input(clusters, count).points))
+
+
+def print_pointnet(content: dict) -> None:
+    """One table; the detector looks at all clusters."""
+    ms = content["ms"]
+    table = Table(title=f"Paper C's network, ms for {content['clusters']:.0f} clusters, "
+                        f"{content['threads']} CPU threads, random weights")
+    for name in ("network", "ms", "to ours"):
+        table.add_column(name, justify="left" if name == "network" else "right")
+    titles = {"improved": "improved PointNet (ours)", "pointnet2": "PointNet++ (SSG), ours",
+              "pointnet": "PointNet, ours"}
+    for name in (*titles, "plain PointNet++ (SSG)"):
+        table.add_row(titles.get(name, name), f"{ms[name]:.1f}",
+                      f"{ms[name] / ms['improved']:.2f}")
+    console.print(table)
+    console.print(f"network {ms['improved']:.1f} ms, target < {NETWORK:.0f}: "
+                  f"{'reached' if ms['improved'] < NETWORK else 'missed'}")
+    steps = ", ".join(f"{step} {value:.1f}" for step, value in content["steps"].items())
+    console.print(f"whole detector {ms['detector']:.1f} ms ({steps}) for {content['points']:.0f} "
+                  f"points, {content['all_clusters']:.0f} clusters, target < {WHOLE:.0f}: "
+                  f"{'reached' if ms['detector'] < WHOLE else 'missed'}", soft_wrap=True)
