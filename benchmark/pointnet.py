@@ -38,8 +38,8 @@ def measure_pointnet(scans: Sequence[LidarFrame], repeat: int) -> dict:
     detector.warm_up()
     rows, steps, counts = [], [], []
     for scan in scans:
-        ids = cluster_obstacles(scan.xyz, segment_ground(scan, config.ground), config.clustering)
-        every = clusters_of(scan, ids, 5)
+        ground = segment_ground(scan, config.ground)
+        every = clusters_of(scan, cluster_obstacles(scan.xyz, ground, config.clustering), 5, ground)
         some = every.take(np.arange(min(COUNT, len(every))))
         calls = {name: (lambda n=network, c=some: predict(n, c))
                  for name, network in networks.items()}

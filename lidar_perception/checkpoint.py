@@ -138,6 +138,33 @@ def load(path: str | Path, kind: type[H], make: Callable[[Any], torch.nn.Module]
     return header, network
 
 
+def adopt(network: torch.nn.Module, path: str | Path, kind: type[Header]) -> tuple[int, int]:
+    """Begin with the weights of a checkpoint of a network of the kind, of any config: each layer of
+    the same name and shape is taken, of a convolution with other inputs those that both have (new
+    ones begin at 0); the rest stays as it is. How many tensors were taken, and of how many.
+    InputError as read, and where nothing fits."""
+    _, tensors = read(path, kind)
+    state = network.state_dict()
+    taken = 0
+    for name, value in state.items():
+        found = tensors.get(name)
+        if found is None or found.ndim != value.ndim:
+            continue
+        if found.shape == value.shape:
+            value.copy_(found)
+        elif value.ndim == 4 and found.shape[0] == value.shape[0] and (
+                found.shape[2:] == value.shape[2:]):
+            common = min(found.shape[1], value.shape[1])
+            value.zero_()
+            value[:, :common] = found[:, :common]
+        else:
+            continue
+        taken += 1
+    if not taken:
+        raise InputError(f"no layer of {path} fits the network that is to be trained")
+    return taken, len(state)
+
+
 def require_same(found: Any, wanted: Any, source: str) -> None:
     """InputError naming the first fields in which two configs differ, with both values."""
     ours, theirs = dataclasses.asdict(wanted), dataclasses.asdict(found)

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
+from lidar_perception.detection.config import SENSOR_HEIGHT
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.pointnet import config as config_module
 from lidar_perception.pointnet.box_head import BoxTargets, cluster_loss, decode, encode
 from lidar_perception.pointnet.calibration import calibrate, calibration_error
-from lidar_perception.pointnet.clusters import Clusters, clusters_of, network_input
+from lidar_perception.pointnet.clusters import (
+    NEAR,
+    Clusters,
+    clusters_of,
+    ground_under,
+    network_input,
+)
 from lidar_perception.pointnet.config import ABLATIONS, NETWORKS, pointnet_config
 from lidar_perception.pointnet.network import Outputs, fused, make_pointnet, nearest
 from lidar_perception.pointnet.predict import found, predict
@@ -89,6 +98,31 @@ def test_points_are_drawn_without_repeating_one_and_no_cluster_minds_its_neighbo
     other = network_input(clusters, 24, seed=1)
     assert not np.array_equal(other.points[4], inputs.points[4])
     assert np.array_equal(other.context, inputs.context)
+
+
+def test_the_ground_is_that_around_a_place_however_it_slopes(rng):
+    flat = rng.uniform(-40, 40, (20_000, 3))
+    flat[:, 2] = 0.05 * flat[:, 0] - 1.7
+    flat = flat[np.hypot(flat[:, 0] - 10, flat[:, 1]) > 4]  # none near here, but farther on
+    places = np.array([[10.0, 0], [-20, 5], [30, -30], [39, 39], [500, 0], [9e4, 9e4]])
+    found = ground_under(flat.astype(np.float32), places)
+    for place, height in zip(places, found):
+        apart = np.hypot(*(flat[:, :2] - place).T)
+        near = next((r for r in NEAR if (apart <= r).sum() >= 3), None)
+        wanted = -SENSOR_HEIGHT if near is None else flat[apart <= near, 2].mean()
+        assert height == pytest.approx(wanted, abs=1e-5)
+    assert found[0] == pytest.approx(-1.2, abs=0.02) and found[4] == found[5] == -SENSOR_HEIGHT
+    assert len(ground_under(flat, np.zeros((0, 2)))) == 0
+    assert (ground_under(flat[:0], places) == -SENSOR_HEIGHT).all()
+    # heights are over it: a hill changes nothing
+    clusters = replace(blobs(rng, [20, 30]), ground=np.array([-1.7, -1.5]))
+    lifted = replace(clusters, points=clusters.points + np.float32([0, 0, 3, 0]),
+                     ground=clusters.ground + 3)
+    here, there = network_input(clusters, 24), network_input(lifted, 24)
+    assert np.allclose(here.context, there.context, atol=1e-5)
+    assert np.allclose(here.points, there.points, atol=1e-5)
+    assert np.allclose(network_input(clusters.take(np.array([1])), 24).context[0],
+                       here.context[1])
 
 
 def test_wherever_a_cluster_lies_around_the_sensor_it_looks_the_same(rng):

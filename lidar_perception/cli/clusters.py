@@ -79,12 +79,12 @@ def _scored(frames: list[KittiFrame], network: Any, scores: ClusterScores) -> It
             scores.skipped.append(str(error))
             scan = None
         if scan is not None:
-            ids = cluster_obstacles(scan.xyz, segment_ground(scan, config.ground),
-                                    config.clustering)
+            ground = segment_ground(scan, config.ground)
+            ids = cluster_obstacles(scan.xyz, ground, config.clustering)
             camera, background = frame.calibration().camera(), len(config.classes)
             places = np.flatnonzero(camera.in_view(scan.xyz))
             seen, ids = scan.take(places), ids[places]
-            made = clusters_of(seen, ids)
+            made = clusters_of(seen, ids, ground=ground[places])
             labels, _ = labelled(made, truth.boxes, truth.class_ids, config.classes)
             labels = unknown_where(labels, made, uncared(truth, camera, made.points[:, :3]),
                                    background)

@@ -40,6 +40,8 @@ SCENES_AND_RUN = (
     click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR",
                  help="Folder for best.safetensors, last.safetensors, logs and the state."),
     click.option("--resume", is_flag=True, help="Go on with the run in --out, if there is one."),
+    click.option("--init", type=click.Path(path_type=Path), metavar="FILE",
+                 help="Begin with the weights of this checkpoint, as far as they fit."),
     click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N."),
     click.option("--jobs", type=click.IntRange(0), default=2, show_default=True,
                  help="Processes that prepare scenes; 0: none but this one. The result is the "
@@ -61,12 +63,10 @@ def train() -> None:
 
 @train.command()
 @scene_options
-@click.option("--init", type=click.Path(path_type=Path), metavar="FILE",
-              help="Begin with the weights of this checkpoint, as far as they fit.")
 @parameter_options(PointPillarsTraining())
 def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
-                 val_split: Path | None, out: Path, resume: bool, device: str, jobs: int,
-                 init: Path | None, params: PointPillarsTraining) -> None:
+                 val_split: Path | None, out: Path, resume: bool, init: Path | None, device: str,
+                 jobs: int, params: PointPillarsTraining) -> None:
     """PointPillars and EG-PointPillars, on KITTI folders, simulated streets, or both.
 
     The best weights so far, by AP on what is validated on, lie in OUT/best.safetensors. Ctrl-C
@@ -110,7 +110,7 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
         stream = Stream(sources, Preparation(seen, params.augment, params.data.least_points,
                                              database), params.seed)
         batches = Batches(stream, params.batch, jobs, rank(), world())
-        about = {**about_data(data, val, stream, held_out), "init": str(init or "")}
+        about = about_data(data, val, stream, held_out, init)
         task = make_task(config, params, batches, JudgedScenes(held_out), out, place, about,
                          commit(), init)
         progress = run(task, params, out, place, resume)
@@ -125,8 +125,8 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
               "a folder in --out, and show them side by side.")
 @parameter_options(PointNetTraining())
 def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
-             val_split: Path | None, out: Path, resume: bool, device: str, jobs: int,
-             ablation: bool, params: PointNetTraining) -> None:
+             val_split: Path | None, out: Path, resume: bool, init: Path | None, device: str,
+             jobs: int, ablation: bool, params: PointNetTraining) -> None:
     """The cluster network of paper C, on KITTI folders, simulated streets, or both.
 
     Scenes are cut into clusters by the package's own ground and clustering; with --data-cache the
@@ -151,14 +151,14 @@ def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
             if rank() == 0 and ablation:
                 console.print(f"{name}:", style="bold")
             _train_pointnet(replace(params, network=name), data, val, scenes, folder, resume,
-                            place, jobs)
+                            init, place, jobs)
         if ablation and rank() == 0:
             print_ablation(out)
 
 
 def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[str, ...],
-                    scenes: tuple[tuple, tuple], out: Path, resume: bool, place: Any,
-                    jobs: int) -> None:
+                    scenes: tuple[tuple, tuple], out: Path, resume: bool,
+                    init: Path | None, place: Any, jobs: int) -> None:
     from lidar_perception.pointnet.config import pointnet_config
     from lidar_perception.training.cut_scenes import CutScenes
     from lidar_perception.training.data import Batches, Stream
@@ -174,7 +174,7 @@ def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[
     stream = Stream(sources, ClusterPreparation(config, params.augment), params.seed)
     batches = Batches(stream, params.batch, jobs, rank(), world())
     task = make_task(config, params, batches, JudgedCuts(held_out), out, place,
-                     about_data(data, val, stream, held_out), commit())
+                     about_data(data, val, stream, held_out, init), commit(), init)
     progress = run(task, params, out, place, resume)
     if rank() == 0:
         tell(progress, batches, out)
@@ -198,10 +198,10 @@ def print_ablation(out: Path) -> None:
 
 
 def about_data(data: tuple[str, ...], val: tuple[str, ...], stream: Sized,
-               held_out: tuple[Sized, ...]) -> dict[str, Any]:
+               held_out: tuple[Sized, ...], init: Path | None) -> dict[str, Any]:
     """What a header says of the scenes."""
     return {"data": list(data), "scenes": len(stream), "validation": list(val) or "held out",
-            "validation_scenes": sum(map(len, held_out))}
+            "validation_scenes": sum(map(len, held_out)), "init": str(init or "")}
 
 
 def tell(progress: Progress, batches: Batches, out: Path) -> None:

@@ -50,26 +50,25 @@ class PointNetDetector(NetworkDetector):
 
     def __call__(self, frame: LidarFrame, cluster_ids: np.ndarray | None = None,
                  ground: np.ndarray | None = None) -> Detections:
-        """The objects in a frame of N points. cluster_ids (N,) int, 0 and below = none, are
-        computed if they are None, and for them ground (N,) bool if that is None, too. InputError
-        for columns of another length, and where CUDA has no memory left and the CPU may not take
-        over."""
+        """The objects in a frame of N points. ground (N,) bool and cluster_ids (N,) int, 0 and
+        below = none, are computed if they are None. InputError for columns of another length, and
+        where CUDA has no memory left and the CPU may not take over."""
         require_columns(frame, cluster_ids=cluster_ids, ground=ground)
         t0 = perf_counter()
         pose = self.params.ground.sensor_pose
         seen = with_intensity_scaled(levelled(frame, pose), self.settings.intensity_scale)
         usable = usable_returns(frame.xyz)
         t1 = perf_counter()
-        if cluster_ids is None and ground is None:
+        if ground is None:
             flat = replace(self.params.ground, sensor_pose=SensorPoseParams(height=SENSOR_HEIGHT))
             ground = segment_ground(seen, flat)
+        ground = np.asarray(ground, bool) & usable
         t2 = perf_counter()
         if cluster_ids is None:
-            cluster_ids = cluster_obstacles(seen.xyz, np.asarray(ground, bool),
-                                            self.params.clustering)
+            cluster_ids = cluster_obstacles(seen.xyz, ground, self.params.clustering)
         t3 = perf_counter()
         cluster_ids = np.where(usable, cluster_ids, 0)
-        clusters = clusters_of(seen, cluster_ids, self.settings.least_points)
+        clusters = clusters_of(seen, cluster_ids, self.settings.least_points, ground)
         self.problem, self.best = self._problem(frame, usable, cluster_ids, clusters), {}
         self.problem = self.problem or self.fallback
         t4 = self.now()

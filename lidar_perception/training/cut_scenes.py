@@ -15,7 +15,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from lidar_perception import __version__
-from lidar_perception.clustering.cluster import cluster
+from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.evaluation.clusters import labelled
 from lidar_perception.files import write_bytes
 from lidar_perception.geometry import points_in_box
@@ -81,24 +81,25 @@ class CutScenes:
 def cut(scene: Scene, config: PointNetConfig, least_points: int) -> CutScene:
     """The clusters of a scene, and after them the points around each object that is wanted."""
     frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
-    obstacles = np.flatnonzero(~segment_ground(frame, config.ground))
-    rest = frame.take(obstacles)
-    clusters = clusters_of(rest, cluster(rest.xyz, config.clustering), least_points)
+    ground = segment_ground(frame, config.ground)
+    clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering),
+                           least_points, ground)
     labels, owners = labelled(clusters, scene.boxes, scene.class_ids, config.classes)
     boxes = np.zeros((len(clusters), 7))
     boxes[owners >= 0] = scene.boxes[owners[owners >= 0]]
-    ids, around = np.zeros(len(rest), np.int64), []
+    ids, around = np.zeros(len(frame), np.int64), []
     for i in np.flatnonzero(scene.wanted):
         name = CLASSES[scene.class_ids[i]]
-        inside = points_in_box(rest.xyz, scene.boxes[i], AROUND) & (ids == 0)
+        inside = points_in_box(frame.xyz, scene.boxes[i], AROUND) & (ids == 0) & ~ground
         if name in config.classes and inside.sum() >= least_points:
             around.append(i)
             ids[inside] = len(around)
-    loose = clusters_of(rest, ids)
+    loose = clusters_of(frame, ids, ground=ground)
     kinds = [config.classes.index(CLASSES[scene.class_ids[i]]) for i in around]
     both = Clusters(np.concatenate([clusters.points, loose.points]),
                     np.concatenate([clusters.first, clusters.first[-1] + loose.first[1:]]),
-                    np.concatenate([clusters.ids, np.full(len(loose), -1)]))
+                    np.concatenate([clusters.ids, np.full(len(loose), -1)]),
+                    np.concatenate([clusters.ground, loose.ground]))
     return CutScene(both, np.concatenate([labels, np.array(kinds, np.int64)]),
                     np.concatenate([boxes, scene.boxes[around].reshape(-1, 7)]),
                     np.arange(len(both)) >= len(clusters))
@@ -113,5 +114,5 @@ def _write(path: Path, scene: CutScene) -> None:
 
 def _read(path: Path) -> CutScene:
     with np.load(path) as arrays:
-        return CutScene(Clusters(arrays["points"], arrays["first"], arrays["ids"]),
-                        arrays["labels"], arrays["boxes"], arrays["loose"])
+        clusters = Clusters(*(arrays[name] for name in ("points", "first", "ids", "ground")))
+        return CutScene(clusters, arrays["labels"], arrays["boxes"], arrays["loose"])

@@ -13,7 +13,6 @@ import torch
 from torch import Tensor, nn
 
 from lidar_perception.datasets.kitti_calibration import KittiCalibration
-from lidar_perception.detection.config import SENSOR_HEIGHT
 from lidar_perception.evaluation.detection import DetectionReport
 from lidar_perception.geometry import points_in_box
 from lidar_perception.pointnet.box_head import BoxTargets, cluster_loss, encode
@@ -26,7 +25,7 @@ from lidar_perception.pointnet.predict import found, outputs_of, predict
 from lidar_perception.training.cut_scenes import CutScene, CutScenes
 from lidar_perception.training.data import Batches, Item, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
-from lidar_perception.training.record import metrics_of, record_of, rounded
+from lidar_perception.training.record import begun_with, metrics_of, record_of, rounded
 from lidar_perception.training.run import Task
 from lidar_perception.types import GroundTruth, InputError
 
@@ -81,7 +80,7 @@ class ClusterPreparation:
 def changed(clusters: Clusters, boxes: np.ndarray, loose: np.ndarray,
             params: ClusterAugmentParams, rng: np.random.Generator
             ) -> tuple[Clusters, np.ndarray]:
-    """Clusters and their boxes (K, 7), all flipped, scaled and raised in the same way, each moved
+    """Clusters and their boxes (K, 7), all flipped and scaled in the same way, each moved
     away with fewer points as a sensor would see it, thinned and made noisy by itself; loose ones
     (K,) cut at a box that is a little off."""
     count = len(clusters)
@@ -105,12 +104,15 @@ def changed(clusters: Clusters, boxes: np.ndarray, loose: np.ndarray,
     boxes[:, :2] += ways
     scale = 1 + rng.uniform(-params.scale, params.scale)
     height = rng.uniform(-params.height, params.height)
-    points[:, 2] += SENSOR_HEIGHT
+    floor = clusters.floor
+    points[:, 2] -= floor[number].astype(np.float32)
+    boxes[:, 2] -= floor
     points[:, :3] *= np.float32(scale)
-    points[:, 2] -= np.float32(SENSOR_HEIGHT - height)
-    boxes[:, 2] += SENSOR_HEIGHT
     boxes[:, :6] *= scale
-    boxes[:, 2] -= SENSOR_HEIGHT - height
+    points[:, 2] += floor[number].astype(np.float32)
+    boxes[:, 2] += floor
+    # The ground is known to so much only.
+    floor = floor + height + rng.uniform(-0.5, 0.5, count) * params.height
     if rng.random() < params.flip:
         points[:, 1] *= -1
         boxes[:, [1, 6]] *= -1
@@ -119,7 +121,7 @@ def changed(clusters: Clusters, boxes: np.ndarray, loose: np.ndarray,
     points[:, 3] = np.clip(points[:, 3] * gain, 0, 1)
     sizes = np.bincount(number[keep], minlength=count)
     first = np.concatenate([[0], np.cumsum(sizes)])
-    return Clusters(points[keep], first, clusters.ids), boxes
+    return Clusters(points[keep], first, clusters.ids, floor), boxes
 
 
 def _means(values: np.ndarray, number: np.ndarray, count: int) -> np.ndarray:
@@ -210,10 +212,10 @@ def validated(network: PointNet, scenes: Sequence[JudgedClusters]) -> dict[str, 
 
 def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches,
               validation: JudgedCuts, out: Path, device: torch.device, about: dict[str, Any],
-              commit: str = "") -> Task:
+              commit: str = "", init: Path | None = None) -> Task:
     """The task of training a network of a config; see training.pointpillars.make_task."""
     torch.manual_seed(params.seed)
-    network = make_pointnet(config).to(device)
+    network = begun_with(make_pointnet(config), init, Header).to(device)
     judged: list[JudgedClusters] = []
 
     def validate(module: PointNet) -> dict[str, float]:

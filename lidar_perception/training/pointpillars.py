@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from lidar_perception.detection.anchors import make_anchors
-from lidar_perception.detection.checkpoint import Header, adopt, save_checkpoint
+from lidar_perception.detection.checkpoint import Header, save_checkpoint
 from lidar_perception.detection.config import NetworkConfig
 from lidar_perception.detection.detector import Detector, TorchNetwork
 from lidar_perception.detection.detector_params import DetectorParams
@@ -35,12 +35,11 @@ from lidar_perception.evaluation.detection import DetectionReport
 from lidar_perception.evaluation.kitti_protocol import NEIGHBOURS
 from lidar_perception.geometry import points_in_box
 from lidar_perception.param_fields import with_values
-from lidar_perception.terminal import errors
 from lidar_perception.training.augment import Scene, augmented
 from lidar_perception.training.data import Batches, Item, loaded
 from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
-from lidar_perception.training.record import metrics_of, record_of, rounded
+from lidar_perception.training.record import begun_with, metrics_of, record_of, rounded
 from lidar_perception.training.run import Task
 from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
 
@@ -200,12 +199,7 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
     resumed run must have the same. init: checkpoint to begin with, see checkpoint.adopt. Weights
     are written to out/best.safetensors and out/last.safetensors."""
     torch.manual_seed(params.seed)
-    network = make_network(config)
-    if init is not None:
-        taken, count = adopt(network, init)
-        if taken < count:
-            errors.print(f"{taken} of {count} tensors are of {init}, the others begin at random",
-                         soft_wrap=True)
+    network = begun_with(make_network(config), init, Header)
     network = network.to(device, memory_format=torch.channels_last)
 
     def validate(module: PointPillars) -> dict[str, float]:

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import nn
 
 from lidar_perception import __version__
+from lidar_perception.checkpoint import Header, adopt
 from lidar_perception.param_fields import flatten
+from lidar_perception.terminal import errors
 from lidar_perception.training.data import Batches
 from lidar_perception.training.params import LoopParams
 
@@ -22,6 +26,16 @@ def record_of(params: LoopParams, batches: Batches, record: dict[str, Any],
             "seconds": round(record["seconds"]), "steps_skipped": record["skipped"],
             "scenes_skipped": len(batches.skipped), "batch": params.batch * batches.world,
             "params": flatten(params), "version": __version__}
+
+
+def begun_with(network: nn.Module, init: Path | None, kind: type[Header]) -> nn.Module:
+    """The network, with the weights of init as far as they fit; what does not is said."""
+    if init is not None:
+        taken, count = adopt(network, init, kind)
+        if taken < count:
+            errors.print(f"{taken} of {count} tensors are of {init}, the others begin at random",
+                         soft_wrap=True)
+    return network
 
 
 def rounded(metrics: dict[str, float]) -> dict[str, float | None]:
