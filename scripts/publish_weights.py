@@ -1,0 +1,94 @@
+"""Put trained weights into the package: as float16, with a model card beside them.
+
+    lidar-perception simulate --format kitti --frames 500 --seed 9000 --out simulated
+    python scripts/publish_weights.py v4/best.safetensors simulated /data/kitti/object
+
+The card says what the weights were trained on and how they score on each folder, of which none
+may have been trained on.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from lidar_perception import checkpoint
+from lidar_perception.checkpoint import POINTNET, network_of, save_checkpoint
+from lidar_perception.cli.detection import score_detector
+from lidar_perception.datasets.kitti import open_kitti
+from lidar_perception.detection.checkpoint import load_network
+from lidar_perception.detection.weights_file import WEIGHTS
+from lidar_perception.detectors import open_detector
+from lidar_perception.evaluation.detection import DetectionReport
+from lidar_perception.files import write_text
+from lidar_perception.pointnet.checkpoint import load_pointnet
+from lidar_perception.pointnet.weights_file import WEIGHTS as POINTNET_WEIGHTS
+from lidar_perception.terminal import console, track
+
+ROWS = (("bev_relaxed", "from above"), ("bev", "from above"), ("3d_relaxed", "in space"),
+        ("3d", "in space"))
+
+
+def scores_of(weights: Path, folder: Path) -> dict[str, Any]:
+    """What evaluate detection finds, as JSON."""
+    report, frames = DetectionReport(), open_kitti(folder)
+    work = score_detector(frames, open_detector(weights), None, report)
+    for _ in track(work, folder.name, len(frames)):
+        pass
+    return report.content()
+
+
+def card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]]) -> str:
+    """The model card, Markdown."""
+    said = header.training
+    lines = [
+        f"# {title}", "",
+        f"- Network: {header.network}, {' '.join(header.config.classes)}; every field of its config "
+        "is in the file's header.",
+        f"- Trained on: {', '.join(said['data'])}, {said['scenes']} scenes; validated on "
+        f"{said['validation_scenes']} others. No real scan was trained on."
+        if said["data"] == ["sim"] else f"- Trained on: {', '.join(said['data'])}",
+        f"- Steps: {said['steps']} of {said['batch']} scenes, {said['seconds'] / 60:.0f} minutes, "
+        f"seed {said['seed']}" + (f", begun with {Path(said['init']).parent.name}/"
+                                  f"{Path(said['init']).name}" if said.get("init") else "") + ".",
+        f"- Commit: {header.commit}.", "- Stored as float16.", ""]
+    for name, content in scored.items():
+        lines += [f"## {name}: {content['frames']} frames", "",
+                  "AP in percent at 40 recall points, moderate; labels in brackets.", "",
+                  "| | overlap | " + " | ".join(header.config.classes) + " |",
+                  "|---|---|" + "---|" * len(header.config.classes)]
+        for row, words in ROWS:
+            cells, overlaps = [], []
+            for kind in header.config.classes:
+                part = content["ap"][kind][row]
+                overlaps.append(f"{part['overlap']:g}")
+                value = part["moderate"]
+                cells.append(f"{value['r40']:.1f} ({value['objects']})" if value else "-")
+            lines.append(f"| {words} | {' / '.join(overlaps)} | {' | '.join(cells)} |")
+        centres = content["pedestrian_centres"]
+        for key, words in (("of_all", "all detections"), ("at_best_score", "from the best score")):
+            total = centres[key]["all"]
+            lines += ["", f"Pedestrians within 1.0 m, {words}: F1 {100 * total['f1']:.1f} (TP "
+                      f"{total['tp']}, FP {total['fp']}, FN {total['fn']})."]
+        lines.append("")
+    return "\n".join(lines)
+
+
+def main(weights: Path, *folders: Path) -> None:
+    """Score, store and describe one checkpoint."""
+    if network_of(weights) == POINTNET:
+        header, network = load_pointnet(weights)
+        out = POINTNET_WEIGHTS
+    else:
+        header, network = load_network(weights)
+        out = WEIGHTS / f"pointpillars_{header.config.version}_{header.config.size}.safetensors"
+    out.parent.mkdir(exist_ok=True)
+    save_checkpoint(out, network, header, half=True)
+    scored = {folder.name: scores_of(out, folder) for folder in folders}
+    write_text(out.with_suffix(".md"), card(header, out.stem, scored))
+    console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:]))
