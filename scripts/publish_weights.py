@@ -47,8 +47,8 @@ def card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]
         f"- Network: {header.network}, {' '.join(header.config.classes)}; every field of its config "
         "is in the file's header.",
         f"- Trained on: {', '.join(said['data'])}, {said['scenes']} scenes; validated on "
-        f"{said['validation_scenes']} others. No real scan was trained on."
-        if said["data"] == ["sim"] else f"- Trained on: {', '.join(said['data'])}",
+        f"{said['validation_scenes']} others." + (" No real scan was trained on."
+                                                  if said["data"] == ["sim"] else ""),
         f"- Steps: {said['steps']} of {said['batch']} scenes, {said['seconds'] / 60:.0f} minutes, "
         f"seed {said['seed']}" + (f", begun with {Path(said['init']).parent.name}/"
                                   f"{Path(said['init']).name}" if said.get("init") else "") + ".",

@@ -19,6 +19,7 @@ from lidar_perception.detection.pointpillars import Outputs
 from lidar_perception.detection.targets import (
     BACKGROUND,
     IGNORED,
+    anchors_near,
     assign,
     nearest_axis_iou,
     stacked,
@@ -109,6 +110,22 @@ def test_targets_are_those_of_a_plain_reading():
         else:
             assert found.labels[0, i] == BACKGROUND and not found.codes[0, i].any()
     assert {*found.labels.unique().tolist()} == {IGNORED, BACKGROUND, *labels.tolist()}
+
+
+@few
+@given(seeds)
+def test_anchors_that_are_not_near_overlap_nothing(seed):
+    config = tiny()
+    anchors = make_anchors(config)
+    boxes = torch.from_numpy(some_boxes(seed, 6, 12.0)).float()
+    kinds = anchor_classes(config)
+    for index in range(len(config.anchors)):
+        near = anchors_near(anchors, config, boxes, index)
+        mine = torch.nonzero(kinds == index)[:, 0]
+        assert torch.isin(near, mine).all() and (near.diff() > 0).all()
+        others = mine[~torch.isin(mine, near)]
+        assert not nearest_axis_iou(anchors[others], boxes).any()
+    assert len(anchors_near(anchors, config, boxes[:0], 0)) == 0
 
 
 def test_every_object_has_an_anchor_and_the_order_of_objects_makes_no_difference():

@@ -12,6 +12,7 @@ import torch
 from click.testing import CliRunner
 from detection_samples import eager, frame, lively, random_detector, same, tiny
 
+from lidar_perception.checkpoint import adopt
 from lidar_perception.cli.main import cli
 from lidar_perception.detection import weights_file as weights_module
 from lidar_perception.detection.checkpoint import (
@@ -24,6 +25,7 @@ from lidar_perception.detection.config import VERSIONS, network_config
 from lidar_perception.detection.detector import CPU, Detector, TorchNetwork, load_detector
 from lidar_perception.detection.detector_params import DetectorParams
 from lidar_perception.detection.import_weights import import_weights
+from lidar_perception.detection.pointpillars import make_network
 from lidar_perception.params import with_values
 from lidar_perception.types import InputError
 
@@ -70,6 +72,30 @@ def test_a_checkpoint_of_another_network_is_refused_with_both_values(saved):
         load_detector(path, "cpu", wanted)
     with pytest.raises(InputError, match=r"holds size compact, asked for was full"):
         load_detector(path, "cpu", with_values(DetectorParams(), {"detection.size": "full"}))
+
+
+def test_a_network_begins_with_what_fits_of_another(saved):
+    path, header, network = saved
+    state = network.state_dict()
+    same = make_network(header.config)
+    taken, count = adopt(same, path, Header)
+    assert taken == count == len(state)
+    assert all(torch.equal(value, state[name]) for name, value in same.state_dict().items())
+    # without the branch of the map the first block has fewer inputs, of which it takes its own
+    other = make_network(tiny("v1"))
+    taken, count = adopt(other, path, Header)
+    assert taken == count
+    first, old = (s["blocks.0.0.0.weight"] for s in (other.state_dict(), state))
+    assert first.shape[1] < old.shape[1] and torch.equal(first, old[:, :first.shape[1]])
+    # and another neck begins at random
+    third = make_network(tiny("v0"))
+    before = {name: value.clone() for name, value in third.state_dict().items()}
+    taken, count = adopt(third, path, Header)
+    assert 0 < taken < count
+    assert all(torch.equal(value, before[name]) for name, value in third.state_dict().items()
+               if name.startswith("neck"))
+    with pytest.raises(InputError, match="no layer"):
+        adopt(torch.nn.Linear(2, 3), path, Header)
 
 
 def test_files_that_are_no_checkpoints_are_refused(saved, tmp_path):
