@@ -44,8 +44,8 @@ def card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]
     said = header.training
     lines = [
         f"# {title}", "",
-        f"- Network: {header.network}, {' '.join(header.config.classes)}; every field of its config "
-        "is in the file's header.",
+        f"- Network: {header.network}, {' '.join(header.config.classes)}; every field of its "
+        "config is in the file's header.",
         f"- Trained on: {', '.join(said['data'])}, {said['scenes']} scenes; validated on "
         f"{said['validation_scenes']} others." + (" No real scan was trained on."
                                                   if said["data"] == ["sim"] else ""),
