@@ -18,6 +18,7 @@ from lidar_perception.evaluation.segmentation import (
     ground_row,
     true_ground,
 )
+from lidar_perception.ground.climbing import REACH, STEP, UNOBSERVED, climbed_cells
 from lidar_perception.ground.cloth import lay_cloth, segment_by_cloth
 from lidar_perception.ground.obstacle import at_rest
 from lidar_perception.params import ClothParams
@@ -68,6 +69,66 @@ def test_multigrid_finds_what_slow_relaxation_finds(seed, lift):
     expected = slow_at_rest(obstacle, lift)
     for levels in (1, 2, 3, 4):
         np.testing.assert_allclose(at_rest(obstacle, lift, 1e-6, levels), expected, atol=1e-3)
+
+
+def climbing_road(seed=0):
+    """A road that climbs by 0.9 m from 18 to 40 m ahead and is level again, seen in rings, with
+    three cars on it that hide what is behind them."""
+    rng = np.random.default_rng(seed)
+    radius = 1.73 / np.tan(np.radians(np.arange(2, 24, 0.42)))
+    angles = np.radians(np.arange(-60, 60, 0.17))
+    reach, angle = (x.ravel() for x in np.meshgrid(radius, angles))
+    x, y = reach * np.cos(angle), reach * np.sin(angle)
+    cars = np.array([[15.0, 3], [26, -3], [34, 4]])
+    away = np.abs(np.stack([x, y], axis=1)[:, None] - cars) > [2.1, 0.9]
+    seen = away.any(axis=2).all(axis=1)
+
+    def rise(x):
+        return 0.45 * (1 - np.cos(np.clip((x - 18) / 22, 0, 1) * np.pi))
+
+    road = np.column_stack([x, y, rise(x) - 1.73 + rng.normal(0, 0.01, len(x))])[seen]
+    things = [rng.uniform(-1, 1, (300, 3)) * [2, 0.85, 0.55] + [*car, rise(car[0]) - 0.9]
+              for car in cars]
+    xyz = np.concatenate([road, *things])
+    return xyz.astype(np.float32), np.arange(len(xyz)) < len(road)
+
+
+def test_a_road_that_climbs_stays_ground_and_the_cars_on_it_do_not_become_it():
+    xyz, road = climbing_road()
+    found = segment_by_cloth(xyz)
+    assert found[road].mean() > 0.97 and found[~road].mean() < 0.1
+    # also where reflections far below pull the cloth down
+    rng = np.random.default_rng(1)
+    below = rng.choice(xyz[road & (xyz[:, 0] > 12)], 12) - np.float32([0, 0, 1])
+    below[:, 2] -= rng.uniform(0, 9, 12)
+    deep = np.concatenate([xyz, below, below + np.float32([0.6, 0, 0.2])])
+    found = segment_by_cloth(deep)
+    assert found[:len(xyz)][road].mean() > 0.97 and not found[len(xyz):].any()
+    assert segment_by_cloth(deep, ClothParams(slope=0.0))[:len(xyz)][road].mean() > 0.9
+
+
+@few
+@given(st.integers(0, 2**31), st.floats(0.01, 0.2))
+def test_cells_are_climbed_as_a_slow_reading_climbs_them(seed, slope):
+    rng = np.random.default_rng(seed)
+    lowest = rng.uniform(0, 0.8, (14, 18)).astype(np.float32)
+    lowest[rng.random(lowest.shape) < 0.4] = UNOBSERVED
+    height = np.zeros_like(lowest)
+    seen = np.argwhere(lowest != UNOBSERVED)
+    touched = {(r, c) for r, c in seen if lowest[r, c] <= 0.1}
+    while True:
+        new = set()
+        for r, c in map(tuple, seen):
+            near = sorted(((r - i) ** 2 + (c - j) ** 2, lowest[i, j]) for i, j in touched)
+            if (r, c) not in touched and near and near[0][0] <= REACH**2 and (
+                    lowest[r, c] - near[0][1] <= STEP + slope * np.sqrt(near[0][0])):
+                new.add((r, c))
+        if not new:
+            break
+        touched |= new
+    found = climbed_cells(lowest, height, np.float32(0.1), slope)
+    assert {tuple(cell) for cell in np.argwhere(found)} == {
+        (r, c) for r, c in touched if lowest[r, c] > np.float32(0.1)}
 
 
 @few

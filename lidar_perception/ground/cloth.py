@@ -14,32 +14,41 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from lidar_perception.ground.climbing import UNOBSERVED, climbed_cells
 from lidar_perception.ground.obstacle import at_rest
 from lidar_perception.params import ClothParams
 
 LEVELS = 6         # grids of the solver, each twice as coarse as the one before
 TOLERANCE = 0.001  # m that a particle may still move
+SQUARES = (2, 6)   # cells around one that are asked whether it is sunk
 SUNK = 0.4         # m under its surroundings from which a lone lowest point is a reflection
-UNOBSERVED = np.float32(np.inf)
 
 
 class Cloth(NamedTuple):
     """height (R, C) float32 of the particles, m; particle (r, c) is at x = x0 + c * resolution,
-    y = y0 + r * resolution."""
+    y = y0 + r * resolution. lowest (R, C) float32: the lowest point of the cell around each, inf
+    where there is none."""
 
     height: np.ndarray
     x0: float
     y0: float
     resolution: float
+    lowest: np.ndarray
 
 
 def segment_by_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> np.ndarray:
     """(N,) bool, True = ground: points (N, 3) float32, finite, within class_threshold of the
-    cloth, vertically. Points beyond max_range are not ground. Eq. 3."""
+    cloth, vertically (Eq. 3), or of the lowest point of a cell that the ground climbs to. Points
+    beyond max_range are not ground."""
     cloth = lay_cloth(xyz, params)
     if cloth is None:
         return np.zeros(len(xyz), bool)
-    return _near_cloth(xyz, cloth.height, cloth.x0, cloth.y0, 1.0 / cloth.resolution,
+    climbed = np.full(cloth.height.shape, -UNOBSERVED, np.float32)
+    if params.slope > 0.0:
+        reached = climbed_cells(cloth.lowest, cloth.height, params.class_threshold,
+                                params.slope * cloth.resolution)
+        climbed[reached] = cloth.lowest[reached]
+    return _near_cloth(xyz, cloth.height, climbed, cloth.x0, cloth.y0, 1.0 / cloth.resolution,
                        params.max_range, params.class_threshold)
 
 
@@ -59,7 +68,7 @@ def lay_cloth(xyz: np.ndarray, params: ClothParams = ClothParams()) -> Cloth | N
     lift = params.curvature * params.resolution**2 / 4
     half = params.resolution / 2
     return Cloth(at_rest(lowest, lift, TOLERANCE, LEVELS), float(x0) + half, float(y0) + half,
-                 params.resolution)
+                 params.resolution, lowest)
 
 
 @njit(cache=True, nogil=True)
@@ -89,31 +98,39 @@ def _lowest_points(xyz, max_range, x0, y0, scale, rows, columns):
 
 @njit(cache=True, nogil=True)
 def _drop_sunk(lowest, depth):
-    """Make cells UNOBSERVED whose lowest point lies deeper than the 24 around it, all but one:
-    reflections under the ground would pull the cloth down for metres around."""
+    """Make cells UNOBSERVED whose lowest point lies deeper than those of the cells around, all but
+    one: reflections under the ground would pull the cloth down for metres around. Far away few
+    cells near have a point, so that the wider square is asked."""
     rows, columns = lowest.shape
     sunk = []
     for r in range(rows):
         for c in range(columns):
             if lowest[r, c] == UNOBSERVED:
                 continue
-            higher = level = 0
-            for i in range(max(r - 2, 0), min(r + 3, rows)):
-                for j in range(max(c - 2, 0), min(c + 3, columns)):
-                    if lowest[i, j] != UNOBSERVED:
-                        if lowest[i, j] > lowest[r, c] + depth:
-                            higher += 1
-                        else:
-                            level += 1
-            if higher >= 4 and level <= 2:  # the cell itself and one more
-                sunk.append((r, c))
+            for reach in SQUARES:
+                higher = level = 0
+                for i in range(max(r - reach, 0), min(r + reach + 1, rows)):
+                    for j in range(max(c - reach, 0), min(c + reach + 1, columns)):
+                        if lowest[i, j] != UNOBSERVED:
+                            if lowest[i, j] > lowest[r, c] + depth:
+                                higher += 1
+                            else:
+                                level += 1
+                    if level > 2:
+                        break
+                if level > 2:
+                    break
+                if higher >= 4:  # the cell itself and one more are not
+                    sunk.append((r, c))
+                    break
     for r, c in sunk:
         lowest[r, c] = UNOBSERVED
 
 
 @njit(cache=True, nogil=True)
-def _near_cloth(xyz, height, x0, y0, scale, max_range, threshold):
-    """(N,) bool: within max_range, and within threshold of the cloth, interpolated bilinearly."""
+def _near_cloth(xyz, height, climbed, x0, y0, scale, max_range, threshold):
+    """(N,) bool: within max_range, and within threshold of the cloth, interpolated bilinearly, or
+    no more than that above climbed (R, C)."""
     rows, columns = height.shape
     near = np.zeros(len(xyz), np.bool_)
     for i in range(len(xyz)):
@@ -125,5 +142,6 @@ def _near_cloth(xyz, height, x0, y0, scale, max_range, threshold):
             a, b = u - c, v - r
             cloth = ((1 - b) * ((1 - a) * height[r, c] + a * height[r, c + 1])
                      + b * ((1 - a) * height[r + 1, c] + a * height[r + 1, c + 1]))
-            near[i] = abs(xyz[i, 2] - cloth) <= threshold
+            near[i] = (abs(xyz[i, 2] - cloth) <= threshold
+                       or xyz[i, 2] - climbed[int(v + 0.5), int(u + 0.5)] <= threshold)
     return near
