@@ -76,8 +76,8 @@ def public_functions(tree):
 
 def test_there_are_sources_to_look_at():
     assert len(files_in("msg_utils")) >= 5
-    for folder in ("ground", "clustering", "candidates", "detection", "pointnet", "training",
-                   "nodes", "cli", "datasets", "evaluation", "reproduction"):
+    for folder in ("ground", "clustering", "candidates", "detection", "pointnet", "hybrid",
+                   "training", "nodes", "cli", "datasets", "evaluation", "reproduction"):
         assert len(files_in(f"lidar_perception/{folder}")) >= 2
 
 
@@ -137,6 +137,14 @@ def test_pointnet_imports_of_the_other_detector_what_is_not_its_network(name):
     assert strangers(name, NUMERIC + ["torch"] + SHARED + algorithms + own) == []
 
 
+@pytest.mark.parametrize("name", files_in("lidar_perception/hybrid"))
+def test_hybrids_import_the_detectors_that_they_join(name):
+    joined = [f"lidar_perception.{module}" for module in (
+        "hybrid", "pointnet", "detection.nms", "detection.view", "detectors", "pipeline", "camera",
+        "configurations", "param_fields")]
+    assert strangers(name, ["numpy", *SHARED, *ALGORITHMS, *joined]) == []
+
+
 SHARED_TRAINING = [f"lidar_perception.training.{name}" for name in (
     "params", "schedule", "ranks", "log", "run", "loop", "augment", "database", "data")]
 
@@ -160,7 +168,8 @@ def test_what_all_networks_train_with_knows_none_of_them(module):
                                         "lidar_perception.types"]),
     ("lidar_perception/devices.py", ["torch", "lidar_perception.types"]),
     ("lidar_perception/detectors.py", ["lidar_perception.checkpoint", "lidar_perception.detection",
-                                       "lidar_perception.pointnet", "lidar_perception.types"]),
+                                       "lidar_perception.pointnet", "lidar_perception.params",
+                                       "lidar_perception.types"]),
     ("lidar_perception/reproduction/paper.py", ["lidar_perception.params"]),
     ("lidar_perception/param_fields.py", []),
     ("lidar_perception/params.py", ["lidar_perception.param_fields"]),
@@ -175,7 +184,7 @@ def test_the_shared_files_are_leaves(name, allowed):
                                           "lidar_perception/simulation"))
 def test_data_sources_know_no_algorithm(name):
     above = [*ALGORITHMS, "lidar_perception.detection", "lidar_perception.pointnet",
-             "lidar_perception.detectors", "lidar_perception.training",
+             "lidar_perception.detectors", "lidar_perception.hybrid", "lidar_perception.training",
              "lidar_perception.pipeline", "lidar_perception.evaluation"]
     assert [m for m in imports(TREES[name]) if within(m, above)] == []
 
@@ -248,6 +257,9 @@ def test_no_source_is_longer_than_a_reader_can_hold(name):
     ("lidar_perception.cli.weights", "numba torch matplotlib scipy"),
     ("lidar_perception.evaluation.candidates", "torch matplotlib sklearn click"),
     ("lidar_perception.evaluation.detection", "torch matplotlib sklearn rich click"),
+    ("lidar_perception.evaluation.comparison", "torch matplotlib sklearn click"),
+    ("lidar_perception.hybrid.params", "numba torch matplotlib scipy numpy rich click"),
+    ("lidar_perception.cli.compare", "numba torch matplotlib scipy sklearn"),
     ("lidar_perception.evaluation.nuscenes", "torch matplotlib sklearn rich click rosbags"),
     ("lidar_perception.reproduction.stm_cpa", "torch matplotlib sklearn click jinja2 distributed"),
     ("lidar_perception.cli.reproduce", "numba torch matplotlib scipy sklearn jinja2 distributed"),

@@ -16,6 +16,7 @@ from lidar_perception.cli.main import cli
 from lidar_perception.datasets.kitti import open_kitti
 from lidar_perception.datasets.kitti_results import read_results, write_results
 from lidar_perception.evaluation.kitti_protocol import DIFFICULTIES, SCORED
+from lidar_perception.evaluation.thinning import thinned
 from lidar_perception.types import CLASSES, Detections, InputError
 
 PERSON, CAR, REGION = LABELS.splitlines()
@@ -120,6 +121,34 @@ def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
     for (_, row, _), cell in cells(content).items():
         if row not in ("image", "aos"):  # the made-up 2D boxes of the labels are no projections
             assert cell["r40"] == 100
+
+
+def test_a_share_of_the_points_is_kept_and_always_the_same(kitti, detector, tmp_path):
+    kept = {}
+    for share in (1, 0.1, 0.1):
+        detector.scans.clear()
+        content, _ = evaluate(tmp_path, "--kitti", kitti, "--weights", "w", "--keep", share)
+        assert content["keep"] == share
+        points = [np.column_stack([scan.xyz, scan.intensity]) for scan in detector.scans]
+        for now, before in zip(points, kept.get(share, points), strict=True):
+            np.testing.assert_array_equal(now, before)
+        kept[share] = points
+    for frame, whole, tenth in zip(open_kitti(kitti), kept[1], kept[0.1], strict=True):
+        np.testing.assert_array_equal(whole[:, :3], frame.load().xyz)
+        assert abs(len(tenth) / len(whole) - 0.1) < 0.03
+        assert set(map(tuple, tenth)) < set(map(tuple, whole))
+    assert len(kept[0.1][0]) != len(kept[0.1][1])  # each frame draws its own
+
+
+def test_a_smaller_share_is_part_of_a_larger_one(kitti):
+    frame = open_kitti(kitti)[0].load()
+    before = frame
+    for share in (1.0, 0.5, 0.2, 0.1, 0.0):
+        now = thinned(frame, share, "000000")
+        assert set(map(bytes, now.xyz)) <= set(map(bytes, before.xyz))
+        assert abs(len(now) - share * len(frame)) <= 3 * np.sqrt(len(frame))
+        before = now
+    assert thinned(frame, 1.0, "a") is frame and len(before) == 0
 
 
 def test_written_results_score_as_what_was_found(kitti, detector, tmp_path):
@@ -231,6 +260,8 @@ def test_what_is_missing_is_named(kitti, found, tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("arguments, words", [
     (["--kitti", "a"], "give either --results DIR or --weights FILE"),
     (["--kitti", "a", "--results", "b", "--weights", "c"], "give either"),
+    (["--kitti", "a", "--results", "b", "--keep", "0.1"], "--keep thins the scans"),
+    (["--kitti", "a", "--weights", "b", "--keep", "1.1"], "1.1 is not in the range"),
     (["--results", "b"], "--kitti"),
     (["--kitti", "a", "--results", "b", "--write-results", "c"], "has its files already"),
 ])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import types
 
@@ -197,8 +198,14 @@ def test_scene_files_that_are_wrong_are_named(root, tmp_path, monkeypatch, capsy
     assert "no scene scene-9999" in error(scenes)
 
 
-def test_the_detector_is_told_how_high_the_sensor_is(monkeypatch):
-    from lidar_perception.detection import detector
-    monkeypatch.setattr(detector, "load_detector", lambda *arguments: arguments)
-    path, device, params = command.detector_at("w", "cpu", 1.84)
-    assert (path, device, params.ground.sensor_pose.height) == ("w", "cpu", 1.84)
+@pytest.mark.parametrize("samples, save", [
+    ("detection_samples", "lidar_perception.detection.checkpoint"),
+    ("pointnet_samples", "lidar_perception.pointnet.checkpoint")])
+def test_the_detector_of_either_network_is_told_how_high_the_sensor_is(samples, save, tmp_path,
+                                                                      one_thread):
+    made, module = importlib.import_module(samples), importlib.import_module(save)
+    config = (made.tiny if samples.startswith("detection") else made.small)()
+    module.save_checkpoint(tmp_path / "w", made.lively(config), module.Header(config))
+    detector = command.detector_at(tmp_path / "w", "cpu", 1.84)
+    assert detector.config == config
+    assert detector.params.ground.sensor_pose.height == 1.84

@@ -21,11 +21,13 @@ STAGES = ("stage1", "stage2", "final")
 class Candidates:
     """Detections after the height filter (stage1), STM (stage2) and STM with CPA (final); scores
     are the similarity with the seed (stage1: without CPA), or the confidence where that is on.
-    ms: time of each step."""
+    clusters (K,) int64: the numbers of the clusters of `final`, ascending. ms: time of each step.
+    """
 
     stage1: Detections
     stage2: Detections
     final: Detections
+    clusters: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int64))
     ms: dict[str, float] = field(default_factory=dict)
 
     @staticmethod
@@ -73,6 +75,7 @@ def refine(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, seed: Seed,
     return Candidates(detections(plain, np.ones(len(kept), bool)),
                       detections(plain, plain >= threshold),
                       detections(final, final >= threshold),
+                      kept[final >= threshold] + 1,
                       dict(height=(t1 - t0) * 1e3, stm=(t2 - t1) * 1e3, cpa=(t3 - t2) * 1e3,
                            confidence=(t4 - t3) * 1e3))
 

@@ -14,6 +14,7 @@ from lidar_perception.datasets.kitti_results import read_results
 from lidar_perception.datasets.kitti_results import write_results as write_result_file
 from lidar_perception.evaluation.detection import DetectionReport
 from lidar_perception.evaluation.detection_report import print_detection_report
+from lidar_perception.evaluation.thinning import thinned
 from lidar_perception.files import write_text
 from lidar_perception.terminal import console, track
 from lidar_perception.types import Detections, InputError
@@ -30,12 +31,16 @@ from lidar_perception.types import Detections, InputError
               "Default: auto.")
 @click.option("--split", type=click.Path(path_type=Path), metavar="FILE",
               help="Score only the frames named in this file, one a line.")
+@click.option("--keep", type=click.FloatRange(0, 1), default=1.0, metavar="SHARE",
+              help="Keep only this share of the points of each scan, 0..1, drawn at random but "
+              "always the same. Default: 1.")
 @click.option("--write-results", type=click.Path(path_type=Path), metavar="DIR",
               help="Write what --weights find as KITTI result files, frames without labels too.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Write the scores to this file.")
 def detection(kitti: Path, results: Path | None, weights: Path | None, device: str,
-              split: Path | None, write_results: Path | None, json_file: Path | None) -> None:
+              split: Path | None, keep: float, write_results: Path | None,
+              json_file: Path | None) -> None:
     """Boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
 
     Average precision in the image, from above and in space, and of orientation, at 40 and 11
@@ -47,12 +52,16 @@ def detection(kitti: Path, results: Path | None, weights: Path | None, device: s
       lidar-perception evaluate detection --kitti /data/kitti/object --results out/data
       lidar-perception evaluate detection --kitti /data/kitti/object --weights v4.safetensors \\
           --split val.txt --json scores.json --write-results out/data
+      lidar-perception evaluate detection --kitti /data/kitti/object --weights v4.safetensors \\
+          --keep 0.1
     """
     if (results is None) == (weights is None):
         raise click.UsageError("give either --results DIR or --weights FILE")
     if write_results is not None and weights is None:
         raise click.UsageError("--write-results writes what --weights find; --results DIR has its "
                                "files already")
+    if keep != 1 and weights is None:
+        raise click.UsageError("--keep thins the scans that --weights see; --results DIR sees none")
     frames = open_kitti(kitti, scans=weights is not None)
     if split is not None:
         frames = frames_of_split(frames, split, kitti)
@@ -63,10 +72,10 @@ def detection(kitti: Path, results: Path | None, weights: Path | None, device: s
         work = score_results(frames, results, report)
     else:
         from lidar_perception.detectors import open_detector
-        work = score_detector(frames, open_detector(weights, device), write_results, report)
+        work = score_detector(frames, open_detector(weights, device), write_results, report, keep)
     for _ in track(work, "evaluating", len(frames)):
         pass
-    content = {"source": str(results or weights), **report.content()}
+    content = {"source": str(results or weights), "keep": keep, **report.content()}
     if json_file:
         write_text(json_file, json.dumps(content, indent=1))
     if write_results is not None:
@@ -110,10 +119,11 @@ def score_results(frames: list[KittiFrame], folder: Path,
 
 
 def score_detector(frames: list[KittiFrame], detector: Callable, folder: Path | None,
-                   report: DetectionReport) -> Iterator[None]:
+                   report: DetectionReport, keep: float = 1.0) -> Iterator[None]:
     """Run a detector on every frame with labels, and add it; with a folder on all frames, and
-    write what is found. Yields after each frame. A scan that cannot be read is skipped; where the
-    detector refuses one, its objects are missed."""
+    write what is found. Of each scan it sees a share `keep` of the points. Yields after each frame.
+    A scan that cannot be read is skipped; where the detector refuses one, its objects are missed.
+    """
     for frame in frames:
         try:
             truth, calibration = frame.truth(), frame.calibration()
@@ -122,6 +132,7 @@ def score_detector(frames: list[KittiFrame], detector: Callable, folder: Path | 
             report.skipped.append(str(error))
             scan = None
         if scan is not None:
+            scan = thinned(scan, keep, frame.name)
             begin = perf_counter()
             try:
                 found = detector(scan)

@@ -13,6 +13,7 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
     "demo": ("demo.demo", "Replay a drive through the real nodes and score the result."),
     "convert": ("convert.convert", "Turn a data set into a rosbag2 bag."),
     "evaluate": ("evaluate.evaluate", "Score the algorithms without ROS."),
+    "compare": ("compare.compare", "Run every detector on the same frames, side by side."),
     "reproduce": ("reproduce.reproduce", "Measure every table of the STM-CPA paper."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),
     "simulate": ("simulate.simulate", "Write simulated scans as a bag or a data set."),

@@ -30,7 +30,7 @@ from lidar_perception.types import InputError
 @click.option("--results", type=click.Path(path_type=Path), metavar="JSON",
               help="Result file of any detector, in the format of nuScenes' detection task.")
 @click.option("--weights", type=click.Path(path_type=Path), metavar="FILE",
-              help="Run the detector of this checkpoint.")
+              help="Run the detector of this checkpoint, PointPillars or PointNet.")
 @click.option("--device", default="auto", help="Where --weights run: auto, cpu, cuda. "
               "Default: auto.")
 @click.option("--write-results", type=click.Path(path_type=Path), metavar="JSON",
@@ -92,11 +92,8 @@ def scene_names(path: Path) -> list[str]:
 
 def detector_at(weights: Path, device: str, sensor_height: float) -> Callable:
     """The detector of a checkpoint for a level sensor so many metres above the ground."""
-    from lidar_perception.detection.detector import load_detector
-    from lidar_perception.detection.detector_params import DetectorParams
-    from lidar_perception.params import with_values
-    params = with_values(DetectorParams(), {"ground.sensor_pose.height": sensor_height})
-    return load_detector(weights, device, params)
+    from lidar_perception.detectors import open_detector
+    return open_detector(weights, device, sensor_height)
 
 
 def score_results(frames: list[NuscenesFrame], found: list[GlobalBoxes],

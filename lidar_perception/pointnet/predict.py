@@ -22,8 +22,8 @@ CHUNK = 256  # clusters at a time: bounds the memory, and the caches like it
 @dataclass(frozen=True)
 class Predictions:
     """Of K clusters: probabilities (K, C + 1) float32 of the C classes of the config and of
-    background, calibrated; kinds (K,) int64 the likeliest class but background; boxes (K, 7)
-    float32 if it is of that class, in the frame of the clusters."""
+    background, calibrated; kinds (K,) int64 the likeliest class but background, or the one that was
+    asked about; boxes (K, 7) float32 if it is of that class, in the frame of the clusters."""
 
     probabilities: np.ndarray
     kinds: np.ndarray
@@ -31,7 +31,7 @@ class Predictions:
 
     @property
     def scores(self) -> np.ndarray:
-        """(K,) the probability of the likeliest class."""
+        """(K,) the probability of the class of kinds."""
         return self.probabilities[np.arange(len(self.kinds)), self.kinds]
 
     def take(self, chosen: np.ndarray) -> Predictions:
@@ -50,9 +50,10 @@ def found(predictions: Predictions, config: PointNetConfig, least: Sequence[floa
 
 
 @torch.inference_mode()
-def predict(network: PointNet, clusters: Clusters, seed: int = 0, chunk: int = CHUNK
-            ) -> Predictions:
-    """What the network, in eval mode, makes of each cluster. K may be 0."""
+def predict(network: PointNet, clusters: Clusters, seed: int = 0, chunk: int = CHUNK,
+            kinds: np.ndarray | None = None) -> Predictions:
+    """What the network, in eval mode, makes of each cluster, of class kinds (K,) if they are given.
+    K may be 0."""
     config, classes = network.config, len(network.config.classes)
     if len(clusters) == 0:
         return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64),
@@ -60,7 +61,8 @@ def predict(network: PointNet, clusters: Clusters, seed: int = 0, chunk: int = C
     inputs = network_input(clusters, config.points, seed)
     outputs = outputs_of(network, inputs, chunk)
     probabilities = network.probabilities(outputs.logits).cpu().numpy()
-    kinds = probabilities[:, :classes].argmax(axis=1)
+    if kinds is None:
+        kinds = probabilities[:, :classes].argmax(axis=1)
     return Predictions(probabilities, kinds, decode(outputs, inputs, config, kinds))
 
 

@@ -1,0 +1,18 @@
+"""Scans with fewer points, for what a detector does with a sparser sensor (paper C)."""
+
+from __future__ import annotations
+
+import zlib
+
+import numpy as np
+
+from lidar_perception.types import LidarFrame
+
+
+def thinned(frame: LidarFrame, share: float, name: str) -> LidarFrame:
+    """About this share (0..1) of the points of the frame called name, drawn at random but always
+    the same; with 1 the frame itself. A smaller share keeps some of the points of a larger one."""
+    if share >= 1.0:
+        return frame
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    return frame.take(np.flatnonzero(rng.random(len(frame)) < share))

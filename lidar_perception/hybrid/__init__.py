@@ -1,0 +1,1 @@
+"""Two detectors that check each other: what one finds is scored again by the cluster network."""
