@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Protocol
 
 from lidar_perception.checkpoint import POINTNET, network_of
-from lidar_perception.params import with_values
+from lidar_perception.params import parameter_fields, with_values
 from lidar_perception.types import Detections, LidarFrame
 
 
@@ -22,10 +22,12 @@ class AnyDetector(Protocol):
 
 
 def open_detector(path: str | Path, device: str = "auto",
-                  sensor_height: float | None = None) -> AnyDetector:
+                  sensor_height: float | None = None,
+                  least_score: float | None = None) -> AnyDetector:
     """The detector of a checkpoint of either network, or of an exported one (.onnx), with its
-    default parameters; with sensor_height for a sensor so many metres above the ground. InputError
-    for a file that cannot be used, or a device that is not there."""
+    default parameters; with sensor_height for a sensor so many metres above the ground, with
+    least_score that threshold for every class. InputError for a file that cannot be used, or a
+    device that is not there."""
     path = Path(path)
     if path.suffix != ".onnx" and network_of(path) == POINTNET:
         from lidar_perception.pointnet.detector import load_pointnet_detector
@@ -33,7 +35,11 @@ def open_detector(path: str | Path, device: str = "auto",
     else:
         from lidar_perception.detection.detector import load_detector
         detector = load_detector(path, device)
+    changed: dict[str, float] = {}
     if sensor_height is not None:
-        detector.params = with_values(detector.params,
-                                      {"ground.sensor_pose.height": sensor_height})
+        changed["ground.sensor_pose.height"] = sensor_height
+    if least_score is not None:
+        changed |= dict.fromkeys((field for field in parameter_fields(detector.params)
+                                  if ".scores." in field), least_score)
+    detector.params = with_values(detector.params, changed)
     return detector

@@ -140,8 +140,8 @@ def test_pointnet_imports_of_the_other_detector_what_is_not_its_network(name):
 @pytest.mark.parametrize("name", files_in("lidar_perception/hybrid"))
 def test_hybrids_import_the_detectors_that_they_join(name):
     joined = [f"lidar_perception.{module}" for module in (
-        "hybrid", "pointnet", "detection.nms", "detection.view", "detectors", "pipeline", "camera",
-        "configurations", "param_fields")]
+        "hybrid", "pointnet", "detection.config", "detection.nms", "detection.view", "detectors",
+        "pipeline", "camera", "configurations", "param_fields")]
     assert strangers(name, ["numpy", *SHARED, *ALGORITHMS, *joined]) == []
 
 

@@ -67,7 +67,7 @@ def detector(monkeypatch):
     was asked."""
     made = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
 
-    def open_detector(path, device="auto"):
+    def open_detector(path, device="auto", least_score=None):
         made.asked.append((str(path), device))
 
         def detect(frame):

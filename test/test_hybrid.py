@@ -55,7 +55,7 @@ def found(judge):
 def clusters(found):
     segmented, candidates = found
     ids = np.where(np.isin(segmented.cluster_ids, candidates.clusters), segmented.cluster_ids, 0)
-    return clusters_of(cloud().take(segmented.places), ids)
+    return clusters_of(cloud().take(segmented.places), ids, ground=segmented.ground)
 
 
 def rescored(judge, **changes) -> Detections:

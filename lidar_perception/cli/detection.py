@@ -31,6 +31,9 @@ from lidar_perception.types import Detections, InputError
               "Default: auto.")
 @click.option("--split", type=click.Path(path_type=Path), metavar="FILE",
               help="Score only the frames named in this file, one a line.")
+@click.option("--least-score", type=click.FloatRange(0, 1), default=0.05, show_default=True,
+              help="Boxes of --weights with a lower score are left out. AP is made of precision "
+              "at every recall, so it needs those that a robot would not act on.")
 @click.option("--keep", type=click.FloatRange(0, 1), default=1.0, metavar="SHARE",
               help="Keep only this share of the points of each scan, 0..1, drawn at random but "
               "always the same. Default: 1.")
@@ -39,7 +42,7 @@ from lidar_perception.types import Detections, InputError
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Write the scores to this file.")
 def detection(kitti: Path, results: Path | None, weights: Path | None, device: str,
-              split: Path | None, keep: float, write_results: Path | None,
+              split: Path | None, least_score: float, keep: float, write_results: Path | None,
               json_file: Path | None) -> None:
     """Boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
 
@@ -72,7 +75,8 @@ def detection(kitti: Path, results: Path | None, weights: Path | None, device: s
         work = score_results(frames, results, report)
     else:
         from lidar_perception.detectors import open_detector
-        work = score_detector(frames, open_detector(weights, device), write_results, report, keep)
+        work = score_detector(frames, open_detector(
+            weights, device, least_score=least_score), write_results, report, keep)
     for _ in track(work, "evaluating", len(frames)):
         pass
     content = {"source": str(results or weights), "keep": keep, **report.content()}

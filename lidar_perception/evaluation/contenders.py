@@ -19,7 +19,7 @@ from lidar_perception.evaluation.comparison import Contender
 from lidar_perception.hybrid.candidates import RescoredCandidates
 from lidar_perception.hybrid.params import ConfirmingParams, RescoringParams
 from lidar_perception.hybrid.proposals import ConfirmedProposals
-from lidar_perception.params import PipelineParams, parameter_fields, with_values
+from lidar_perception.params import PipelineParams, with_values
 from lidar_perception.pipeline import (
     SeedSource,
     automatic_seed,
@@ -95,7 +95,7 @@ def _own_files() -> tuple[list[Path], dict[str, str]]:
 
 
 def _open(path: Path, device: str, taken: Sequence[str]) -> Opened:
-    detector = open_detector(path, device)
+    detector = open_detector(path, device, least_score=LEAST)
     kind = detector.header.network
     if kind == POINTPILLARS:
         name = f"PointPillars {detector.config.version} {detector.config.size}"
@@ -105,9 +105,7 @@ def _open(path: Path, device: str, taken: Sequence[str]) -> Opened:
     base, number = name, 2
     while name in taken:
         name, number = f"{base} #{number}", number + 1
-    operating = detector.settings.scores.pedestrian
-    scores = {field: LEAST for field in parameter_fields(detector.params) if ".scores." in field}
-    detector.params = with_values(detector.params, scores)
+    operating = type(detector.settings)().scores.pedestrian  # which nobody lowered
     return Opened(name, kind, detector, path, operating)
 
 

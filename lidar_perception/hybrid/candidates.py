@@ -45,8 +45,9 @@ class RescoredCandidates:
         self.problem = explain_nothing(len(frame), segmented.ground, segmented.cluster_ids)
         t0 = perf_counter()
         chosen = np.flatnonzero(np.isin(segmented.cluster_ids, found.clusters))
-        seen = seen_by(self.judge, frame.take(segmented.places[chosen]), pose)
-        clusters = clusters_of(seen, segmented.cluster_ids[chosen])
+        seen = seen_by(self.judge, frame.take(segmented.places), pose)
+        clusters = clusters_of(seen.take(chosen), segmented.cluster_ids[chosen]).on(
+            seen.xyz.compress(segmented.ground, axis=0))
         result, whole = judged(self.judge, found.final, clusters, params.weight, pose)
         result = result[result.scores >= params.threshold] if params.box == "cluster" else (
             self._whole(result, whole))

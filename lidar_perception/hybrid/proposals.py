@@ -7,6 +7,7 @@ from time import perf_counter
 
 import numpy as np
 
+from lidar_perception.detection.config import SENSOR_HEIGHT
 from lidar_perception.detectors import AnyDetector
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.segment import segment_ground
@@ -14,7 +15,6 @@ from lidar_perception.hybrid.judging import judged, known, seen_by
 from lidar_perception.hybrid.params import ConfirmingParams
 from lidar_perception.params import SensorPoseParams
 from lidar_perception.pointnet.clusters import Clusters
-from lidar_perception.pointnet.config import SENSOR_HEIGHT
 from lidar_perception.pointnet.detector import PointNetDetector
 from lidar_perception.types import Detections, LidarFrame
 
@@ -44,16 +44,17 @@ class ConfirmedProposals:
             seen = seen_by(self.judge, frame, pose)
             flat = replace(self.judge.params.ground,
                            sensor_pose=SensorPoseParams(height=SENSOR_HEIGHT))
-            obstacles = np.flatnonzero(~segment_ground(seen, flat))
+            ground = segment_ground(seen, flat)
+            obstacles = np.flatnonzero(~ground)
             t2 = perf_counter()
             clusters = points_of(proposals.boxes, frame.take(obstacles), seen.take(obstacles),
                                  params.margin)
             asked = np.flatnonzero((clusters.sizes >= params.least_points)
                                    & known(self.judge, proposals.class_ids))
+            clusters = clusters.take(asked).on(seen.xyz.compress(ground, axis=0))
             t3 = perf_counter()
             scores = proposals.scores.copy()
-            scores[asked] = judged(self.judge, proposals[asked], clusters.take(asked),
-                                   params.weight)[0].scores
+            scores[asked] = judged(self.judge, proposals[asked], clusters, params.weight)[0].scores
             kept = np.flatnonzero(scores >= params.threshold)
             kept = kept[np.argsort(-scores[kept], kind="stable")]
             proposals = Detections(proposals.boxes[kept], proposals.class_ids[kept], scores[kept])

@@ -7,7 +7,7 @@ thing is seen.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -47,6 +47,10 @@ class Clusters:
         rows = np.repeat(self.first[chosen] - first[:-1], sizes) + np.arange(first[-1])
         return Clusters(self.points[rows], first, self.ids[chosen],
                         None if self.ground is None else self.ground[chosen])
+
+    def on(self, ground: np.ndarray) -> Clusters:
+        """The same clusters, none of them empty, over the ground's points (G, 3)."""
+        return replace(self, ground=ground_under(ground, _middles(self.points, self.first)))
 
     @property
     def floor(self) -> np.ndarray:
@@ -88,10 +92,8 @@ def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, least_points: int = 
     if frame.intensity is not None:
         points[:, 3] = frame.intensity[order]
     first = np.concatenate([[0], np.cumsum(sizes[kept])]).astype(np.int64)
-    floor = None
-    if ground is not None:
-        floor = ground_under(frame.xyz.compress(ground, axis=0), _middles(points, first))
-    return Clusters(points, first, known[kept].astype(np.int64), floor)
+    found = Clusters(points, first, known[kept].astype(np.int64))
+    return found if ground is None else found.on(frame.xyz.compress(ground, axis=0))
 
 
 def ground_under(xyz: np.ndarray, places: np.ndarray) -> np.ndarray:
