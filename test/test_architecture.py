@@ -118,7 +118,8 @@ def test_algorithms_import_numbers_and_the_shared_files_only(name):
     assert strangers(name, NUMERIC + SHARED + ALGORITHMS) == []
 
 
-NETWORKS = [f"lidar_perception.{name}" for name in ("checkpoint", "devices", "param_fields")]
+NETWORKS = [f"lidar_perception.{name}"
+            for name in ("checkpoint", "config_json", "devices", "param_fields")]
 
 
 @pytest.mark.parametrize("name", files_in("lidar_perception/detection"))

@@ -25,12 +25,13 @@ from lidar_perception.pointnet.network import make_pointnet
 from lidar_perception.pointnet.predict import Predictions
 from lidar_perception.training.augment import Scene
 from lidar_perception.training.cut_scenes import CutScene, CutScenes, cut
+from lidar_perception.training.data import JudgedScenes
 from lidar_perception.training.params import ClusterAugmentParams
 from lidar_perception.training.pointnet import (
     FEWEST,
     ClusterPreparation,
-    JudgedCuts,
     changed,
+    judged_clusters,
     make_loss,
     validated,
 )
@@ -249,7 +250,7 @@ def test_validation_reads_every_scene_and_calibrates(rng):
         def judged(self, i):
             return "a", LidarFrame(np.zeros((0, 3), np.float32)), truth, CALIBRATION
 
-    items = [JudgedCuts((Source(),))[n] for n in range(2)]
+    items = [JudgedScenes((Source(),), judged_clusters)[n] for n in range(2)]
     assert items[1].sample is None and items[1].skipped == ("broken.bin",)
     torch.manual_seed(0)
     network = make_pointnet(CONFIG).eval()

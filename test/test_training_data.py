@@ -16,17 +16,17 @@ from lidar_perception.geometry import points_in_box
 from lidar_perception.simulation import drive
 from lidar_perception.training import scenes as scenes_module
 from lidar_perception.training.augment import Scene
-from lidar_perception.training.data import Batches, Item, RawScenes, Stream
+from lidar_perception.training.data import Batches, Item, JudgedScenes, RawScenes, Stream
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pointpillars import (
-    JudgedScenes,
     Preparation,
     Sample,
+    judged_scan,
     make_loss,
-    metrics_of,
     score_detector,
     targets_of,
 )
+from lidar_perception.training.record import metrics_of
 from lidar_perception.training.scenes import (
     KittiScenes,
     SimulatedScenes,
@@ -239,7 +239,7 @@ def test_a_scene_that_the_network_cannot_see_is_skipped():
 
 def test_a_perfect_detector_scores_and_a_blind_one_does_not(tmp_path):
     root = broken_folder(tmp_path)
-    scenes = JudgedScenes((KittiScenes(root, kitti_names(root)),))
+    scenes = JudgedScenes((KittiScenes(root, kitti_names(root)),), judged_scan)
     right = score_detector(lambda frame: Detections.of([WALKER]), scenes)
     blind = score_detector(lambda frame: Detections.none(), scenes)
     assert right.content()["frames"] == 3 and len(right.skipped) == 2

@@ -82,13 +82,13 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
     """
     from lidar_perception.detection.config import network_config
     from lidar_perception.devices import chosen_device
-    from lidar_perception.training.data import Batches, RawScenes, Stream
+    from lidar_perception.training.data import Batches, JudgedScenes, RawScenes, Stream
     from lidar_perception.training.database import cut_objects
     from lidar_perception.training.loop import may_begin
     from lidar_perception.training.loop import train as run
     from lidar_perception.training.pointpillars import (
-        JudgedScenes,
         Preparation,
+        judged_scan,
         make_task,
         narrowed,
     )
@@ -111,8 +111,8 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
                                              database), params.seed)
         batches = Batches(stream, params.batch, jobs, rank(), world())
         about = about_data(data, val, stream, held_out, init)
-        task = make_task(config, params, batches, JudgedScenes(held_out), out, place, about,
-                         commit(), init)
+        task = make_task(config, params, batches, JudgedScenes(held_out, judged_scan), out, place,
+                         about, commit(), init)
         progress = run(task, params, out, place, resume)
         if rank() > 0:
             return
@@ -161,10 +161,10 @@ def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[
                     init: Path | None, place: Any, jobs: int) -> None:
     from lidar_perception.pointnet.config import pointnet_config
     from lidar_perception.training.cut_scenes import CutScenes
-    from lidar_perception.training.data import Batches, Stream
+    from lidar_perception.training.data import Batches, JudgedScenes, Stream
     from lidar_perception.training.loop import may_begin
     from lidar_perception.training.loop import train as run
-    from lidar_perception.training.pointnet import ClusterPreparation, JudgedCuts, make_task
+    from lidar_perception.training.pointnet import ClusterPreparation, judged_clusters, make_task
     from lidar_perception.training.ranks import rank, world
     may_begin(out, resume)
     config = pointnet_config(params.network)
@@ -173,7 +173,8 @@ def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[
                                for source in part) for part in scenes)
     stream = Stream(sources, ClusterPreparation(config, params.augment), params.seed)
     batches = Batches(stream, params.batch, jobs, rank(), world())
-    task = make_task(config, params, batches, JudgedCuts(held_out), out, place,
+    task = make_task(config, params, batches, JudgedScenes(held_out, judged_clusters), out,
+                     place,
                      about_data(data, val, stream, held_out, init), commit(), init)
     progress = run(task, params, out, place, resume)
     if rank() == 0:

@@ -11,6 +11,7 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
+from lidar_perception.config_json import config_of
 from lidar_perception.types import CLASSES, InputError
 
 SENSOR_HEIGHT = 1.73  # m, KITTI's; the networks see every cloud as from this height
@@ -167,15 +168,8 @@ def to_json(config: NetworkConfig) -> dict[str, Any]:
 
 def from_json(content: dict[str, Any], source: str = "the header") -> NetworkConfig:
     """The inverse of to_json. InputError naming source and what does not fit."""
-    known = {f.name for f in dataclasses.fields(NetworkConfig)}
-    try:
-        if unknown := sorted(set(content) - known):
-            raise ValueError(f"unknown field {unknown[0]!r}; it was made by a later version")
-        values = {name: tuple(value) if isinstance(value, list) else value
-                  for name, value in content.items()}
-        if "anchors" in values:
-            values["anchors"] = tuple(AnchorClass(**{**a, "size": tuple(a["size"])})
-                                      for a in values["anchors"])
-        return NetworkConfig(**values)
-    except (TypeError, ValueError, KeyError) as error:
-        raise InputError(f"{source} describes no network: {error}") from None
+    return config_of(NetworkConfig, content, source, {"anchors": _anchors})
+
+
+def _anchors(content: list[dict[str, Any]]) -> tuple[AnchorClass, ...]:
+    return tuple(AnchorClass(**{**anchor, "size": tuple(anchor["size"])}) for anchor in content)

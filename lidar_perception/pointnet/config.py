@@ -11,6 +11,7 @@ import dataclasses
 from dataclasses import dataclass, replace
 from typing import Any
 
+from lidar_perception.config_json import config_of
 from lidar_perception.params import ClusteringParams, EuclideanParams, GroundParams
 from lidar_perception.types import CLASSES, InputError
 
@@ -129,14 +130,5 @@ def to_json(config: PointNetConfig) -> dict[str, Any]:
 
 def from_json(content: dict[str, Any], source: str = "the header") -> PointNetConfig:
     """The inverse of to_json. InputError naming source and what does not fit."""
-    known = {f.name for f in dataclasses.fields(PointNetConfig)}
-    try:
-        if unknown := sorted(set(content) - known):
-            raise ValueError(f"unknown field {unknown[0]!r}; it was made by a later version")
-        values = {name: tuple(value) if isinstance(value, list) else value
-                  for name, value in content.items()}
-        if "sizes" in values:
-            values["sizes"] = tuple(map(tuple, values["sizes"]))
-        return PointNetConfig(**values)
-    except (TypeError, ValueError, KeyError) as error:
-        raise InputError(f"{source} describes no network: {error}") from None
+    return config_of(PointNetConfig, content, source, {
+        "sizes": lambda sizes: tuple(map(tuple, sizes))})

@@ -49,11 +49,8 @@ class Stream:
 
     def scene(self, place: int) -> Scene:
         """Scene `place` of all sources behind one another."""
-        for source in self.sources:
-            if place < len(source):
-                return source.scene(place)
-            place -= len(source)
-        raise IndexError(place)
+        source, i = source_of(self.sources, place)
+        return source.scene(i)
 
     def __getitem__(self, n: int) -> Item:
         epoch, place = divmod(n, len(self))
@@ -67,6 +64,33 @@ class Stream:
             except InputError as error:
                 skipped.append(str(error))
         raise InputError(f"none of the {len(self)} scenes can be used ({skipped[0]})")
+
+
+def source_of(sources: Sequence[Any], place: int) -> tuple[Any, int]:
+    """The source, and which of its scenes, that scene `place` of all behind one another is."""
+    for source in sources:
+        if place < len(source):
+            return source, place
+        place -= len(source)
+    raise IndexError(place)
+
+
+@dataclass(frozen=True)
+class JudgedScenes:
+    """scenes[n]: an Item of what validation reads of the n-th scene of all sources, None if it
+    cannot be read. judged(source, i) reads one, or raises InputError."""
+
+    sources: tuple[Any, ...]
+    judged: Callable[[Any, int], Any]
+
+    def __len__(self) -> int:
+        return sum(map(len, self.sources))
+
+    def __getitem__(self, n: int) -> Item:
+        try:
+            return Item(self.judged(*source_of(self.sources, n)))
+        except InputError as error:
+            return Item(None, (str(error),))
 
 
 @dataclass

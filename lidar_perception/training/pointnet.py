@@ -23,7 +23,7 @@ from lidar_perception.pointnet.config import PointNetConfig
 from lidar_perception.pointnet.network import PointNet, make_pointnet
 from lidar_perception.pointnet.predict import found, outputs_of, predict
 from lidar_perception.training.cut_scenes import CutScene, CutScenes
-from lidar_perception.training.data import Batches, Item, loaded
+from lidar_perception.training.data import Batches, JudgedScenes, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
 from lidar_perception.training.record import begun_with, metrics_of, record_of, rounded
 from lidar_perception.training.run import Task
@@ -160,28 +160,12 @@ class JudgedClusters:
     calibration: KittiCalibration
 
 
-@dataclass(frozen=True)
-class JudgedCuts:
-    """scenes[n]: an Item of the n-th JudgedClusters of all sources, None if it cannot be read."""
-
-    sources: tuple[CutScenes, ...]
-
-    def __len__(self) -> int:
-        return sum(map(len, self.sources))
-
-    def __getitem__(self, n: int) -> Item:
-        for source in self.sources:
-            if n < len(source):
-                try:
-                    scene = source.scene(n)
-                    made = np.flatnonzero(~scene.loose)
-                    name, _, truth, calibration = source.judged(n)
-                    return Item(JudgedClusters(name, scene.clusters.take(made),
-                                               scene.labels[made], truth, calibration))
-                except InputError as error:
-                    return Item(None, (str(error),))
-            n -= len(source)
-        raise IndexError(n)
+def judged_clusters(source: CutScenes, i: int) -> JudgedClusters:
+    """Scene i of a source, to validate on. InputError naming the file that cannot be used."""
+    scene = source.scene(i)
+    made = np.flatnonzero(~scene.loose)
+    name, _, truth, calibration = source.judged(i)
+    return JudgedClusters(name, scene.clusters.take(made), scene.labels[made], truth, calibration)
 
 
 def validated(network: PointNet, scenes: Sequence[JudgedClusters]) -> dict[str, float]:
@@ -211,7 +195,7 @@ def validated(network: PointNet, scenes: Sequence[JudgedClusters]) -> dict[str, 
 
 
 def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches,
-              validation: JudgedCuts, out: Path, device: torch.device, about: dict[str, Any],
+              validation: JudgedScenes, out: Path, device: torch.device, about: dict[str, Any],
               commit: str = "", init: Path | None = None) -> Task:
     """The task of training a network of a config; see training.pointpillars.make_task."""
     torch.manual_seed(params.seed)

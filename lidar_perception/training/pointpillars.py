@@ -36,11 +36,12 @@ from lidar_perception.evaluation.kitti_protocol import NEIGHBOURS
 from lidar_perception.geometry import points_in_box
 from lidar_perception.param_fields import with_values
 from lidar_perception.training.augment import Scene, augmented
-from lidar_perception.training.data import Batches, Item, loaded
+from lidar_perception.training.data import Batches, JudgedScenes, loaded
 from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
 from lidar_perception.training.record import begun_with, metrics_of, record_of, rounded
 from lidar_perception.training.run import Task
+from lidar_perception.training.scenes import Judged
 from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
 
 # Boxes of low score cost precision only where recall has ended; fewer of them are quicker.
@@ -160,24 +161,9 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     return loss
 
 
-@dataclass(frozen=True)
-class JudgedScenes:
-    """scenes[n]: an Item of the n-th Judged of all sources, None if it cannot be read."""
-
-    sources: tuple[Any, ...]
-
-    def __len__(self) -> int:
-        return sum(map(len, self.sources))
-
-    def __getitem__(self, n: int) -> Item:
-        for source in self.sources:
-            if n < len(source):
-                try:
-                    return Item(source.judged(n))
-                except InputError as error:
-                    return Item(None, (str(error),))
-            n -= len(source)
-        raise IndexError(n)
+def judged_scan(source: Any, i: int) -> Judged:
+    """Scene i of a source, to validate on. InputError naming the file that cannot be used."""
+    return source.judged(i)
 
 
 def score_detector(detector: Callable[[LidarFrame], Detections], scenes: JudgedScenes,
