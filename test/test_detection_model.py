@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -17,7 +19,6 @@ from lidar_perception.detection.config import (
     VERSIONS,
     from_json,
     network_config,
-    to_json,
 )
 from lidar_perception.detection.losses import detection_loss
 from lidar_perception.detection.pillars import first_of_each, make_pillars
@@ -56,7 +57,7 @@ def some_map(config, seed=0) -> torch.Tensor | None:
 @pytest.mark.parametrize("size", SIZES)
 def test_a_config_survives_json(version, size):
     config = network_config(version, size, classes=("Cyclist", "Car"))
-    assert from_json(to_json(config)) == config
+    assert from_json(dataclasses.asdict(config)) == config
     assert config.classes == ("Cyclist", "Car") and config.grid == (496, 432)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -221,7 +221,7 @@ def test_every_switch_of_the_ablation_changes_the_network_or_the_clusters():
 
 def test_a_config_survives_json_and_what_cannot_be_is_said():
     config = pointnet_config("pointnet2", points=64)
-    assert config_module.from_json(config_module.to_json(config)) == config
+    assert config_module.from_json(asdict(config)) == config
     with pytest.raises(InputError, match="no network 'resnet'"):
         pointnet_config("resnet")
     with pytest.raises(InputError, match="Bus"):

@@ -7,7 +7,6 @@ JSON, so that weights always come with their network.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -161,13 +160,8 @@ def network_config(version: str = "v0", size: str = "full",
         raise InputError(str(error)) from None
 
 
-def to_json(config: NetworkConfig) -> dict[str, Any]:
-    """The config as numbers, strings, lists and dicts."""
-    return dataclasses.asdict(config)
-
-
 def from_json(content: dict[str, Any], source: str = "the header") -> NetworkConfig:
-    """The inverse of to_json. InputError naming source and what does not fit."""
+    """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
     return config_of(NetworkConfig, content, source, {"anchors": _anchors})
 
 

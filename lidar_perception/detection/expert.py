@@ -6,17 +6,17 @@ the nodes ground_segmentation and clustering, are taken as they are.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
 
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
-from lidar_perception.detection.config import SENSOR_HEIGHT, NetworkConfig
+from lidar_perception.detection.config import NetworkConfig
 from lidar_perception.detection.detector_params import EXPERT_CLUSTERING, EXPERT_GROUND
-from lidar_perception.ground.segment import segment_ground
-from lidar_perception.params import ClusteringParams, GroundParams, SensorPoseParams
+from lidar_perception.detection.view import levelled_ground
+from lidar_perception.params import ClusteringParams, GroundParams
 from lidar_perception.types import CLASSES, LidarFrame
 
 SPARSE = 16  # largest number of a cluster, in points, up to which a table of all numbers is made
@@ -44,8 +44,7 @@ def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | 
     """
     needs_clusters = config.cluster_ids or config.pseudo_map
     if ground is None and (config.remove_ground or (needs_clusters and cluster_ids is None)):
-        flat = replace(ground_params, sensor_pose=SensorPoseParams(height=SENSOR_HEIGHT))
-        ground = segment_ground(seen, flat)
+        ground = levelled_ground(seen, ground_params)
     if needs_clusters and cluster_ids is None:
         cluster_ids = cluster_obstacles(seen.xyz, ground, clustering)
     if config.remove_ground:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from lidar_perception.detection.config import SENSOR_HEIGHT, NetworkConfig
-from lidar_perception.ground.segment import level
-from lidar_perception.params import SensorPoseParams
+from lidar_perception.ground.segment import level, segment_ground
+from lidar_perception.params import GroundParams, SensorPoseParams
 from lidar_perception.types import Detections, InputError, LidarFrame
 
 
@@ -68,3 +68,10 @@ def made_up_frame(pose: SensorPoseParams) -> LidarFrame:
     xyz = np.concatenate([flat, thing]).astype(np.float32)
     xyz[:, 2] -= pose.height - SENSOR_HEIGHT
     return LidarFrame(xyz, np.zeros(len(xyz), np.float32))
+
+
+def levelled_ground(seen: LidarFrame, params: GroundParams) -> np.ndarray:
+    """(N,) bool: the ground of a frame that is levelled and as from SENSOR_HEIGHT, whatever pose
+    params give its sensor."""
+    return segment_ground(seen, replace(params, sensor_pose=SensorPoseParams(
+        height=SENSOR_HEIGHT)))

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
 
-from lidar_perception.detection.config import SENSOR_HEIGHT
+from lidar_perception.detection.view import levelled_ground
 from lidar_perception.detectors import AnyDetector
 from lidar_perception.geometry import points_in_box
-from lidar_perception.ground.segment import segment_ground
 from lidar_perception.hybrid.judging import judged, known, seen_by
 from lidar_perception.hybrid.params import ConfirmingParams
-from lidar_perception.params import SensorPoseParams
 from lidar_perception.pointnet.clusters import Clusters
 from lidar_perception.pointnet.detector import PointNetDetector
 from lidar_perception.types import Detections, LidarFrame
@@ -42,9 +39,7 @@ class ConfirmedProposals:
         if len(proposals):
             pose = self.judge.params.ground.sensor_pose
             seen = seen_by(self.judge, frame, pose)
-            flat = replace(self.judge.params.ground,
-                           sensor_pose=SensorPoseParams(height=SENSOR_HEIGHT))
-            ground = segment_ground(seen, flat)
+            ground = levelled_ground(seen, self.judge.params.ground)
             obstacles = np.flatnonzero(~ground)
             t2 = perf_counter()
             clusters = points_of(proposals.boxes, frame.take(obstacles), seen.take(obstacles),

@@ -7,7 +7,6 @@ A checkpoint holds the dataclass as JSON, so that weights always come with their
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -123,12 +122,7 @@ def pointnet_config(name: str = "improved", **changes: Any) -> PointNetConfig:
         raise InputError(str(error)) from None
 
 
-def to_json(config: PointNetConfig) -> dict[str, Any]:
-    """The config as numbers, strings, lists and dicts."""
-    return dataclasses.asdict(config)
-
-
 def from_json(content: dict[str, Any], source: str = "the header") -> PointNetConfig:
-    """The inverse of to_json. InputError naming source and what does not fit."""
+    """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
     return config_of(PointNetConfig, content, source, {
         "sizes": lambda sizes: tuple(map(tuple, sizes))})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -10,19 +9,17 @@ import numpy as np
 import torch
 
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.detection.config import SENSOR_HEIGHT
 from lidar_perception.detection.network_detector import NetworkDetector
 from lidar_perception.detection.nms import suppressed
 from lidar_perception.detection.view import (
     in_sensor_frame,
     levelled,
+    levelled_ground,
     made_up_frame,
     require_columns,
     with_intensity_scaled,
 )
 from lidar_perception.devices import CPU, chosen_device
-from lidar_perception.ground.segment import segment_ground
-from lidar_perception.params import SensorPoseParams
 from lidar_perception.pointnet.checkpoint import Header, load_pointnet
 from lidar_perception.pointnet.clusters import Clusters, clusters_of
 from lidar_perception.pointnet.network import PointNet, fused
@@ -60,8 +57,7 @@ class PointNetDetector(NetworkDetector):
         usable = usable_returns(frame.xyz)
         t1 = perf_counter()
         if ground is None:
-            flat = replace(self.params.ground, sensor_pose=SensorPoseParams(height=SENSOR_HEIGHT))
-            ground = segment_ground(seen, flat)
+            ground = levelled_ground(seen, self.params.ground)
         ground = np.asarray(ground, bool) & usable
         t2 = perf_counter()
         if cluster_ids is None:

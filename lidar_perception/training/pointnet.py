@@ -17,7 +17,7 @@ from lidar_perception.evaluation.detection import DetectionReport
 from lidar_perception.geometry import points_in_box
 from lidar_perception.pointnet.box_head import BoxTargets, cluster_loss, encode
 from lidar_perception.pointnet.calibration import calibrate, calibration_error
-from lidar_perception.pointnet.checkpoint import Header, save_checkpoint
+from lidar_perception.pointnet.checkpoint import Header
 from lidar_perception.pointnet.clusters import ClusterInput, Clusters, network_input
 from lidar_perception.pointnet.config import PointNetConfig
 from lidar_perception.pointnet.network import PointNet, make_pointnet
@@ -25,7 +25,7 @@ from lidar_perception.pointnet.predict import found, outputs_of, predict
 from lidar_perception.training.cut_scenes import CutScene, CutScenes
 from lidar_perception.training.data import Batches, JudgedScenes, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
-from lidar_perception.training.record import begun_with, metrics_of, record_of, rounded
+from lidar_perception.training.record import begun_with, keeper, metrics_of
 from lidar_perception.training.run import Task
 from lidar_perception.types import GroundTruth, InputError
 
@@ -209,9 +209,5 @@ def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches
                     judged.append(item.sample)
         return validated(module, judged)
 
-    def keep(name: str, module: PointNet, record: dict[str, Any]) -> None:
-        header = Header(config, record_of(params, batches, record, about),
-                        rounded(record["metrics"]), commit)
-        save_checkpoint(out / f"{name}.safetensors", module, header)
-
-    return Task(network, make_loss(config, device), batches, validate, keep, batches.epoch, about)
+    return Task(network, make_loss(config, device), batches, validate,
+                keeper(out, Header, config, params, batches, about, commit), batches.epoch, about)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from lidar_perception.detection.anchors import make_anchors
-from lidar_perception.detection.checkpoint import Header, save_checkpoint
+from lidar_perception.detection.checkpoint import Header
 from lidar_perception.detection.config import NetworkConfig
 from lidar_perception.detection.detector import Detector, TorchNetwork
 from lidar_perception.detection.detector_params import DetectorParams
@@ -39,7 +39,7 @@ from lidar_perception.training.augment import Scene, augmented
 from lidar_perception.training.data import Batches, JudgedScenes, loaded
 from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
-from lidar_perception.training.record import begun_with, metrics_of, record_of, rounded
+from lidar_perception.training.record import begun_with, keeper, metrics_of
 from lidar_perception.training.run import Task
 from lidar_perception.training.scenes import Judged
 from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
@@ -193,11 +193,6 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
         content = score_detector(detector, validation, batches.jobs).content()
         return metrics_of(content, params.score, config.classes)
 
-    def keep(name: str, module: PointPillars, record: dict[str, Any]) -> None:
-        header = Header(config, record_of(params, batches, record, about),
-                        rounded(record.get("metrics", {})), commit)
-        save_checkpoint(out / f"{name}.safetensors", module, header)
-
     seen = narrowed(config, params.ahead, params.aside)
-    return Task(network, make_loss(seen, device), batches, validate, keep, batches.epoch,
-                about)
+    return Task(network, make_loss(seen, device), batches, validate,
+                keeper(out, Header, config, params, batches, about, commit), batches.epoch, about)

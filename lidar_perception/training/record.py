@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from torch import nn
 
 from lidar_perception import __version__
-from lidar_perception.checkpoint import Header, adopt
+from lidar_perception.checkpoint import Header, adopt, save_checkpoint
 from lidar_perception.param_fields import flatten
 from lidar_perception.terminal import errors
 from lidar_perception.training.data import Batches
@@ -26,6 +26,17 @@ def record_of(params: LoopParams, batches: Batches, record: dict[str, Any],
             "seconds": round(record["seconds"]), "steps_skipped": record["skipped"],
             "scenes_skipped": len(batches.skipped), "batch": params.batch * batches.world,
             "params": flatten(params), "version": __version__}
+
+
+def keeper(out: Path, kind: type[Header], config: Any, params: LoopParams, batches: Batches,
+           about: dict[str, Any], commit: str) -> Callable[[str, nn.Module, dict[str, Any]], None]:
+    """keep(name, module, record) of a Task: writes out/name.safetensors."""
+    def keep(name: str, module: nn.Module, record: dict[str, Any]) -> None:
+        header = kind(config, record_of(params, batches, record, about),
+                      rounded(record.get("metrics", {})), commit)
+        save_checkpoint(out / f"{name}.safetensors", module, header)
+
+    return keep
 
 
 def begun_with(network: nn.Module, init: Path | None, kind: type[Header]) -> nn.Module:
