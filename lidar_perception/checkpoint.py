@@ -140,7 +140,7 @@ def load(path: str | Path, kind: type[H], make: Callable[[Any], torch.nn.Module]
 
 def adopt(network: torch.nn.Module, path: str | Path, kind: type[Header]) -> tuple[int, int]:
     """Begin with the weights of a checkpoint of a network of the kind, of any config: each layer of
-    the same name and shape is taken, of a convolution with other inputs those that both have (new
+    the same name and shape is taken, of one with other inputs those that both have (new
     ones begin at 0); the rest stays as it is. How many tensors were taken, and of how many.
     InputError as read, and where nothing fits."""
     _, tensors = read(path, kind)
@@ -152,7 +152,7 @@ def adopt(network: torch.nn.Module, path: str | Path, kind: type[Header]) -> tup
             continue
         if found.shape == value.shape:
             value.copy_(found)
-        elif value.ndim == 4 and found.shape[0] == value.shape[0] and (
+        elif value.ndim > 1 and found.shape[0] == value.shape[0] and (
                 found.shape[2:] == value.shape[2:]):
             common = min(found.shape[1], value.shape[1])
             value.zero_()

@@ -13,6 +13,8 @@ from lidar_perception.training.augment import (
     Scene,
     augmented,
     brightened,
+    cropped,
+    faced,
     flipped,
     raised,
     scaled,
@@ -24,6 +26,7 @@ from lidar_perception.training.database import Database, cut_objects, with_objec
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 
+AREA = np.array([0.0, -15, -3]), np.array([20.0, 15, 1])
 few = settings(deadline=None, max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
@@ -148,7 +151,7 @@ def test_objects_that_are_put_in_touch_nothing_and_keep_their_points(seed):
                            ("Car", "Pedestrian", "Cyclist"), 5)
     scene, rng = random_scene(seed), np.random.default_rng(seed)
     params = AugmentParams(cars=4, pedestrians=4, cyclists=0)
-    fuller = with_objects(scene, database, params, rng)
+    fuller = with_objects(scene, database, params, *AREA, rng)
     old, count = len(scene.boxes), len(fuller.boxes)
     assert not touching(fuller.boxes)
     assert np.array_equal(fuller.boxes[:old], scene.boxes)
@@ -157,13 +160,90 @@ def test_objects_that_are_put_in_touch_nothing_and_keep_their_points(seed):
         here = (fuller.class_ids == kind).sum()
         assert here <= max(most, (scene.class_ids == kind).sum())
     inside = members(fuller, 1e-3).sum(axis=1)
-    assert (inside[:old] == members(scene, 1e-3).sum(axis=1)).all()
+    assert (inside[:old] <= members(scene, 1e-3).sum(axis=1)).all()  # some may be in a shadow now
     sizes = np.diff(database.first)
+    ranges = np.hypot(database.boxes[:, 0], database.boxes[:, 1])
     for box, number in zip(fuller.boxes[old:], inside[old:]):
-        origin = np.flatnonzero((database.boxes[:, :2] == box[:2]).all(axis=1))
-        assert number == sizes[origin[0]] >= 5
-    again = with_objects(scene, database, params, np.random.default_rng(seed))
+        assert (box[:2] >= AREA[0][:2]).all() and (box[:2] < AREA[1][:2]).all()
+        origin = np.abs(ranges - np.hypot(box[0], box[1])).argmin()
+        assert ranges[origin] == pytest.approx(np.hypot(box[0], box[1]), abs=1e-9)
+        assert number <= sizes[origin] and sizes[origin] >= 5  # the next one may stand before it
+    again = with_objects(scene, database, params, *AREA, np.random.default_rng(seed))
     assert np.array_equal(again.points, fuller.points)
+
+
+def wall(x: float, y: tuple[float, float], z: tuple[float, float]) -> np.ndarray:
+    """(N, 4) points 2 cm apart."""
+    sides, heights = np.meshgrid(np.arange(*y, 0.02), np.arange(*z, 0.02))
+    return np.column_stack([np.full(sides.size, x), sides.ravel(), heights.ravel(),
+                            np.zeros(sides.size)]).astype(np.float32)
+
+
+def one_walker(x: float) -> Database:
+    """A pedestrian x metres ahead, a flat grid of points."""
+    own = wall(x, (-0.25, 0.25), (-1.7, 0))
+    return Database(np.array([[x, 0, -0.86, 0.8, 0.7, 1.74, 0]]),
+                    np.array([PEDESTRIAN], np.int32), own, np.array([0, len(own)]))
+
+
+def street_with(*walls: np.ndarray) -> Scene:
+    ground = wall(-1.73, (-15, 15), (0, 15))[::7][:, [2, 1, 0, 3]]
+    return Scene(np.concatenate([ground, *walls]), np.zeros((0, 7)), np.zeros(0, int),
+                 np.zeros(0, bool))
+
+
+@few
+@given(seeds)
+def test_what_is_behind_an_object_goes_and_none_is_put_behind_something(seed):
+    params, rng = AugmentParams(cars=0, pedestrians=1, cyclists=0), np.random.default_rng(seed)
+    behind = wall(12.0, (-14, 14), (-1.7, 1.0))
+    scene = street_with(behind)
+    fuller = with_objects(scene, one_walker(8.0), params, *AREA, rng)
+    assert len(fuller.boxes) == 1
+    box = fuller.boxes[0]
+    assert np.hypot(box[0], box[1]) == pytest.approx(8.0)
+    count = len(one_walker(8.0).points)
+    rest, own = fuller.points[:-count], fuller.points[-count:]
+    assert points_in_box(own, box, 1e-4).all()
+    seen = rest[(rest[:, 0] == 12) & (rest[:, 2] > -1.72)]
+    # a ray from the sensor to a point of the wall that is left misses the walker
+    for share in np.linspace(0.5, 0.95, 40):
+        assert not points_in_box(seen * np.float32(share), box - [0, 0, 0, 0.35, 0.3, 0.1, 0]).any()
+    assert len(seen) > 0.8 * len(behind)
+    if abs(np.arctan2(box[1], box[0])) < 0.6:
+        assert len(seen) < len(behind)
+    hidden = with_objects(scene, one_walker(14.0), params, *AREA, rng)
+    assert len(hidden.boxes) == 0 or abs(np.arctan2(*hidden.boxes[0, 1::-1])) > 0.45
+    assert len(with_objects(street_with(), one_walker(14.0), params, *AREA, rng).boxes) == 1
+
+
+@few
+@given(seeds, st.sampled_from([-1, 1]), st.sampled_from([-1, 1]))
+def test_nothing_that_may_come_into_view_is_cut_off(seed, larger, higher):
+    scene, params = random_scene(seed), AugmentParams(turn=0, scale=0.1, height=0.3)
+    low, high = np.array([0, -10, -1.8]), np.array([10.0, 10, 0.5])
+
+    def changed(scene: Scene) -> Scene:
+        scene = raised(scaled(scene, 1 + larger * params.scale), higher * params.height)
+        return cropped(scene, low, high)
+
+    part = faced(scene, params, low, high, np.random.default_rng(seed))
+    assert len(part.points) < len(scene.points) and len(part.boxes) == len(part.class_ids)
+    whole, cut = changed(scene), changed(part)
+    assert np.array_equal(whole.points, cut.points)
+    np.testing.assert_allclose(whole.boxes, cut.boxes, atol=1e-12)
+    assert np.array_equal(whole.class_ids, cut.class_ids)
+
+
+def test_scenes_that_are_labelled_all_around_are_turned_all_around():
+    def bearings(around: bool) -> np.ndarray:
+        scene = Scene(np.array([[5, 0, -1, 0.5]], np.float32), np.zeros((0, 7)), np.zeros(0, int),
+                      np.zeros(0, bool), around)
+        turned = [faced(scene, AugmentParams(), np.full(3, -9.0), np.full(3, 9.0),
+                        np.random.default_rng(seed)).points[0] for seed in range(60)]
+        return np.abs(np.arctan2(*np.array(turned).T[1::-1]))
+
+    assert bearings(True).max() > 2.5 and 0.6 < bearings(False).max() <= AugmentParams().turn
 
 
 def test_objects_survive_their_file_and_a_broken_file_is_named(tmp_path):
@@ -182,4 +262,5 @@ def test_where_there_is_no_ground_nothing_is_put():
     database = cut_objects([random_scene(k) for k in range(4)], ("Car",), 5)
     empty = Scene(np.zeros((0, 4), np.float32), np.zeros((0, 7)), np.zeros(0, int),
                   np.zeros(0, bool))
-    assert len(with_objects(empty, database, AugmentParams(), np.random.default_rng(0)).boxes) == 0
+    assert len(with_objects(empty, database, AugmentParams(), *AREA,
+                            np.random.default_rng(0)).boxes) == 0

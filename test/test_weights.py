@@ -87,6 +87,11 @@ def test_a_network_begins_with_what_fits_of_another(saved):
     assert taken == count
     first, old = (s["blocks.0.0.0.weight"] for s in (other.state_dict(), state))
     assert first.shape[1] < old.shape[1] and torch.equal(first, old[:, :first.shape[1]])
+    # a new input, such as the number of the cluster, comes last and begins at 0
+    numbered = make_network(tiny("v2"))
+    assert len(set(adopt(numbered, path, Header))) == 1
+    first, old = (s["pillar_net.linear.weight"] for s in (numbered.state_dict(), state))
+    assert torch.equal(first[:, :-1], old) and not first[:, -1].any()
     # and another neck begins at random
     third = make_network(tiny("v0"))
     before = {name: value.clone() for name, value in third.state_dict().items()}

@@ -58,10 +58,9 @@ class PillarNet(nn.Module):
         self.norm = nn.BatchNorm1d(config.pillar_channels, **NORM)
 
     def forward(self, pillars: Pillars) -> Tensor:
-        points = pillars.points
-        if self.config.cluster_ids:
-            points = torch.cat([points[:, :4], points[:, 4:] * self.config.id_scale], dim=1)
-        inputs = torch.cat([points, pillars.offsets], dim=1)       # (N, 9 to 11)
+        # The clusters' numbers come last, so that versions with and without share a beginning.
+        numbers = pillars.points[:, 4:] * self.config.id_scale
+        inputs = torch.cat([pillars.points[:, :4], pillars.offsets, numbers], dim=1)  # (N, 9..11)
         values = functional.relu(self.norm(self.linear(inputs)))   # (N, C)
         height, width = pillars.grid
         count = pillars.batch * height * width

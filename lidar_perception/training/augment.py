@@ -30,17 +30,36 @@ class Scene:
 
 
 def augmented(scene: Scene, params: AugmentParams, rng: np.random.Generator) -> Scene:
-    """All changes but the objects of other scenes, see database.with_objects."""
+    """All changes but the turn and the objects of other scenes, see database.with_objects."""
     scene = with_moved_objects(scene, params.object_turn, params.object_shift, rng)
     if rng.random() < params.flip:
         scene = flipped(scene)
-    turn = np.pi if scene.around and params.turn else params.turn
-    scene = turned(scene, rng.uniform(-turn, turn))
     scene = scaled(scene, 1 + rng.uniform(-params.scale, params.scale))
     scene = thinned(scene, rng.uniform(0, params.dropout), rng)
     scene = brightened(scene, 1 + rng.uniform(-params.intensity, params.intensity),
                        rng.uniform(-params.intensity, params.intensity) / 2)
     return raised(scene, rng.uniform(-params.height, params.height))
+
+
+def faced(scene: Scene, params: AugmentParams, low: np.ndarray, high: np.ndarray,
+          rng: np.random.Generator) -> Scene:
+    """The scene turned, and what can come between low and high (3,) by all other changes, metres:
+    first, since most of a scan lies elsewhere."""
+    turn = np.pi if scene.around and params.turn else params.turn
+    scene = turned(scene, rng.uniform(-turn, turn))
+    margin = 1 + params.height + params.scale / (1 - params.scale) * np.abs([low, high])
+    return cropped(scene, low - margin[0], high + margin[1])
+
+
+def cropped(scene: Scene, low: np.ndarray, high: np.ndarray) -> Scene:
+    """The points between low and high (3,), and the boxes whose centre is, seen from above."""
+    kept = np.ones(len(scene.points), bool)
+    for axis in range(3):
+        kept &= (scene.points[:, axis] >= low[axis]) & (scene.points[:, axis] < high[axis])
+    centres = scene.boxes[:, :2]
+    here = ((centres >= low[:2]) & (centres < high[:2])).all(axis=1)
+    return replace(scene, points=scene.points[kept], boxes=scene.boxes[here],
+                   class_ids=scene.class_ids[here], wanted=scene.wanted[here])
 
 
 def flipped(scene: Scene) -> Scene:
@@ -52,10 +71,11 @@ def flipped(scene: Scene) -> Scene:
 
 def turned(scene: Scene, angle: float) -> Scene:
     """Turned about the sensor, counter-clockwise."""
-    back = np.array([0.0, 0, 0, 0, 0, 0, -angle])  # into the frame of a sensor turned the other way
+    cos, sin = np.cos(angle), np.sin(angle)
+    matrix = np.array([[cos, sin], [-sin, cos]])
     points, boxes = scene.points.copy(), scene.boxes.copy()
-    points[:, :3] = to_box_frame(scene.points.astype(np.float64), back)
-    boxes[:, :3] = to_box_frame(scene.boxes, back)
+    points[:, :2] = scene.points[:, :2] @ matrix.astype(np.float32)
+    boxes[:, :2] = scene.boxes[:, :2] @ matrix
     boxes[:, 6] = wrap_angle(boxes[:, 6] + angle)
     return replace(scene, points=points, boxes=boxes)
 

@@ -60,8 +60,8 @@ class LoopParams(Params):
 class AugmentParams(Params):
     """How scenes are changed. 0 switches a change off."""
 
-    cars: int = param(10, "Cars of other scenes are put in until there are so many.", low=0,
-                      high=100)
+    cars: int = param(10, "Cars of other scenes are put in until there are so many where "
+                      "the network looks.", low=0, high=100)
     pedestrians: int = param(8, "Likewise pedestrians.", low=0, high=100)
     cyclists: int = param(8, "Likewise cyclists.", low=0, high=100)
     database_scans: int = param(2000, "Those objects come from so many scenes, at most.", low=0,

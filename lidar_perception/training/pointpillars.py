@@ -35,7 +35,7 @@ from lidar_perception.evaluation.detection import DetectionReport
 from lidar_perception.evaluation.kitti_protocol import NEIGHBOURS
 from lidar_perception.geometry import points_in_box
 from lidar_perception.param_fields import with_values
-from lidar_perception.training.augment import Scene, augmented
+from lidar_perception.training.augment import Scene, augmented, faced
 from lidar_perception.training.data import Batches, JudgedScenes, loaded
 from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
@@ -83,8 +83,10 @@ class Preparation:
 
     def __call__(self, scene: Scene, rng: np.random.Generator) -> Sample:
         """InputError if the network would see no point."""
+        low, high = np.array(self.config.low), np.array(self.config.high)
+        scene = faced(scene, self.augment, low, high, rng)
         if self._objects is not None:
-            scene = with_objects(scene, self._objects, self.augment, rng)
+            scene = with_objects(scene, self._objects, self.augment, low, high, rng)
         scene = augmented(scene, self.augment, rng)
         frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
         _, seen = visible(frame, self.config)
