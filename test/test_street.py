@@ -16,6 +16,7 @@ from lidar_perception.types import CLASSES, InputError
 
 SEEDS = range(3)
 EVERY = [(kind, seed) for kind in KINDS for seed in SEEDS]
+SIGN = 81  # of SemanticKITTI
 TIMES = (0.0, 4.0, 8.0, 12.0, 16.0)
 HEIGHT = 1.73
 SITTING, CAR, PEDESTRIAN, CYCLIST = (
@@ -144,8 +145,22 @@ def test_solids_carry_the_velocity_and_the_class_of_their_owner():
         flat = np.hypot(*m.solids.velocity[:, :2].T)
         assert np.allclose(flat, [speed.get(o, 0.0) for o in m.solids.owner])
         assert set(m.solids.owner) <= {0, *m.track_ids} >= set(m.track_ids)
-        assert 300 < len(m.solids) < 4500
+        assert 300 < len(m.solids) < 5000
         assert (m.solids.semantic > 0).all() and (m.solids.half > 0).all()
+
+
+def test_what_stands_between_the_directions_is_at_crossings_and_leaves_the_lanes_free():
+    found = 0
+    for kind, seed in EVERY:
+        scene = scene_of(kind, seed)
+        middle = [a for a in scene.actors if not a.thing.label and a.speed == 0.0
+                  and 1.3 < a.y < 2.8 and (a.thing.parts(0.0)["semantic"] == SIGN).any()]
+        edges = np.ravel(scene.ground.crossings)
+        for actor in middle:
+            found += 1
+            assert np.abs(edges - actor.x).min() <= 15.0
+            assert abs(actor.footprint[1]) - actor.footprint[WIDTH] > 1.0  # our lane's cars
+    assert found > 10
 
 
 def test_streets_hold_what_kitti_labels():
@@ -165,7 +180,7 @@ def test_streets_hold_what_kitti_labels():
     assert share.sum() == pytest.approx(1.0)
     assert 1.0 < mean[CAR] < 4.5
     assert 0.2 < mean[PEDESTRIAN] < 1.5
-    assert 0.05 < mean[CYCLIST] < 0.6
+    assert 0.02 < mean[CYCLIST] < 0.6
     assert (found.sum(axis=0)[:len(CLASSES) - 1] > 0).sum() >= 6
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lidar_perception.simulation.actors import Actor, Room
+from lidar_perception.simulation.actors import Actor, Room, prop
 from lidar_perception.simulation.shapes import furniture, vegetation
 from lidar_perception.simulation.shapes.buildings import building
 from lidar_perception.simulation.solids import extents
@@ -16,7 +16,7 @@ PLANTS = (70, 71)  # of SemanticKITTI
 BORDERS = (*[vegetation.hedge] * 3, *[furniture.fence] * 2, furniture.wall)
 # Of bushes and trees on 100 m, and how deep they stand, m: a wood, a hedgerow, fields.
 WILDS = ((110, 60, 4.0), (130, 12, 1.2), (8, 3, 15.0))
-ROADSIDE = (furniture.sign, furniture.bollard, furniture.pole)  # of the country
+ROADSIDE = (furniture.sign, furniture.beacon, furniture.bollard, furniture.pole)  # of the country
 
 
 def furnish(rng: np.random.Generator, street: Street, room: Room) -> None:
@@ -27,6 +27,8 @@ def furnish(rng: np.random.Generator, street: Street, room: Room) -> None:
     for side in street.blocks:
         for thing in _furniture(rng, side, street.kind):
             room.admit(thing, gap=0.3)
+    for thing in _islands(rng, street):
+        room.admit(thing, gap=0.3)
 
 
 def is_plant(actor: Actor) -> bool:
@@ -164,6 +166,19 @@ def _furniture(rng, side: Side, kind: Kind) -> Iterator[Actor]:
         out = side.walk - wide if at_wall else edge + wide + rng.uniform(0, 0.15)
         turn = rng.choice([0.0, np.pi / 2, np.pi, -np.pi / 2]) + rng.normal(0, 0.1)
         yield side.put(made, along, max(out, 0.2 + wide), turn)
+
+
+def _islands(rng, street: Street) -> Iterator[Actor]:
+    """Beacons and signs between the directions, at both ends of some crossings."""
+    ours, oncoming = street.lanes[0], [lane.y for lane in street.lanes if lane.direction < 0]
+    middle = (ours.y + min(oncoming)) / 2
+    for crossing in street.ground.crossings:
+        if rng.random() >= street.kind.islands:
+            continue
+        for x, away in zip(crossing, (-1, 1)):
+            for far in (rng.uniform(0.5, 2.0), rng.uniform(6.0, 15.0)):
+                made = (furniture.beacon, furniture.beacon, furniture.sign)[rng.integers(3)](rng)
+                yield Actor(prop(made), x + away * far, middle, rng.choice([0.0, np.pi]))
 
 
 def _street_tree(rng) -> np.ndarray:

@@ -41,6 +41,7 @@ class Kind:
     lamp: float = 3.0                 # rates for each side
     tree: float = 4.0
     clutter: float = 4.0
+    islands: float = 0.3              # chance that a crossing has some between the directions
     walkers: float = 3.3
     standers: float = 0.12
     seats: float = 0.05

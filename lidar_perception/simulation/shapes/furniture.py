@@ -45,8 +45,8 @@ def traffic_light(rng: np.random.Generator) -> np.ndarray:
 
 
 def sign(rng: np.random.Generator) -> np.ndarray:
-    """One or two plates that shine, to +x, on a post."""
-    low = rng.uniform(1.7, 2.2)
+    """One or two plates that shine, to +x, on a post; some hang low, as on islands."""
+    low = rng.uniform(1.7, 2.2) if rng.random() < 0.75 else rng.uniform(0.4, 1.0)
     size = rng.uniform(0.25, 0.4)
     plates = [(low, size)] + ([(low + 2 * size + 0.05, 0.2)] if rng.random() < 0.4 else [])
     rows = [_post(low + 2 * size, 0.035)]
@@ -107,6 +107,24 @@ def bollard(rng: np.random.Generator) -> np.ndarray:
     if rng.random() < 0.3:
         rows.append(_cylinder(high - 0.2, high - 0.1, radius + 0.003, PLATE))
     return parts(rows, POLE)
+
+
+def beacon(rng: np.random.Generator) -> np.ndarray:
+    """A post or board of 0.8 to 1.6 m, most of which shines, such as stands on islands and at
+    roadworks: narrower than a person, as high, and seen from far. Some have a base or a round
+    sign."""
+    high, low, half = rng.uniform((0.8, 0.05, 0.06), (1.6, 0.4, 0.18))
+    if rng.random() < 0.5:
+        rows = [_cylinder(DEEP, low, 0.8 * half, 0.3), _cylinder(low, high, half, PLATE)]
+    else:
+        rows = [_post(low, 0.04),
+                block((-0.03, -half, low), (0.03, half, high), reflectance=PLATE)]
+    if rng.random() < 0.4:
+        rows.append(block((-0.4, -0.2, 0.0), (0.4, 0.2, 0.1), reflectance=RUBBER))
+    if rng.random() < 0.3:
+        rows += [_post(high + 0.5, 0.04),
+                 part(ELLIPSOID, (0, 0, high + 0.3), (0.03, 0.3, 0.3), reflectance=PLATE)]
+    return parts(rows, SIGN)
 
 
 def cabinet(rng: np.random.Generator) -> np.ndarray:
@@ -215,5 +233,6 @@ def _cylinder(low: float, high: float, radius: float, reflectance: float) -> tup
 
 
 # What a detector may take for a person.
-PERSON_SIZED = (sign, litter_bin, wheelie_bin, bollard, cabinet, shopping_trolley, phone_box,
-                advertising_column, cone, planter, parasol, hydrant, traffic_light, bench)
+PERSON_SIZED = (sign, beacon, litter_bin, wheelie_bin, bollard, cabinet, shopping_trolley,
+                phone_box, advertising_column, cone, planter, parasol, hydrant, traffic_light,
+                bench)
