@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 
 def wrap_angle(angle):
@@ -27,18 +26,10 @@ def to_box_frame(xyz: np.ndarray, box: np.ndarray) -> np.ndarray:
 def points_in_box(xyz: np.ndarray, box: np.ndarray, margin: float = 0.0) -> np.ndarray:
     """(N,) bool: points (N, 3 or more) inside box (7,) grown by margin metres on every side; faces
     count."""
-    return _points_in_box(np.asarray(xyz), np.asarray(box, np.float64), margin)
-
-
-@njit(cache=True, nogil=True)
-def _points_in_box(xyz, box, margin):
-    cos, sin = np.cos(box[6]), np.sin(box[6])
-    length, width, height = box[3] / 2 + margin, box[4] / 2 + margin, box[5] / 2 + margin
-    inside = np.zeros(len(xyz), np.bool_)
-    for i in range(len(xyz)):
-        dx, dy = xyz[i, 0] - box[0], xyz[i, 1] - box[1]
-        inside[i] = (abs(cos * dx + sin * dy) <= length and abs(cos * dy - sin * dx) <= width
-                     and abs(xyz[i, 2] - box[2]) <= height)
+    half = np.asarray(box[3:6], np.float64) / 2 + margin
+    inside = np.zeros(len(xyz), bool)
+    near = np.flatnonzero(np.abs(xyz[:, 0] - np.float32(box[0])) <= np.hypot(*half[:2]) + 1e-3)
+    inside[near] = (np.abs(to_box_frame(xyz[near], box)) <= half).all(axis=1)
     return inside
 
 

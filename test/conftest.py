@@ -10,6 +10,7 @@ import pytest
 from lidar_perception.nodes.main import use_large_shared_memory
 
 FRAMES = 8
+os.environ.pop("COLUMNS", None)  # pytest-xdist sets 80 for its workers; some tests set their own
 use_large_shared_memory()  # Fast DDS reads its profile once: before any test that imports rclpy
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -11,6 +12,7 @@ import click
 from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
+MOST_WORKERS = 4  # each holds torch and compiles what it runs
 PASS_ON = dict(ignore_unknown_options=True, help_option_names=[])
 
 
@@ -19,23 +21,38 @@ PASS_ON = dict(ignore_unknown_options=True, help_option_names=[])
 def test(arguments: tuple[str, ...]) -> None:
     """Run the tests of this checkout; ARGUMENTS go to pytest.
 
+    Without ARGUMENTS all of them: first those of the core, on all cores, then those with processes
+    that talk to each other, which would disturb each other, one by one.
+
     \b
     Examples:
       lidar test
       lidar test -k clustering -x
     """
-    _run("test", ["-m", "pytest", *arguments])
+    if arguments:
+        sys.exit(_run("test", ["-m", "pytest", *arguments]))
+    workers = min(os.cpu_count() or 1, MOST_WORKERS)
+    core = _run("test", ["-m", "pytest", "-n", str(workers), "--dist", "loadfile",
+                         *(f"--ignore=test/{path.name}" for path in _with_processes())])
+    rest = _run("test", ["-m", "pytest", *map(str, _with_processes())])
+    sys.exit(core or rest)
+
+
+def _with_processes() -> list[Path]:
+    folder = ROOT / "test"
+    return sorted([*folder.glob("test_ros_*.py"), *folder.glob("test_stopping.py")])
 
 
 @click.command(context_settings=PASS_ON)
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def benchmark(arguments: tuple[str, ...]) -> None:
     """Time the algorithms beside their peers; see `benchmark --help`."""
-    _run("benchmark", ["-m", "benchmark", *arguments])
+    sys.exit(_run("benchmark", ["-m", "benchmark", *arguments]))
 
 
-def _run(folder: str, command: list[str]) -> None:
+def _run(folder: str, command: list[str]) -> int:
+    """The exit code."""
     if not (ROOT / folder).is_dir():
         raise InputError(f"'{folder}' needs a checkout of the repository, and {ROOT} has no "
                          f"folder {folder}/")
-    sys.exit(subprocess.run([sys.executable, *command], cwd=ROOT).returncode)
+    return subprocess.run([sys.executable, *command], cwd=ROOT).returncode
