@@ -136,6 +136,16 @@ def test_the_order_of_the_points_makes_no_difference():
     assert image.max() > 0
 
 
+def test_points_keep_their_precision_where_the_rest_runs_in_16_bits():
+    config = tiny()
+    network = lively(config)
+    pillars = make_pillars([some_points(config)], config)
+    whole = network.pillar_net(pillars)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(network.pillar_net(pillars), whole)
+        assert network.features(pillars).dtype == torch.bfloat16
+
+
 def test_moving_the_points_by_a_pillar_moves_the_image_by_a_cell():
     config = tiny("v0", low=(0.0, -4.0, -3.0), high=(8.0, 4.0, 1.0), cell=0.25)
     network = lively(config)

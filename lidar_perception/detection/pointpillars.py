@@ -57,6 +57,8 @@ class PillarNet(nn.Module):
                                 config.pillar_channels, bias=False)
         self.norm = nn.BatchNorm1d(config.pillar_channels, **NORM)
 
+    @torch.autocast("cuda", enabled=False)
+    @torch.autocast("cpu", enabled=False)  # where x is 60 m, 16 bits would leave 25 cm of it
     def forward(self, pillars: Pillars) -> Tensor:
         # The clusters' numbers come last, so that versions with and without share a beginning.
         numbers = pillars.points[:, 4:] * self.config.id_scale
