@@ -31,6 +31,8 @@ SIZES = {
                     block_layers=(1, 3, 3), deconv_channels=32, fpn_channels=32),
 }
 
+XY_SCALE = 0.02  # of networks that are trained here
+
 
 @dataclass(frozen=True)
 class AnchorClass:
@@ -64,6 +66,10 @@ class NetworkConfig:
     fusion in the fpn: 'add' or 'concat'. head_stride: of block_strides the first, as both necks
     end at the finest block.
 
+    xy_scale: x and y of a point are multiplied by this before the first layer. With 1, as in the
+    papers and in imported weights, they are 50 times as large as the other inputs, and most of the
+    few channels of a compact network come to say where a pillar is, which its place says already.
+
     max_points: points of a pillar that are read, in the order of the cloud; 0 reads all. Imported
     weights need it, and the next two. zero_row: a pillar with fewer points than max_points also has
     a point whose inputs are all 0, as in code that pads pillars. middle_z: points come with their
@@ -82,6 +88,7 @@ class NetworkConfig:
     low: tuple[float, float, float] = (0.0, -39.68, -3.0)
     high: tuple[float, float, float] = (69.12, 39.68, 1.0)
     cell: float = 0.16
+    xy_scale: float = 1.0
     max_points: int = 0
     zero_row: bool = False
     middle_z: bool = False
@@ -152,8 +159,8 @@ def network_config(version: str = "v0", size: str = "full",
     if not classes or (unknown := [name for name in classes if name not in anchors]):
         raise InputError(f"there is no anchor for {unknown[0] if classes else 'no class'}; choose "
                          f"some of {', '.join(anchors)}")
-    settings = dict(version=version, size=size, anchors=tuple(anchors[name] for name in classes),
-                    **VERSIONS[version], **SIZES[size])
+    settings = dict(version=version, size=size, xy_scale=XY_SCALE,
+                    anchors=tuple(anchors[name] for name in classes), **VERSIONS[version], **SIZES[size])
     try:
         return NetworkConfig(**{**settings, **changes})
     except ValueError as error:

@@ -61,8 +61,9 @@ class PillarNet(nn.Module):
     @torch.autocast("cpu", enabled=False)  # where x is 60 m, 16 bits would leave 25 cm of it
     def forward(self, pillars: Pillars) -> Tensor:
         # The clusters' numbers come last, so that versions with and without share a beginning.
-        numbers = pillars.points[:, 4:] * self.config.id_scale
-        inputs = torch.cat([pillars.points[:, :4], pillars.offsets, numbers], dim=1)  # (N, 9..11)
+        points = pillars.points
+        inputs = torch.cat([points[:, :2] * self.config.xy_scale, points[:, 2:4], pillars.offsets,
+                            points[:, 4:] * self.config.id_scale], dim=1)      # (N, 9 to 11)
         values = functional.relu(self.norm(self.linear(inputs)))   # (N, C)
         height, width = pillars.grid
         count = pillars.batch * height * width
