@@ -160,9 +160,19 @@ def test_moving_the_points_by_a_pillar_moves_the_image_by_a_cell():
         torch.testing.assert_close(shifted, image.roll((rows, columns), (2, 3)), atol=1e-5, rtol=0)
 
 
+def test_smaller_x_and_y_need_larger_weights():
+    config = tiny("v2", xy_scale=1.0)
+    plain, small = lively(config), lively(dataclasses.replace(config, xy_scale=0.125))
+    small.load_state_dict(plain.state_dict())
+    pillars = make_pillars([some_points(config)], config)
+    assert not torch.allclose(small.pillar_net(pillars), plain.pillar_net(pillars), atol=0.1)
+    small.pillar_net.linear.weight[:, :2] *= 8
+    torch.testing.assert_close(small.pillar_net(pillars), plain.pillar_net(pillars))
+
+
 @pytest.mark.parametrize("middle_z", [False, True])
 def test_limited_pillars_are_those_of_padded_code(middle_z):
-    config = tiny("v0", max_points=2, zero_row=True, middle_z=middle_z)
+    config = tiny("v0", max_points=2, zero_row=True, middle_z=middle_z, xy_scale=1.0)
     network, points = lively(config), some_points(config, 900)
     net, low = network.pillar_net, torch.tensor(config.low)
     image = net(make_pillars([points], config))[0]
