@@ -160,7 +160,8 @@ def network_config(version: str = "v0", size: str = "full",
         raise InputError(f"there is no anchor for {unknown[0] if classes else 'no class'}; choose "
                          f"some of {', '.join(anchors)}")
     settings = dict(version=version, size=size, xy_scale=XY_SCALE,
-                    anchors=tuple(anchors[name] for name in classes), **VERSIONS[version], **SIZES[size])
+                    anchors=tuple(anchors[name] for name in classes), **VERSIONS[version],
+                    **SIZES[size])
     try:
         return NetworkConfig(**{**settings, **changes})
     except ValueError as error:

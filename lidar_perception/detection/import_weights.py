@@ -146,7 +146,8 @@ def _config(project: Project, kinds: int, classes: tuple[str, ...], path: Path) 
                                 + known[name].size[2] / 2, known[name].matched,
                                 known[name].unmatched) for name in names)
     return network_config("v0", "full", xy_scale=1.0, anchors=anchors, max_points=MAX_POINTS,
-                          zero_row=True, middle_z=True, yaws=(0.0, 1.57), anchors_at=project.anchors_at,
+                          zero_row=True, middle_z=True, yaws=(0.0, 1.57),
+                          anchors_at=project.anchors_at,
                           direction_offset=project.direction_offset)
 
 
