@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -255,3 +261,28 @@ def test_samples_are_plain_arrays_that_other_processes_can_send():
     sample = Preparation(tiny("v4"), STILL)(scene_of_two(), np.random.default_rng(0))
     assert all(isinstance(value, np.ndarray) for value in vars(sample).values())
     assert isinstance(Item(sample).sample, Sample)
+
+
+class Workers:
+    """items[n]: the process that makes them."""
+
+    def __getitem__(self, n: int) -> int:
+        return os.getpid()
+
+
+def test_workers_end_with_a_process_that_is_killed():
+    script = ("from test_training_data import Workers\n"
+              "from lidar_perception.training.data import loaded\n"
+              "for pids in loaded(Workers(), ([n] for n in range(10**6)), 1):\n"
+              "    print(pids[0], flush=True)\n"
+              "    input()\n")
+    run = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parent, text=True,
+                           stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    worker = Path(f"/proc/{int(run.stdout.readline())}/stat")
+    assert worker.exists()
+    run.kill()
+    run.wait()
+    end = time.monotonic() + 30
+    while worker.exists() and worker.read_text().split()[2] != "Z":
+        assert time.monotonic() < end, "the worker lives on"
+        time.sleep(0.05)

@@ -5,7 +5,10 @@ So neither the number of worker processes nor a stop in between changes what is 
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count, islice
@@ -141,7 +144,15 @@ def loaded(items: Any, numbers: Iterator[Sequence[int]], jobs: int) -> Iterator[
 
 def _begin_work(_: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process ends its workers
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     numba.set_num_threads(1)
+
+
+def _end_with_parent() -> None:
+    """torch's workers ask whether their parent lives, which here is the fork server, and would
+    outlive a main process that was killed."""
+    multiprocessing.parent_process().join()
+    os._exit(1)
 
 
 @dataclass(frozen=True)
