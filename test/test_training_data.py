@@ -276,12 +276,12 @@ def test_workers_end_with_a_process_that_is_killed():
               "for pids in loaded(Workers(), ([n] for n in range(10**6)), 1):\n"
               "    print(pids[0], flush=True)\n"
               "    input()\n")
-    run = subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parent, text=True,
-                           stdin=subprocess.PIPE, stdout=subprocess.PIPE)
-    worker = Path(f"/proc/{int(run.stdout.readline())}/stat")
-    assert worker.exists()
-    run.kill()
-    run.wait()
+    with subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parent, text=True,
+                          stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                          stderr=subprocess.DEVNULL) as run:
+        worker = Path(f"/proc/{int(run.stdout.readline())}/stat")
+        assert worker.exists()
+        run.kill()
     end = time.monotonic() + 30
     while worker.exists() and worker.read_text().split()[2] != "Z":
         assert time.monotonic() < end, "the worker lives on"
