@@ -167,20 +167,21 @@ def test_streets_hold_what_kitti_labels():
     """In the forward camera's view and within 30 m, the 57 labelled frames beside the checkout
     have 1.7 cars, 0.19 pedestrians and 0.14 cyclists, fewer than stand there: what is hidden has
     no label. They are few (11 pedestrians, 8 cyclists), so the bands are wide."""
+    seeds = range(4)  # cyclists are rare
     share = np.array([k.share for k in KINDS.values()])
     found = np.zeros((len(KINDS), len(CLASSES)))
     for i, kind in enumerate(KINDS):
-        for seed in SEEDS:
+        for seed in seeds:
             for t in TIMES:
                 m = scene_of(kind, seed).at(t, HEIGHT)
                 seen = ((np.abs(np.arctan2(m.boxes[:, 1], m.boxes[:, 0])) < np.radians(40))
                         & (np.hypot(*m.boxes[:, :2].T) < 30))
                 found[i] += np.bincount(m.class_ids[seen], minlength=len(CLASSES))
-    mean = share @ found / (len(TIMES) * len(SEEDS))
+    mean = share @ found / (len(TIMES) * len(seeds))
     assert share.sum() == pytest.approx(1.0)
     assert 1.0 < mean[CAR] < 4.5
     assert 0.2 < mean[PEDESTRIAN] < 1.5
-    assert 0.02 < mean[CYCLIST] < 0.6
+    assert 0.05 < mean[CYCLIST] < 0.6
     assert (found.sum(axis=0)[:len(CLASSES) - 1] > 0).sum() >= 6
 
 
