@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidar_perception.checkpoint import require_same
-from lidar_perception.detection.anchors import make_anchors
+from lidar_perception.detection.anchors import anchor_classes, make_anchors
 from lidar_perception.detection.box_coder import decode
 from lidar_perception.detection.config import (
     SIZES,
@@ -248,13 +248,13 @@ def test_a_tiny_network_learns_two_objects():
     for module in network.modules():
         if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
             module.momentum = 0.1
-    anchors = make_anchors(config)
+    anchors, kinds = make_anchors(config), anchor_classes(config)
     targets = assign(anchors, config, BOXES, LABELS)
     points = torch.from_numpy(two_objects())
     optimizer = torch.optim.AdamW(network.parameters())
     rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 0.02, total_steps=400)
     for _ in range(400):
-        losses = detection_loss(network(make_pillars([points], config)), targets)
+        losses = detection_loss(network(make_pillars([points], config)), targets, kinds)
         optimizer.zero_grad()
         losses.total.backward()
         optimizer.step()

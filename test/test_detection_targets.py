@@ -19,6 +19,7 @@ from lidar_perception.detection.pointpillars import Outputs
 from lidar_perception.detection.targets import (
     BACKGROUND,
     IGNORED,
+    Targets,
     anchors_near,
     assign,
     nearest_axis_iou,
@@ -166,30 +167,53 @@ def outputs_of(targets, classes=3, sure=12.0):
 
 def test_what_is_right_costs_nothing_and_what_is_wrong_costs():
     config = tiny("v0")
+    kinds = anchor_classes(config)
     targets = assign(make_anchors(config), config, BOXES, LABELS)
     right = outputs_of(targets)
-    assert detection_loss(right, targets).total < 1e-4
+    assert detection_loss(right, targets, kinds).total < 1e-4
     turned = right._replace(codes=right.codes + torch.tensor([0, 0, 0, 0, 0, 0, np.pi]))
-    assert detection_loss(turned, targets).boxes < 1e-6  # the direction is another loss
-    assert detection_loss(right._replace(directions=-right.directions), targets).directions > 1
-    assert detection_loss(right._replace(codes=right.codes + 0.3), targets).boxes > 0.1
-    assert detection_loss(right._replace(logits=-right.logits), targets).classes > 1
+    assert detection_loss(turned, targets, kinds).boxes < 1e-6  # the direction is another loss
+    wrong = right._replace(directions=-right.directions)
+    assert detection_loss(wrong, targets, kinds).directions > 1
+    assert detection_loss(right._replace(codes=right.codes + 0.3), targets, kinds).boxes > 0.1
+    assert detection_loss(right._replace(logits=-right.logits), targets, kinds).classes > 1
 
 
-def test_losses_are_means_over_clouds_and_do_not_see_what_is_ignored():
-    config = tiny("v0")
-    anchors = make_anchors(config)
-    one, none = (assign(anchors, config, BOXES[:n], LABELS[:n]) for n in (2, 0))
+def random_outputs(anchors, clouds=1):
     torch.manual_seed(0)
-    out = Outputs(*(torch.randn(1, len(anchors), n) for n in (3, 7, 2)))
-    both = detection_loss(Outputs(*(torch.cat([t, t]) for t in out)), stacked([one, none]))
-    for a, b, mean in zip(detection_loss(out, one), detection_loss(out, none), both):
-        torch.testing.assert_close((a + b) / 2, mean)
+    return Outputs(*(torch.randn(clouds, len(anchors), n) for n in (3, 7, 2)))
+
+
+def test_losses_of_a_batch_twice_are_the_same_and_do_not_see_what_is_ignored():
+    config = tiny("v0")
+    anchors, kinds = make_anchors(config), anchor_classes(config)
+    targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors)
+    once = detection_loss(out, targets, kinds)
+    twice = detection_loss(Outputs(*(torch.cat([t, t]) for t in out)), stacked([targets, targets]),
+                           kinds)
+    for a, b in zip(once, twice):
+        torch.testing.assert_close(a, b)
     changed = out.logits.clone()
-    changed[one.labels == IGNORED] += 5
-    assert (one.labels == IGNORED).any()
-    torch.testing.assert_close(detection_loss(out._replace(logits=changed), one).total,
-                               detection_loss(out, one).total)
+    changed[targets.labels == IGNORED] += 5
+    assert (targets.labels == IGNORED).any()
+    torch.testing.assert_close(detection_loss(out._replace(logits=changed), targets, kinds).total,
+                               once.total)
+
+
+def test_scores_of_every_class_weigh_alike_however_many_anchors_it_is_on():
+    config = tiny("v0")
+    anchors, kinds = make_anchors(config), anchor_classes(config)
+    targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors, 2)
+    targets = stacked([targets, assign(anchors, config, BOXES[:1], LABELS[:1])])
+    parts = []
+    for kind in range(3):
+        mine = kinds == kind
+        part = detection_loss(Outputs(*(t[:, mine] for t in out)),
+                              Targets(*(t[:, mine] for t in targets)), kinds[mine])
+        parts.append(part.classes)
+    numbers = [int(((targets.labels >= 0) & (kinds == kind)).sum()) for kind in range(3)]
+    assert max(numbers) > 2 * min(numbers)
+    torch.testing.assert_close(detection_loss(out, targets, kinds).classes, sum(parts))
 
 
 # non-maximum suppression

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -22,16 +24,23 @@ from lidar_perception.training.augment import (
     turned,
     with_moved_objects,
 )
-from lidar_perception.training.database import Database, cut_objects, with_objects
+from lidar_perception.training.database import (
+    THING,
+    Database,
+    cut_objects,
+    varied,
+    with_objects,
+)
 from lidar_perception.training.params import AugmentParams
+from lidar_perception.training.putting import inside
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 
 AREA = np.array([0.0, -15, -3]), np.array([20.0, 15, 1])
 few = settings(deadline=None, max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
-STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, object_turn=0, object_shift=0, flip=0,
-                      turn=0, scale=0, dropout=0, intensity=0, height=0)
+STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
+                      flip=0, turn=0, scale=0, dropout=0, intensity=0, height=0)
 
 
 def random_scene(seed: int, around: bool = False) -> Scene:
@@ -62,6 +71,15 @@ def members(scene: Scene, margin: float = 0.0) -> np.ndarray:
 
 def touching(boxes: np.ndarray) -> bool:
     return bool((bev_iou(boxes, boxes) - np.eye(len(boxes)) > 1e-9).any())
+
+
+@few
+@given(seeds, st.floats(0, 0.5))
+def test_points_inside_a_box_are_found_as_by_the_plain_way(seed, margin):
+    scene = random_scene(seed)
+    for box in scene.boxes:
+        plain = points_in_box(scene.points[:, :3], box, margin)
+        assert np.array_equal(inside(scene.points, box, margin), np.flatnonzero(plain))
 
 
 # augmentation
@@ -159,11 +177,11 @@ def test_objects_that_are_put_in_touch_nothing_and_keep_their_points(seed):
     for kind, most in ((CAR, 4), (PEDESTRIAN, 4), (CYCLIST, 0)):
         here = (fuller.class_ids == kind).sum()
         assert here <= max(most, (scene.class_ids == kind).sum())
-    inside = members(fuller, 1e-3).sum(axis=1)
-    assert (inside[:old] <= members(scene, 1e-3).sum(axis=1)).all()  # some may be in a shadow now
+    within = members(fuller, 1e-3).sum(axis=1)
+    assert (within[:old] <= members(scene, 1e-3).sum(axis=1)).all()  # some may be in a shadow now
     sizes = np.diff(database.first)
     ranges = np.hypot(database.boxes[:, 0], database.boxes[:, 1])
-    for box, number in zip(fuller.boxes[old:], inside[old:]):
+    for box, number in zip(fuller.boxes[old:], within[old:]):
         assert (box[:2] >= AREA[0][:2]).all() and (box[:2] < AREA[1][:2]).all()
         origin = np.abs(ranges - np.hypot(box[0], box[1])).argmin()
         assert ranges[origin] == pytest.approx(np.hypot(box[0], box[1]), abs=1e-9)
@@ -215,6 +233,42 @@ def test_what_is_behind_an_object_goes_and_none_is_put_behind_something(seed):
     hidden = with_objects(scene, one_walker(14.0), params, *AREA, rng)
     assert len(hidden.boxes) == 0 or abs(np.arctan2(*hidden.boxes[0, 1::-1])) > 0.45
     assert len(with_objects(street_with(), one_walker(14.0), params, *AREA, rng).boxes) == 1
+
+
+def test_posts_are_learned_from_but_are_no_objects():
+    post = wall(8.0, (2.9, 3.1), (-1.73, 0.6))
+    walker = one_walker(9.0)
+    scene = street_with(post, walker.points, wall(11.0, (-8, -5), (-1.73, 0.5)))
+    scene = replace(scene, boxes=walker.boxes, class_ids=walker.class_ids, wanted=np.ones(1, bool))
+    database = cut_objects([scene], ("Pedestrian",), 5)
+    assert database.class_ids.tolist() == [PEDESTRIAN, THING]
+    assert len(cut_objects([scene], ("Car",), 5)) == 0
+    box, own = database.boxes[1], database.points_of(1)
+    assert (own[:, 0] == 8).all() and len(own) > 0.8 * len(post)
+    assert box[:2] == pytest.approx([8, 3], abs=0.05) and box[5] == pytest.approx(2.33, abs=0.1)
+    params = replace(STILL, things=1, things_stretch=0, object_intensity=0)
+    fuller = with_objects(street_with(), database, params, *AREA, np.random.default_rng(0))
+    assert len(fuller.boxes) == len(fuller.class_ids) == len(fuller.wanted) == 0
+    added = fuller.points[-len(own):]
+    np.testing.assert_allclose(np.hypot(added[:, 0], added[:, 1]),
+                               np.hypot(own[:, 0], own[:, 1]), atol=1e-4)
+    assert added[:, 2].max() == pytest.approx(0.6, abs=0.1)
+
+
+@few
+@given(seeds)
+def test_what_is_put_in_is_stretched_upon_its_floor(seed):
+    scene, rng = random_scene(seed), np.random.default_rng(seed)
+    for box in scene.boxes:
+        own = scene.points[inside(scene.points, box, 0.0)]
+        grown, points = varied(box, own, 0.5, 0.4, rng)
+        assert len(inside(points, grown, 1e-3)) == len(own)
+        assert grown[2] - grown[5] / 2 == pytest.approx(box[2] - box[5] / 2)
+        assert grown[[0, 1, 6]] == pytest.approx(box[[0, 1, 6]])
+        assert (np.abs(np.log(grown[3:6] / box[3:6])) <= 0.5).all()
+        same, still = varied(box, own, 0.0, 0.0, rng)
+        np.testing.assert_allclose(same, box, atol=1e-12)
+        np.testing.assert_allclose(still, own, atol=1e-6)
 
 
 @few

@@ -25,28 +25,34 @@ class Losses(NamedTuple):
     directions: Tensor
 
 
-def detection_loss(outputs: Outputs, targets: Targets) -> Losses:
-    """Each cloud's losses divided by the number of its anchors that have an object (at least 1),
-    averaged over the clouds."""
+def detection_loss(outputs: Outputs, targets: Targets, kinds: Tensor) -> Losses:
+    """Scores: the focal losses of the anchors of each class, divided by the number of those that
+    have an object, averaged over the classes. Boxes and directions: the mean over all anchors that
+    have an object. Numbers are at least 1 a cloud. kinds (A,) of anchors.anchor_classes.
+
+    So classes weigh alike where they are told from the background. Lang et al. divide scores by
+    the anchors of all classes, too; a car is on ten times as many of them as a pedestrian.
+    """
     positive = targets.labels >= 0                                       # (B, A)
-    share = positive.sum(dim=1).clamp(min=1).reciprocal() / len(positive)  # (B,)
     logits = outputs.logits.float()
-    wanted = functional.one_hot(targets.labels.clamp(min=0), logits.shape[2]).to(logits.dtype)
+    clouds, _, classes = logits.shape
+    count = logits.new_zeros(classes).index_add_(0, kinds, positive.sum(dim=0).to(logits))
+    share = (count.clamp(min=clouds) * classes).reciprocal()[kinds]      # (A,)
+    wanted = functional.one_hot(targets.labels.clamp(min=0), classes).to(logits.dtype)
     focal = focal_loss(logits, wanted * positive[..., None]).sum(dim=2)  # (B, A)
-    classes = ((focal * (targets.labels != IGNORED)).sum(dim=1) * share).sum()
-    weight = share[:, None].expand_as(positive)[positive]                # (P,)
-    codes, bins = targets.codes[positive], targets.bins[positive]
+    scores = ((focal * (targets.labels != IGNORED)).sum(dim=0) * share).sum()
+    number = count.sum().clamp(min=clouds)
+    codes, bins = targets.codes[positive], targets.bins[positive]        # (P, 7), (P,)
     found = outputs.codes.float()[positive]
     # sin(a - b), so that a box turned by half a circle costs nothing here
     difference = torch.cat([found[:, :6] - codes[:, :6],
                             torch.sin(found[:, 6:] - codes[:, 6:])], dim=1)
     boxes = functional.smooth_l1_loss(difference, torch.zeros_like(difference), beta=SMOOTH,
-                                      reduction="none").sum(dim=1)
+                                      reduction="sum") / number
     headings = functional.cross_entropy(outputs.directions.float()[positive], bins,
-                                        reduction="none")
-    boxes, headings = (boxes * weight).sum(), (headings * weight).sum()
-    total = CLASS_WEIGHT * classes + BOX_WEIGHT * boxes + DIRECTION_WEIGHT * headings
-    return Losses(total, classes, boxes, headings)
+                                        reduction="sum") / number
+    total = CLASS_WEIGHT * scores + BOX_WEIGHT * boxes + DIRECTION_WEIGHT * headings
+    return Losses(total, scores, boxes, headings)
 
 
 def focal_loss(logits: Tensor, wanted: Tensor) -> Tensor:

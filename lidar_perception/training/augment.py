@@ -9,9 +9,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidar_perception.geometry import points_in_box, to_box_frame, wrap_angle
+from lidar_perception.geometry import to_box_frame, wrap_angle
 from lidar_perception.rotated_iou import bev_iou
 from lidar_perception.training.params import AugmentParams
+from lidar_perception.training.putting import inside
 
 BORDER = 0.01  # m: points so near to a box are taken for its own, as labels are rounded
 
@@ -123,8 +124,8 @@ def with_moved_objects(scene: Scene, turn: float, shift: float, rng: np.random.G
         goal[6] = wrap_angle(goal[6] + angles[i])
         if bev_iou(grown(np.stack([boxes[i], goal])), others).any():
             continue
-        inside = np.flatnonzero(points_in_box(points[:, :3], boxes[i], BORDER))
-        points[inside, :3] = carried(points[inside, :3], boxes[i], goal)
+        own = inside(points, boxes[i], BORDER)
+        points[own, :3] = carried(points[own, :3], boxes[i], goal)
         boxes[i] = goal
     return replace(scene, points=points, boxes=boxes)
 

@@ -9,13 +9,13 @@ from pathlib import Path
 from zipfile import BadZipFile
 
 import numpy as np
-from numba import njit
 
 from lidar_perception.files import write_bytes
-from lidar_perception.geometry import points_in_box
 from lidar_perception.rotated_iou import bev_iou
 from lidar_perception.training.augment import BORDER, Scene, grown, turned
 from lidar_perception.training.params import AugmentParams
+from lidar_perception.training.putting import ground_under, inside, joined
+from lidar_perception.training.things import things_in
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 
 NEIGHBOURHOOD = 3.0  # m: the ground under an object is looked for so far around it
@@ -26,14 +26,14 @@ SECTORS = 720        # directions that are told apart
 TRIES = 64           # of them drawn for an object
 DRAWN = 3
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
+THING = -1           # class of what is no object, see things.py
 HIDDEN = 0.3         # an object is hidden if more points than this share of its own are before it
-TOUCH = 1e-3         # m: nothing is nearer to the sensor
 
 
 @dataclass(frozen=True)
 class Database:
-    """K objects with P points in all: boxes (K, 7) float64, class_ids (K,) int32, points (P, 4)
-    float32, those of object i from first[i] to first[i + 1]."""
+    """K objects with P points in all: boxes (K, 7) float64, class_ids (K,) int32, THING for what is
+    none, points (P, 4) float32, those of object i from first[i] to first[i + 1]."""
 
     boxes: np.ndarray
     class_ids: np.ndarray
@@ -65,20 +65,25 @@ class Database:
 
 
 def cut_objects(scenes: Iterable[Scene], classes: tuple[str, ...], least_points: int) -> Database:
-    """The wanted objects of some classes that have enough points; where boxes overlap, none."""
+    """The wanted objects of some classes that have enough points; where boxes overlap, none. If
+    people are among them, things that look like people, too."""
     chosen = [CLASSES.index(name) for name in classes]
     boxes, class_ids, points = [np.zeros((0, 7))], [], [np.zeros((0, 4), np.float32)]
-    sizes = []
-    for scene in scenes:
+    for n, scene in enumerate(scenes):
         overlap = bev_iou(scene.boxes, scene.boxes) > 0
         alone = overlap.sum(axis=1) <= 1
         for i in np.flatnonzero(scene.wanted & alone & np.isin(scene.class_ids, chosen)):
-            own = scene.points[points_in_box(scene.points[:, :3], scene.boxes[i])]
+            own = scene.points[inside(scene.points, scene.boxes[i], 0.0)]
             if len(own) >= least_points:
                 boxes.append(scene.boxes[i:i + 1])
                 class_ids.append(scene.class_ids[i])
                 points.append(own)
-                sizes.append(len(own))
+        if PEDESTRIAN in chosen:
+            things, of_things = things_in(scene, least_points, np.random.default_rng(n))
+            boxes.append(things)
+            class_ids.extend([THING] * len(things))
+            points.extend(of_things)
+    sizes = [len(own) for own in points[1:]]
     return Database(np.concatenate(boxes), np.array(class_ids, np.int32), np.concatenate(points),
                     np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
 
@@ -86,31 +91,53 @@ def cut_objects(scenes: Iterable[Scene], classes: tuple[str, ...], least_points:
 def with_objects(scene: Scene, database: Database, params: AugmentParams, low: np.ndarray,
                  high: np.ndarray, rng: np.random.Generator) -> Scene:
     """The scene with objects of the database until it has as many of each class as params say, or
-    DRAWN times as many as it lacks were tried.
+    DRAWN times as many as it lacks were tried; and with so many things, which are no objects.
 
     An object comes as far from the sensor as it was in its own scene, on the ground found there, in
     a direction drawn at random from those in which its centre lies between low and high (2 or
     more,), metres, and nothing stands before it. Where it would touch another box or be hidden, or
     there is no ground, it is left out. What was in its box goes, and what is in its shadow.
     """
-    points, boxes, new = scene.points, scene.boxes, []
+    points, taken = scene.points, scene.boxes
+    boxes, class_ids = [scene.boxes], list(scene.class_ids)
     free = _free_depths(points)
     for kind, number in ((CAR, params.cars), (PEDESTRIAN, params.pedestrians),
-                         (CYCLIST, params.cyclists)):
+                         (CYCLIST, params.cyclists), (THING, params.things)):
         known = np.flatnonzero(database.class_ids == kind)
         missing = number - int((scene.class_ids == kind).sum())
         for i in rng.permutation(known)[:max(DRAWN * missing, 0)]:
             if missing == 0:
                 break
-            put = _put(database.boxes[i], database.points_of(i), points, boxes, free, low, high,
-                       rng)
-            if put is not None:
-                points, boxes = put
-                new.append(i)
-                missing -= 1
-    return replace(scene, points=points, boxes=boxes,
-                   class_ids=np.concatenate([scene.class_ids, database.class_ids[new]]),
-                   wanted=np.concatenate([scene.wanted, np.ones(len(new), bool)]))
+            stretch = params.things_stretch if kind == THING else 0.0
+            box, own = varied(database.boxes[i], database.points_of(i), stretch,
+                              params.object_intensity, rng)
+            put = _put(box, own, points, taken, free, low, high, rng)
+            if put is None:
+                continue
+            points, taken = put
+            missing -= 1
+            if kind != THING:
+                boxes.append(taken[-1:])
+                class_ids.append(kind)
+    new = len(class_ids) - len(scene.class_ids)
+    return replace(scene, points=points, boxes=np.concatenate(boxes),
+                   class_ids=np.array(class_ids, scene.class_ids.dtype),
+                   wanted=np.concatenate([scene.wanted, np.ones(new, bool)]))
+
+
+def varied(box: np.ndarray, points: np.ndarray, stretch: float, intensity: float,
+           rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """An object that is wider, higher and brighter, or less so: its lengths about the middle of its
+    floor times up to exp(stretch) or its inverse, the same along x and y; intensities likewise."""
+    wide, high = np.exp(rng.uniform(-stretch, stretch, 2))
+    factors = np.array([wide, wide, high])
+    floor = box[:3] - [0, 0, box[5] / 2]
+    points, box = points.copy(), box.copy()
+    points[:, :3] = (points[:, :3] - floor) * factors + floor
+    box[3:6] *= factors
+    box[2] = floor[2] + box[5] / 2
+    points[:, 3] = np.clip(points[:, 3] * np.exp(rng.uniform(-intensity, intensity)), 0, 1)
+    return box, points
 
 
 def _put(box, own, points, boxes, free, low, high,
@@ -122,16 +149,13 @@ def _put(box, own, points, boxes, free, low, high,
     box, own = _about_sensor(box, own, turn)
     if bev_iou(grown(box[None]), grown(boxes)).any():
         return None
-    step = _ground_under(points, box) - (box[2] - box[5] / 2)
+    step = ground_under(points, box, NEIGHBOURHOOD, GROUND_SHARE) - (box[2] - box[5] / 2)
     if not abs(step) <= MOST_STEP:  # NaN: no ground
         return None
     box[2] += step
     own[:, 2] += np.float32(step)
-    before, behind = _around(points, own, float(np.arctan2(box[1], box[0])))
-    if before > HIDDEN * len(own):
-        return None
-    left = np.flatnonzero(~(behind | points_in_box(points, box, BORDER)))
-    return np.concatenate([points.take(left, axis=0), own]), np.concatenate([boxes, box[None]])
+    points = joined(points, own, box, BORDER, HIDDEN * len(own))
+    return (points, np.concatenate([boxes, box[None]])) if len(points) else None
 
 
 def _free_depths(points: np.ndarray) -> np.ndarray:
@@ -167,43 +191,3 @@ def _about_sensor(box: np.ndarray, points: np.ndarray,
     alone = Scene(points, box[None], np.zeros(1, int), np.ones(1, bool))
     alone = turned(alone, angle)
     return alone.boxes[0], alone.points
-
-
-@njit(cache=True, nogil=True)
-def _around(points, own, bearing):
-    """How many points (N, 4) the sensor sees before those of an object (K, 4), which is in this
-    direction, and (N,) bool, which behind them."""
-    cos, sin = np.cos(bearing), np.sin(bearing)
-    least, most = np.full(3, np.inf), np.full(3, -np.inf)  # depth, tangents to the side and upwards
-    for i in range(len(own)):
-        depth = max(cos * own[i, 0] + sin * own[i, 1], TOUCH)
-        for k, value in enumerate((depth, (cos * own[i, 1] - sin * own[i, 0]) / depth,
-                                   own[i, 2] / depth)):
-            least[k], most[k] = min(least[k], value), max(most[k], value)
-    before, behind = 0, np.zeros(len(points), np.bool_)
-    for i in range(len(points)):
-        depth = cos * points[i, 0] + sin * points[i, 1]
-        if depth <= 0.0 or least[0] <= depth <= most[0]:
-            continue
-        aside = cos * points[i, 1] - sin * points[i, 0]
-        if (least[1] * depth <= aside <= most[1] * depth
-                and least[2] * depth <= points[i, 2] <= most[2] * depth):
-            if depth < least[0]:
-                before += 1
-            else:
-                behind[i] = True
-    return before, behind
-
-
-@njit(cache=True, nogil=True)
-def _ground_under(points, box):
-    """Height of the ground around a box, NaN where there are no points."""
-    heights, count = np.empty(len(points), points.dtype), 0
-    for i in range(len(points)):
-        if (abs(points[i, 0] - box[0]) <= NEIGHBOURHOOD
-                and abs(points[i, 1] - box[1]) <= NEIGHBOURHOOD):
-            heights[count] = points[i, 2]
-            count += 1
-    if count < 5:
-        return np.nan
-    return np.sort(heights[:count])[int(GROUND_SHARE * count)]

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lidar_perception.detection.anchors import make_anchors
+from lidar_perception.detection.anchors import anchor_classes, make_anchors
 from lidar_perception.detection.checkpoint import Header
 from lidar_perception.detection.config import NetworkConfig
 from lidar_perception.detection.detector import Detector, TorchNetwork
@@ -33,12 +33,12 @@ from lidar_perception.detection.targets import (
 from lidar_perception.detection.view import visible
 from lidar_perception.evaluation.detection import DetectionReport
 from lidar_perception.evaluation.kitti_protocol import NEIGHBOURS
-from lidar_perception.geometry import points_in_box
 from lidar_perception.param_fields import with_values
 from lidar_perception.training.augment import Scene, augmented, faced
 from lidar_perception.training.data import Batches, JudgedScenes, loaded
 from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
+from lidar_perception.training.putting import inside
 from lidar_perception.training.record import begun_with, keeper, metrics_of
 from lidar_perception.training.run import Task
 from lidar_perception.training.scenes import Judged
@@ -103,7 +103,7 @@ class Preparation:
         within = ((scene.boxes[:, :2] >= low[:2]) & (scene.boxes[:, :2] < high[:2])).all(axis=1)
         kept = np.flatnonzero(within & (labels >= 0))
         counted = [bool(scene.wanted[i]) and names[i] not in LIKE
-                   and points_in_box(xyz, scene.boxes[i]).sum() >= self.least_points
+                   and len(inside(xyz, scene.boxes[i], 0.0)) >= self.least_points
                    for i in kept]
         return scene.boxes[kept].astype(np.float32), labels[kept], np.array(counted, bool)
 
@@ -148,7 +148,7 @@ def targets_of(sample: Sample, anchors: Tensor, config: NetworkConfig) -> Target
 
 def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     """loss(network, samples) -> total, parts, as the loop wants it."""
-    anchors = make_anchors(config, device)
+    anchors, kinds = make_anchors(config, device), anchor_classes(config, device)
 
     def loss(network: nn.Module, samples: Sequence[Sample]) -> tuple[Tensor, dict[str, Tensor]]:
         pillars = make_pillars([torch.from_numpy(s.points).to(device) for s in samples], config)
@@ -156,7 +156,7 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
         if config.pseudo_map:
             maps = torch.from_numpy(np.stack([s.cluster_map for s in samples])).to(device)
         targets = stacked([targets_of(sample, anchors, config) for sample in samples])
-        losses = detection_loss(network(pillars, maps), targets)
+        losses = detection_loss(network(pillars, maps), targets, kinds)
         return losses.total, {"classes": losses.classes.detach(), "boxes": losses.boxes.detach(),
                               "directions": losses.directions.detach()}
 

@@ -1,0 +1,45 @@
+"""What stands upright like a person and is none: posts, poles, trunks, bins. To be learned from as
+often as people are, or a network takes them for people."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.clustering.shapes import extents
+from lidar_perception.detection.detector_params import EXPERT_CLUSTERING, EXPERT_GROUND
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.pointnet.clusters import ground_under
+from lidar_perception.rotated_iou import bev_iou
+from lidar_perception.training.augment import Scene, grown
+from lidar_perception.types import LidarFrame
+
+WIDEST = 1.2          # m to a side
+HEIGHTS = 0.6, 4.5    # m of its top above the ground
+MOST_GAP = 0.8        # m between the ground and the lowest point
+APART = 0.3           # m from every labelled box
+MOST = 20             # of a scene
+
+
+def things_in(scene: Scene, least_points: int,
+              rng: np.random.Generator) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Boxes (K, 7) float64, from the ground up along the axes, and the points (N, 4) of each: the
+    clusters of obstacles of a person's width with so many points that touch no box of the scene; at
+    most MOST, drawn by rng."""
+    xyz = np.ascontiguousarray(scene.points[:, :3])
+    ground = segment_ground(LidarFrame(xyz), EXPERT_GROUND)
+    ids = cluster_obstacles(xyz, ground, EXPERT_CLUSTERING)
+    low, high, sizes = extents(xyz, ids, int(ids.max(initial=0)))
+    boxes = np.zeros((len(sizes), 7))
+    boxes[:, :2] = (low[:, :2] + high[:, :2]) / 2
+    boxes[:, 3:5] = high[:, :2] - low[:, :2]
+    floor = ground_under(xyz[ground], boxes[:, :2])
+    boxes[:, 5] = high[:, 2] - floor
+    boxes[:, 2] = floor + boxes[:, 5] / 2
+    kept = ((sizes >= least_points) & (boxes[:, 3:5].max(axis=1, initial=0) <= WIDEST)
+            & (boxes[:, 5] >= HEIGHTS[0]) & (boxes[:, 5] <= HEIGHTS[1])
+            & (low[:, 2] - floor <= MOST_GAP))
+    kept = np.flatnonzero(kept)
+    kept = kept[~bev_iou(grown(boxes[kept]), grown(scene.boxes, APART)).any(axis=1)]
+    kept = rng.permutation(kept)[:MOST]
+    return boxes[kept], [scene.points[ids == k + 1] for k in kept]
