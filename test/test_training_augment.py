@@ -40,7 +40,8 @@ few = settings(deadline=None, max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
 STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
-                      flip=0, turn=0, scale=0, dropout=0, intensity=0, height=0)
+                      flip=0, turn=0, scale=0, beam_noise=0, range_noise=0, dropout=0, intensity=0,
+                      height=0)
 
 
 def random_scene(seed: int, around: bool = False) -> Scene:

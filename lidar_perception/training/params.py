@@ -81,6 +81,10 @@ class AugmentParams(Params):
                         "labelled all around by anything, unless this is 0.", unit="rad", low=0.0,
                         high=3.1416)
     scale: float = param(0.05, "The scene grows or shrinks by up to this share.", low=0.0, high=0.5)
+    beam_noise: float = param(0.08, "The ranges of each beam are off by up to about this; standard "
+                              "deviation.", unit="m", low=0.0, high=1.0)
+    range_noise: float = param(0.08, "Likewise the range of each point.", unit="m", low=0.0,
+                               high=1.0)
     dropout: float = param(0.3, "Up to this share of the points is left out.", low=0.0, high=0.99)
     intensity: float = param(0.15, "Intensities are multiplied by 1 plus or minus up to this, and "
                              "raised or lowered by up to half of it.", low=0.0, high=1.0)
