@@ -63,7 +63,7 @@ def test_kittis_sensor_is_kittis():
 @pytest.mark.parametrize("change, named", [
     ({"elevations": ()}, "elevations"), ({"elevations": (0.1, 0.2)}, "elevations"),
     ({"elevations": (2.0,)}, "elevations"), ({"elevations": (np.nan,)}, "elevations"),
-    ({"lifts": (0.1,)}, "lifts"), ({"biases": (0.1,)}, "biases"),
+    ({"lifts": (0.1,)}, "lifts"), ({"biases": (0.1,)}, "biases"), ({"offsets": (0.1,)}, "offsets"),
     ({"azimuth_step": 0.0}, "azimuth_step"), ({"azimuth_step": np.nan}, "azimuth_step"),
     ({"height": 0.0}, "height"), ({"max_range": 0.5}, "max_range"),
     ({"min_range": -1}, "max_range"),
@@ -133,6 +133,15 @@ def test_a_ring_keeps_its_elevation_and_time_its_bearing():
 def test_noise_is_as_wide_as_told():
     found = measured(replace(SMALL, range_noise=0.05), 20.0)
     assert abs((np.linalg.norm(found.xyz, axis=1) - 20).std() - 0.05) < 0.003
+
+
+def test_beams_may_disagree_about_the_range():
+    offsets = tuple(np.linspace(-0.05, 0.05, 8))
+    found = measured(replace(SMALL, offsets=offsets), 20.0)
+    for ring, offset in enumerate(offsets):
+        ranges = np.linalg.norm(found.xyz[found.ring == ring], axis=1)
+        assert abs(ranges.mean() - 20 - offset) < 0.01
+    assert 0.01 < np.std(HDL64E.offsets[:39]) < 0.03
 
 
 def test_far_and_dark_is_lost():

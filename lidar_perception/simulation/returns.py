@@ -46,6 +46,8 @@ def measure(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator
     shape = hits.range.shape
     turn = rays(sensor, motion if compensated else STILL)
     noisy = hits.range + rng.normal(0.0, sensor.range_noise, shape)
+    if sensor.offsets:
+        noisy += np.asarray(sensor.offsets)
     with np.errstate(divide="ignore"):
         power = (np.log(hits.brightness / 0.1) + GRAZING * np.log(hits.cosine)
                  - 2 * np.log(hits.range / sensor.reach))
