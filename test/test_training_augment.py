@@ -247,7 +247,7 @@ def test_posts_are_learned_from_but_are_no_objects():
     box, own = database.boxes[1], database.points_of(1)
     assert (own[:, 0] == 8).all() and len(own) > 0.8 * len(post)
     assert box[:2] == pytest.approx([8, 3], abs=0.05) and box[5] == pytest.approx(2.33, abs=0.1)
-    params = replace(STILL, things=1, things_stretch=0, object_intensity=0)
+    params = replace(STILL, things=1, things_stretch=0, things_intensity=0)
     fuller = with_objects(street_with(), database, params, *AREA, np.random.default_rng(0))
     assert len(fuller.boxes) == len(fuller.class_ids) == len(fuller.wanted) == 0
     added = fuller.points[-len(own):]
@@ -258,7 +258,7 @@ def test_posts_are_learned_from_but_are_no_objects():
 
 @few
 @given(seeds)
-def test_what_is_put_in_is_stretched_upon_its_floor(seed):
+def test_things_are_stretched_upon_their_floor(seed):
     scene, rng = random_scene(seed), np.random.default_rng(seed)
     for box in scene.boxes:
         own = scene.points[inside(scene.points, box, 0.0)]

@@ -108,9 +108,9 @@ def with_objects(scene: Scene, database: Database, params: AugmentParams, low: n
         for i in rng.permutation(known)[:max(DRAWN * missing, 0)]:
             if missing == 0:
                 break
-            stretch = params.things_stretch if kind == THING else 0.0
-            box, own = varied(database.boxes[i], database.points_of(i), stretch,
-                              params.object_intensity, rng)
+            box, own = database.boxes[i], database.points_of(i)
+            if kind == THING:
+                box, own = varied(box, own, params.things_stretch, params.things_intensity, rng)
             put = _put(box, own, points, taken, free, low, high, rng)
             if put is None:
                 continue

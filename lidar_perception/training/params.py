@@ -68,8 +68,8 @@ class AugmentParams(Params):
                         "are put in likewise, as what is not to be found.", low=0, high=100)
     things_stretch: float = param(0.5, "They are made wider or thinner, higher or lower, by "
                                   "factors up to exp(this).", low=0.0, high=3.0)
-    object_intensity: float = param(0.4, "Intensities of what is put in are multiplied by up to "
-                                    "exp(this), or divided.", low=0.0, high=3.0)
+    things_intensity: float = param(0.8, "Their intensities are multiplied by up to exp(this), or "
+                                    "divided.", low=0.0, high=3.0)
     database_scans: int = param(2000, "Those objects come from so many scenes, at most.", low=0,
                                 high=10**6)
     object_turn: float = param(0.157, "Each object is turned by up to this.", unit="rad", low=0.0,
