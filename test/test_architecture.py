@@ -147,7 +147,8 @@ def test_hybrids_import_the_detectors_that_they_join(name):
 
 
 SHARED_TRAINING = [f"lidar_perception.training.{name}" for name in (
-    "params", "schedule", "ranks", "log", "run", "loop", "augment", "database", "data")]
+    "params", "schedule", "ranks", "log", "run", "loop", "augment", "putting", "database",
+    "data")]
 
 
 @pytest.mark.parametrize("module", SHARED_TRAINING)

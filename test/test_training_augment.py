@@ -24,13 +24,8 @@ from lidar_perception.training.augment import (
     turned,
     with_moved_objects,
 )
-from lidar_perception.training.database import (
-    THING,
-    Database,
-    cut_objects,
-    varied,
-    with_objects,
-)
+from lidar_perception.training.cut_objects import cut_objects
+from lidar_perception.training.database import THING, Database, varied, with_objects
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.putting import inside
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError

@@ -82,8 +82,8 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
     """
     from lidar_perception.detection.config import network_config
     from lidar_perception.devices import chosen_device
+    from lidar_perception.training.cut_objects import cut_objects
     from lidar_perception.training.data import Batches, JudgedScenes, RawScenes, Stream
-    from lidar_perception.training.database import cut_objects
     from lidar_perception.training.loop import may_begin
     from lidar_perception.training.loop import train as run
     from lidar_perception.training.pointpillars import (

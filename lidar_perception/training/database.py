@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from zipfile import BadZipFile
@@ -14,8 +13,7 @@ from lidar_perception.files import write_bytes
 from lidar_perception.rotated_iou import bev_iou
 from lidar_perception.training.augment import BORDER, Scene, grown, turned
 from lidar_perception.training.params import AugmentParams
-from lidar_perception.training.putting import ground_under, inside, joined
-from lidar_perception.training.things import things_in
+from lidar_perception.training.putting import ground_under, joined
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 
 NEIGHBOURHOOD = 3.0  # m: the ground under an object is looked for so far around it
@@ -26,7 +24,7 @@ SECTORS = 720        # directions that are told apart
 TRIES = 64           # of them drawn for an object
 DRAWN = 3
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
-THING = -1           # class of what is no object, see things.py
+THING = -1           # class of what is no object, see cut_objects.py
 HIDDEN = 0.3         # an object is hidden if more points than this share of its own are before it
 
 
@@ -62,30 +60,6 @@ class Database:
         except (OSError, ValueError, TypeError, EOFError, BadZipFile) as error:
             raise InputError(f"cannot read the objects {path}: {error}; remove it, and it is made "
                              "again") from None
-
-
-def cut_objects(scenes: Iterable[Scene], classes: tuple[str, ...], least_points: int) -> Database:
-    """The wanted objects of some classes that have enough points; where boxes overlap, none. If
-    people are among them, things that look like people, too."""
-    chosen = [CLASSES.index(name) for name in classes]
-    boxes, class_ids, points = [np.zeros((0, 7))], [], [np.zeros((0, 4), np.float32)]
-    for n, scene in enumerate(scenes):
-        overlap = bev_iou(scene.boxes, scene.boxes) > 0
-        alone = overlap.sum(axis=1) <= 1
-        for i in np.flatnonzero(scene.wanted & alone & np.isin(scene.class_ids, chosen)):
-            own = scene.points[inside(scene.points, scene.boxes[i], 0.0)]
-            if len(own) >= least_points:
-                boxes.append(scene.boxes[i:i + 1])
-                class_ids.append(scene.class_ids[i])
-                points.append(own)
-        if PEDESTRIAN in chosen:
-            things, of_things = things_in(scene, least_points, np.random.default_rng(n))
-            boxes.append(things)
-            class_ids.extend([THING] * len(things))
-            points.extend(of_things)
-    sizes = [len(own) for own in points[1:]]
-    return Database(np.concatenate(boxes), np.array(class_ids, np.int32), np.concatenate(points),
-                    np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
 
 
 def with_objects(scene: Scene, database: Database, params: AugmentParams, low: np.ndarray,

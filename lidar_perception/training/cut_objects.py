@@ -1,7 +1,9 @@
-"""What stands upright like a person and is none: posts, poles, trunks, bins. To be learned from as
-often as people are, or a network takes them for people."""
+"""What scenes give to others: labelled objects, and what stands upright like a person and is none
+(posts, poles, trunks, bins), to be learned from as often as people are."""
 
 from __future__ import annotations
+
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -12,13 +14,39 @@ from lidar_perception.ground.segment import segment_ground
 from lidar_perception.pointnet.clusters import ground_under
 from lidar_perception.rotated_iou import bev_iou
 from lidar_perception.training.augment import Scene, grown
-from lidar_perception.types import LidarFrame
+from lidar_perception.training.database import THING, Database
+from lidar_perception.training.putting import inside
+from lidar_perception.types import CLASSES, PEDESTRIAN, LidarFrame
 
 WIDEST = 1.2          # m to a side
 HEIGHTS = 0.6, 4.5    # m of its top above the ground
 MOST_GAP = 0.8        # m between the ground and the lowest point
 APART = 0.3           # m from every labelled box
 MOST = 20             # of a scene
+
+
+def cut_objects(scenes: Iterable[Scene], classes: tuple[str, ...], least_points: int) -> Database:
+    """The wanted objects of some classes that have enough points; where boxes overlap, none. If
+    people are among them, things that look like people, too."""
+    chosen = [CLASSES.index(name) for name in classes]
+    boxes, class_ids, points = [np.zeros((0, 7))], [], [np.zeros((0, 4), np.float32)]
+    for n, scene in enumerate(scenes):
+        overlap = bev_iou(scene.boxes, scene.boxes) > 0
+        alone = overlap.sum(axis=1) <= 1
+        for i in np.flatnonzero(scene.wanted & alone & np.isin(scene.class_ids, chosen)):
+            own = scene.points[inside(scene.points, scene.boxes[i], 0.0)]
+            if len(own) >= least_points:
+                boxes.append(scene.boxes[i:i + 1])
+                class_ids.append(scene.class_ids[i])
+                points.append(own)
+        if PEDESTRIAN in chosen:
+            things, of_things = things_in(scene, least_points, np.random.default_rng(n))
+            boxes.append(things)
+            class_ids.extend([THING] * len(things))
+            points.extend(of_things)
+    sizes = [len(own) for own in points[1:]]
+    return Database(np.concatenate(boxes), np.array(class_ids, np.int32), np.concatenate(points),
+                    np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
 
 
 def things_in(scene: Scene, least_points: int,
