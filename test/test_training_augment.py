@@ -12,8 +12,10 @@ from hypothesis import strategies as st
 from lidar_perception.geometry import points_in_box, wrap_angle
 from lidar_perception.rotated_iou import bev_iou
 from lidar_perception.training.augment import (
+    STEP,
     Scene,
     augmented,
+    blurred,
     brightened,
     cropped,
     faced,
@@ -249,6 +251,26 @@ def test_posts_are_learned_from_but_are_no_objects():
     np.testing.assert_allclose(np.hypot(added[:, 0], added[:, 1]),
                                np.hypot(own[:, 0], own[:, 1]), atol=1e-4)
     assert added[:, 2].max() == pytest.approx(0.6, abs=0.1)
+
+
+@few
+@given(seeds)
+def test_noise_is_along_the_ray_and_beams_have_theirs_in_common(seed):
+    scene, rng = random_scene(seed), np.random.default_rng(seed)
+    scene = replace(scene, points=np.concatenate([scene.points, np.zeros((1, 4), np.float32)]))
+    assert np.array_equal(blurred(scene, 0, 0, rng).points, scene.points)
+    before = np.linalg.norm(scene.points[:-1, :3], axis=1)
+    for beam, point in ((0.05, 0.0), (0.0, 0.05)):
+        moved = blurred(scene, beam, point, rng).points[:-1]
+        after = np.linalg.norm(moved[:, :3], axis=1)
+        np.testing.assert_allclose(moved[:, :3] / after[:, None],
+                                   scene.points[:-1, :3] / before[:, None], atol=1e-5)
+        shift, (x, y, z) = after - before, scene.points[:-1, :3].T
+        assert 0.02 < shift.std() < 0.1
+        beams = np.floor(np.arctan2(z, np.hypot(x, y)) / STEP)
+        known, sizes = np.unique(beams, return_counts=True)
+        fullest = shift[beams == known[sizes.argmax()]]
+        assert (np.ptp(fullest) < 1e-3) == (point == 0)
 
 
 @few

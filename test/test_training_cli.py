@@ -134,7 +134,8 @@ def test_what_is_held_out_is_not_trained_on(tmp_path):
 ])
 def test_what_cannot_be_is_said_at_once(tmp_path, small, arguments, reason):
     result = train(*arguments, "--out", tmp_path / "run", "--jobs", 0, "--data-scans", 1,
-                   "--augment-cars", 0, "--augment-pedestrians", 0, "--augment-cyclists", 0)
+                   "--augment-cars", 0, "--augment-pedestrians", 0, "--augment-cyclists", 0,
+                   "--augment-things", 0)
     assert isinstance(result.exception, InputError) and reason in str(result.exception)
     assert not (tmp_path / "run" / "last.pt").exists()
 

@@ -98,12 +98,13 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
     sources, held_out = training_scenes(data, val, split, val_split, params.data, params.seed)
     with joined(chosen_device(device)) as place:
         database = None
-        counts = params.augment.cars, params.augment.pedestrians, params.augment.cyclists
-        if any(counts) and params.augment.database_scans:
+        wanted = params.augment
+        if wanted.database_scans and (wanted.cars or wanted.pedestrians or wanted.cyclists
+                                      or wanted.things):
             database = out / "objects.npz"
             if rank() == 0 and not (resume and database.is_file()):
                 raw = Stream(sources, None, params.seed)
-                scenes = RawScenes(raw).some(params.augment.database_scans, jobs)
+                scenes = RawScenes(raw).some(wanted.database_scans, jobs)
                 cut_objects(scenes, config.classes, params.data.least_points).save(database)
             wait()
         seen = narrowed(config, params.ahead, params.aside)

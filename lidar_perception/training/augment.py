@@ -114,7 +114,8 @@ def blurred(scene: Scene, beam: float, point: float, rng: np.random.Generator) -
     """
     points = scene.points.copy()
     ranges = np.maximum(np.linalg.norm(points[:, :3], axis=1), TOUCH)
-    beams = np.floor(np.arcsin(points[:, 2] / ranges) / STEP).astype(np.int64)
+    elevations = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+    beams = np.floor(elevations / STEP).astype(np.int64)
     first = beams.min(initial=0)
     offsets = rng.normal(0, beam, int(beams.max(initial=0) - first) + 1)
     shift = offsets[beams - first] + rng.normal(0, point, len(points))
