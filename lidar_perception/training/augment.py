@@ -12,10 +12,9 @@ import numpy as np
 from lidar_perception.geometry import to_box_frame, wrap_angle
 from lidar_perception.rotated_iou import bev_iou
 from lidar_perception.training.params import AugmentParams
-from lidar_perception.training.putting import inside
+from lidar_perception.training.putting import TOUCH, inside
 
 STEP = np.radians(0.4)  # of elevation between two beams
-TOUCH = 1e-3   # m: nothing is nearer to the sensor
 BORDER = 0.01  # m: points so near to a box are taken for its own, as labels are rounded
 
 
