@@ -13,7 +13,7 @@ from lidar_perception.files import write_bytes
 from lidar_perception.rotated_iou import bev_iou
 from lidar_perception.training.augment import BORDER, Scene, grown, turned
 from lidar_perception.training.params import AugmentParams
-from lidar_perception.training.putting import ground_under, joined
+from lidar_perception.training.putting import floor_under, put_among
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 
 NEIGHBOURHOOD = 3.0  # m: the ground under an object is looked for so far around it
@@ -73,7 +73,7 @@ def with_objects(scene: Scene, database: Database, params: AugmentParams, low: n
     there is no ground, it is left out. What was in its box goes, and what is in its shadow.
     """
     points, taken = scene.points, scene.boxes
-    boxes, class_ids = [scene.boxes], list(scene.class_ids)
+    kinds = []
     free = _free_depths(points)
     for kind, number in ((CAR, params.cars), (PEDESTRIAN, params.pedestrians),
                          (CYCLIST, params.cyclists), (THING, params.things)):
@@ -86,17 +86,16 @@ def with_objects(scene: Scene, database: Database, params: AugmentParams, low: n
             if kind == THING:
                 box, own = varied(box, own, params.things_stretch, params.things_intensity, rng)
             put = _put(box, own, points, taken, free, low, high, rng)
-            if put is None:
-                continue
-            points, taken = put
-            missing -= 1
-            if kind != THING:
-                boxes.append(taken[-1:])
-                class_ids.append(kind)
-    new = len(class_ids) - len(scene.class_ids)
-    return replace(scene, points=points, boxes=np.concatenate(boxes),
-                   class_ids=np.array(class_ids, scene.class_ids.dtype),
-                   wanted=np.concatenate([scene.wanted, np.ones(new, bool)]))
+            if put is not None:
+                points, taken = put
+                kinds.append(kind)
+                missing -= 1
+    new = np.array(kinds, scene.class_ids.dtype)
+    objects = new != THING
+    return replace(scene, points=points,
+                   boxes=np.concatenate([scene.boxes, taken[len(scene.boxes):][objects]]),
+                   class_ids=np.concatenate([scene.class_ids, new[objects]]),
+                   wanted=np.concatenate([scene.wanted, np.ones(objects.sum(), bool)]))
 
 
 def varied(box: np.ndarray, points: np.ndarray, stretch: float, intensity: float,
@@ -123,12 +122,12 @@ def _put(box, own, points, boxes, free, low, high,
     box, own = _about_sensor(box, own, turn)
     if bev_iou(grown(box[None]), grown(boxes)).any():
         return None
-    step = ground_under(points, box, NEIGHBOURHOOD, GROUND_SHARE) - (box[2] - box[5] / 2)
+    step = floor_under(points, box, NEIGHBOURHOOD, GROUND_SHARE) - (box[2] - box[5] / 2)
     if not abs(step) <= MOST_STEP:  # NaN: no ground
         return None
     box[2] += step
     own[:, 2] += np.float32(step)
-    points = joined(points, own, box, BORDER, HIDDEN * len(own))
+    points = put_among(points, own, box, BORDER, HIDDEN * len(own))
     return (points, np.concatenate([boxes, box[None]])) if len(points) else None
 
 

@@ -31,8 +31,8 @@ def _within(point, box, half, cos, sin):
 
 
 @njit(cache=True, nogil=True)
-def joined(points: np.ndarray, own: np.ndarray, box: np.ndarray, margin: float,
-           most: float) -> np.ndarray:
+def put_among(points: np.ndarray, own: np.ndarray, box: np.ndarray, margin: float,
+              most: float) -> np.ndarray:
     """points (N, 4) float32 without those in box (7,) float64, grown by margin, and those that the
     sensor sees behind the object, and after them the object's own (K, 4).
 
@@ -69,7 +69,7 @@ def joined(points: np.ndarray, own: np.ndarray, box: np.ndarray, margin: float,
 
 
 @njit(cache=True, nogil=True)
-def ground_under(points: np.ndarray, box: np.ndarray, reach: float, share: float) -> float:
+def floor_under(points: np.ndarray, box: np.ndarray, reach: float, share: float) -> float:
     """Height that this share of the points (N, 3 or more) within reach of the middle of box (7,)
     is below, along both axes, metres; NaN where there are not 5 points."""
     heights, count = np.empty(len(points), points.dtype), 0
