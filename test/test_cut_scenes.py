@@ -39,8 +39,8 @@ from lidar_perception.types import CLASSES, GroundTruth, InputError, LidarFrame
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = pointnet_config(**SMALL)
-STILL = ClusterAugmentParams(box_shift=0, farther=0, dropout=0, noise=0, scale=0, flip=0,
-                             intensity=0, height=0)
+STILL = ClusterAugmentParams(box_shift=0, farther=0, dropout=0, beam_noise=0, range_noise=0,
+                             scale=0, flip=0, intensity=0, height=0)
 
 
 @pytest.fixture
@@ -134,7 +134,7 @@ def test_changes_keep_points_in_their_boxes_and_take_far_ones_as_a_sensor_would(
     same, boxes = changed(clusters, BOXES, no, STILL, rng)
     assert np.allclose(same.points, clusters.points, atol=1e-6) and np.allclose(boxes, BOXES)
     for seed in range(5):
-        params = ClusterAugmentParams(noise=0, intensity=0)
+        params = ClusterAugmentParams(beam_noise=0, range_noise=0, intensity=0)
         made, boxes = changed(clusters, BOXES, no, params, np.random.default_rng(seed))
         for k in range(4):
             own = made.points[made.first[k]:made.first[k + 1], :3]

@@ -256,16 +256,16 @@ def test_posts_are_learned_from_but_are_no_objects():
 @few
 @given(seeds)
 def test_noise_is_along_the_ray_and_beams_have_theirs_in_common(seed):
-    scene, rng = random_scene(seed), np.random.default_rng(seed)
-    scene = replace(scene, points=np.concatenate([scene.points, np.zeros((1, 4), np.float32)]))
-    assert np.array_equal(blurred(scene, 0, 0, rng).points, scene.points)
-    before = np.linalg.norm(scene.points[:-1, :3], axis=1)
+    rng = np.random.default_rng(seed)
+    points = np.concatenate([random_scene(seed).points, np.zeros((1, 4), np.float32)])
+    assert np.array_equal(blurred(points, 0, 0, rng), points)
+    before = np.linalg.norm(points[:-1, :3], axis=1)
     for beam, point in ((0.05, 0.0), (0.0, 0.05)):
-        moved = blurred(scene, beam, point, rng).points[:-1]
+        moved = blurred(points, beam, point, rng)[:-1]
         after = np.linalg.norm(moved[:, :3], axis=1)
         np.testing.assert_allclose(moved[:, :3] / after[:, None],
-                                   scene.points[:-1, :3] / before[:, None], atol=1e-5)
-        shift, (x, y, z) = after - before, scene.points[:-1, :3].T
+                                   points[:-1, :3] / before[:, None], atol=1e-5)
+        shift, (x, y, z) = after - before, points[:-1, :3].T
         assert 0.02 < shift.std() < 0.1
         beams = np.floor(np.arctan2(z, np.hypot(x, y)) / STEP)
         known, sizes = np.unique(beams, return_counts=True)

@@ -150,8 +150,10 @@ class ClusterAugmentParams(Params):
                            "range, and lose points as they would.", low=0.0, high=10.0)
     dropout: float = param(0.9, "Of half the clusters up to this share of the points is left out.",
                            low=0.0, high=0.99)
-    noise: float = param(0.03, "Points are moved by up to about this; standard deviation.",
-                         unit="m", low=0.0, high=1.0)
+    beam_noise: float = param(0.08, "The ranges of each beam are off by up to about this; standard "
+                              "deviation.", unit="m", low=0.0, high=1.0)
+    range_noise: float = param(0.08, "Likewise the range of each point.", unit="m", low=0.0,
+                               high=1.0)
     scale: float = param(0.05, "Clusters grow or shrink by up to this share.", low=0.0, high=0.5)
     flip: float = param(0.5, "Chance that left and right are swapped.", low=0.0, high=1.0)
     intensity: float = param(0.2, "Intensities are multiplied by 1 plus or minus up to this.",

@@ -23,7 +23,8 @@ from lidar_perception.simulation.solids import BOX, ELLIPSOID, part, parts
 
 BICYCLE, MOTORCYCLE, BICYCLIST = 11, 15, 31
 CRANK, GEAR = 0.17, 5.0  # metres: length of a crank, way for one turn of the cranks
-SPOKES = 0.75  # share of the beams that pass between the spokes
+SPOKES = 0.5  # share of the beams that pass between the spokes
+OPEN = 0.6    # likewise between stays, chain and pedals, and through the rack
 THIGH, SHANK = 0.26, 0.27  # lengths as shares of the rider's height, down to the pedal
 
 
@@ -67,7 +68,7 @@ def riding(travelled: float, rider: Rider) -> np.ndarray:
     bar_x, bar_z = 0.22 * length, 0.61 * height
     head = (neck[0] + 0.03, 0.0, height - 0.075 * trunk)
     rows = [
-        *_bicycle(length, width / 2, (bar_x, bar_z), (hip[0] - 0.03, seat - 0.1), rider.frame),
+        *_bicycle(length, width / 2, (bar_x, bar_z), rider.frame),
         part(ELLIPSOID, head, (0.057 * trunk, 0.047 * trunk, 0.075 * trunk),
              reflectance=(SKIN + rider.head) / 2),
         part(ELLIPSOID, (along(0.15)[0], 0.0, along(0.15)[1]),
@@ -96,15 +97,18 @@ def riding(travelled: float, rider: Rider) -> np.ndarray:
     return parts(rows, BICYCLIST)
 
 
-def _bicycle(length: float, half_bar: float, bar: tuple, seat: tuple, frame: float) -> list[tuple]:
-    """Wheels, tubes and handlebar, with bar (x, z) and seat (x, z)."""
+def _bicycle(length: float, half_bar: float, bar: tuple, frame: float) -> list[tuple]:
+    """Wheels, what is between and above them, tubes and handlebar, with bar (x, z). As thick as
+    wide beams see it: 46 % of the points of KITTI's cyclists are lower than 0.42 of their height,
+    22 % also more than 0.35 m ahead of the middle or behind it (10 cyclists up to 40 m)."""
     radius = 0.19 * length
     axle, crank = length / 2 - radius, (-0.02 * length, 0.0, 0.88 * radius)
-    return [disc((-axle, 0, radius), radius, 0.02, reflectance=0.3, transmission=SPOKES),
-            disc((axle, 0, radius), radius, 0.02, reflectance=0.3, transmission=SPOKES),
-            rod((axle, 0, radius), (bar[0], 0, bar[1]), 0.02, reflectance=frame),
-            rod(crank, (0.85 * bar[0], 0, 0.8 * bar[1]), 0.025, reflectance=frame),
-            rod(crank, (seat[0], 0, seat[1]), 0.025, reflectance=frame),
+    return [disc((-axle, 0, radius), radius, 0.03, reflectance=0.3, transmission=SPOKES),
+            disc((axle, 0, radius), radius, 0.03, reflectance=0.3, transmission=SPOKES),
+            block((-axle - 0.2, -0.06, 0.5 * radius), (crank[0] + 0.1, 0.06, 2 * radius + 0.1),
+                  reflectance=frame, transmission=OPEN),
+            rod((axle, 0, radius), (bar[0], 0, bar[1]), 0.04, reflectance=frame),
+            rod(crank, (0.85 * bar[0], 0, 0.8 * bar[1]), 0.05, reflectance=frame),
             rod((bar[0], -half_bar, bar[1]), (bar[0], half_bar, bar[1]), 0.018, reflectance=METAL)]
 
 
@@ -112,7 +116,7 @@ def parked_bicycle(rng: np.random.Generator) -> np.ndarray:
     """(P,) PART of a bicycle that stands, with a reflector that shines."""
     length = rng.uniform(1.6, 1.85)
     seat = (-0.15 * length, 0.92)
-    rows = [*_bicycle(length, 0.3, (0.22 * length, 1.02), seat, rng.uniform(0.05, 0.5)),
+    rows = [*_bicycle(length, 0.3, (0.22 * length, 1.02), rng.uniform(0.05, 0.5)),
             part(ELLIPSOID, (seat[0], 0, seat[1]), (0.13, 0.08, 0.05), reflectance=RUBBER),
             block((seat[0] - 0.4, -0.04, 0.68), (seat[0] - 0.38, 0.04, 0.74), reflectance=PLATE)]
     return parts(rows, BICYCLE)

@@ -21,8 +21,10 @@ from lidar_perception.simulation.shapes.thing import (
 from lidar_perception.simulation.solids import ELLIPSOID, part, parts
 
 CAR = 10
-PILLAR = 0.035  # radius, m
+PILLAR = 0.035   # radius, m
 LIGHTS = 0.9
+TAIL = 0.08      # m: so far before its end a tail is flat
+LEGS = 0.5       # m: from a bench to the front seats, at least
 
 
 class Style(NamedTuple):
@@ -58,7 +60,7 @@ def car(rng: np.random.Generator, driver: bool = True) -> Thing:
         style = (SEDAN, SEDAN, ESTATE)[rng.integers(3)]
     else:
         style = (HATCHBACK, HATCHBACK, HATCHBACK, ESTATE, SEDAN)[rng.integers(5)]
-    return rigid(body(size, style, paint(rng), rng.uniform(0.8, 0.92), driver), size, "Car")
+    return rigid(body(size, style, paint(rng), rng.uniform(0.6, 0.92), driver), size, "Car")
 
 
 def van(rng: np.random.Generator, driver: bool = True) -> Thing:
@@ -97,7 +99,7 @@ def body(size: tuple[float, float, float], style: Style, colour: float, glass: f
     rows = [
         block((rear, -0.98 * y, clear), (front, 0.98 * y, arch), reflectance=0.5 * colour),
         block((low, -0.97 * y, arch), (x - 0.25, 0.97 * y, bonnet), **shell),
-        block((0.15 - x, -0.97 * y, arch), (load, 0.97 * y, deck - 0.02), **shell),
+        block((TAIL - x, -0.93 * y, 1.7 * clear), (load, 0.93 * y, deck - 0.02), **shell),
         _nose(x, 0.97 * y, clear, bonnet, shell),
         _nose(-x, 0.97 * y, clear, belt, shell),
         block((roof, -narrow, height - 0.06), (high, narrow, height), **shell),
@@ -124,7 +126,7 @@ def body(size: tuple[float, float, float], style: Style, colour: float, glass: f
     rows += [  # plates in front and behind; the tail lights are the ends of a strip in the tail
         block((x - 0.02, -0.26, 0.28 * height), (x, 0.26, 0.28 * height + 0.11), reflectance=PLATE),
         block((-x, -0.26, 0.4 * height), (0.02 - x, 0.26, 0.4 * height + 0.11), reflectance=PLATE),
-        block((0.1 - x, -0.92 * y, 0.38 * height), (0.2 - x, 0.92 * y, 0.46 * height),
+        block((TAIL - 0.005 - x, -0.92 * y, 0.38 * height), (0.2 - x, 0.92 * y, 0.44 * height),
               reflectance=LIGHTS)]
     rows += _seats(0.5 * (low + high) - 0.75, load, 0.75 * y, arch, 0.45 * belt + 0.55 * top,
                    driver)
@@ -142,7 +144,7 @@ def _seats(x: float, rear: float, y: float, low: float, high: float, driver: boo
     Some beams end on none of them: what comes back through two panes is weak."""
     cloth = dict(reflectance=0.1, transmission=0.3)
     rows = [block((x - 0.08, -y, low), (x + 0.04, y, high), **cloth)]
-    if x - rear > 0.9:
+    if x - rear > LEGS:
         rows.append(block((rear + 0.1, -y, low), (rear + 0.25, y, high - 0.05), **cloth))
     if driver:
         rows.append(part(ELLIPSOID, (x + 0.18, y / 2 + 0.06, (low + high) / 2 + 0.05),
