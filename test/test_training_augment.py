@@ -38,7 +38,7 @@ seeds = st.integers(0, 2**32 - 1)
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
 STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
                       flip=0, turn=0, scale=0, beam_noise=0, range_noise=0, dropout=0, intensity=0,
-                      height=0)
+                      height=0, tilt=0)
 
 
 def random_scene(seed: int, around: bool = False) -> Scene:
@@ -107,11 +107,23 @@ def test_whole_scenes_move_as_one(seed):
 
 
 @few
+@given(seeds, st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
+def test_on_a_slope_everything_is_as_high_above_the_ground_as_before(seed, ahead, aside):
+    scene = random_scene(seed)
+    tilted = raised(scene, 0.3, (ahead, aside))
+    for before, after in ((scene.points, tilted.points), (scene.boxes, tilted.boxes)):
+        np.testing.assert_allclose(after[:, 2] - 0.3 - after[:, :2] @ [ahead, aside], before[:, 2],
+                                   atol=1e-5)
+        assert np.array_equal(np.delete(after, 2, axis=1), np.delete(before, 2, axis=1))
+
+
+@few
 @given(seeds, st.floats(-7, 7))
 def test_changes_are_undone_by_their_inverses(seed, angle):
     scene = random_scene(seed)
     for back in (flipped(flipped(scene)), turned(turned(scene, angle), -angle),
-                 scaled(scaled(scene, 1.25), 0.8), raised(raised(scene, 0.5), -0.5)):
+                 scaled(scaled(scene, 1.25), 0.8),
+                 raised(raised(scene, 0.5, (0.02, -0.01)), -0.5, (-0.02, 0.01))):
         np.testing.assert_allclose(back.points, scene.points, atol=1e-4)
         np.testing.assert_allclose(back.boxes[:, :6], scene.boxes[:, :6], atol=1e-9)
         np.testing.assert_allclose(wrap_angle(back.boxes[:, 6] - scene.boxes[:, 6]), 0, atol=1e-9)
@@ -292,11 +304,12 @@ def test_things_are_stretched_upon_their_floor(seed):
 @few
 @given(seeds, st.sampled_from([-1, 1]), st.sampled_from([-1, 1]))
 def test_nothing_that_may_come_into_view_is_cut_off(seed, larger, higher):
-    scene, params = random_scene(seed), AugmentParams(turn=0, scale=0.1, height=0.3)
+    scene, params = random_scene(seed), AugmentParams(turn=0, scale=0.1, height=0.3, tilt=0.1)
     low, high = np.array([0, -10, -1.8]), np.array([10.0, 10, 0.5])
 
     def changed(scene: Scene) -> Scene:
-        scene = raised(scaled(scene, 1 + larger * params.scale), higher * params.height)
+        scene = raised(scaled(scene, 1 + larger * params.scale), higher * params.height,
+                       (higher * params.tilt, -larger * params.tilt))
         return cropped(scene, low, high)
 
     part = faced(scene, params, low, high, np.random.default_rng(seed))

@@ -46,7 +46,7 @@ seeds = st.integers(0, 2**32 - 1)
 CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
 STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
                       flip=0, turn=0, scale=0, beam_noise=0, range_noise=0, dropout=0, intensity=0,
-                      height=0)
+                      height=0, tilt=0)
 SENSOR = "generic:8,-20,4,2,10"
 
 

@@ -5,6 +5,7 @@ Points in a box stay in it. A scene is a cloud with its boxes, in the frame of a
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -42,7 +43,8 @@ def augmented(scene: Scene, params: AugmentParams, rng: np.random.Generator) -> 
     scene = thinned(scene, rng.uniform(0, params.dropout), rng)
     scene = brightened(scene, 1 + rng.uniform(-params.intensity, params.intensity),
                        rng.uniform(-params.intensity, params.intensity) / 2)
-    return raised(scene, rng.uniform(-params.height, params.height))
+    return raised(scene, rng.uniform(-params.height, params.height),
+                  rng.uniform(-params.tilt, params.tilt, 2))
 
 
 def faced(scene: Scene, params: AugmentParams, low: np.ndarray, high: np.ndarray,
@@ -52,6 +54,7 @@ def faced(scene: Scene, params: AugmentParams, low: np.ndarray, high: np.ndarray
     turn = np.pi if scene.around and params.turn else params.turn
     scene = turned(scene, rng.uniform(-turn, turn))
     margin = 1 + params.height + params.scale / (1 - params.scale) * np.abs([low, high])
+    margin[:, 2] += 2 * params.tilt * np.abs([low[:2], high[:2]]).max()
     return cropped(scene, low - margin[0], high + margin[1])
 
 
@@ -122,11 +125,12 @@ def blurred(points: np.ndarray, beam: float, point: float, rng: np.random.Genera
     return moved
 
 
-def raised(scene: Scene, height: float) -> Scene:
-    """As from a sensor mounted lower by height, metres."""
+def raised(scene: Scene, height: float, slopes: Sequence[float] = (0.0, 0.0)) -> Scene:
+    """As from a sensor mounted lower by height, metres, on ground that rises by slopes, along x and
+    y. Boxes stay upright, so that points in a box stay in it if the slopes are 0."""
     points, boxes = scene.points.copy(), scene.boxes.copy()
-    points[:, 2] += np.float32(height)
-    boxes[:, 2] += height
+    points[:, 2] += (height + scene.points[:, :2] @ np.asarray(slopes)).astype(np.float32)
+    boxes[:, 2] += height + scene.boxes[:, :2] @ np.asarray(slopes)
     return replace(scene, points=points, boxes=boxes)
 
 

@@ -60,6 +60,8 @@ class LoopParams(Params):
 class AugmentParams(Params):
     """How scenes are changed. 0 switches a change off."""
 
+    crowded: float = param(0.7, "Chance that a scene gets objects of other scenes. The rest "
+                           "stay as empty as streets are.", low=0.0, high=1.0)
     cars: int = param(10, "Cars of other scenes are put in until there are so many where "
                       "the network looks.", low=0, high=100)
     pedestrians: int = param(8, "Likewise pedestrians.", low=0, high=100)
@@ -90,6 +92,8 @@ class AugmentParams(Params):
                              "raised or lowered by up to half of it.", low=0.0, high=1.0)
     height: float = param(0.1, "The sensor is raised or lowered by up to this.", unit="m", low=0.0,
                           high=2.0)
+    tilt: float = param(0.01, "The ground rises or falls ahead, and to the side, by up to this.",
+                        unit="m/m", low=0.0, high=0.3)
 
 
 @dataclass(frozen=True)

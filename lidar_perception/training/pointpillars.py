@@ -85,7 +85,7 @@ class Preparation:
         """InputError if the network would see no point."""
         low, high = np.array(self.config.low), np.array(self.config.high)
         scene = faced(scene, self.augment, low, high, rng)
-        if self._objects is not None:
+        if self._objects is not None and rng.random() < self.augment.crowded:
             scene = with_objects(scene, self._objects, self.augment, low, high, rng)
         scene = augmented(scene, self.augment, rng)
         frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
