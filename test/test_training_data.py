@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,7 @@ from lidar_perception.geometry import points_in_box
 from lidar_perception.simulation import drive
 from lidar_perception.training import scenes as scenes_module
 from lidar_perception.training.augment import Scene
+from lidar_perception.training.cut_objects import cut_objects
 from lidar_perception.training.data import Batches, Item, JudgedScenes, RawScenes, Stream
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pointpillars import (
@@ -212,6 +214,21 @@ def test_samples_hold_what_the_version_sees(version):
     from lidar_perception.detection.pointpillars import make_network
     total, parts = loss(make_network(config), [sample, sample])
     assert torch.isfinite(total) and set(parts) == {"classes", "boxes", "directions"}
+
+
+def test_a_share_of_the_scenes_gets_objects_of_others(tmp_path):
+    cut_objects([scene_of_two()], tiny().classes, 1).save(tmp_path / "objects.npz")
+    rng, alone = np.random.default_rng(0), scene_of_two()
+    alone = replace(alone, boxes=alone.boxes[:1], class_ids=alone.class_ids[:1],
+                    wanted=alone.wanted[:1])
+
+    def numbers(crowded: float) -> list[int]:
+        prepare = Preparation(tiny(), replace(STILL, pedestrians=1, crowded=crowded),
+                              database=tmp_path / "objects.npz")
+        return [len(prepare(alone, rng).labels) for _ in range(24)]
+
+    assert set(numbers(0.0)) == {1} and set(numbers(0.5)) == {1, 2}
+    assert sum(numbers(1.0)) > sum(numbers(0.0))
 
 
 def test_what_nobody_needs_to_find_is_neither_object_nor_background():
