@@ -99,8 +99,8 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
     with joined(chosen_device(device)) as place:
         database = None
         wanted = params.augment
-        if wanted.database_scans and (wanted.cars or wanted.pedestrians or wanted.cyclists
-                                      or wanted.things):
+        if wanted.database_scans and wanted.crowded and (
+                wanted.cars or wanted.pedestrians or wanted.cyclists or wanted.things):
             database = out / "objects.npz"
             if rank() == 0 and not (resume and database.is_file()):
                 raw = Stream(sources, None, params.seed)

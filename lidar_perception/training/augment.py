@@ -1,6 +1,7 @@
 """Changes of labelled scenes that a detector should not mind; pure, with the rng given.
 
-Points in a box stay in it. A scene is a cloud with its boxes, in the frame of a level sensor.
+But for noise and slopes, points in a box stay in it. A scene is a cloud with its boxes, in the
+frame of a level sensor.
 """
 
 from __future__ import annotations
