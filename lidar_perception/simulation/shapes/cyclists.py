@@ -23,8 +23,8 @@ from lidar_perception.simulation.solids import BOX, ELLIPSOID, part, parts
 
 BICYCLE, MOTORCYCLE, BICYCLIST = 11, 15, 31
 CRANK, GEAR = 0.17, 5.0  # metres: length of a crank, way for one turn of the cranks
-SPOKES = 0.5  # share of the beams that pass between the spokes
-OPEN = 0.6    # likewise between stays, chain and pedals, and through the rack
+SPOKES = 0.5            # share of the beams that pass between the spokes
+OPEN = 0.6              # likewise between stays, chain and pedals, and through the rack
 THIGH, SHANK = 0.26, 0.27  # lengths as shares of the rider's height, down to the pedal
 
 
@@ -54,7 +54,7 @@ def cyclist(rng: np.random.Generator) -> Thing:
 
 def riding(travelled: float, rider: Rider) -> np.ndarray:
     """(P,) PART of a rider after so many metres; the cranks turn, the wheels are discs that let
-    most beams pass."""
+    half of the beams pass."""
     length, width, height = rider.size
     seat = 0.53 * height
     trunk = (height - seat) / (0.31 * np.cos(rider.lean) + 0.16)  # the rider's height
