@@ -13,7 +13,7 @@ import numpy as np
 
 from lidar_perception.geometry import to_box_frame, wrap_angle
 from lidar_perception.rotated_iou import bev_iou
-from lidar_perception.training.params import AugmentParams
+from lidar_perception.training.params import AugmentParams, NoiseParams
 from lidar_perception.training.putting import TOUCH, inside
 
 STEP = np.radians(0.4)  # of elevation between two beams
@@ -38,8 +38,7 @@ def augmented(scene: Scene, params: AugmentParams, rng: np.random.Generator) -> 
     scene = with_moved_objects(scene, params.object_turn, params.object_shift, rng)
     if rng.random() < params.flip:
         scene = flipped(scene)
-    scene = replace(scene, points=blurred(scene.points, rng.uniform(0, params.beam_noise),
-                                          rng.uniform(0, params.range_noise), rng))
+    scene = replace(scene, points=noisy(scene.points, params, rng))
     scene = scaled(scene, 1 + rng.uniform(-params.scale, params.scale))
     scene = thinned(scene, rng.uniform(0, params.dropout), rng)
     scene = brightened(scene, 1 + rng.uniform(-params.intensity, params.intensity),
@@ -106,6 +105,12 @@ def brightened(scene: Scene, factor: float, offset: float) -> Scene:
     points = scene.points.copy()
     points[:, 3] = np.clip(points[:, 3] * factor + offset, 0, 1)
     return replace(scene, points=points)
+
+
+def noisy(points: np.ndarray, params: NoiseParams, rng: np.random.Generator) -> np.ndarray:
+    """Points (N, 4) blurred by up to what params say."""
+    return blurred(points, rng.uniform(0, params.beam_noise), rng.uniform(0, params.range_noise),
+                   rng)
 
 
 def blurred(points: np.ndarray, beam: float, point: float, rng: np.random.Generator) -> np.ndarray:

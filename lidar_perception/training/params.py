@@ -57,7 +57,17 @@ class LoopParams(Params):
 
 
 @dataclass(frozen=True)
-class AugmentParams(Params):
+class NoiseParams(Params):
+    """How far off the ranges are."""
+
+    beam_noise: float = param(0.08, "The ranges of each beam are off by up to about this; standard "
+                              "deviation.", unit="m", low=0.0, high=1.0)
+    range_noise: float = param(0.08, "Likewise the range of each point.", unit="m", low=0.0,
+                               high=1.0)
+
+
+@dataclass(frozen=True)
+class AugmentParams(NoiseParams):
     """How scenes are changed. 0 switches a change off."""
 
     crowded: float = param(0.7, "Chance that a scene gets objects of other scenes. The rest "
@@ -83,10 +93,6 @@ class AugmentParams(Params):
                         "labelled all around by anything, unless this is 0.", unit="rad", low=0.0,
                         high=3.1416)
     scale: float = param(0.05, "The scene grows or shrinks by up to this share.", low=0.0, high=0.5)
-    beam_noise: float = param(0.08, "The ranges of each beam are off by up to about this; standard "
-                              "deviation.", unit="m", low=0.0, high=1.0)
-    range_noise: float = param(0.08, "Likewise the range of each point.", unit="m", low=0.0,
-                               high=1.0)
     dropout: float = param(0.3, "Up to this share of the points is left out.", low=0.0, high=0.99)
     intensity: float = param(0.15, "Intensities are multiplied by 1 plus or minus up to this, and "
                              "raised or lowered by up to half of it.", low=0.0, high=1.0)
@@ -142,7 +148,7 @@ class PointPillarsTraining(LoopParams):
 
 
 @dataclass(frozen=True)
-class ClusterAugmentParams(Params):
+class ClusterAugmentParams(NoiseParams):
     """Which clusters of a scene are learned from, and how they are changed. 0 switches a change
     off."""
 
@@ -154,10 +160,6 @@ class ClusterAugmentParams(Params):
                            "range, and lose points as they would.", low=0.0, high=10.0)
     dropout: float = param(0.9, "Of half the clusters up to this share of the points is left out.",
                            low=0.0, high=0.99)
-    beam_noise: float = param(0.08, "The ranges of each beam are off by up to about this; standard "
-                              "deviation.", unit="m", low=0.0, high=1.0)
-    range_noise: float = param(0.08, "Likewise the range of each point.", unit="m", low=0.0,
-                               high=1.0)
     scale: float = param(0.05, "Clusters grow or shrink by up to this share.", low=0.0, high=0.5)
     flip: float = param(0.5, "Chance that left and right are swapped.", low=0.0, high=1.0)
     intensity: float = param(0.2, "Intensities are multiplied by 1 plus or minus up to this.",

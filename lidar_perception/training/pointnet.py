@@ -22,7 +22,7 @@ from lidar_perception.pointnet.clusters import ClusterInput, Clusters, network_i
 from lidar_perception.pointnet.config import PointNetConfig
 from lidar_perception.pointnet.network import PointNet, make_pointnet
 from lidar_perception.pointnet.predict import found, outputs_of, predict
-from lidar_perception.training.augment import blurred
+from lidar_perception.training.augment import noisy
 from lidar_perception.training.cut_scenes import CutScene, CutScenes
 from lidar_perception.training.data import Batches, JudgedScenes, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
@@ -117,8 +117,7 @@ def changed(clusters: Clusters, boxes: np.ndarray, loose: np.ndarray,
     if rng.random() < params.flip:
         points[:, 1] *= -1
         boxes[:, [1, 6]] *= -1
-    points = blurred(points, rng.uniform(0, params.beam_noise), rng.uniform(0, params.range_noise),
-                     rng)
+    points = noisy(points, params, rng)
     gain = rng.uniform(1 - params.intensity, 1 + params.intensity)
     points[:, 3] = np.clip(points[:, 3] * gain, 0, 1)
     sizes = np.bincount(number[keep], minlength=count)
