@@ -10,13 +10,13 @@ from click.testing import CliRunner
 from samples import object_folder, walker_label, write
 
 from lidar_perception.cli.main import cli
-from lidar_perception.cli.train import training_scenes
 from lidar_perception.detection import config as config_module
 from lidar_perception.detection.checkpoint import read_header
 from lidar_perception.detection.detector import load_detector
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.params import PAPER_SHARE, DataParams, PointPillarsTraining
+from lidar_perception.training.sources import training_scenes
 from lidar_perception.types import InputError
 
 pytestmark = pytest.mark.usefixtures("one_thread")

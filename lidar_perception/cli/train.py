@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Sized
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,16 +13,13 @@ import click
 from lidar_perception import __version__
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.terminal import console
-from lidar_perception.training.params import DataParams, PointNetTraining, PointPillarsTraining
-from lidar_perception.types import InputError
+from lidar_perception.training.params import PointNetTraining, PointPillarsTraining
 
 if TYPE_CHECKING:
     from lidar_perception.training.data import Batches
     from lidar_perception.training.run import Progress
 
-SIM = "sim"
 PAPER_ABLATION = (75.52, 80.15, 81.33, 83.44, 85.10, 86.33, 86.89, 88.96)  # paper C, Table 5
-FIRST_STREET, FIRST_VALIDATION_STREET = 10_000_000, 20_000_000  # far from what anybody else takes
 
 SCENES_AND_RUN = (
     click.option("--data", multiple=True, required=True, metavar="DIR|sim",
@@ -93,6 +89,7 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
         narrowed,
     )
     from lidar_perception.training.ranks import joined, rank, wait, world
+    from lidar_perception.training.sources import about_data, training_scenes
     may_begin(out, resume)
     config = network_config(params.version, params.size)
     sources, held_out = training_scenes(data, val, split, val_split, params.data, params.seed)
@@ -145,6 +142,7 @@ def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
     from lidar_perception.devices import chosen_device
     from lidar_perception.pointnet.config import ABLATIONS
     from lidar_perception.training.ranks import joined, rank
+    from lidar_perception.training.sources import training_scenes
     scenes = training_scenes(data, val, split, val_split, params.data, params.seed)
     with joined(chosen_device(device)) as place:
         for name in ABLATIONS if ablation else (params.network,):
@@ -167,6 +165,7 @@ def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[
     from lidar_perception.training.loop import train as run
     from lidar_perception.training.pointnet import ClusterPreparation, judged_clusters, make_task
     from lidar_perception.training.ranks import rank, world
+    from lidar_perception.training.sources import about_data
     may_begin(out, resume)
     config = pointnet_config(params.network)
     cache = Path(params.data.cache) / "clusters" if params.data.cache else None
@@ -175,8 +174,7 @@ def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[
     stream = Stream(sources, ClusterPreparation(config, params.augment), params.seed)
     batches = Batches(stream, params.batch, jobs, rank(), world())
     task = make_task(config, params, batches, JudgedScenes(held_out, judged_clusters), out,
-                     place,
-                     about_data(data, val, stream, held_out, init), commit(), init)
+                     place, about_data(data, val, stream, held_out, init), commit(), init)
     progress = run(task, params, out, place, resume)
     if rank() == 0:
         tell(progress, batches, out)
@@ -199,13 +197,6 @@ def print_ablation(out: Path) -> None:
     console.print(table)
 
 
-def about_data(data: tuple[str, ...], val: tuple[str, ...], stream: Sized,
-               held_out: tuple[Sized, ...], init: Path | None) -> dict[str, Any]:
-    """What a header says of the scenes."""
-    return {"data": list(data), "scenes": len(stream), "validation": list(val) or "held out",
-            "validation_scenes": sum(map(len, held_out)), "init": str(init or "")}
-
-
 def tell(progress: Progress, batches: Batches, out: Path) -> None:
     """Say how a run ended; a stopped one ends the process."""
     if batches.skipped:
@@ -219,53 +210,6 @@ def tell(progress: Progress, batches: Batches, out: Path) -> None:
     if progress.stopped:
         console.print(f"stopped at step {progress.step}; --resume goes on", soft_wrap=True)
         sys.exit(130)
-
-
-def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
-                    val_split: Path | None, settings: DataParams,
-                    seed: int) -> tuple[tuple, tuple]:
-    """Sources to train on and to validate on. InputError for what is not there, or an option that
-    would not be used."""
-    from lidar_perception.training.scenes import KittiScenes, kitti_names, random_split
-    folders = [Path(name) for name in data if name != SIM]
-    val_folders = [Path(name) for name in val if name != SIM] or ([] if val else folders)
-    if split is not None and len(folders) != 1:
-        raise InputError("--split names frames of one KITTI folder in --data; give one")
-    if val_split is not None and len(val_folders) != 1:
-        raise InputError("--val-split names frames of one KITTI folder; give one in --val")
-    train_on, judge_on = [], []
-    for folder in folders:
-        names, held = kitti_names(folder, split), ()
-        if val_split is not None and folder in val_folders:
-            held = kitti_names(folder, val_split)
-            names = tuple(name for name in names if name not in set(held))
-        elif not val:
-            names, held = random_split(names, settings.val_share, seed)
-        if not names:
-            raise InputError(f"{folder}: no frame is left to train on")
-        train_on.append(KittiScenes(folder, names, settings.view))
-        if held:
-            judge_on.append(KittiScenes(folder, held, settings.view))
-    for folder in val_folders if val else ():
-        if folder not in folders or val_split is None:
-            judge_on.append(KittiScenes(folder, kitti_names(folder, val_split), settings.view))
-    if SIM in data:
-        train_on.append(_streets(FIRST_STREET, settings.scans, settings.people, settings,
-                                 settings.street_scans))
-    if SIM in (val or data):
-        judge_on.append(_streets(FIRST_VALIDATION_STREET, settings.val_scans, settings.val_people,
-                                 settings))
-    return tuple(train_on), tuple(judge_on)
-
-
-def _streets(first: int, scans: int, people: float, settings: DataParams, per_street: int = 1):
-    from lidar_perception.simulation.scene import Streets
-    from lidar_perception.simulation.sensor import sensor_named
-    from lidar_perception.training.scenes import SimulatedScenes
-    sensor_named(settings.sensor)  # InputError here, not in a worker
-    return SimulatedScenes(first, scans, settings.sensor, Streets(people=people),
-                           Path(settings.cache) if settings.cache else None, settings.cache_gb,
-                           per_street)
 
 
 def commit() -> str:

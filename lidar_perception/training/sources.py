@@ -1,0 +1,71 @@
+"""Which scenes a network is trained on and which it is validated on."""
+
+from __future__ import annotations
+
+from collections.abc import Sized
+from pathlib import Path
+from typing import Any
+
+from lidar_perception.simulation.scene import Streets
+from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.training.params import DataParams
+from lidar_perception.training.scenes import (
+    KittiScenes,
+    SimulatedScenes,
+    kitti_names,
+    random_split,
+)
+from lidar_perception.types import InputError
+
+SIM = "sim"  # the name of simulated streets where a folder could stand
+FIRST_STREET, FIRST_VALIDATION_STREET = 10_000_000, 20_000_000  # far from what anybody else takes
+
+
+def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
+                    val_split: Path | None, settings: DataParams,
+                    seed: int) -> tuple[tuple, tuple]:
+    """Sources to train on and to validate on. InputError for what is not there, or an option that
+    would not be used."""
+    folders = [Path(name) for name in data if name != SIM]
+    val_folders = [Path(name) for name in val if name != SIM] or ([] if val else folders)
+    if split is not None and len(folders) != 1:
+        raise InputError("--split names frames of one KITTI folder in --data; give one")
+    if val_split is not None and len(val_folders) != 1:
+        raise InputError("--val-split names frames of one KITTI folder; give one in --val")
+    train_on, judge_on = [], []
+    for folder in folders:
+        names, held = kitti_names(folder, split), ()
+        if val_split is not None and folder in val_folders:
+            held = kitti_names(folder, val_split)
+            names = tuple(name for name in names if name not in set(held))
+        elif not val:
+            names, held = random_split(names, settings.val_share, seed)
+        if not names:
+            raise InputError(f"{folder}: no frame is left to train on")
+        train_on.append(KittiScenes(folder, names, settings.view))
+        if held:
+            judge_on.append(KittiScenes(folder, held, settings.view))
+    for folder in val_folders if val else ():
+        if folder not in folders or val_split is None:
+            judge_on.append(KittiScenes(folder, kitti_names(folder, val_split), settings.view))
+    if SIM in data:
+        train_on.append(_streets(FIRST_STREET, settings.scans, settings.people, settings,
+                                 settings.street_scans))
+    if SIM in (val or data):
+        judge_on.append(_streets(FIRST_VALIDATION_STREET, settings.val_scans, settings.val_people,
+                                 settings))
+    return tuple(train_on), tuple(judge_on)
+
+
+def _streets(first: int, scans: int, people: float, settings: DataParams, per_street: int = 1):
+    sensor_named(settings.sensor)  # InputError here, not in a worker
+    return SimulatedScenes(first, scans, settings.sensor, Streets(people=people),
+                           Path(settings.cache) if settings.cache else None, settings.cache_gb,
+                           per_street)
+
+
+def about_data(data: tuple[str, ...], val: tuple[str, ...], stream: Sized,
+               held_out: tuple[Sized, ...], init: Path | None) -> dict[str, Any]:
+    """What a header says of the scenes."""
+    return {"data": list(data), "scenes": len(stream), "validation": list(val) or "held out",
+            "validation_scenes": sum(map(len, held_out)), "init": str(init or "")}
