@@ -123,12 +123,13 @@ def lay_out(rng: np.random.Generator, kind: Kind, seconds: float) -> Street:
     lanes, right, left = _lanes(rng, kind, speed, parking)
     walk, crossings = rng.uniform(*kind.walk), _crossings(rng, kind, start, end)
     # Slopes of 27 scans of KITTI: 0.67 +- 0.2 degrees ahead (the sensor's own pitch), +- 0.45
-    # aside. Wave, camber, roughness and reflectances are guesses.
+    # aside. Heights of grass and litter are such that cells of 1 m scatter about their planes as
+    # within 20 m ahead of KITTI's car. Wave, camber and reflectances are guesses.
     ground = Ground(*np.tan(np.radians(rng.normal((0.6, 0.05), (0.25, 0.4)))),
                     wave=rng.uniform(0.03, 0.16), wavelength=rng.uniform(25, 60),
                     camber=rng.uniform(0.01, 0.035), curb_left=left, curb_right=right,
                     curb_height=kind.curb * rng.uniform(0.6, 1.2), walk=walk, crossings=crossings,
-                    parking=parking, rough=rng.uniform(0.03, 0.12),
+                    parking=parking, rough=rng.uniform(0.1, 0.4), litter=rng.uniform(0.0, 0.3),
                     road=rng.uniform(0.23, 0.38), sidewalk=rng.uniform(0.33, 0.48),
                     grass=rng.uniform(0.3, 0.4))
     names, weights = list(kind.fronts), list(kind.fronts.values())

@@ -17,6 +17,7 @@ from lidar_perception.simulation.hashing import uniform
 
 ROAD, PARKING, SIDEWALK, GRASS = 40, 44, 48, 72  # SemanticKITTI
 GRAIN = 0.25  # m between the bumps of a rough surface
+PATCH = 10    # bumps from one rough patch to the next
 
 
 class Ground(NamedTuple):
@@ -34,7 +35,8 @@ class Ground(NamedTuple):
     walk: float = 1e9         # width of the sidewalk beyond each curb; grass beyond
     crossings: tuple[tuple[float, float], ...] = ()  # x intervals of side streets, without a curb
     parking: float = 0.0      # width of the parking strip inside each curb
-    rough: float = 0.0        # height of the tufts of grass; a tenth of it on all else
+    rough: float = 0.0        # height of the tufts of grass; a tenth of it on the road
+    litter: float = 0.0       # height of what lies and grows on sidewalks and parking strips
     road: float = 0.3         # reflectances
     sidewalk: float = 0.4
     grass: float = 0.35
@@ -87,8 +89,10 @@ def cast_ground(ground: Ground, start: torch.Tensor, way: torch.Tensor, max_rang
     _, slope_x, slope_y = _relief(ground, x, y)
     cosine = (slope_x * way[0] + slope_y * way[1] - way[2]).clip(1e-3, 1.0)
     semantic, reflectance = _surface(ground, x, y, edge > 0)
-    if ground.rough:
-        height = ground.rough * torch.where(semantic == GRASS, 1.0, 0.1) * _bumps(x, y)
+    if ground.rough or ground.litter:
+        height = torch.where(semantic == GRASS, ground.rough, torch.where(
+            semantic == ROAD, 0.1 * ground.rough, ground.litter))
+        height = height * _bumps(x, y) * 2 * _bumps(x / PATCH, y / PATCH)
         # Tufts hide each other: a grazing ray meets one of those in its last metre.
         t = t - torch.where(edge > 0, 0.0, (height / cosine).clip(max=1.0))
     cosine = torch.where(edge > 0, edge, cosine)
