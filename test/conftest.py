@@ -6,12 +6,16 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 from lidar_perception.nodes.main import use_large_shared_memory
 
 FRAMES = 8
 os.environ.pop("COLUMNS", None)  # pytest-xdist sets 80 for its workers; some tests set their own
 use_large_shared_memory()  # Fast DDS reads its profile once: before any test that imports rclpy
+
+settings.register_profile("any machine", deadline=None)  # no test measures time
+settings.load_profile("any machine")
 
 
 @pytest.fixture(scope="session")

@@ -35,8 +35,8 @@ class Ground(NamedTuple):
     walk: float = 1e9         # width of the sidewalk beyond each curb; grass beyond
     crossings: tuple[tuple[float, float], ...] = ()  # x intervals of side streets, without a curb
     parking: float = 0.0      # width of the parking strip inside each curb
-    rough: float = 0.0        # height of the tufts of grass; a tenth of it on the road
-    litter: float = 0.0       # height of what lies and grows on sidewalks and parking strips
+    rough: float = 0.0        # greatest height of tufts of grass; a tenth of it on the road
+    litter: float = 0.0       # likewise of what lies and grows on sidewalks and parking strips
     road: float = 0.3         # reflectances
     sidewalk: float = 0.4
     grass: float = 0.35
@@ -92,7 +92,7 @@ def cast_ground(ground: Ground, start: torch.Tensor, way: torch.Tensor, max_rang
     if ground.rough or ground.litter:
         height = torch.where(semantic == GRASS, ground.rough, torch.where(
             semantic == ROAD, 0.1 * ground.rough, ground.litter))
-        height = height * _bumps(x, y) * 2 * _bumps(x / PATCH, y / PATCH)
+        height = height * _bumps(x, y) * _bumps(x / PATCH, y / PATCH)
         # Tufts hide each other: a grazing ray meets one of those in its last metre.
         t = t - torch.where(edge > 0, 0.0, (height / cosine).clip(max=1.0))
     cosine = torch.where(edge > 0, edge, cosine)
