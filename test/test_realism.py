@@ -52,9 +52,10 @@ LIGHT = [name for name in CURVES if "intensity" in name]
 def recorded(seed: int, points: int = 500) -> Recorded:
     """A street all around, and objects full of points."""
     rng = np.random.default_rng(seed)
-    reach, turn = rng.uniform(3, 70, 9000), rng.uniform(-np.pi, np.pi, 9000)
+    reach, turn = rng.uniform(3, 70, 12000), rng.uniform(-np.pi, np.pi, 12000)
+    reach[:3000] = rng.uniform(3, 9, 3000)  # so dense that cells of the ground have enough
     parts = [np.column_stack([reach * np.cos(turn), reach * np.sin(turn),
-                              rng.normal(FEET, 0.01, 9000)])]
+                              rng.normal(FEET, 0.01, 12000)])]
     boxes, ids = [], []
     for name, places in PLACES.items():
         for x, y in places:

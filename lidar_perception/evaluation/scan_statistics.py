@@ -16,6 +16,7 @@ from lidar_perception.candidates.boxes import height_matches
 from lidar_perception.candidates.refine import STAGES
 from lidar_perception.datasets.recording import Recorded
 from lidar_perception.evaluation.matching import RANGE_NAMES
+from lidar_perception.evaluation.roughness import roughness
 from lidar_perception.geometry import box_corners, horizontal_range, points_in_box, to_box_frame
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.params import GroundParams, PipelineParams
@@ -34,6 +35,8 @@ ELEVATIONS = np.arange(-26.0, 4.1, 2.0)
 QUANTILES = (5, 25, 50, 75, 95)
 INTENSITIES = np.arange(20) * 0.05 - 0.005  # between the steps of KITTI's reflectance
 INTENSITY_STEP = 0.01
+ROUGH_STEP = 0.002        # metres
+BELT = 0.65               # of an object's height; above it a car has windows
 SCORES = {"precision": ("tp", "fp"), "recall": ("tp", "fn"), "f1": ("tp", "fp", "fn")}
 
 
@@ -64,6 +67,7 @@ CURVES = {
     "elevation": Curve("points", tuple(f"{a:g}..{a + 2:g}" for a in ELEVATIONS[:-1]),
                        "elevation [deg]", log=True),
     "ground share": Curve("share of points on the ground", _BY_RANGE),
+    "roughness": Curve("scatter about the ground of 1 m2, 75 % [m]", _BY_RANGE, step=ROUGH_STEP),
     "neighbour": Curve("distance to the nearest point [m]", _BY_RANGE),
     "clusters": Curve("clusters", _BY_RANGE),
     "person clusters": Curve("clusters as high as a person", _BY_RANGE),
@@ -77,7 +81,7 @@ CURVES = {
        for name in CLASSES for what, title in (
            ("points", "points, not occluded"), ("points of all", "points, all"),
            ("height", "height seen / box"), ("length", "length seen / box"),
-           ("width", "width seen / box"))},
+           ("width", "width seen / box"), ("above", "points above 0.65 of the height"))},
     **{f"{stage} {score}": Curve(f"paper A, {stage}: {score}", (*RANGE_NAMES, "all"))
        for stage in STAGES for score in SCORES},
 }
@@ -105,6 +109,7 @@ def scan_rows(frame: LidarFrame, params: PipelineParams = PipelineParams()) -> d
             "elevation": np.histogram(elevation, ELEVATIONS)[0],
             "ground share": np.where(count >= LEAST_IN_BIN, on_ground / np.maximum(count, 1),
                                      np.nan),
+            "roughness": roughness(xyz, RANGES),
             "neighbour": _neighbours(xyz, where),
             "clusters": np.bincount(at, minlength=bins),
             "person clusters": np.bincount(at[person], minlength=bins)}
@@ -132,8 +137,9 @@ def object_rows(recorded: Recorded) -> dict:
         if truth.extras[i].get("occluded", 0) == 0:
             values |= {"points": len(inside), "density": len(inside) / square_degrees(box)}
             if len(inside) >= LEAST_POINTS:
-                seen = np.ptp(to_box_frame(frame.xyz[inside].astype(float), box), axis=0)
-                values |= dict(zip(("length", "width", "height"), seen / box[3:6]))
+                own = to_box_frame(frame.xyz[inside].astype(float), box) / box[3:6]
+                values |= dict(zip(("length", "width", "height"), np.ptp(own, axis=0)))
+                values["above"] = (own[:, 2] > BELT - 0.5).mean()
         new = {f"{name} {what}": np.where(np.arange(bins) == place, value, np.nan)
                for what, value in values.items()}
         if frame.intensity is not None and len(inside) >= LEAST_POINTS:

@@ -77,7 +77,7 @@ def van(rng: np.random.Generator, driver: bool = True) -> Thing:
 
 def paint(rng: np.random.Generator) -> float:
     """The reflectance of a coat of paint. Half of all points on KITTI's cars are below 0.03 and a
-    tenth is above 0.4: dark paint throws the beam away."""
+    tenth is above 0.4: dark paint throws the beam away. Yet dark cars are seen at 40 m."""
     dark, middle, light = (0.02, 0.05), (0.04, 0.35), (0.35, 0.85)
     return float(rng.uniform(*(dark, middle, light)[rng.choice(3, p=(0.5, 0.25, 0.25))]))
 
