@@ -129,9 +129,10 @@ def lay_out(rng: np.random.Generator, kind: Kind, seconds: float) -> Street:
                     wave=rng.uniform(0.03, 0.16), wavelength=rng.uniform(25, 60),
                     camber=rng.uniform(0.01, 0.035), curb_left=left, curb_right=right,
                     curb_height=kind.curb * rng.uniform(0.6, 1.2), walk=walk, crossings=crossings,
-                    parking=parking, rough=rng.uniform(0.2, 0.8), litter=rng.uniform(0.0, 0.6),
+                    parking=parking, rough=rng.uniform(0.2, 0.8),
                     road=rng.uniform(0.23, 0.38), sidewalk=rng.uniform(0.33, 0.48),
                     grass=rng.uniform(0.3, 0.4))
+    ground = ground._replace(litter=ground.rough - 0.2)  # where grass is high, nobody sweeps
     names, weights = list(kind.fronts), list(kind.fronts.values())
     fronts = rng.choice(names, 2, p=weights)
     edges = [start, *np.ravel(crossings), end]

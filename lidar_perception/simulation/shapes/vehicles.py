@@ -71,8 +71,7 @@ def van(rng: np.random.Generator, driver: bool = True) -> Thing:
     size = draw_size(rng, "Van")
     style = PANEL_VAN if rng.random() < 0.6 else MINIBUS
     coat = max(paint(rng), paint(rng))
-    return rigid(_mottled(body(size, style, coat, rng.uniform(0.6, 0.9), driver), rng),
-                 size, "Van")
+    return rigid(_mottled(body(size, style, coat, rng.uniform(0.6, 0.9), driver), rng), size, "Van")
 
 
 def paint(rng: np.random.Generator) -> float:
@@ -83,8 +82,9 @@ def paint(rng: np.random.Generator) -> float:
 
 
 def _mottled(solids: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The same with parts brighter and darker than others, as lacquer on KITTI's cars is."""
-    factor = rng.lognormal(0.0, MOTTLE, len(solids))
+    """The same with parts brighter and darker than others, as lacquer on KITTI's cars is. Nothing
+    is drawn from rng itself: streets stay as they are, whatever their cars are made of."""
+    factor = rng.spawn(1)[0].lognormal(0.0, MOTTLE, len(solids))
     solids["reflectance"] = np.minimum(solids["reflectance"] * factor, 1.0)
     return solids
 
