@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from lidar_perception.candidates.accumulation import Accumulated, accumulate, aligned, velocities
 
-few = settings(deadline=None, max_examples=30, database=None)
+few = settings(max_examples=30, database=None)
 AGES = np.array([0.4, 0.3, 0.2, 0.1, 0.0])
 
 

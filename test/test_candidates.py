@@ -24,7 +24,7 @@ from lidar_perception.pipeline import (
 )
 from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
 
-few = settings(deadline=None, max_examples=40, database=None)
+few = settings(max_examples=40, database=None)
 seeds = st.integers(0, 2**32 - 1)
 
 

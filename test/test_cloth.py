@@ -23,7 +23,7 @@ from lidar_perception.ground.cloth import lay_cloth, segment_by_cloth
 from lidar_perception.ground.obstacle import at_rest
 from lidar_perception.params import ClothParams
 
-few = settings(deadline=None, max_examples=25, database=None)
+few = settings(max_examples=25, database=None)
 
 
 def obstacles(seed, rows=24, columns=40, seen=0.6):

@@ -19,7 +19,7 @@ from lidar_perception.ground.threshold import segment_by_threshold
 from lidar_perception.params import DbscanParams
 
 SCANS = DATA / "kitti_object/training/velodyne_reduced"
-few = settings(deadline=None, max_examples=40, database=None)
+few = settings(max_examples=40, database=None)
 
 
 def reference(xyz, eps, min_samples):
@@ -322,7 +322,7 @@ def test_two_dense_places_within_eps_are_one_cluster_however_many_points():
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 300),
        scale=st.sampled_from([0.3, 1.0, 4.0]), eps=st.sampled_from([0.1, 0.25, 0.5]),
        min_samples=st.integers(1, 12))
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=100)
 def test_by_cells_and_by_pairs_the_labels_are_scikit_learns(seed, n, scale, eps, min_samples):
     rng = np.random.default_rng(seed)
     xyz = (rng.random((n, 3)) * scale).astype(np.float32)

@@ -35,7 +35,7 @@ from lidar_perception.params import PipelineParams, StmParams, with_values
 from lidar_perception.pipeline import automatic_seed, refined, segment, truth_seed
 from lidar_perception.types import PEDESTRIAN, LidarFrame
 
-few = settings(deadline=None, max_examples=30, database=None)
+few = settings(max_examples=30, database=None)
 seeds = st.integers(0, 2**32 - 1)
 METRIC = with_values(PipelineParams(), {"stm.window": "metric", "stm.spread": True,
                                         "stm.dilations": 0})

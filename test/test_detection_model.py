@@ -27,7 +27,7 @@ from lidar_perception.detection.targets import assign
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import InputError
 
-few = settings(deadline=None, max_examples=25, database=None)
+few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 pytestmark = pytest.mark.usefixtures("one_thread")
 each_version = pytest.mark.parametrize("version", VERSIONS)

@@ -27,7 +27,7 @@ from lidar_perception.evaluation.kitti_protocol import (
 from lidar_perception.evaluation.matching import match_centres
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
 
-few = settings(deadline=None, max_examples=15, database=None)
+few = settings(max_examples=15, database=None)
 seeds = st.integers(0, 2**32 - 1)
 
 

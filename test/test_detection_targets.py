@@ -26,7 +26,7 @@ from lidar_perception.detection.targets import (
     stacked,
 )
 
-few = settings(deadline=None, max_examples=25, database=None)
+few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 pytestmark = pytest.mark.usefixtures("one_thread")
 

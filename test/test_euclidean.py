@@ -75,7 +75,7 @@ def test_scenes_give_the_labels_of_the_plain_reading(seed, params):
     assert labels.max() > 3 and ((labels == 0).any() or params.beta == 0)  # it says something
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=150)
 @given(st.data())
 def test_any_cloud_gives_the_labels_of_the_plain_reading(data):
     """Coordinates on a coarse lattice: equal distances and thresholds met exactly are common."""

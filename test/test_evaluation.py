@@ -20,7 +20,7 @@ from lidar_perception.evaluation.matching import (
 from lidar_perception.params import PipelineParams, SeedParams
 from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, InputError, LidarFrame
 
-few = settings(deadline=None, max_examples=60, database=None)
+few = settings(max_examples=60, database=None)
 seeds = st.integers(0, 2**32 - 1)
 small = st.integers(0, 5)
 

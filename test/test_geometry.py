@@ -18,7 +18,7 @@ from lidar_perception.geometry import (
 )
 from lidar_perception.types import MAX_RANGE, LidarFrame, usable_returns
 
-few = settings(deadline=None, max_examples=80, database=None)
+few = settings(max_examples=80, database=None)
 seeds = st.integers(0, 2**32 - 1)
 angles = st.floats(-50, 50)
 places = st.floats(-80, 80)

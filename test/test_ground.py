@@ -20,7 +20,7 @@ from lidar_perception.ground.threshold import (
 from lidar_perception.params import ThresholdParams
 
 SCANS = DATA / "kitti_object/training/velodyne"
-few = settings(deadline=None, max_examples=30, database=None)
+few = settings(max_examples=30, database=None)
 slopes = st.floats(-0.15, 0.15)
 
 

@@ -119,7 +119,7 @@ def test_the_global_pose_takes_boxes_of_a_frame_to_the_labels(root):
 angles = st.floats(-3.1, 3.1)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), angles, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
 def test_to_the_global_frame_and_back(seed, yaw, pitch, roll):
     rng = np.random.default_rng(seed)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lidar_perception.reproduction.params import BootstrapParams
 from lidar_perception.reproduction.statistics import bootstrap, cells, known, rates, ratio, stack
 
-few = settings(deadline=None, max_examples=25, database=None)
+few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 
 

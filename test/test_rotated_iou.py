@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lidar_perception.geometry import box_corners
 from lidar_perception.rotated_iou import bev_and_3d_iou, bev_iou, iou_3d
 
-few = settings(deadline=None, max_examples=60, database=None)
+few = settings(max_examples=60, database=None)
 seeds = st.integers(0, 2**32 - 1)
 QUARTER = np.pi / 2
 

@@ -23,7 +23,7 @@ from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.geometry import points_in_box
 from lidar_perception.types import InputError
 
-few = settings(deadline=None, max_examples=40, database=None)
+few = settings(max_examples=40, database=None)
 seeds = st.integers(0, 2**32 - 1)
 
 

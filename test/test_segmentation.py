@@ -31,7 +31,7 @@ from lidar_perception.evaluation.segmentation_report import PUBLISHED
 from lidar_perception.params import CLUSTERING_METHODS, GROUND_METHODS
 from lidar_perception.types import CLASSES, GroundTruth, InputError
 
-few = settings(deadline=None, max_examples=60, database=None)
+few = settings(max_examples=60, database=None)
 seeds = st.integers(0, 2**32 - 1)
 CAR, VAN, TRUCK = (CLASSES.index(name) for name in ("Car", "Van", "Truck"))
 

@@ -16,7 +16,7 @@ from lidar_perception.geometry import box_corners, points_in_box
 from lidar_perception.params import BOX_SHAPES
 from lidar_perception.types import CLASSES
 
-few = settings(deadline=None, max_examples=40, database=None)
+few = settings(max_examples=40, database=None)
 seeds = st.integers(0, 2**32 - 1)
 QUARTER = np.float32(np.pi / 2)  # of a turn
 each_shape = pytest.mark.parametrize("shape", BOX_SHAPES)

@@ -22,7 +22,7 @@ from lidar_perception.pipeline import segment
 from lidar_perception.types import LidarFrame
 
 SCANS = DATA / "kitti_object/training/velodyne_reduced"
-few = settings(deadline=None, max_examples=40, database=None)
+few = settings(max_examples=40, database=None)
 seeds = st.integers(0, 2**32 - 1)
 PLAIN = np.ones((1, 1))
 

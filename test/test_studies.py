@@ -24,7 +24,7 @@ from lidar_perception.reproduction.studies.density import thinned
 from lidar_perception.reproduction.variants import Found, best_f1, score
 from lidar_perception.types import InputError
 
-few = settings(deadline=None, max_examples=30, database=None)
+few = settings(max_examples=30, database=None)
 COUNT = 4
 
 

@@ -24,7 +24,7 @@ from lidar_perception.training.run import Run, Task
 from lidar_perception.training.schedule import Average, one_cycle
 from lidar_perception.types import InputError
 
-few = settings(deadline=None, max_examples=25, database=None)
+few = settings(max_examples=25, database=None)
 CPU = torch.device("cpu")
 PARAMS = LoopParams(steps=13, validate_steps=4, save_steps=3, log_steps=1, seed=3, lr=0.05)
 

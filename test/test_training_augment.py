@@ -33,7 +33,7 @@ from lidar_perception.training.putting import inside
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 
 AREA = np.array([0.0, -15, -3]), np.array([20.0, 15, 1])
-few = settings(deadline=None, max_examples=25, database=None)
+few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
 STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,

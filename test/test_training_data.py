@@ -43,7 +43,7 @@ from lidar_perception.training.scenes import (
 )
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError
 
-few = settings(deadline=None, max_examples=25, database=None)
+few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
 STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,

@@ -124,7 +124,8 @@ def lay_out(rng: np.random.Generator, kind: Kind, seconds: float) -> Street:
     walk, crossings = rng.uniform(*kind.walk), _crossings(rng, kind, start, end)
     # Slopes of 27 scans of KITTI: 0.67 +- 0.2 degrees ahead (the sensor's own pitch), +- 0.45
     # aside. Heights of grass and litter are such that cells of 1 m scatter about their planes as
-    # within 20 m ahead of KITTI's car. Wave, camber and reflectances are guesses.
+    # they do 10 to 15 m from KITTI's car; nearer it is too much, farther away too little. Wave,
+    # camber and reflectances are guesses.
     ground = Ground(*np.tan(np.radians(rng.normal((0.6, 0.05), (0.25, 0.4)))),
                     wave=rng.uniform(0.03, 0.16), wavelength=rng.uniform(25, 60),
                     camber=rng.uniform(0.01, 0.035), curb_left=left, curb_right=right,
