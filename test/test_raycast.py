@@ -6,14 +6,15 @@ import numpy as np
 import pytest
 import torch
 
+from lidar_perception.evaluation.roughness import roughness
 from lidar_perception.simulation import foliage
 from lidar_perception.simulation.hashing import uniform
 from lidar_perception.simulation.pairs import View
 from lidar_perception.simulation.raycast import cast, cast_batch
 from lidar_perception.simulation.returns import measure
-from lidar_perception.simulation.sensor import STILL, Motion, generic, rays
+from lidar_perception.simulation.sensor import HDL64E, STILL, Motion, generic, rays
 from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID, Solids
-from lidar_perception.simulation.terrain import Ground, surface_height
+from lidar_perception.simulation.terrain import Ground, cast_ground, surface_height, tufts
 
 SENSOR = generic(24, -24.0, 12.0, 1.0, 10.0, height=1.7, max_range=60.0, divergence=0.0,
                  lifts=tuple(np.linspace(0.2, 0.0, 24)))
@@ -337,3 +338,33 @@ def test_rough_ground_lies_within_its_roughness_and_stays_where_it_is():
         assert off[near].std() > 0.1 * most
     # The same bumps from elsewhere.
     assert np.isfinite(on_ground(rough, (4.0, 0.4))[0]).all()
+
+
+def test_grass_is_rough_at_every_range_and_hides_what_is_behind_it():
+    meadow = Ground(curb_left=2.0, curb_right=-2.0, walk=0.0, rough=0.6)
+    at, _, met, hits = on_ground(meadow, sensor=HDL64E)
+    above = at[:, 2] - surface_height(meadow, at[:, 0], at[:, 1])
+    assert -0.01 < above.min() and above.max() < 0.6
+    wild = np.abs(at[:, 1]) > 8  # no tuft of the road's side reaches there
+    near, middle, far = roughness(at[wild], np.array([8.0, 12.0, 18.0, 30.0]))
+    assert 0.02 < min(near, middle, far) and max(near, middle, far) < 0.1
+    _, _, _, smooth = on_ground(meadow._replace(rough=0.0), sensor=HDL64E)
+    assert (hits.range[met] <= smooth.range[met] + 1e-9).all()
+
+
+def test_tufts_are_met_where_a_slow_march_meets_them():
+    rng = np.random.default_rng(1)
+    meadow = Ground(curb_left=2.0, curb_right=-2.0, walk=0.0, rough=0.5)
+    yaw = torch.as_tensor(rng.uniform(0.3, 2.8, 400))
+    down = torch.as_tensor(rng.uniform(0.06, 0.3, 400))
+    way = torch.stack([yaw.cos() * down.cos(), yaw.sin() * down.cos(), -down.sin()])
+    start = torch.tensor([0.0, 0.0, 1.7], dtype=torch.float64)[:, None].expand(3, 400)
+    found = cast_ground(meadow, start, way, 60.0).range
+    # The first place, 5 mm by 5 mm, at which the ray is below the tufts.
+    t = torch.arange(0.0, 30.0, 0.005, dtype=torch.float64)
+    places = start[:, :, None] + way[:, :, None] * t
+    top = tufts(meadow, places[0].ravel(), places[1].ravel()).reshape(400, -1)
+    first = t[(places[2] < top).to(torch.int8).argmax(1)]
+    off = found - first
+    # Steps are longer than tufts are thick: some are missed, and few met too early.
+    assert off.abs().quantile(0.5) < 0.1 and off.abs().quantile(0.9) < 0.5

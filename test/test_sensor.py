@@ -18,6 +18,8 @@ from lidar_perception.simulation.sensor import (
     rays,
     sensor_named,
 )
+from lidar_perception.simulation.solids import RETROREFLECTOR
+from lidar_perception.simulation.terrain import shine
 from lidar_perception.types import InputError
 
 SMALL = generic(8, -10.0, 4.0, 0.5, 10.0)
@@ -169,6 +171,22 @@ def test_intensity_is_the_brightness_unless_the_beam_or_range_says_otherwise():
     biased = measured(replace(SMALL, biases=biases), 10.0, 0.4)
     for ring, bias in enumerate(biases):
         assert abs(biased.intensity[biased.ring == ring].mean() - 0.4 - bias) < 0.01
+
+
+def test_what_is_weak_reads_0_and_nothing_else_does():
+    sensor = replace(SMALL, floor=0.2, biases=(0.1,) * 8)
+    assert (measured(sensor, 10.0, 0.05).intensity == 0).all()
+    assert (measured(sensor, 10.0, 0.4).intensity > 0.2).all()
+    on_the_verge = measured(sensor, 10.0, 0.2).intensity
+    assert 0.4 < (on_the_verge == 0).mean() < 0.6
+    assert on_the_verge[on_the_verge > 0].min() >= 0.3  # nothing between 0 and the floor
+
+
+def test_retroreflectors_do_not_fade():
+    sensor = replace(SMALL, fade=(10.0, 0.01))
+    assert measured(sensor, 60.0, RETROREFLECTOR).intensity.mean() > 0.95
+    assert measured(sensor, 60.0, 0.9).intensity.mean() < 0.45
+    assert shine(RETROREFLECTOR, 0.1) == RETROREFLECTOR > 1.2 * shine(0.99, 0.1)
 
 
 def test_the_vehicle_blocks_its_sectors():

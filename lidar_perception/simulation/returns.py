@@ -8,6 +8,7 @@ import numpy as np
 
 from lidar_perception.simulation.raycast import Hits
 from lidar_perception.simulation.sensor import STILL, Motion, Sensor, rays
+from lidar_perception.simulation.solids import RETROREFLECTOR
 
 # How a grazed surface weakens a return, as a power of the cosine of the incidence, and how the
 # logarithm of the power scatters. With these the road is lost as ahead of KITTI's car, where in 27
@@ -60,11 +61,12 @@ def measure(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator
     origin = np.broadcast_to(turn.origin, turn.direction.shape)
     xyz = origin[column, ring] + turn.direction[column, ring] * noisy[column, ring, None]
     intensity = hits.brightness[column, ring] + rng.normal(0.0, SPECKLE, len(ring))
-    intensity -= sensor.fade[1] * np.maximum(hits.range[column, ring] - sensor.fade[0], 0.0)
+    faded = sensor.fade[1] * np.maximum(hits.range[column, ring] - sensor.fade[0], 0.0)
+    intensity -= np.where(hits.brightness[column, ring] < RETROREFLECTOR, faded, 0.0)
+    weak = (intensity < sensor.floor) | (rng.random(len(intensity)) < sensor.silent)
     if sensor.biases:
         intensity += np.asarray(sensor.biases)[ring]
-    intensity = np.round(np.clip(intensity, 0.0, 1.0), 2)
-    intensity[rng.random(len(intensity)) < sensor.silent] = 0.0
+    intensity = np.where(weak, 0.0, np.round(np.clip(intensity, 0.0, 1.0), 2))
     time = rays(sensor, motion).since[column]
     return Returns(xyz.astype(np.float32), intensity.astype(np.float32), hits.owner[column, ring],
                    hits.semantic[column, ring], ring.astype(np.uint16), time.astype(np.float32))

@@ -26,6 +26,7 @@ class Sensor:
     rate: float = 10.0             # turns per second
     reach: float = 50.0            # half of the returns of a surface of brightness 0.1 are lost
     silent: float = 0.0            # share of returns whose intensity is 0
+    floor: float = 0.0             # an intensity below this is 0, too
     dropout: float = 0.005         # share of the returns lost for no reason
     divergence: float = 2e-3       # full angle of a beam
     pulse: float = 0.75            # two surfaces closer than this give one return between them
@@ -54,8 +55,8 @@ class Sensor:
                  "max_range must exceed min_range, which must not be negative"),
                 (not 0 < self.rate < np.inf, "rate must be positive"),
                 (not 0 < self.reach <= np.inf, "reach must be positive"),
-                (not (0 <= self.dropout <= 1 and 0 <= self.silent <= 1),
-                 "dropout and silent must be in 0 .. 1"),
+                (not all(0 <= x <= 1 for x in (self.dropout, self.silent, self.floor)),
+                 "dropout, silent and floor must be in 0 .. 1"),
                 (not all(0 <= x < np.inf for x in (self.range_noise, self.divergence, self.pulse)),
                  "range_noise, divergence and pulse must not be negative")):
             if wrong:
@@ -187,13 +188,15 @@ def hdl64e(rate: float = 10.0) -> Sensor:
     Divergence and reach are those of the data sheet: 50 m for pavement, which shines back a tenth.
     Within a beam the range jitters by 0.008 to 0.009 m on the road, sidewalks and facades of a
     SemanticKITTI scan (second differences). KITTI's points end at 80 m. Intensity falls by 0.008 a
-    metre from 18 m on: so the quantiles over all 27 scans do up to 80 m, within 0.02."""
+    metre from 18 m on: so the quantiles over all 27 scans do up to 80 m, within 0.02. On 57 frames
+    1 % of the points have 0.01 to 0.05, and half of those on cars have 0."""
     if not 5 <= rate <= 20:
         raise InputError(f"impossible sensor: rate {rate} must be 5 .. 20 turns per second")
     return Sensor(tuple(np.radians(_HDL64E_DEGREES).tolist()),
                   2 * np.pi / round(_HDL64E_COLUMNS * 10 / rate), rate=rate, max_range=80.0,
                   range_noise=0.01, lifts=_HDL64E_LIFTS, offsets=_HDL64E_OFFSETS,
-                  biases=_HDL64E_BIASES, fade=(18.0, 0.008), silent=0.07, blocked=_HDL64E_BLOCKED)
+                  biases=_HDL64E_BIASES, fade=(18.0, 0.008), silent=0.07, floor=0.08,
+                  blocked=_HDL64E_BLOCKED)
 
 
 HDL64E = hdl64e()

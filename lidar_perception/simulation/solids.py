@@ -11,9 +11,11 @@ BOX, ELLIPSOID, CYLINDER = 0, 1, 2  # a cylinder stands along its z axis
 # One part of a thing, in the thing's frame: x forward, y left, z up from the ground below its
 # origin; metres, radians. half: half sizes along its own axes, which are turned by pitch about y
 # (positive: nose down), then by yaw about z.
-# semantic: SemanticKITTI class. reflectance 0..1. density 1/m: inf is solid; foliage lets a beam
+# semantic: SemanticKITTI class. reflectance 0..1; RETROREFLECTOR sends beams back where they come
+# from, is as bright from anywhere and does not fade. density 1/m: inf is solid; foliage lets a beam
 # through for 1 / density metres in the mean. transmission: share of the beams that pass, as through
 # glass.
+RETROREFLECTOR = 1.0
 PART = np.dtype([("kind", np.int8), ("centre", np.float64, 3), ("half", np.float64, 3),
                  ("pitch", np.float64), ("yaw", np.float64), ("reflectance", np.float64),
                  ("semantic", np.uint16), ("density", np.float64), ("transmission", np.float64)])

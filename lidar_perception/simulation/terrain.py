@@ -14,10 +14,14 @@ import numpy as np
 import torch
 
 from lidar_perception.simulation.hashing import uniform
+from lidar_perception.simulation.solids import RETROREFLECTOR
 
 ROAD, PARKING, SIDEWALK, GRASS = 40, 44, 48, 72  # SemanticKITTI
 GRAIN = 0.25  # m between the bumps of a rough surface
 PATCH = 10    # bumps from one rough patch to the next
+BARE, RISE = 0.45, 3.0  # share of the ground between the patches, about; how steep their edges are
+EVEN, PAVED = 0.1, 0.06  # height of bumps there and on the road, of that of the patches
+TUFTS_HIDE, TUFT_STEPS = 6.0, 8  # m of a grazing ray in which tufts are looked for, and steps
 
 
 class Ground(NamedTuple):
@@ -54,8 +58,8 @@ class GroundHits(NamedTuple):
 
 def shine(reflectance, cosine):
     """Brightness, much softer than Lambert's law: on KITTI's scans the road has the same intensity
-    at 20 m, where the rays graze it, as at 6 m."""
-    return reflectance * (0.75 + 0.25 * cosine)
+    at 20 m, where the rays graze it, as at 6 m. A retroreflector is as bright from anywhere."""
+    return reflectance * (1 - 0.25 * (1 - cosine) * (reflectance < RETROREFLECTOR))
 
 
 def ground_height(ground: Ground, x, y):
@@ -88,14 +92,10 @@ def cast_ground(ground: Ground, start: torch.Tensor, way: torch.Tensor, max_rang
     x, y = start[:2] + t * way[:2]
     _, slope_x, slope_y = _relief(ground, x, y)
     cosine = (slope_x * way[0] + slope_y * way[1] - way[2]).clip(1e-3, 1.0)
-    semantic, reflectance = _surface(ground, x, y, edge > 0)
     if ground.rough or ground.litter:
-        height = torch.where(semantic == GRASS, ground.rough, torch.where(
-            semantic == ROAD, 0.1 * ground.rough, ground.litter))
-        height = height * _bumps(x, y) * _bumps(x / PATCH, y / PATCH)
-        # Tufts hide each other: a grazing ray meets one of those in its last metre.
-        t = t - torch.where(edge > 0, 0.0, (height / cosine).clip(max=1.0))
+        t = torch.where(edge > 0, t, _meet_tufts(ground, start, way, t, cosine))
     cosine = torch.where(edge > 0, edge, cosine)
+    semantic, reflectance = _surface(ground, *(start[:2] + t * way[:2]), edge > 0)
     hits.range[falls], hits.cosine[falls] = t, cosine
     hits.brightness[falls] = shine(reflectance, cosine)
     hits.semantic[falls] = semantic
@@ -165,6 +165,42 @@ def _meet_raised(ground: Ground, start: torch.Tensor, way: torch.Tensor, low: to
         meets = (high < at) & (at < t) & ~on_top & _raised(ground, x, y)
         t, edge = torch.where(meets, at, t), torch.where(meets, way[axis].abs(), edge)
     return t, edge
+
+
+def _meet_tufts(ground: Ground, start: torch.Tensor, way: torch.Tensor, t: torch.Tensor,
+                cosine: torch.Tensor) -> torch.Tensor:
+    """(N,) range of the first tuft or bump met before the ground at t, else t: looked for where a
+    ray is low enough, from the sensor on, in TUFT_STEPS steps."""
+    step = (max(ground.rough, ground.litter) / cosine).clip(max=TUFTS_HIDE) / TUFT_STEPS
+    met, ends = t.clone(), start[1] + torch.stack([t, t - TUFT_STEPS * step]) * way[1]
+    wayside = ((ends > ground.curb_left - ground.parking)
+               | (ends < ground.curb_right + ground.parking)).any(0)
+    left = torch.nonzero(wayside)[:, 0]  # the road itself is nowhere as high
+    for k in range(TUFT_STEPS - 1, -1, -1):
+        left = left if k else torch.nonzero(met == t)[:, 0]
+        back = k * step[left]
+        x, y = start[:2, left] + (t[left] - back) * way[:2, left]
+        top = tufts(ground, x, y, back * cosine[left])
+        above = top / cosine[left]  # the ray is as high so far before t
+        hit = above > back
+        found = left[hit]
+        met[found] = t[found] - torch.minimum(above[hit], back[hit] + step[found])
+        left = left[~hit]
+    return met
+
+
+def tufts(ground: Ground, x: torch.Tensor, y: torch.Tensor, least=0.0) -> torch.Tensor:
+    """(N,) height of what grows and lies at x, y, in patches with nearly bare ground between;
+    0 where it is surely not above least, a number or (N,)."""
+    semantic, _ = _surface(ground, x, y, torch.zeros_like(x, dtype=torch.bool))
+    patch = ((_bumps(x / PATCH, y / PATCH) - BARE) * RISE).clip(EVEN, 1.0)
+    patch = torch.where(semantic == ROAD, PAVED, patch)
+    most = patch * torch.where((semantic == ROAD) | (semantic == GRASS), ground.rough,
+                               ground.litter)
+    high = torch.nonzero(most > least)[:, 0]
+    height = torch.zeros_like(most)
+    height[high] = most[high] * _bumps(x[high], y[high])
+    return height
 
 
 def _surface(ground: Ground, x: torch.Tensor, y: torch.Tensor,

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidar_perception.simulation.solids import BOX, CYLINDER, part
+from lidar_perception.simulation.solids import BOX, CYLINDER, RETROREFLECTOR, part
 
-RUBBER, METAL, SKIN, GLASS, PLATE = 0.06, 0.3, 0.4, 0.04, 1.0
+RUBBER, METAL, SKIN, GLASS, PLATE = 0.06, 0.3, 0.4, 0.04, RETROREFLECTOR
 
 # Length, width, height in metres: mean and standard deviation, and the correlation of length and
 # height, over the labels of 57 frames of KITTI's object training set and the tracks of 30 frames

@@ -77,7 +77,7 @@ def van(rng: np.random.Generator, driver: bool = True) -> Thing:
 def paint(rng: np.random.Generator) -> float:
     """The reflectance of a coat of paint. Half of all points on KITTI's cars are below 0.03 and a
     tenth is above 0.4: dark paint throws the beam away. Yet dark cars are seen at 40 m."""
-    dark, middle, light = (0.02, 0.05), (0.04, 0.35), (0.35, 0.85)
+    dark, middle, light = (0.02, 0.05), (0.04, 0.35), (0.25, 0.6)
     return float(rng.uniform(*(dark, middle, light)[rng.choice(3, p=(0.5, 0.25, 0.25))]))
 
 
@@ -85,7 +85,8 @@ def _mottled(solids: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """The same with parts brighter and darker than others, as lacquer on KITTI's cars is. Nothing
     is drawn from rng itself: streets stay as they are, whatever their cars are made of."""
     factor = rng.spawn(1)[0].lognormal(0.0, MOTTLE, len(solids))
-    solids["reflectance"] = np.minimum(solids["reflectance"] * factor, 1.0)
+    dull = solids["reflectance"] < PLATE
+    solids["reflectance"][dull] = np.minimum(solids["reflectance"] * factor, 0.95)[dull]
     return solids
 
 
