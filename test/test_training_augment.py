@@ -155,6 +155,8 @@ def test_intensities_stay_intensities_and_nothing_else_changes(seed):
     changed = brightened(scene, 1.4, 0.2)
     assert changed.points[:, 3].min() >= 0 and changed.points[:, 3].max() <= 1
     assert np.array_equal(changed.points[:, :3], scene.points[:, :3])
+    scene.points[::2, 3] = 0  # what was too weak to be told
+    assert (brightened(scene, 1.4, 0.2).points[::2, 3] == 0).all()
 
 
 @few

@@ -101,9 +101,11 @@ def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
 
 
 def brightened(scene: Scene, factor: float, offset: float) -> Scene:
-    """Intensities times factor, plus offset, within 0 .. 1."""
+    """Intensities times factor, plus offset, within 0 .. 1. Those of 0 stay: that is what sensors
+    report of the weakest returns, however bright the others are."""
     points = scene.points.copy()
-    points[:, 3] = np.clip(points[:, 3] * factor + offset, 0, 1)
+    read = points[:, 3] > 0
+    points[read, 3] = np.clip(points[read, 3] * factor + offset, 0, 1)
     return replace(scene, points=points)
 
 

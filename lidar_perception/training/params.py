@@ -95,7 +95,7 @@ class AugmentParams(NoiseParams):
     scale: float = param(0.05, "The scene grows or shrinks by up to this share.", low=0.0, high=0.5)
     dropout: float = param(0.3, "Up to this share of the points is left out.", low=0.0, high=0.99)
     intensity: float = param(0.15, "Intensities are multiplied by 1 plus or minus up to this, and "
-                             "raised or lowered by up to half of it.", low=0.0, high=1.0)
+                             "raised or lowered by up to half of it; 0 stays 0.", low=0.0, high=1.0)
     height: float = param(0.1, "The sensor is raised or lowered by up to this.", unit="m", low=0.0,
                           high=2.0)
     tilt: float = param(0.01, "The ground rises or falls ahead, and to the side, by up to this.",
