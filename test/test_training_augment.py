@@ -258,7 +258,7 @@ def test_posts_are_learned_from_but_are_no_objects():
     box, own = database.boxes[1], database.points_of(1)
     assert (own[:, 0] == 8).all() and len(own) > 0.8 * len(post)
     assert box[:2] == pytest.approx([8, 3], abs=0.05) and box[5] == pytest.approx(2.33, abs=0.1)
-    params = replace(STILL, things=1, things_stretch=0, things_intensity=0)
+    params = replace(STILL, things=1, things_stretch=0, things_intensity=0, things_shine=0)
     fuller = with_objects(street_with(), database, params, *AREA, np.random.default_rng(0))
     assert len(fuller.boxes) == len(fuller.class_ids) == len(fuller.wanted) == 0
     added = fuller.points[-len(own):]
@@ -287,18 +287,37 @@ def test_noise_is_along_the_ray_and_beams_have_theirs_in_common(seed):
         assert (np.ptp(fullest) < 1e-3) == (point == 0)
 
 
+STILL_THINGS = AugmentParams(things_stretch=0, things_intensity=0, things_shine=0)
+
+
+@few
+@given(seeds)
+def test_what_shines_of_a_thing_is_between_two_heights(seed):
+    scene, rng = random_scene(seed), np.random.default_rng(seed)
+    for box in scene.boxes:
+        own = scene.points[inside(scene.points, box, 0.0)]
+        own[:, 3] = 0.3
+        _, points = varied(box, own, replace(STILL_THINGS, things_shine=1), rng)
+        bright = points[:, 3] > 0.9
+        assert (points[~bright, 3] == np.float32(0.3)).all()
+        if bright.any():
+            low, high = points[bright, 2].min(), points[bright, 2].max()
+            assert bright[(points[:, 2] >= low) & (points[:, 2] <= high)].all()
+
+
 @few
 @given(seeds)
 def test_things_are_stretched_upon_their_floor(seed):
     scene, rng = random_scene(seed), np.random.default_rng(seed)
+    changes = replace(STILL_THINGS, things_stretch=0.5, things_intensity=0.4)
     for box in scene.boxes:
         own = scene.points[inside(scene.points, box, 0.0)]
-        grown, points = varied(box, own, 0.5, 0.4, rng)
+        grown, points = varied(box, own, changes, rng)
         assert len(inside(points, grown, 1e-3)) == len(own)
         assert grown[2] - grown[5] / 2 == pytest.approx(box[2] - box[5] / 2)
         assert grown[[0, 1, 6]] == pytest.approx(box[[0, 1, 6]])
         assert (np.abs(np.log(grown[3:6] / box[3:6])) <= 0.5).all()
-        same, still = varied(box, own, 0.0, 0.0, rng)
+        same, still = varied(box, own, STILL_THINGS, rng)
         np.testing.assert_allclose(same, box, atol=1e-12)
         np.testing.assert_allclose(still, own, atol=1e-6)
 

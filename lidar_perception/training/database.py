@@ -23,6 +23,7 @@ THINGS = (-1.1, 0.5)  # m from the sensor's height up: what is there is no groun
 SECTORS = 720        # directions that are told apart
 TRIES = 64           # of them drawn for an object
 DRAWN = 3
+SHINING = 0.99       # intensity of a reflector
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
 THING = -1           # class of what is no object, see cut_objects.py
 HIDDEN = 0.3         # an object is hidden if more points than this share of its own are before it
@@ -84,7 +85,7 @@ def with_objects(scene: Scene, database: Database, params: AugmentParams, low: n
                 break
             box, own = database.boxes[i], database.points_of(i)
             if kind == THING:
-                box, own = varied(box, own, params.things_stretch, params.things_intensity, rng)
+                box, own = varied(box, own, params, rng)
             put = _put(box, own, points, taken, free, low, high, rng)
             if put is not None:
                 points, taken = put
@@ -98,18 +99,24 @@ def with_objects(scene: Scene, database: Database, params: AugmentParams, low: n
                    wanted=np.concatenate([scene.wanted, np.ones(objects.sum(), bool)]))
 
 
-def varied(box: np.ndarray, points: np.ndarray, stretch: float, intensity: float,
+def varied(box: np.ndarray, points: np.ndarray, params: AugmentParams,
            rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """An object that is wider, higher and brighter, or less so: its lengths about the middle of its
-    floor times up to exp(stretch) or its inverse, the same along x and y; intensities likewise."""
-    wide, high = np.exp(rng.uniform(-stretch, stretch, 2))
+    """A thing that is wider, higher and brighter, or less so: its lengths about the middle of its
+    floor times up to exp(things_stretch) or its inverse, the same along x and y; intensities
+    likewise by things_intensity. With the chance things_shine it shines between two heights."""
+    wide, high = np.exp(rng.uniform(-params.things_stretch, params.things_stretch, 2))
     factors = np.array([wide, wide, high])
     floor = box[:3] - [0, 0, box[5] / 2]
     points, box = points.copy(), box.copy()
     points[:, :3] = (points[:, :3] - floor) * factors + floor
     box[3:6] *= factors
     box[2] = floor[2] + box[5] / 2
-    points[:, 3] = np.clip(points[:, 3] * np.exp(rng.uniform(-intensity, intensity)), 0, 1)
+    factor = np.exp(rng.uniform(-params.things_intensity, params.things_intensity))
+    points[:, 3] = np.clip(points[:, 3] * factor, 0, 1)
+    if rng.random() < params.things_shine:
+        share = (points[:, 2] - floor[2]) / box[5]
+        start, end = np.sort(rng.random(2))
+        points[(share >= start) & (share <= end), 3] = SHINING
     return box, points
 
 

@@ -82,6 +82,8 @@ class AugmentParams(NoiseParams):
                                   "factors up to exp(this).", low=0.0, high=3.0)
     things_intensity: float = param(0.8, "Their intensities are multiplied by up to exp(this), or "
                                     "divided.", low=0.0, high=3.0)
+    things_shine: float = param(0.25, "Chance that a part of one shines, as signs and reflectors "
+                                "do.", low=0.0, high=1.0)
     database_scans: int = param(2000, "Those objects come from so many scenes, at most.", low=0,
                                 high=10**6)
     object_turn: float = param(0.157, "Each object is turned by up to this.", unit="rad", low=0.0,
