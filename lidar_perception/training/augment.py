@@ -17,6 +17,7 @@ from lidar_perception.training.params import AugmentParams, NoiseParams
 from lidar_perception.training.putting import TOUCH, inside
 
 STEP = np.radians(0.4)  # of elevation between two beams
+SHINING = 0.99  # intensity of a reflector
 BORDER = 0.01  # m: points so near to a box are taken for its own, as labels are rounded
 
 
@@ -107,6 +108,15 @@ def brightened(scene: Scene, factor: float, offset: float) -> Scene:
     read = points[:, 3] > 0
     points[read, 3] = np.clip(points[read, 3] * factor + offset, 0, 1)
     return replace(scene, points=points)
+
+
+def with_reflector(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Points (N, 4) of one thing, N at least 1, of which those between two heights shine."""
+    points = points.copy()
+    height = points[:, 2]
+    low, high = np.sort(rng.uniform(height.min(), height.max(), 2))
+    points[(height >= low) & (height <= high), 3] = SHINING
+    return points
 
 
 def noisy(points: np.ndarray, params: NoiseParams, rng: np.random.Generator) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 
 from lidar_perception.files import write_bytes
 from lidar_perception.rotated_iou import bev_iou
-from lidar_perception.training.augment import BORDER, Scene, grown, turned
+from lidar_perception.training.augment import BORDER, Scene, grown, turned, with_reflector
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.putting import floor_under, put_among
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
@@ -23,7 +23,6 @@ THINGS = (-1.1, 0.5)  # m from the sensor's height up: what is there is no groun
 SECTORS = 720        # directions that are told apart
 TRIES = 64           # of them drawn for an object
 DRAWN = 3
-SHINING = 0.99       # intensity of a reflector
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
 THING = -1           # class of what is no object, see cut_objects.py
 HIDDEN = 0.3         # an object is hidden if more points than this share of its own are before it
@@ -114,9 +113,7 @@ def varied(box: np.ndarray, points: np.ndarray, params: AugmentParams,
     factor = np.exp(rng.uniform(-params.things_intensity, params.things_intensity))
     points[:, 3] = np.clip(points[:, 3] * factor, 0, 1)
     if rng.random() < params.things_shine:
-        share = (points[:, 2] - floor[2]) / box[5]
-        start, end = np.sort(rng.random(2))
-        points[(share >= start) & (share <= end), 3] = SHINING
+        points = with_reflector(points, rng)
     return box, points
 
 

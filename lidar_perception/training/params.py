@@ -166,6 +166,8 @@ class ClusterAugmentParams(NoiseParams):
     flip: float = param(0.5, "Chance that left and right are swapped.", low=0.0, high=1.0)
     intensity: float = param(0.2, "Intensities are multiplied by 1 plus or minus up to this.",
                              low=0.0, high=1.0)
+    shine: float = param(0.1, "Chance that a part of a cluster of background shines, as signs and "
+                         "reflectors do.", low=0.0, high=1.0)
     height: float = param(0.15, "The ground is taken to be higher or lower by up to this, and by "
                           "half of it for each cluster by itself.", unit="m", low=0.0, high=2.0)
 

@@ -22,7 +22,7 @@ from lidar_perception.pointnet.clusters import ClusterInput, Clusters, network_i
 from lidar_perception.pointnet.config import PointNetConfig
 from lidar_perception.pointnet.network import PointNet, make_pointnet
 from lidar_perception.pointnet.predict import found, outputs_of, predict
-from lidar_perception.training.augment import noisy
+from lidar_perception.training.augment import noisy, with_reflector
 from lidar_perception.training.cut_scenes import CutScene, CutScenes
 from lidar_perception.training.data import Batches, JudgedScenes, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
@@ -60,6 +60,10 @@ class ClusterPreparation:
             raise InputError("a scene has no cluster to learn from")
         labels, boxes = scene.labels[chosen], scene.boxes[chosen].copy()
         clusters = scene.clusters.take(chosen)
+        background = np.flatnonzero(labels == len(self.config.classes))
+        for k in background[rng.random(len(background)) < self.augment.shine]:
+            own = slice(clusters.first[k], clusters.first[k + 1])
+            clusters.points[own] = with_reflector(clusters.points[own], rng)
         clusters, boxes = changed(clusters, boxes, scene.loose[chosen], self.augment, rng)
         inputs = network_input(clusters, self.config.points, int(rng.integers(1 << 30)))
         has_box = (labels >= 0) & (labels < len(self.config.classes))
