@@ -3,7 +3,8 @@ beyond the curbs sidewalks, then grass.
 
 It is a smooth relief in the world (x along the street, y left, z up, metres), raised by the height
 of the curb beyond the curbs. A ray is above both the relief and the raised relief until it meets
-the latter; there it is at its end, or from there on it meets a curb or the road.
+the latter; there it is at its end, or from there on it meets a curb or the road. Before that it may
+meet what lies and grows there: bumps everywhere, tufts and litter in patches.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class Ground(NamedTuple):
     walk: float = 1e9         # width of the sidewalk beyond each curb; grass beyond
     crossings: tuple[tuple[float, float], ...] = ()  # x intervals of side streets, without a curb
     parking: float = 0.0      # width of the parking strip inside each curb
-    rough: float = 0.0        # greatest height of tufts of grass; a tenth of it on the road
+    rough: float = 0.0        # greatest height of tufts of grass; PAVED of it on the road
     litter: float = 0.0       # likewise of what lies and grows on sidewalks and parking strips
     road: float = 0.3         # reflectances
     sidewalk: float = 0.4
