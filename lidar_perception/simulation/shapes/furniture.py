@@ -35,24 +35,30 @@ def lamp(rng: np.random.Generator) -> np.ndarray:
 
 
 def traffic_light(rng: np.random.Generator) -> np.ndarray:
-    """A mast with lights at 2.2 m, and a box with a button."""
-    height = rng.uniform(3.0, 3.5)
-    return parts([_post(height, 0.07), block((0.08, -0.15, height - 0.95), (0.3, 0.15, height),
-                                             reflectance=0.05),
-                  block((0.06, -0.28, height - 1.0), (0.08, 0.28, height + 0.05),
-                        reflectance=0.1),
-                  block((-0.16, -0.06, 1.0), (-0.06, 0.06, 1.25), reflectance=0.4)], POLE)
+    """A mast with lights at 2.2 m, a box with a button, and most often a sign or two below."""
+    height, own = rng.uniform(3.0, 3.5), rng.spawn(1)[0]
+    rows = [_post(height, 0.07),
+            block((0.08, -0.15, height - 0.95), (0.3, 0.15, height), reflectance=0.05),
+            block((0.06, -0.28, height - 1.0), (0.08, 0.28, height + 0.05), reflectance=0.1),
+            block((-0.16, -0.06, 1.0), (-0.06, 0.06, 1.25), reflectance=0.4)]
+    return parts(rows + [_plate(0.1, *own.uniform((0.5, 0.2), (1.6, 0.35)))
+                         for _ in range(own.integers(3))], POLE)
 
 
 def sign(rng: np.random.Generator) -> np.ndarray:
-    """One or two plates that shine, to +x, on a post; some hang low, as on islands."""
-    low = rng.uniform(1.7, 2.2) if rng.random() < 0.75 else rng.uniform(0.4, 1.0)
-    size = rng.uniform(0.25, 0.4)
+    """One or two plates that shine, to +x, on a post; some hang low, as on islands, half of these
+    on a mast. Of KITTI's clusters as wide as a person, 15 % shine in part, most of them low."""
+    low = rng.uniform(1.7, 2.2) if rng.random() < 0.6 else rng.uniform(0.4, 1.0)
+    size, own = rng.uniform(0.25, 0.4), rng.spawn(1)[0]
     plates = [(low, size)] + ([(low + 2 * size + 0.05, 0.2)] if rng.random() < 0.4 else [])
-    rows = [_post(low + 2 * size, 0.035)]
-    rows += [block((0.04, -half, z), (0.06, half, z + 2 * half), reflectance=PLATE, semantic=SIGN)
-             for z, half in plates]
-    return parts(rows, POLE)
+    mast = low < 1.0 and own.random() < 0.5
+    rows = [_post(own.uniform(2.5, 4.0), 0.07) if mast else _post(low + 2 * size, 0.035)]
+    return parts(rows + [_plate(0.08 if mast else 0.04, z, half) for z, half in plates], POLE)
+
+
+def _plate(x: float, z: float, half: float) -> tuple:
+    """The plate of a sign at x, from z up, so far to each side."""
+    return block((x, -half, z), (x + 0.02, half, z + 2 * half), reflectance=PLATE, semantic=SIGN)
 
 
 def fence(rng: np.random.Generator, length: float) -> np.ndarray:
@@ -113,7 +119,7 @@ def beacon(rng: np.random.Generator) -> np.ndarray:
     """A post or board of 0.8 to 1.6 m, most of which shines, such as stands on islands and at
     roadworks: narrower than a person, as high, and seen from far. Some have a base or a round
     sign."""
-    high, low, half = rng.uniform((0.8, 0.05, 0.06), (1.6, 0.4, 0.18))
+    high, low, half = rng.uniform((0.8, 0.05, 0.06), (1.6, 0.4, 0.3))
     if rng.random() < 0.5:
         rows = [_cylinder(DEEP, low, 0.8 * half, 0.3), _cylinder(low, high, half, PLATE)]
     else:
