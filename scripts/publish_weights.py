@@ -2,6 +2,7 @@
 
     lidar-perception simulate --format kitti --frames 500 --seed 9000 --out simulated
     python scripts/publish_weights.py v4/best.safetensors simulated /data/kitti/object
+    python scripts/publish_weights.py v4/best.safetensors --mean-with before.safetensors simulated
 
 The card says what the weights were trained on and how they score on each folder, of which none
 may have been trained on.
@@ -9,12 +10,14 @@ may have been trained on.
 
 from __future__ import annotations
 
-import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import click
+
 from lidar_perception import checkpoint
-from lidar_perception.checkpoint import POINTNET, network_of, save_checkpoint
+from lidar_perception.checkpoint import POINTNET, network_of, require_same, save_checkpoint
 from lidar_perception.cli.detection import score_detector
 from lidar_perception.datasets.kitti import open_kitti
 from lidar_perception.detection.checkpoint import load_network
@@ -54,7 +57,10 @@ def card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]
         f"- Steps: {said['steps']} of {said['batch']} scenes, {said['seconds'] / 60:.0f} minutes, "
         f"seed {said['seed']}" + (f", begun with {Path(said['init']).parent.name}/"
                                   f"{Path(said['init']).name}" if said.get("init") else "") + ".",
-        f"- Commit: {header.commit}.", "- Stored as float16.", ""]
+        f"- Commit: {header.commit}.",
+        *(f"- The mean of these weights and of earlier ones, {other['steps']} steps at commit "
+          f"{other['commit']}." for other in said.get("mean_with", ())),
+        "- Stored as float16.", ""]
     for name, content in scored.items():
         lines += [f"## {name}: {content['frames']} frames", "",
                   "AP in percent at 40 recall points, moderate; labels in brackets.", "",
@@ -77,13 +83,27 @@ def card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]
     return "\n".join(lines)
 
 
-def main(weights: Path, *folders: Path) -> None:
+@click.command()
+@click.argument("weights", type=click.Path(exists=True, path_type=Path))
+@click.argument("folders", nargs=-1, type=click.Path(exists=True, path_type=Path))
+@click.option("--mean-with", "before", type=click.Path(exists=True, path_type=Path),
+              help="Store the mean of both, weight by weight (Wortsman et al., CVPR 2022).")
+def main(weights: Path, folders: tuple[Path, ...], before: Path | None) -> None:
     """Score, store and describe one checkpoint."""
-    if network_of(weights) == POINTNET:
-        header, network = load_pointnet(weights)
+    load = load_pointnet if network_of(weights) == POINTNET else load_network
+    header, network = load(weights)
+    if before is not None:
+        earlier, other = load(before)
+        require_same(header.config, earlier.config, str(before))
+        state = other.state_dict()
+        network.load_state_dict({
+            name: (value + state[name]) / 2 if value.is_floating_point() else value
+            for name, value in network.state_dict().items()})
+        header = replace(header, metrics={}, training={**header.training, "mean_with": [
+            {"steps": earlier.training["steps"], "commit": earlier.commit}]})
+    if header.network == POINTNET:
         out = POINTNET_WEIGHTS
     else:
-        header, network = load_network(weights)
         out = WEIGHTS / f"pointpillars_{header.config.version}_{header.config.size}.safetensors"
     out.parent.mkdir(exist_ok=True)
     save_checkpoint(out, network, header, half=True)
@@ -93,4 +113,4 @@ def main(weights: Path, *folders: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(*map(Path, sys.argv[1:]))
+    main()
