@@ -193,14 +193,14 @@ def _meet_tufts(ground: Ground, start: torch.Tensor, way: torch.Tensor, t: torch
 def tufts(ground: Ground, x: torch.Tensor, y: torch.Tensor, least=0.0) -> torch.Tensor:
     """(N,) height of what grows and lies at x, y, in patches with nearly bare ground between;
     0 where it is surely not above least, a number or (N,)."""
-    semantic, _ = _surface(ground, x, y, torch.zeros_like(x, dtype=torch.bool))
+    height = torch.zeros_like(x)
     patch = ((_bumps(x / PATCH, y / PATCH) - BARE) * RISE).clip(EVEN, 1.0)
-    patch = torch.where(semantic == ROAD, PAVED, patch)
-    most = patch * torch.where((semantic == ROAD) | (semantic == GRASS), ground.rough,
-                               ground.litter)
-    high = torch.nonzero(most > least)[:, 0]
-    height = torch.zeros_like(most)
-    height[high] = most[high] * _bumps(x[high], y[high])
+    high = torch.nonzero(patch * max(ground.rough, ground.litter) > least)[:, 0]
+    x, y, patch = x[high], y[high], patch[high]
+    semantic, _ = _surface(ground, x, y, torch.zeros_like(x, dtype=torch.bool))
+    paved = semantic == ROAD
+    most = torch.where(paved | (semantic == GRASS), ground.rough, ground.litter)
+    height[high] = torch.where(paved, PAVED, patch) * most * _bumps(x, y)
     return height
 
 
