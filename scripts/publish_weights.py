@@ -28,6 +28,7 @@ from lidar_perception.files import write_text
 from lidar_perception.pointnet.checkpoint import load_pointnet
 from lidar_perception.pointnet.weights_file import WEIGHTS as POINTNET_WEIGHTS
 from lidar_perception.terminal import console, track
+from lidar_perception.training.record import metrics_of, rounded
 
 LEAST_SCORE = 0.05  # AP needs boxes that a robot would not act on
 ROWS = (("bev_relaxed", "from above"), ("bev", "from above"), ("3d_relaxed", "in space"),
@@ -85,7 +86,7 @@ def card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]
 
 @click.command()
 @click.argument("weights", type=click.Path(exists=True, path_type=Path))
-@click.argument("folders", nargs=-1, type=click.Path(exists=True, path_type=Path))
+@click.argument("folders", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--mean-with", "before", type=click.Path(exists=True, path_type=Path),
               help="Store the mean of both, weight by weight (Wortsman et al., CVPR 2022).")
 def main(weights: Path, folders: tuple[Path, ...], before: Path | None) -> None:
@@ -99,7 +100,7 @@ def main(weights: Path, folders: tuple[Path, ...], before: Path | None) -> None:
         network.load_state_dict({
             name: (value + state[name]) / 2 if value.is_floating_point() else value
             for name, value in network.state_dict().items()})
-        header = replace(header, metrics={}, training={**header.training, "mean_with": [
+        header = replace(header, training={**header.training, "mean_with": [
             {"steps": earlier.training["steps"], "commit": earlier.commit}]})
     if header.network == POINTNET:
         out = POINTNET_WEIGHTS
@@ -108,6 +109,9 @@ def main(weights: Path, folders: tuple[Path, ...], before: Path | None) -> None:
     out.parent.mkdir(exist_ok=True)
     save_checkpoint(out, network, header, half=True)
     scored = {folder.name: scores_of(out, folder) for folder in folders}
+    if before is not None:  # the header has what the first folder says of the mean
+        metrics = metrics_of(scored[folders[0].name], "bev", header.config.classes)
+        save_checkpoint(out, network, replace(header, metrics=rounded(metrics)), half=True)
     write_text(out.with_suffix(".md"), card(header, out.stem, scored))
     console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB", soft_wrap=True)
 
