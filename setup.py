@@ -41,7 +41,7 @@ setup(
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "msg_utils*"]),
     package_data={NAME: ["nodes/*.xml", "candidates/*.json", "reproduction/*.html",
-                         "detection/weights/*", "pointnet/weights/*"]},
+                         "detectors/*/weights/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -50,7 +50,7 @@ setup(
         (f"lib/{NAME}", node_executables()),
     ],
     install_requires=[
-        "click>=8.1", "cloth-simulation-filter>=1.1.5", "jinja2>=3.1", "matplotlib>=3.7",
+        "click>=8.1", "jinja2>=3.1", "matplotlib>=3.7",
         "mcap>=1.2", "numba>=0.59", "numpy>=1.26", "pypatchworkpp>=1.0", "pyyaml>=6", "rich>=13",
         "rosbags>=0.11.6", "safetensors>=0.4", "scikit-learn>=1.3", "scipy>=1.11",
         "threadpoolctl>=3.1", "torch>=2.2",
@@ -64,7 +64,7 @@ setup(
         "odometry": ["kiss-icp>=1.2"],
         "onnx": ["onnx>=1.16", "onnxruntime>=1.18", "onnxscript>=0.2", "torch>=2.6"],
         "train": ["tensorboard>=2.15"],
-        "benchmark": ["dbscan>=1.0", "opencv-python-headless>=4.8"],
+        "benchmark": ["cloth-simulation-filter>=1.1.5", "dbscan>=1.0", "opencv-python-headless>=4.8"],
     },
     entry_points={"console_scripts": [
         "lidar-perception = lidar_perception.cli.main:main",

@@ -20,18 +20,19 @@ from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, print_planes
 from benchmark.simulation import measure_simulation
 from benchmark.timing import spread
-from lidar_perception.datasets.kitti import KittiFrame, open_kitti
-from lidar_perception.datasets.recording import Recorded, open_recording
-from lidar_perception.datasets.semantickitti import open_semantic_kitti
-from lidar_perception.evaluation.candidates import pedestrians
-from lidar_perception.files import write_text
+from lidar_perception.candidates.segmented import points_in_view
+from lidar_perception.candidates.warm_up import warm_up
+from lidar_perception.data.kitti.folder import KittiFrame, open_kitti
+from lidar_perception.data.recording import Recorded, open_recording
+from lidar_perception.data.semantickitti import open_semantic_kitti
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.threshold import segment_by_threshold
-from lidar_perception.machine import cpu_name
-from lidar_perception.params import ViewParams
-from lidar_perception.pipeline import points_in_view, warm_up
-from lidar_perception.terminal import errors
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.machine import cpu_name
+from lidar_perception.runs.terminal import errors
+from lidar_perception.scoring.centres.report import pedestrians
 from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.wire.params import ViewParams
 
 FULL_SCAN = 60_000   # points; a scan cut to the camera's view has some 20,000
 FEW = 3              # frames with a pedestrian, below which those without serve too

@@ -6,19 +6,15 @@ import numpy as np
 from rich.table import Table
 
 from benchmark import plain_stm_cpa
+from lidar_perception.candidates.configurations import BEST, PAPER
+from lidar_perception.candidates.pipeline import find_candidates, refined
 from lidar_perception.candidates.refine import STAGES
+from lidar_perception.candidates.seed_sources import truth_seed
+from lidar_perception.candidates.segmented import Segmented, grounded_boxes
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.configurations import BEST, PAPER
-from lidar_perception.datasets.recording import Recorded
-from lidar_perception.evaluation.candidates import pedestrians
-from lidar_perception.pipeline import (
-    Segmented,
-    find_candidates,
-    grounded_boxes,
-    refined,
-    truth_seed,
-)
-from lidar_perception.terminal import console, track
+from lidar_perception.data.recording import Recorded
+from lidar_perception.runs.terminal import console, track
+from lidar_perception.scoring.centres.report import pedestrians
 
 SAME = 0.02  # metres between boxes of the same candidate; planes of two RANSACs differ a little
 

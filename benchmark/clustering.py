@@ -15,9 +15,9 @@ from benchmark.rows import against, measured, row, with_target
 from benchmark.timing import SLOW_REPEAT, Clock, in_child, spread, thin
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
 from lidar_perception.clustering.euclidean import euclidean
+from lidar_perception.clustering.params import DbscanParams, EuclideanParams
 from lidar_perception.ground.cloth import segment_by_cloth
-from lidar_perception.params import DbscanParams, EuclideanParams
-from lidar_perception.terminal import track
+from lidar_perception.runs.terminal import track
 
 PLAIN = "SciPy and NumPy"
 

@@ -9,15 +9,15 @@ import torch
 from rich.table import Table
 
 from benchmark.timing import spread
-from lidar_perception.detection.checkpoint import Header
-from lidar_perception.detection.config import SIZES, VERSIONS, network_config
-from lidar_perception.detection.detector import Detector, TorchNetwork
-from lidar_perception.detection.detector_params import STEPS, DetectorParams
-from lidar_perception.detection.pointpillars import make_network
-from lidar_perception.devices import chosen_device
-from lidar_perception.machine import cpu_name
-from lidar_perception.params import with_values
-from lidar_perception.terminal import console, track
+from lidar_perception.detectors.devices import chosen_device
+from lidar_perception.detectors.pointpillars.checkpoint import Header
+from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, network_config
+from lidar_perception.detectors.pointpillars.detector import Detector, TorchNetwork
+from lidar_perception.detectors.pointpillars.network import make_network
+from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
+from lidar_perception.param_fields import with_values
+from lidar_perception.runs.machine import cpu_name
+from lidar_perception.runs.terminal import console, track
 from lidar_perception.types import LidarFrame
 
 PAPER_TO_V0 = {"v0": 1.0, "v1": 1.06, "v2": 1.86, "v3": 2.48, "v4": 3.54}  # paper B, RTX 4090

@@ -7,12 +7,12 @@ from pathlib import Path
 
 from rich.table import Table
 
-from lidar_perception.configurations import PAPER
-from lidar_perception.datasets.bag import Bag
-from lidar_perception.datasets.kitti import open_kitti
-from lidar_perception.datasets.to_bag import kitti_scan, write_bag
-from lidar_perception.terminal import console, track
-from lidar_perception.topics import POINTS
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.data.bag import Bag
+from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.to_bag import kitti_scan, write_bag
+from lidar_perception.runs.terminal import console, track
+from lidar_perception.wire.topics import POINTS
 
 
 def measure_graph(kitti: Path, single: bool) -> dict:

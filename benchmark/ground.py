@@ -10,9 +10,9 @@ import numpy as np
 from benchmark import peers
 from benchmark.rows import against, measured, row
 from benchmark.timing import SLOW_REPEAT, Clock, spread, thin
-from lidar_perception.datasets.semantickitti import SemanticFrame
-from lidar_perception.evaluation.segmentation import PROTOCOLS, GroundReport
+from lidar_perception.data.semantickitti import SemanticFrame
 from lidar_perception.ground.cloth import segment_by_cloth
+from lidar_perception.ground.params import ClothParams, GroundParams, ThresholdParams
 from lidar_perception.ground.patchwork import segment_by_patchwork, silent_stdout
 from lidar_perception.ground.segment import METHODS
 from lidar_perception.ground.threshold import (
@@ -21,8 +21,8 @@ from lidar_perception.ground.threshold import (
     ransac_plane,
     segment_by_threshold,
 )
-from lidar_perception.params import ClothParams, GroundParams, ThresholdParams
-from lidar_perception.terminal import track
+from lidar_perception.runs.terminal import track
+from lidar_perception.scoring.points.segmentation import PROTOCOLS, GroundReport
 from lidar_perception.types import LidarFrame
 
 PARAMS = GroundParams()

@@ -37,8 +37,8 @@ def _resident(name: str) -> float:
 
 
 def _main(file: str) -> None:
+    from lidar_perception.candidates.warm_up import warm_up
     from lidar_perception.clustering.dbscan import distance_aware_dbscan
-    from lidar_perception.pipeline import warm_up
     xyz = np.load(file)
     warm_up()
     Path("/proc/self/clear_refs").write_text("5")

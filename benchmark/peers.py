@@ -10,9 +10,10 @@ from unittest import mock
 
 import numpy as np
 
+from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.geometry import horizontal_range
+from lidar_perception.ground.params import ClothParams, PatchworkParams
 from lidar_perception.ground.patchwork import library_settings
-from lidar_perception.params import ClothParams, DbscanParams, PatchworkParams
 
 
 @dataclass(frozen=True)

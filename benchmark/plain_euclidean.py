@@ -13,7 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from lidar_perception.params import EuclideanParams
+from lidar_perception.clustering.params import EuclideanParams
 
 AT_ONCE = 4_000_000  # neighbours that are held at a time: about 300 MB
 

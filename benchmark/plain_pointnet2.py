@@ -9,7 +9,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from lidar_perception.pointnet.config import PointNetConfig
+from lidar_perception.detectors.pointnet.config import PointNetConfig
 
 
 def farthest(xyz: Tensor, count: int) -> Tensor:

@@ -11,15 +11,15 @@ from rich.table import Table
 from benchmark.plain_pointnet2 import PlainPointNet2
 from benchmark.timing import interleaved
 from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.detectors.pointnet.checkpoint import Header
+from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of, network_input
+from lidar_perception.detectors.pointnet.config import pointnet_config
+from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.detectors.pointnet.network import fused, make_pointnet
+from lidar_perception.detectors.pointnet.params import STEPS
+from lidar_perception.detectors.pointnet.predict import predict
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.pointnet.checkpoint import Header
-from lidar_perception.pointnet.clusters import Clusters, clusters_of, network_input
-from lidar_perception.pointnet.config import pointnet_config
-from lidar_perception.pointnet.detector import PointNetDetector
-from lidar_perception.pointnet.network import fused, make_pointnet
-from lidar_perception.pointnet.params import STEPS
-from lidar_perception.pointnet.predict import predict
-from lidar_perception.terminal import console
+from lidar_perception.runs.terminal import console
 from lidar_perception.types import LidarFrame
 
 COUNT = 100                  # clusters

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from rich.table import Table
 
-from lidar_perception.terminal import console
+from lidar_perception.runs.terminal import console
 
 
 def measured(title: str, frames: int, points: float, rows: list[dict], **more) -> dict:

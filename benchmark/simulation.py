@@ -10,12 +10,12 @@ import torch
 
 from benchmark.rows import measured, row
 from benchmark.timing import Clock
+from lidar_perception.runs.terminal import track
 from lidar_perception.simulation.pairs import View
 from lidar_perception.simulation.raycast import cast, cast_batch
 from lidar_perception.simulation.returns import measure
 from lidar_perception.simulation.scene import Moment, Scene, make_scene
 from lidar_perception.simulation.sensor import HDL64E
-from lidar_perception.terminal import track
 
 LEAST_ACTORS = 150  # near the sensor
 BATCH = 16

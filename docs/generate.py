@@ -13,9 +13,11 @@ from typing import Any
 import yaml
 
 from lidar_perception import params
-from lidar_perception.configurations import BEST_VALUES
-from lidar_perception.detection.detector_params import DetectorParams
-from lidar_perception.pointnet.params import PointNetDetectorParams
+from lidar_perception.candidates.configurations import BEST_VALUES
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
+from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.param_fields import flatten, parameter_fields
 
 CONFIG = Path(__file__).parents[1] / "config"
 BEST, POINTPILLARS, POINTNET = (CONFIG / f"{name}.param.yaml"
@@ -86,7 +88,7 @@ NODES: dict[str, dict[str, Any]] = {
         inputs=[("~/input/points", CLOUD, "With columns `ground` and `cluster_id`."), *SEED_IN],
         outputs=CANDIDATES_OUT),
     "perception": dict(
-        params=params.PipelineParams(),
+        params=PipelineParams(),
         what="The three stages in one process, with the same parameters and results and without "
              "the copies between them.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN,
@@ -162,7 +164,7 @@ def page(name: str) -> str:
             lines += [f"## {title}", "", "| name | type | |", "|---|---|---|",
                       *(f"| `{a}` | {b} | {c} |" for a, b, c in rows), ""]
     lines += ["## Parameters", "", "| name | default | range | |", "|---|---|---|---|"]
-    for key, f in params.parameter_fields(node["params"]).items():
+    for key, f in parameter_fields(node["params"]).items():
         lines.append(f"| `{key}` | {_default(f)} | {_range(f)} | {f.metadata['doc']}"
                      + (" Fixed at start." if f.metadata["fixed"] else "") + " |")
     return "\n".join(lines) + "\n"
@@ -170,27 +172,27 @@ def page(name: str) -> str:
 
 def best() -> str:
     """The parameter file of the configuration `best`, for nodes."""
-    return _parameter_file("The configuration `best` (lidar_perception/configurations.py), for "
-                           "nodes", BEST_VALUES)
+    return _parameter_file("The configuration `best` (lidar_perception/candidates/"
+                           "configurations.py), for nodes", BEST_VALUES)
 
 
 def pointpillars() -> str:
     """The parameter file of the PointPillars detector's graph."""
-    return _shared_numbers("The detector's experts (detection/detector_params.py)",
+    return _shared_numbers("The detector's experts (detectors/pointpillars/params.py)",
                            DetectorParams())
 
 
 def pointnet() -> str:
     """The parameter file of the PointNet detector's graph."""
-    return _shared_numbers("The ground and clusters of pointnet/params.py",
+    return _shared_numbers("The ground and clusters of detectors/pointnet/params.py",
                            PointNetDetectorParams())
 
 
 def _shared_numbers(what: str, detector: Any) -> str:
     """A detector's numbers for the nodes that find ground and clusters."""
     shared = (params.GroundNodeParams(), params.ClusteringNodeParams())
-    defaults = {key: value for group in shared for key, value in params.flatten(group).items()}
-    values = {key: value for key, value in params.flatten(detector).items()
+    defaults = {key: value for group in shared for key, value in flatten(group).items()}
+    values = {key: value for key, value in flatten(detector).items()
               if key in defaults and value != defaults[key]}
     return _parameter_file(f"{what}, for the nodes that find ground and clusters", values)
 

@@ -65,3 +65,26 @@ def _in_view(xyz, projection, width, height):
         v = p[1, 0] * x + p[1, 1] * y + p[1, 2] * z + p[1, 3]
         seen[i] = 0 <= u < width * depth and 0 <= v < height * depth  # so depth > 0
     return seen
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """intrinsics P2 (3, 4); lidar_to_camera (4, 4) velodyne points into the rectified camera
+    frame (R0_rect Tr_velo_to_cam); image width and height in pixels."""
+
+    intrinsics: np.ndarray
+    lidar_to_camera: np.ndarray
+    width: int
+    height: int
+
+    @property
+    def pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """The camera in the LiDAR frame as TF has it: quaternion [x y z w], translation (3,)."""
+        to_lidar = Rotation.from_matrix(self.lidar_to_camera[:3, :3].T)
+        return to_lidar.as_quat(), -to_lidar.apply(self.lidar_to_camera[:3, 3])
+
+    def camera(self) -> Camera:
+        rotation, translation = self.pose
+        return Camera.of(self.intrinsics, rotation, translation, self.width, self.height)
+
+

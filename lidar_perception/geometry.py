@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
+from numba import njit
 
 
 def wrap_angle(angle):
@@ -44,3 +47,98 @@ def box_corners(boxes: np.ndarray) -> np.ndarray:
     half = boxes[:, None, 5] / 2
     below, above = (np.broadcast_to(boxes[:, None, 2] + s * half, x.shape) for s in (-1, 1))
     return np.concatenate([np.stack([x, y, below], -1), np.stack([x, y, above], -1)], axis=1)
+
+
+MOST_CORNERS = 8  # of what two rectangles share; four cuts add one corner each
+
+
+def bev_and_3d_iou(boxes: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two (K, M) float64, 0..1: IoU seen from above and in space of boxes (K, 7) and others
+    (M, 7), [x y z l w h yaw] with z up. A box without area (without volume, in space), or with a
+    number that is not finite, overlaps nothing, not even itself."""
+    return _ious(_rows(boxes), _rows(others))
+
+
+def bev_iou(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(K, M) float64, 0..1: IoU seen from above, as in bev_and_3d_iou."""
+    return bev_and_3d_iou(boxes, others)[0]
+
+
+def iou_3d(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(K, M) float64, 0..1: IoU in space, as in bev_and_3d_iou."""
+    return bev_and_3d_iou(boxes, others)[1]
+
+
+def _rows(boxes: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(boxes, np.float64).reshape(-1, 7)
+
+
+@njit(cache=True, nogil=True)
+def _ious(boxes, others):
+    bev = np.zeros((len(boxes), len(others)))
+    space = np.zeros((len(boxes), len(others)))
+    work = np.empty((4, MOST_CORNERS))
+    for i in range(len(boxes)):
+        a = boxes[i]
+        area_a = a[3] * a[4]
+        if not (a[3] > 0 and a[4] > 0 and np.isfinite(a).all()):
+            continue
+        radius_a = math.hypot(a[3], a[4]) / 2
+        for j in range(len(others)):
+            b = others[j]
+            reach = radius_a + math.hypot(b[3], b[4]) / 2
+            dx, dy = a[0] - b[0], a[1] - b[1]
+            if not (dx * dx + dy * dy < reach * reach and b[3] > 0 and b[4] > 0
+                    and np.isfinite(b).all()):
+                continue
+            area_b = b[3] * b[4]
+            shared = min(_shared_area(a, b, work), area_a, area_b)
+            bev[i, j] = shared / (area_a + area_b - shared)
+            height = min(a[2] + a[5] / 2, b[2] + b[5] / 2) - max(a[2] - a[5] / 2, b[2] - b[5] / 2)
+            height = min(height, a[5], b[5])
+            if height > 0:
+                volume = shared * height
+                space[i, j] = volume / (area_a * a[5] + area_b * b[5] - volume)
+    return bev, space
+
+
+@njit(cache=True, nogil=True)
+def _shared_area(a, b, work):
+    """Area that two rectangles share; work (4, MOST_CORNERS) float64 is overwritten."""
+    x, y, cut_x, cut_y = work[0], work[1], work[2], work[3]
+    cos, sin = math.cos(b[6]), math.sin(b[6])
+    dx, dy = a[0] - b[0], a[1] - b[1]
+    centre_x, centre_y = cos * dx + sin * dy, cos * dy - sin * dx
+    cos, sin = math.cos(a[6] - b[6]), math.sin(a[6] - b[6])
+    for k in range(4):
+        along = a[3] / 2 if k == 0 or k == 3 else -a[3] / 2
+        across = a[4] / 2 if k < 2 else -a[4] / 2
+        x[k] = centre_x + cos * along - sin * across
+        y[k] = centre_y + sin * along + cos * across
+    count = _cut(x, y, 4, 1.0, b[3] / 2, cut_x, cut_y)
+    count = _cut(cut_x, cut_y, count, -1.0, b[3] / 2, x, y)
+    count = _cut(y, x, count, 1.0, b[4] / 2, cut_y, cut_x)
+    count = _cut(cut_y, cut_x, count, -1.0, b[4] / 2, y, x)
+    area = 0.0
+    for k in range(1, count - 1):
+        area += (x[k] - x[0]) * (y[k + 1] - y[0]) - (x[k + 1] - x[0]) * (y[k] - y[0])
+    return max(area / 2, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _cut(u, v, count, sign, limit, kept_u, kept_v):
+    """The part of a convex polygon u, v (count corners) where sign * u <= limit, into kept_u and
+    kept_v; returns the number of its corners."""
+    kept = 0
+    for k in range(count):
+        following = k + 1 if k + 1 < count else 0
+        here, there = sign * u[k] - limit, sign * u[following] - limit
+        if here <= 0:
+            kept_u[kept], kept_v[kept] = u[k], v[k]
+            kept += 1
+        if (here < 0 and there > 0) or (here > 0 and there < 0):
+            share = here / (here - there)
+            kept_u[kept] = sign * limit
+            kept_v[kept] = v[k] + share * (v[following] - v[k])
+            kept += 1
+    return kept

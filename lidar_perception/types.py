@@ -15,6 +15,7 @@ CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tr
 PEDESTRIAN = CLASSES.index("Pedestrian")
 
 MAX_RANGE = 1e5  # metres; what is farther is a broken return, not a point
+SENSOR_HEIGHT = 1.73  # metres: KITTI's sensor above the road. Defaults, anchors and simulation
 
 
 class InputError(ValueError):

@@ -20,15 +20,16 @@ from scipy.special import expit
 
 from lidar_perception.candidates import confidence as module
 from lidar_perception.candidates.confidence import SEED_KNOTS, SHAPE_KNOTS, shape_features
-from lidar_perception.candidates.refine import group_points
+from lidar_perception.candidates.configurations import BEST
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.seed_sources import truth_seed
 from lidar_perception.candidates.seeds import Seed
 from lidar_perception.candidates.silhouette import silhouettes, similarity
-from lidar_perception.configurations import BEST
-from lidar_perception.datasets.kitti import KittiFrame, open_kitti
-from lidar_perception.evaluation.matching import match_centres, range_bins
-from lidar_perception.files import write_text
-from lidar_perception.params import PipelineParams
-from lidar_perception.pipeline import segment, truth_seed
+from lidar_perception.data.kitti.folder import KittiFrame, open_kitti
+from lidar_perception.groups import group_points
+from lidar_perception.runs.files import write_text
+from lidar_perception.scoring.centres.matching import match_centres, range_bins
 from lidar_perception.types import PEDESTRIAN, InputError
 
 KITTI_RANGES = np.array([2093, 1771, 468, 118, 37])  # paper A, Table 1

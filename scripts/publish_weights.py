@@ -16,18 +16,23 @@ from typing import Any
 
 import click
 
-from lidar_perception import checkpoint
-from lidar_perception.checkpoint import POINTNET, network_of, require_same, save_checkpoint
 from lidar_perception.cli.detection import score_detector
-from lidar_perception.datasets.kitti import open_kitti
-from lidar_perception.detection.checkpoint import load_network
-from lidar_perception.detection.weights_file import WEIGHTS
-from lidar_perception.detectors import open_detector
-from lidar_perception.evaluation.detection import DetectionReport
-from lidar_perception.files import write_text
-from lidar_perception.pointnet.checkpoint import load_pointnet
-from lidar_perception.pointnet.weights_file import WEIGHTS as POINTNET_WEIGHTS
-from lidar_perception.terminal import console, track
+from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.detectors import checkpoint
+from lidar_perception.detectors.checkpoint import (
+    POINTNET,
+    network_of,
+    require_same,
+    save_checkpoint,
+)
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointnet.checkpoint import load_pointnet
+from lidar_perception.detectors.pointnet.weights_file import WEIGHTS as POINTNET_WEIGHTS
+from lidar_perception.detectors.pointpillars.checkpoint import load_network
+from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.terminal import console, track
+from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.record import metrics_of, rounded
 
 LEAST_SCORE = 0.05  # AP needs boxes that a robot would not act on

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from samples import CALIBRATION, STAMP, scene, walker_truth
 
-from lidar_perception.datasets.bag import Bag
-from lidar_perception.datasets.kitti_calibration import KittiCalibration
-from lidar_perception.datasets.to_bag import Scan
-from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, TF_STATIC
+from lidar_perception.camera import Calibration
+from lidar_perception.data.bag import Bag
+from lidar_perception.data.to_bag import Scan
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, TF_STATIC
 
-OTHER_CALIBRATION = KittiCalibration(CALIBRATION.intrinsics * [[2], [2], [1]],
+OTHER_CALIBRATION = Calibration(CALIBRATION.intrinsics * [[2], [2], [1]],
                                      CALIBRATION.lidar_to_camera, 640, 480)
 LATCHED = {CAMERA_INFO, EXTRINSICS, TF_STATIC}
 

@@ -51,7 +51,7 @@ def streets():
 @pytest.fixture(scope="session")
 def drive_bag(streets, tmp_path_factory) -> Path:
     """A bag of a simulated drive: clouds, labels, camera."""
-    from lidar_perception.datasets.to_bag import write_bag
+    from lidar_perception.data.to_bag import write_bag
     from lidar_perception.simulation.scene import CROWDED
     from lidar_perception.simulation.to_bag import simulated_scans
     path = tmp_path_factory.mktemp("drive") / "drive"
@@ -64,7 +64,7 @@ def written(tmp_path_factory) -> Path:
     """The bag of bag_samples.scans(); tests copy what they change."""
     from bag_samples import scans
 
-    from lidar_perception.datasets.to_bag import write_bag
+    from lidar_perception.data.to_bag import write_bag
     path = tmp_path_factory.mktemp("bags") / "drive"
     assert write_bag(path, scans()) == 3
     return path
@@ -125,8 +125,8 @@ def few(tmp_path) -> Path:
 @pytest.fixture(scope="session")
 def domain() -> int:
     """A ROS domain of this test session's own, reached by this machine only."""
+    from lidar_perception.candidates.warm_up import warm_up
     from lidar_perception.nodes.graph import private_domain
-    from lidar_perception.pipeline import warm_up
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     number = private_domain()
     warm_up()  # what nodes compile is cached then; on a fresh machine that can outlast a wait

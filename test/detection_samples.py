@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from lidar_perception.detection.checkpoint import Header
-from lidar_perception.detection.config import NetworkConfig, network_config
-from lidar_perception.detection.detector import CPU, Detector, TorchNetwork
-from lidar_perception.detection.detector_params import DetectorParams
-from lidar_perception.detection.pointpillars import make_network
-from lidar_perception.params import with_values
+from lidar_perception.detectors.pointpillars.checkpoint import Header
+from lidar_perception.detectors.pointpillars.config import NetworkConfig, network_config
+from lidar_perception.detectors.pointpillars.detector import CPU, Detector, TorchNetwork
+from lidar_perception.detectors.pointpillars.network import make_network
+from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.param_fields import with_values
 from lidar_perception.types import Detections, LidarFrame
 
 # A car across and a pedestrian, standing on the ground 1.73 m below [x y z l w h yaw].

@@ -205,6 +205,7 @@ def evaluate(prepared, kind, level, least, metric):
     objects, scores = first_pass(prepared, kind, level, least)
     if objects == 0:
         return None
+
     def at(threshold):
         return second_pass(prepared, kind, level, least, metric, threshold)
 

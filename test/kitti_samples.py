@@ -17,10 +17,10 @@ from samples import (
     write,
 )
 
-from lidar_perception.datasets.bag import bag_message, decode, encode
-from lidar_perception.datasets.kitti_labels import format_label, to_labels
-from lidar_perception.messages import to_truth, truth_markers
+from lidar_perception.data.kitti.labels import format_label, to_labels
 from lidar_perception.types import GroundTruth
+from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.messages import to_truth, truth_markers
 from msg_utils.markers import from_marker_array
 
 TRACKING_LABELS = """\

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
-from lidar_perception.params import with_values
-from lidar_perception.pointnet.checkpoint import Header
-from lidar_perception.pointnet.config import PointNetConfig, pointnet_config
-from lidar_perception.pointnet.detector import PointNetDetector
-from lidar_perception.pointnet.network import CONTEXT, PointNet, make_pointnet
-from lidar_perception.pointnet.params import PointNetDetectorParams
+from lidar_perception.detectors.pointnet.checkpoint import Header
+from lidar_perception.detectors.pointnet.clusters import Clusters
+from lidar_perception.detectors.pointnet.config import PointNetConfig, pointnet_config
+from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.detectors.pointnet.network import CONTEXT, PointNet, make_pointnet
+from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
+from lidar_perception.param_fields import with_values
 
 CPU = torch.device("cpu")
 SMALL = dict(points=32, centroids=12, coarse=4, neighbours=(4, 6, 8), coarse_neighbours=4,
@@ -55,3 +57,12 @@ def random_detector(params: PointNetDetectorParams | None = None,
     """With random weights."""
     config = small(**changes)
     return PointNetDetector(lively(config), Header(config), CPU, params or eager())
+
+
+def blobs(rng, sizes, spread=0.4):
+    """Clusters of so many points, each around a place of its own."""
+    middles = rng.uniform(-30, 30, (len(sizes), 3)) * [1, 1, 0.03]
+    number = np.repeat(np.arange(len(sizes)), sizes)
+    xyz = middles[number] + rng.normal(0, spread, (len(number), 3))
+    points = np.column_stack([xyz, rng.random(len(number))]).astype(np.float32)
+    return Clusters(points, np.concatenate([[0], np.cumsum(sizes)]), np.arange(1, len(sizes) + 1))

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lidar_perception.datasets.bag import bag_message
-from lidar_perception.datasets.kitti_calibration import KittiCalibration
-from lidar_perception.datasets.kitti_labels import format_label, to_labels
-from lidar_perception.datasets.write_kitti import write_object
+from lidar_perception.camera import Calibration
+from lidar_perception.data.kitti.labels import format_label, to_labels
+from lidar_perception.data.kitti.write import write_object
 from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth
+from lidar_perception.wire.codec import bag_message
 from msg_utils.messages import ros_message
 from msg_utils.stamps import header_message
 
@@ -40,7 +40,7 @@ VELODYNE = np.column_stack([Rotation.from_euler("xyz", [0.002, 0.006, -0.009]).a
 INTRINSICS = np.array([[721.5377, 0, 609.6, 45.0], [0, 721.5377, 172.9, 0.2], [0, 0, 1, 0.003]])
 LIDAR_TO_CAMERA = np.eye(4)
 LIDAR_TO_CAMERA[:3] = RECTIFY @ VELODYNE
-CALIBRATION = KittiCalibration(INTRINSICS, LIDAR_TO_CAMERA, 1242, 375)
+CALIBRATION = Calibration(INTRINSICS, LIDAR_TO_CAMERA, 1242, 375)
 
 WALKER = np.array([8.0, 0.5, -0.85, 0.5, 0.5, 1.7, 0.3])  # [x y z l w h yaw]
 LABELS = """\

@@ -18,11 +18,20 @@ ROS = {"rclpy", "ament_index_python", "launch", "launch_ros", "sensor_msgs", "st
        "geometry_msgs", "visualization_msgs", "vision_msgs", "builtin_interfaces", "rosbag2_py"}
 MAX_LINES = 400
 
-# Each list is what the files of a folder may import; a dotted name includes all inside it.
-SHARED = [f"lidar_perception.{name}"
-          for name in ("types", "geometry", "params", "files", "rotated_iou")]
-ALGORITHMS = [f"lidar_perception.{name}" for name in ("ground", "clustering", "candidates")]
-NUMERIC = ["numpy", "scipy", "numba", "sklearn", "pypatchworkpp"]
+# From the ground up: a room imports only those before it, and itself.
+ROOMS = ("types", "param_fields", "geometry", "camera", "groups", "runs", "wire", "data", "ground",
+         "clustering", "candidates", "detectors", "scoring", "simulation", "training",
+         "reproduction", "params", "nodes", "cli")
+# What the files of a room may import besides the rooms below and the standard library.
+NUMBERS = ["numpy", "scipy", "numba"]
+STRANGERS = {
+    "types": ["numpy"], "param_fields": [], "geometry": ["numpy", "numba"], "camera": NUMBERS,
+    "groups": ["numpy"], "runs": ["rich"], "wire": ["numpy", "rosbags", "msg_utils"],
+    "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils"],
+    "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,
+    "detectors": [*NUMBERS, "torch", "safetensors", "onnx", "onnxruntime", "onnxscript"],
+    "params": [],
+}
 
 
 def imports(tree, everywhere=True):
@@ -76,8 +85,9 @@ def public_functions(tree):
 
 def test_there_are_sources_to_look_at():
     assert len(files_in("msg_utils")) >= 5
-    for folder in ("ground", "clustering", "candidates", "detection", "pointnet", "hybrid",
-                   "training", "nodes", "cli", "datasets", "evaluation", "reproduction"):
+    assert {n.split("/")[1].removesuffix(".py") for n in TREES if n.startswith("lidar_perception/")
+            } == {*ROOMS, "__init__"}
+    for folder in ROOMS[5:-3]:
         assert len(files_in(f"lidar_perception/{folder}")) >= 2
 
 
@@ -112,96 +122,54 @@ def test_the_command_line_imports_no_ros_when_it_is_imported(name):
     assert ros == set()
 
 
-@pytest.mark.parametrize("name", files_in("lidar_perception/ground", "lidar_perception/clustering",
-                                          "lidar_perception/candidates"))
-def test_algorithms_import_numbers_and_the_shared_files_only(name):
-    assert strangers(name, NUMERIC + SHARED + ALGORITHMS) == []
+def room(name):
+    """Of a module or a file's name."""
+    return name.replace("/", ".").split(".")[1] if "." in name.replace("/", ".") else ""
 
 
-NETWORKS = [f"lidar_perception.{name}"
-            for name in ("checkpoint", "config_json", "devices", "param_fields")]
+@pytest.mark.parametrize("name", [n for n in TREES if n.startswith("lidar_perception/")
+                                  and n != "lidar_perception/__init__.py"])
+def test_no_arrow_points_up(name):
+    """Imports inside functions count, and those for types."""
+    below = ROOMS[:ROOMS.index(room(name.removesuffix(".py"))) + 1]
+    above = [m for m in imports(TREES[name]) if m.startswith("lidar_perception.")
+             and m != "lidar_perception.__version__" and room(m) not in below]
+    assert above == []
 
 
-@pytest.mark.parametrize("name", files_in("lidar_perception/detection"))
-def test_detectors_import_torch_and_the_algorithms(name):
-    tensors = ["torch", "safetensors", "onnx", "onnxruntime", "onnxscript"]
-    own = ["lidar_perception.detection", *NETWORKS]
-    assert strangers(name, NUMERIC + tensors + SHARED + ALGORITHMS + own) == []
+@pytest.mark.parametrize("name", [n for n in TREES if room(n.removesuffix(".py")) in STRANGERS])
+def test_a_room_of_the_core_needs_no_other_library(name):
+    allowed = [*STRANGERS[room(name.removesuffix(".py"))], "lidar_perception"]
+    assert strangers(name, allowed) == []
 
 
-@pytest.mark.parametrize("name", files_in("lidar_perception/pointnet"))
-def test_pointnet_imports_of_the_other_detector_what_is_not_its_network(name):
-    shared = [f"lidar_perception.detection.{module}" for module in (
-        "config", "detector_params", "network_detector", "nms", "view", "weights_file")]
-    own = ["lidar_perception.pointnet", *NETWORKS, *shared]
-    algorithms = [m for m in ALGORITHMS if not m.endswith("candidates")]
-    assert strangers(name, NUMERIC + ["torch"] + SHARED + algorithms + own) == []
+NETWORKS = "lidar_perception.detectors.pointpillars", "lidar_perception.detectors.pointnet"
 
 
-@pytest.mark.parametrize("name", files_in("lidar_perception/hybrid"))
-def test_hybrids_import_the_detectors_that_they_join(name):
-    joined = [f"lidar_perception.{module}" for module in (
-        "hybrid", "pointnet", "detection.config", "detection.nms", "detection.view", "detectors",
-        "pipeline", "camera", "configurations", "param_fields")]
-    assert strangers(name, ["numpy", *SHARED, *ALGORITHMS, *joined]) == []
+@pytest.mark.parametrize("name", files_in(*(n.replace(".", "/") for n in NETWORKS)))
+def test_a_network_knows_no_other(name):
+    other, = (n for n in NETWORKS if not name.startswith(n.replace(".", "/")))
+    assert [m for m in imports(TREES[name]) if within(m, [other])] == []
 
 
-SHARED_TRAINING = [f"lidar_perception.training.{name}" for name in (
-    "params", "schedule", "ranks", "log", "run", "loop", "augment", "putting", "database",
-    "data")]
+SHARED_TRAINING = [f"lidar_perception/training/{name}.py" for name in (
+    "schedule", "ranks", "log", "run", "loop", "augment", "putting", "database", "data")]
 
 
-@pytest.mark.parametrize("module", SHARED_TRAINING)
-def test_what_all_networks_train_with_knows_none_of_them(module):
-    own = [*SHARED_TRAINING, "lidar_perception.param_fields", "lidar_perception.terminal"]
-    assert strangers(f"{module.replace('.', '/')}.py", [*NUMERIC, "torch", *SHARED, *own]) == []
-
-
-@pytest.mark.parametrize("name, allowed", [
-    ("lidar_perception/types.py", []),
-    ("lidar_perception/rotated_iou.py", ["numba"]),
-    ("lidar_perception/geometry.py", []),
-    ("lidar_perception/files.py", ["lidar_perception.types"]),
-    ("lidar_perception/topics.py", []),
-    ("lidar_perception/machine.py", []),
-    ("lidar_perception/processes.py", ["lidar_perception.types"]),
-    ("lidar_perception/resuming.py", ["lidar_perception.types"]),
-    ("lidar_perception/checkpoint.py", ["torch", "safetensors", "lidar_perception.files",
-                                        "lidar_perception.types"]),
-    ("lidar_perception/devices.py", ["torch", "lidar_perception.types"]),
-    ("lidar_perception/detectors.py", ["lidar_perception.checkpoint", "lidar_perception.detection",
-                                       "lidar_perception.pointnet", "lidar_perception.params",
-                                       "lidar_perception.types"]),
-    ("lidar_perception/reproduction/paper.py", ["lidar_perception.params"]),
-    ("lidar_perception/param_fields.py", []),
-    ("lidar_perception/params.py", ["lidar_perception.param_fields"]),
-    ("lidar_perception/camera.py", ["scipy", "numba", "lidar_perception.types"]),
-    ("lidar_perception/pipeline.py", ["lidar_perception.camera", *SHARED, *ALGORITHMS]),
-])
-def test_the_shared_files_are_leaves(name, allowed):
-    assert strangers(name, ["numpy", *allowed]) == []
-
-
-@pytest.mark.parametrize("name", files_in("lidar_perception/datasets",
-                                          "lidar_perception/simulation"))
-def test_data_sources_know_no_algorithm(name):
-    above = [*ALGORITHMS, "lidar_perception.detection", "lidar_perception.pointnet",
-             "lidar_perception.detectors", "lidar_perception.hybrid", "lidar_perception.training",
-             "lidar_perception.pipeline", "lidar_perception.evaluation"]
-    assert [m for m in imports(TREES[name]) if within(m, above)] == []
-
-
-@pytest.mark.parametrize("name", [n for n in OUTSIDE if "/reproduction/" not in n])
-def test_experiments_are_on_top_of_the_core(name):
-    found = [m for m in imports(TREES[name]) if within(m, ["lidar_perception.reproduction"])]
-    assert all(within(m, ["lidar_perception.reproduction.paper"]) for m in found)
+@pytest.mark.parametrize("name", SHARED_TRAINING)
+def test_what_all_networks_train_with_knows_none_of_them(name):
+    assert [m for m in imports(TREES[name]) if within(m, NETWORKS)] == []
 
 
 def test_modules_do_not_import_in_circles():
+    """Imports inside functions count, and those for types."""
     modules = {name.removesuffix(".py").removesuffix("/__init__").replace("/", "."): tree
                for name, tree in TREES.items()}
-    arrows = {m: {other for i in imports(tree, everywhere=False)
-                  for other in (i, i.rpartition(".")[0]) if other in modules and other != m}
+    packages = {name.removesuffix("/__init__.py").replace("/", ".") for name in TREES
+                if name.endswith("/__init__.py")}
+    arrows = {m: {other for i in imports(tree)
+                  for other in (i, i.rpartition(".")[0])
+                  if other in modules and other not in packages and other != m}
               for m, tree in modules.items()}
     done, path = set(), []
 
@@ -238,31 +206,37 @@ def test_no_source_is_longer_than_a_reader_can_hold(name):
 
 @pytest.mark.parametrize("module, heavy", [
     ("lidar_perception.types", "numba torch matplotlib scipy sklearn rosbags rich click"),
-    ("lidar_perception.params", "numba torch matplotlib scipy sklearn rosbags rich click numpy"),
-    ("lidar_perception.topics", "numba torch matplotlib scipy sklearn rosbags rich click numpy"),
-    ("lidar_perception.geometry", "numba torch matplotlib scipy sklearn"),
+    ("lidar_perception.params", "numba torch matplotlib scipy sklearn rosbags rich click"),
+    ("lidar_perception.wire.topics", "numba torch matplotlib scipy sklearn rosbags rich click"),
+    ("lidar_perception.geometry", "torch matplotlib sklearn rosbags rich click"),
     ("lidar_perception.camera", "torch matplotlib sklearn"),
-    ("lidar_perception.pipeline", "torch matplotlib sklearn rosbags rich click"),
+    ("lidar_perception.candidates.pipeline", "torch matplotlib sklearn rosbags rich click"),
     ("msg_utils.point_cloud2", "numba torch matplotlib scipy rosbags lidar_perception"),
     ("msg_utils.markers", "numba torch matplotlib scipy rosbags lidar_perception"),
-    ("lidar_perception.detection.config", "numba torch matplotlib scipy sklearn rich click"),
-    ("lidar_perception.detection.detector_params", "numba torch matplotlib scipy numpy click"),
-    ("lidar_perception.detection.weights_file", "numba torch matplotlib scipy click"),
-    ("lidar_perception.pointnet.config", "numba torch matplotlib scipy sklearn rich click"),
-    ("lidar_perception.pointnet.params", "numba torch matplotlib scipy sklearn rich click"),
-    ("lidar_perception.pointnet.weights_file", "numba torch matplotlib scipy click"),
-    ("lidar_perception.pointnet.detector", "onnx onnxruntime matplotlib sklearn rich click"),
-    ("lidar_perception.detection.expert", "torch matplotlib sklearn rosbags rich click"),
-    ("lidar_perception.detection.detector", "onnx onnxruntime matplotlib sklearn rich click"),
-    ("lidar_perception.training.params", "numba torch matplotlib scipy numpy rich click"),
+    ("lidar_perception.detectors.pointpillars.config",
+     "numba torch matplotlib scipy sklearn rich click"),
+    ("lidar_perception.detectors.pointpillars.params", "numba torch matplotlib scipy click"),
+    ("lidar_perception.detectors.pointpillars.weights_file", "numba torch matplotlib scipy click"),
+    ("lidar_perception.detectors.pointnet.config",
+     "numba torch matplotlib scipy sklearn rich click"),
+    ("lidar_perception.detectors.pointnet.params",
+     "numba torch matplotlib scipy sklearn rich click"),
+    ("lidar_perception.detectors.pointnet.weights_file", "numba torch matplotlib scipy click"),
+    ("lidar_perception.detectors.pointnet.detector",
+     "onnx onnxruntime matplotlib sklearn rich click"),
+    ("lidar_perception.detectors.pointpillars.expert",
+     "torch matplotlib sklearn rosbags rich click"),
+    ("lidar_perception.detectors.pointpillars.detector",
+     "onnx onnxruntime matplotlib sklearn rich click"),
+    ("lidar_perception.training.params", "numba torch matplotlib scipy rich click"),
     ("lidar_perception.cli.train", "numba torch matplotlib scipy"),
     ("lidar_perception.cli.weights", "numba torch matplotlib scipy"),
-    ("lidar_perception.evaluation.candidates", "torch matplotlib sklearn click"),
-    ("lidar_perception.evaluation.detection", "torch matplotlib sklearn rich click"),
-    ("lidar_perception.evaluation.comparison", "torch matplotlib sklearn click"),
-    ("lidar_perception.hybrid.params", "numba torch matplotlib scipy numpy rich click"),
+    ("lidar_perception.scoring.centres.report", "torch matplotlib sklearn click"),
+    ("lidar_perception.scoring.kitti.report", "torch matplotlib sklearn rich click"),
+    ("lidar_perception.scoring.comparison.outcomes", "torch matplotlib sklearn click"),
+    ("lidar_perception.detectors.hybrid.params", "numba torch matplotlib scipy rich click"),
     ("lidar_perception.cli.compare", "numba torch matplotlib scipy sklearn"),
-    ("lidar_perception.evaluation.nuscenes", "torch matplotlib sklearn rich click rosbags"),
+    ("lidar_perception.scoring.nuscenes.report", "torch matplotlib sklearn rich click rosbags"),
     ("lidar_perception.reproduction.stm_cpa", "torch matplotlib sklearn click jinja2 distributed"),
     ("lidar_perception.cli.reproduce", "numba torch matplotlib scipy sklearn jinja2 distributed"),
     ("lidar_perception.cli.main", "numba torch matplotlib scipy sklearn rosbags"),

@@ -20,7 +20,7 @@ from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, row, target_text, value_text
 from benchmark.timing import Clock, in_child, interleaved
 from lidar_perception.clustering.euclidean import euclidean
-from lidar_perception.params import EuclideanParams
+from lidar_perception.clustering.params import EuclideanParams
 from lidar_perception.types import LidarFrame
 
 SKLEARN = [p.name for p in peers.SKLEARN]

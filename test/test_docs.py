@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from lidar_perception.nodes.main import NODES, help_text
-from lidar_perception.params import parameter_fields
+from lidar_perception.param_fields import parameter_fields
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -77,9 +77,10 @@ def test_links_lead_somewhere(page):
 
 
 def test_the_parameter_file_of_best_is_made_from_the_code(generate):
+    from lidar_perception.candidates.configurations import BEST_VALUES
+    from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
-    from lidar_perception.configurations import BEST_VALUES
-    from lidar_perception.params import PipelineParams, with_values
+    from lidar_perception.param_fields import with_values
     assert generate.BEST.read_text() == generate.best(), "run: python docs/generate.py"
     assert (with_values(PipelineParams(), read_config(generate.BEST, PipelineParams()))
             == with_values(PipelineParams(), BEST_VALUES))
@@ -88,13 +89,10 @@ def test_the_parameter_file_of_best_is_made_from_the_code(generate):
 
 @pytest.mark.parametrize("network", ["pointpillars", "pointnet"])
 def test_the_nodes_before_a_detector_get_its_numbers(generate, network):
+    from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
-    from lidar_perception.params import (
-        ClusteringNodeParams,
-        GroundNodeParams,
-        PipelineParams,
-        with_values,
-    )
+    from lidar_perception.param_fields import with_values
+    from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
     file = getattr(generate, network.upper())
     assert file.read_text() == getattr(generate, network)(), "run: python docs/generate.py"
     values = read_config(file, PipelineParams())

@@ -7,30 +7,33 @@ import math
 
 import pytest
 
-from lidar_perception import params as module
+from lidar_perception import params as node_params
+from lidar_perception.candidates import params as candidate_params
+from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.cli.options import read_config
-from lidar_perception.detection import detector_params
-from lidar_perception.detection.detector_params import DetectorParams
+from lidar_perception.clustering import params as clustering_params
+from lidar_perception.clustering.params import DbscanParams
+from lidar_perception.detectors import params as detector_params
+from lidar_perception.detectors.pointnet import params as pointnet_params
+from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
+from lidar_perception.detectors.pointpillars import params as pointpillars_params
+from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.ground import params as ground_params
+from lidar_perception.ground.params import ThresholdParams
+from lidar_perception.param_fields import Params, flatten, parameter_fields, with_values
 from lidar_perception.params import (
     ClusteringNodeParams,
-    DbscanParams,
     GroundNodeParams,
-    Params,
-    PipelineParams,
     PlayerParams,
     RefinementNodeParams,
-    ThresholdParams,
-    flatten,
-    parameter_fields,
-    with_values,
 )
-from lidar_perception.pointnet import params as pointnet_params
-from lidar_perception.pointnet.params import PointNetDetectorParams
 from lidar_perception.training import params as training_params
 from lidar_perception.training.params import PointPillarsTraining
 from lidar_perception.types import InputError
+from lidar_perception.wire import params as wire_params
 
-MODULES = module, detector_params, pointnet_params, training_params  # tests may import more
+MODULES = (node_params, candidate_params, clustering_params, detector_params, ground_params,
+           wire_params, pointpillars_params, pointnet_params, training_params)
 
 
 def groups_below(base: type) -> list[type]:

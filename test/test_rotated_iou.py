@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidar_perception.geometry import box_corners
-from lidar_perception.rotated_iou import bev_and_3d_iou, bev_iou, iou_3d
+from lidar_perception.geometry import bev_and_3d_iou, bev_iou, box_corners, iou_3d
 
 few = settings(max_examples=60, database=None)
 seeds = st.integers(0, 2**32 - 1)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidar_perception.params import HeightParams
+from lidar_perception.candidates.params import HeightParams
 
 
 def snap_to_ground(boxes: np.ndarray, plane: np.ndarray | None) -> np.ndarray:

@@ -14,6 +14,7 @@ from importlib.resources import files
 import numpy as np
 from numba import njit
 
+from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
     HEIGHT,
@@ -22,7 +23,7 @@ from lidar_perception.candidates.silhouette import (
     covered,
     silhouettes,
 )
-from lidar_perception.params import PipelineParams, with_values
+from lidar_perception.param_fields import with_values
 
 SHAPE_KNOTS = {  # feature -> where its curve bends; it is level beyond the first and the last
     "range_m": (5, 10, 15, 20, 30, 40, 55),

@@ -9,9 +9,10 @@ import numpy as np
 
 from lidar_perception.candidates.boxes import height_matches
 from lidar_perception.candidates.confidence import confidence, shape_features
+from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.seeds import Seed, own_cluster
 from lidar_perception.candidates.silhouette import cpa_scales, silhouettes, similarity
-from lidar_perception.params import PipelineParams
+from lidar_perception.groups import group_points
 from lidar_perception.types import PEDESTRIAN, Detections
 
 STAGES = ("stage1", "stage2", "final")
@@ -78,16 +79,3 @@ def refine(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, seed: Seed,
                       kept[final >= threshold] + 1,
                       dict(height=(t1 - t0) * 1e3, stm=(t2 - t1) * 1e3, cpa=(t3 - t2) * 1e3,
                            confidence=(t4 - t3) * 1e3))
-
-
-def group_points(xyz: np.ndarray, labels: np.ndarray,
-                 wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """points (M, 3) of the clusters `wanted` (K,) of ids, one cluster after the other, and
-    start (K + 1,) where each begins."""
-    place = np.full(int(labels.max(initial=0)) + 1, -1)
-    place[wanted] = np.arange(len(wanted))
-    group = place[labels]
-    members = np.flatnonzero(group >= 0)
-    members = members[np.argsort(group[members], kind="stable")]
-    sizes = np.bincount(group[members], minlength=len(wanted))
-    return xyz.take(members, axis=0), np.concatenate([[0], np.cumsum(sizes)])

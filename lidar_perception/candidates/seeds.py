@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.silhouette import silhouettes, to_pixels
-from lidar_perception.files import write_text
 from lidar_perception.geometry import points_in_box
-from lidar_perception.params import PipelineParams
+from lidar_perception.runs.files import write_text
 from lidar_perception.types import InputError
 
 MIN_POINTS = 10  # a thinner seed has no shape to compare with; DBSCAN's min_samples likewise

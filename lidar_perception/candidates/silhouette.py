@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.params import CpaParams, PipelineParams, StmParams
+from lidar_perception.candidates.params import CpaParams, PipelineParams, StmParams
 
 ROWS, COLUMNS = 80, 32  # the paper's window, Table 2
 HEIGHT, WIDTH = 2.4, 1.6  # metres, of the metric window

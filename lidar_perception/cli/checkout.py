@@ -39,7 +39,7 @@ def test(arguments: tuple[str, ...]) -> None:
 
 
 def _with_processes() -> list[Path]:
-    folder = ROOT / "test"
+    folder = ROOT / "test/ros"
     return sorted([*folder.glob("test_ros_*.py"), *folder.glob("test_stopping.py")])
 
 

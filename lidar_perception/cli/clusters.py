@@ -11,8 +11,12 @@ import click
 import numpy as np
 from rich.console import Console
 
-from lidar_perception.datasets.kitti import KittiFrame, open_kitti
-from lidar_perception.evaluation.clusters import (
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.data.kitti.folder import KittiFrame, open_kitti
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.terminal import console, track
+from lidar_perception.scoring.points.clusters import (
     UNKNOWN,
     ClusterScores,
     labelled,
@@ -20,11 +24,7 @@ from lidar_perception.evaluation.clusters import (
     uncared,
     unknown_where,
 )
-from lidar_perception.evaluation.report import narrow_table, print_skipped
-from lidar_perception.files import write_text
-from lidar_perception.ground.segment import segment_ground
-from lidar_perception.pipeline import cluster_obstacles
-from lidar_perception.terminal import console, track
+from lidar_perception.scoring.tables import narrow_table, print_skipped
 from lidar_perception.types import InputError
 
 # Paper C: segmentation on KITTI, in percent
@@ -50,9 +50,9 @@ def clusters(kitti: Path, weights: Path | None, json_file: Path | None) -> None:
     Example:
       lidar-perception evaluate clusters --kitti /data/kitti/object --json clusters.json
     """
-    from lidar_perception.pointnet.checkpoint import load_pointnet
-    from lidar_perception.pointnet.network import fused
-    from lidar_perception.pointnet.weights_file import WEIGHTS
+    from lidar_perception.detectors.pointnet.checkpoint import load_pointnet
+    from lidar_perception.detectors.pointnet.network import fused
+    from lidar_perception.detectors.pointnet.weights_file import WEIGHTS
     _, network = load_pointnet(weights or WEIGHTS)
     frames = open_kitti(kitti)
     scores = ClusterScores(network.config.classes)
@@ -68,8 +68,8 @@ def clusters(kitti: Path, weights: Path | None, json_file: Path | None) -> None:
 
 
 def _scored(frames: list[KittiFrame], network: Any, scores: ClusterScores) -> Iterator[None]:
-    from lidar_perception.pointnet.clusters import clusters_of
-    from lidar_perception.pointnet.predict import predict
+    from lidar_perception.detectors.pointnet.clusters import clusters_of
+    from lidar_perception.detectors.pointnet.predict import predict
     config = network.config
     for frame in frames:
         try:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import click
 
-from lidar_perception.files import write_text
-from lidar_perception.terminal import console, errors, track
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.terminal import console, errors, track
 from lidar_perception.types import InputError
 
 
@@ -40,13 +40,13 @@ def compare(kitti: Path, weights: tuple[Path, ...], most: int | None, json_file:
       lidar-perception compare --kitti /data/kitti/object --json compare.json --png compare.png
       lidar-perception compare --kitti training_data --weights v4.safetensors --frames 100
     """
-    from lidar_perception.datasets.kitti import open_kitti
-    from lidar_perception.evaluation.comparison import Outcome, objects
-    from lidar_perception.evaluation.comparison import compare as compared
-    from lidar_perception.evaluation.comparison_report import draw_comparison, print_comparison
-    from lidar_perception.evaluation.contenders import contenders
-    from lidar_perception.evaluation.detection_report import CENTRE_F1
-    from lidar_perception.machine import cpu_name
+    from lidar_perception.data.kitti.folder import open_kitti
+    from lidar_perception.runs.machine import cpu_name
+    from lidar_perception.scoring.comparison.contenders import contenders
+    from lidar_perception.scoring.comparison.outcomes import Outcome, objects
+    from lidar_perception.scoring.comparison.outcomes import compare as compared
+    from lidar_perception.scoring.comparison.report import draw_comparison, print_comparison
+    from lidar_perception.scoring.kitti.tables import CENTRE_F1
 
     frames = open_kitti(kitti)
     with errors.status("loading detectors"):

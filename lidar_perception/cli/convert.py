@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from lidar_perception.datasets.kitti import open_kitti
-from lidar_perception.datasets.to_bag import kitti_scan, write_bag
-from lidar_perception.terminal import console, track
+from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.to_bag import kitti_scan, write_bag
+from lidar_perception.runs.terminal import console, track
 from lidar_perception.types import InputError
 
 

@@ -9,19 +9,19 @@ from pathlib import Path
 import click
 import numpy as np
 
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.cli.evaluate import view_as_recorded
 from lidar_perception.cli.options import parameter_options
-from lidar_perception.configurations import PAPER
-from lidar_perception.datasets.bag import Bag
-from lidar_perception.evaluation.matching import match_centres
-from lidar_perception.evaluation.report import print_candidate_report
-from lidar_perception.files import write_text
-from lidar_perception.messages import column, to_detections, to_frame
+from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.graph import cloud_topic, result_topics
-from lidar_perception.params import PipelineParams
-from lidar_perception.pipeline import warm_up
-from lidar_perception.terminal import console, errors, track
-from lidar_perception.topics import POINTS, TRUTH
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.terminal import console, errors, track
+from lidar_perception.scoring.centres.matching import match_centres
+from lidar_perception.scoring.centres.tables import print_candidate_report
+from lidar_perception.wire.messages import column, to_detections, to_frame
+from lidar_perception.wire.topics import POINTS, TRUTH
 from msg_utils.markers import from_marker_array
 
 
@@ -83,8 +83,8 @@ def demo(kitti: Path | None, bag: Path | None, out: Path, frames: int, drive_see
 
 
 def _make_bag(path: Path, kitti: Path | None, frames: int, drive_seed: int) -> Path:
-    from lidar_perception.datasets.kitti import open_kitti
-    from lidar_perception.datasets.to_bag import kitti_scan, write_bag
+    from lidar_perception.data.kitti.folder import open_kitti
+    from lidar_perception.data.to_bag import kitti_scan, write_bag
     if kitti is not None:
         found = open_kitti(kitti)
         scans = track(map(kitti_scan, found), f"converting {kitti}", len(found))
@@ -99,7 +99,7 @@ def _make_bag(path: Path, kitti: Path | None, frames: int, drive_seed: int) -> P
 
 def _draw_best(result: Path, picture: Path, single: bool) -> bool:
     """Draw the recorded frame with most hits; False if none has a labelled pedestrian."""
-    from lidar_perception.evaluation.pictures import draw_frame
+    from lidar_perception.scoring.pictures import draw_frame
     final = result_topics(single)["final"]
     frames: dict[int, dict] = {}
     with Bag(result) as bag:
@@ -123,5 +123,3 @@ def _draw_best(result: Path, picture: Path, single: bool) -> bool:
                            f"pedestrians found, stamp {best / 1e9:.1f} s")
                 return True
     return False
-
-

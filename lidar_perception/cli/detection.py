@@ -9,14 +9,14 @@ from time import perf_counter
 
 import click
 
-from lidar_perception.datasets.kitti import KittiFrame, open_kitti
-from lidar_perception.datasets.kitti_results import read_results
-from lidar_perception.datasets.kitti_results import write_results as write_result_file
-from lidar_perception.evaluation.detection import DetectionReport
-from lidar_perception.evaluation.detection_report import print_detection_report
-from lidar_perception.evaluation.thinning import thinned
-from lidar_perception.files import write_text
-from lidar_perception.terminal import console, track
+from lidar_perception.data.kitti.folder import KittiFrame, open_kitti
+from lidar_perception.data.kitti.results import read_results
+from lidar_perception.data.kitti.results import write_results as write_result_file
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.terminal import console, track
+from lidar_perception.scoring.kitti.report import DetectionReport
+from lidar_perception.scoring.kitti.tables import print_detection_report
+from lidar_perception.scoring.thinning import thinned
 from lidar_perception.types import Detections, InputError
 
 
@@ -74,7 +74,7 @@ def detection(kitti: Path, results: Path | None, weights: Path | None, device: s
             raise InputError(f"{results} is not a folder; give the folder of the result files")
         work = score_results(frames, results, report)
     else:
-        from lidar_perception.detectors import open_detector
+        from lidar_perception.detectors.open import open_detector
         work = score_detector(frames, open_detector(
             weights, device, least_score=least_score), write_results, report, keep)
     for _ in track(work, "evaluating", len(frames)):

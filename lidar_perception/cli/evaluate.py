@@ -7,23 +7,24 @@ from pathlib import Path
 
 import click
 
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.cli.clusters import clusters
 from lidar_perception.cli.detection import detection
 from lidar_perception.cli.nuscenes import nuscenes
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.cli.segmentation import segmentation
-from lidar_perception.configurations import PAPER
-from lidar_perception.datasets.bag import Bag
-from lidar_perception.datasets.recording import open_recording
-from lidar_perception.evaluation.candidates import CandidateReport, pedestrians
-from lidar_perception.evaluation.candidates import evaluate as evaluate_frames
-from lidar_perception.evaluation.report import print_candidate_report
-from lidar_perception.files import write_text
-from lidar_perception.params import PipelineParams, with_values
-from lidar_perception.pipeline import warm_up
-from lidar_perception.terminal import console, errors, track
-from lidar_perception.topics import CAMERA_INFO, EXTRINSICS
+from lidar_perception.data.bag import Bag
+from lidar_perception.data.recording import open_recording
+from lidar_perception.param_fields import with_values
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.terminal import console, errors, track
+from lidar_perception.scoring.centres.report import CandidateReport, pedestrians
+from lidar_perception.scoring.centres.report import evaluate as evaluate_frames
+from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.types import InputError
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS
 
 
 def view_as_recorded(bag: Path, params: PipelineParams) -> PipelineParams:
@@ -82,7 +83,7 @@ def candidates(kitti: Path | None, bag: Path | None, json_file: Path | None, png
         raise InputError(f"{recording.path}: no frame with a Pedestrian label{reasons}")
     print_candidate_report(content, console)
     if best is not None:
-        from lidar_perception.evaluation.pictures import draw_frame
+        from lidar_perception.scoring.pictures import draw_frame
         _, recorded, segmented, found = best
         draw_frame(png, segmented.xyz, segmented.ground, segmented.cluster_ids,
                    pedestrians(recorded), found.final.boxes, title=f"frame {recorded.name}")

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 from rich.table import Table
 
-from lidar_perception.datasets.bag import Bag
-from lidar_perception.terminal import console
+from lidar_perception.data.bag import Bag
+from lidar_perception.runs.terminal import console
 
 
 @click.command()

@@ -9,14 +9,14 @@ from time import perf_counter
 
 import click
 
-from lidar_perception.datasets.nuscenes import NuscenesFrame, open_nuscenes
-from lidar_perception.datasets.nuscenes_boxes import GlobalBoxes
-from lidar_perception.datasets.nuscenes_results import read_results, to_results
-from lidar_perception.datasets.nuscenes_results import write_results as write_result_file
-from lidar_perception.evaluation.nuscenes import NuscenesReport
-from lidar_perception.evaluation.nuscenes_report import print_nuscenes_report
-from lidar_perception.files import write_text
-from lidar_perception.terminal import console, track
+from lidar_perception.data.nuscenes.boxes import GlobalBoxes
+from lidar_perception.data.nuscenes.folder import NuscenesFrame, open_nuscenes
+from lidar_perception.data.nuscenes.results import read_results, to_results
+from lidar_perception.data.nuscenes.results import write_results as write_result_file
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.terminal import console, track
+from lidar_perception.scoring.nuscenes.report import NuscenesReport
+from lidar_perception.scoring.nuscenes.tables import print_nuscenes_report
 from lidar_perception.types import InputError
 
 
@@ -92,7 +92,7 @@ def scene_names(path: Path) -> list[str]:
 
 def detector_at(weights: Path, device: str, sensor_height: float) -> Callable:
     """The detector of a checkpoint for a level sensor so many metres above the ground."""
-    from lidar_perception.detectors import open_detector
+    from lidar_perception.detectors.open import open_detector
     return open_detector(weights, device, sensor_height)
 
 

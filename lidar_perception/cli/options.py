@@ -10,8 +10,8 @@ from typing import Any
 import click
 import yaml
 
-from lidar_perception.configurations import CONFIGURATIONS
-from lidar_perception.params import flatten, parameter_fields, with_values
+from lidar_perception.candidates.configurations import CONFIGURATIONS
+from lidar_perception.param_fields import flatten, parameter_fields, with_values
 from lidar_perception.types import InputError
 
 

@@ -13,8 +13,8 @@ from typing import Any
 import click
 
 from lidar_perception import __version__
-from lidar_perception.machine import cpu_name
 from lidar_perception.reproduction.studies import STUDIES
+from lidar_perception.runs.machine import cpu_name
 from lidar_perception.types import InputError
 
 EXPERIMENTS = {"stm-cpa": "lidar_perception.reproduction.stm_cpa:STM_CPA"}
@@ -54,7 +54,7 @@ def reproduce(experiment: str, study: str | None, kitti: Path, out: Path, jobs: 
                                  param_hint="--study")
     from lidar_perception.reproduction.report import print_report, skipped_groups, write_report
     from lidar_perception.reproduction.runner import run
-    from lidar_perception.terminal import console
+    from lidar_perception.runs.terminal import console
 
     chosen = _load(EXPERIMENTS[experiment] if study is None else STUDIES[study])
     started, before = datetime.now().astimezone(), perf_counter()

@@ -8,15 +8,17 @@ from pathlib import Path
 import click
 import numpy as np
 
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.seed_sources import clicked_seed, truth_seed
 from lidar_perception.candidates.seeds import save_seed
 from lidar_perception.candidates.silhouette import to_pixels
 from lidar_perception.cli.options import parameter_options
-from lidar_perception.datasets.recording import Recorded, open_recording
-from lidar_perception.evaluation.candidates import pedestrians
-from lidar_perception.params import PipelineParams, ViewParams
-from lidar_perception.pipeline import clicked_seed, segment, truth_seed
-from lidar_perception.terminal import console
+from lidar_perception.data.recording import Recorded, open_recording
+from lidar_perception.runs.terminal import console
+from lidar_perception.scoring.centres.report import pedestrians
 from lidar_perception.types import InputError
+from lidar_perception.wire.params import ViewParams
 
 
 @click.command()

@@ -14,30 +14,26 @@ import click
 import numpy as np
 from rich.markup import escape
 
+from lidar_perception.candidates.segmented import points_in_view
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.datasets.recording import Recording, open_recording
-from lidar_perception.datasets.semantickitti import SemanticFrame, open_semantic_kitti
-from lidar_perception.evaluation.segmentation import (
+from lidar_perception.clustering.params import CLUSTERING_METHODS, ClusteringParams
+from lidar_perception.data.recording import Recording, open_recording
+from lidar_perception.data.semantickitti import SemanticFrame, open_semantic_kitti
+from lidar_perception.ground.params import GROUND_METHODS, GroundParams
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.terminal import console, errors, track
+from lidar_perception.scoring.points.segmentation import (
     ClusterReport,
     GroundReport,
     Objects,
     objects_in_boxes,
     objects_of_instances,
 )
-from lidar_perception.evaluation.segmentation_report import draw_ground, print_scores
-from lidar_perception.files import write_text
-from lidar_perception.ground.segment import segment_ground
-from lidar_perception.params import (
-    CLUSTERING_METHODS,
-    GROUND_METHODS,
-    ClusteringParams,
-    GroundParams,
-    ViewParams,
-)
-from lidar_perception.pipeline import points_in_view
-from lidar_perception.terminal import console, errors, track
+from lidar_perception.scoring.points.tables import draw_ground, print_scores
 from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.wire.params import ViewParams
 
 
 @dataclass(frozen=True)

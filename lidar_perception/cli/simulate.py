@@ -11,17 +11,17 @@ from pathlib import Path
 import click
 
 from lidar_perception import __version__
-from lidar_perception.datasets.recording import Recorded, open_recording
-from lidar_perception.datasets.to_bag import write_bag
-from lidar_perception.files import write_text
+from lidar_perception.data.recording import Recorded, open_recording
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.folder import is_finished, unfinished
+from lidar_perception.runs.terminal import console, track
 from lidar_perception.simulation.camera import FORWARD_CAMERA, labels_in_view
 from lidar_perception.simulation.dataset import LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import drive, longest_drive
-from lidar_perception.simulation.folder import is_finished, unfinished
 from lidar_perception.simulation.scene import KINDS, Streets
 from lidar_perception.simulation.sensor import GENERIC, SENSORS, sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
-from lidar_perception.terminal import console, track
 from lidar_perception.types import InputError
 
 
@@ -126,10 +126,10 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
 
 def _compare(kitti: Path, frames: int, seed: int, streets: Streets, json_file: Path | None,
              png: Path | None) -> None:
-    from lidar_perception.configurations import PAPER
-    from lidar_perception.evaluation.realism import compare, labelled, measure
-    from lidar_perception.evaluation.realism_report import draw_realism, print_realism
-    from lidar_perception.pipeline import warm_up
+    from lidar_perception.candidates.configurations import PAPER
+    from lidar_perception.candidates.warm_up import warm_up
+    from lidar_perception.simulation.realism.compare import compare, labelled, measure
+    from lidar_perception.simulation.realism.report import draw_realism, print_realism
 
     recording = labelled(open_recording(kitti=kitti))
     warm_up()

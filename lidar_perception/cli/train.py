@@ -12,7 +12,7 @@ import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.options import parameter_options
-from lidar_perception.terminal import console
+from lidar_perception.runs.terminal import console
 from lidar_perception.training.params import PointNetTraining, PointPillarsTraining
 
 if TYPE_CHECKING:
@@ -76,13 +76,13 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
       torchrun --nproc-per-node 4 -m lidar_perception.cli.main train pointpillars --size full \\
           --data sim --out v4
     """
-    from lidar_perception.detection.config import network_config
-    from lidar_perception.devices import chosen_device
+    from lidar_perception.detectors.devices import chosen_device
+    from lidar_perception.detectors.pointpillars.config import network_config
     from lidar_perception.training.cut_objects import cut_objects
     from lidar_perception.training.data import Batches, JudgedScenes, RawScenes, Stream
     from lidar_perception.training.loop import may_begin
     from lidar_perception.training.loop import train as run
-    from lidar_perception.training.pointpillars import (
+    from lidar_perception.training.pointpillars.task import (
         Preparation,
         judged_scan,
         make_task,
@@ -139,8 +139,8 @@ def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
       lidar-perception train pointnet --ablation --data sim --data-cache scans --steps 1000 \\
           --out ablation
     """
-    from lidar_perception.devices import chosen_device
-    from lidar_perception.pointnet.config import ABLATIONS
+    from lidar_perception.detectors.devices import chosen_device
+    from lidar_perception.detectors.pointnet.config import ABLATIONS
     from lidar_perception.training.ranks import joined, rank
     from lidar_perception.training.sources import training_scenes
     scenes = training_scenes(data, val, split, val_split, params.data, params.seed)
@@ -158,12 +158,16 @@ def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
 def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[str, ...],
                     scenes: tuple[tuple, tuple], out: Path, resume: bool,
                     init: Path | None, place: Any, jobs: int) -> None:
-    from lidar_perception.pointnet.config import pointnet_config
-    from lidar_perception.training.cut_scenes import CutScenes
+    from lidar_perception.detectors.pointnet.config import pointnet_config
     from lidar_perception.training.data import Batches, JudgedScenes, Stream
     from lidar_perception.training.loop import may_begin
     from lidar_perception.training.loop import train as run
-    from lidar_perception.training.pointnet import ClusterPreparation, judged_clusters, make_task
+    from lidar_perception.training.pointnet.cut_scenes import CutScenes
+    from lidar_perception.training.pointnet.task import (
+        ClusterPreparation,
+        judged_clusters,
+        make_task,
+    )
     from lidar_perception.training.ranks import rank, world
     from lidar_perception.training.sources import about_data
     may_begin(out, resume)
@@ -182,9 +186,9 @@ def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[
 
 def print_ablation(out: Path) -> None:
     """The best of each row beside the paper's mAP on KITTI (Table 5)."""
-    from lidar_perception.evaluation.report import narrow_table
-    from lidar_perception.pointnet.checkpoint import read_header
-    from lidar_perception.pointnet.config import ABLATIONS
+    from lidar_perception.detectors.pointnet.checkpoint import read_header
+    from lidar_perception.detectors.pointnet.config import ABLATIONS
+    from lidar_perception.scoring.tables import narrow_table
     table = narrow_table("Ablation, simulated or KITTI frames validated on", "network", "paper mAP",
                          "AP from above", "accuracy", "of objects")
     for name, paper in zip(ABLATIONS, PAPER_ABLATION):

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from lidar_perception.terminal import console
+from lidar_perception.runs.terminal import console
 
 
 @click.command("import-weights")
@@ -27,8 +27,8 @@ def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:
       lidar-perception import-weights pointpillar_7728.pth --out pointpillars.safetensors
       lidar-perception import-weights car.pth --classes Car --out car.safetensors
     """
-    from lidar_perception.detection.checkpoint import Header, save_checkpoint
-    from lidar_perception.detection.import_weights import import_weights as converted
+    from lidar_perception.detectors.pointpillars.checkpoint import Header, save_checkpoint
+    from lidar_perception.detectors.pointpillars.import_weights import import_weights as converted
     names = tuple(name.strip() for name in classes.split(",") if name.strip())
     config, network, project = converted(source, names)
     save_checkpoint(out, network, Header(config, {"imported from": project, "file": source.name}),
@@ -55,8 +55,8 @@ def onnx(weights: Path, out: Path) -> None:
     Examples:
       lidar-perception export onnx v4.safetensors --out v4.onnx
     """
-    from lidar_perception.detection.checkpoint import load_network
-    from lidar_perception.detection.onnx_network import export_onnx
+    from lidar_perception.detectors.pointpillars.checkpoint import load_network
+    from lidar_perception.detectors.pointpillars.onnx import export_onnx
     header, network = load_network(weights)
     export_onnx(network.eval(), header, out)
     config = header.config

@@ -6,7 +6,7 @@ import numpy as np
 
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
 from lidar_perception.clustering.euclidean import euclidean
-from lidar_perception.params import ClusteringParams
+from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.types import usable_returns
 
 METHODS = {  # finite points (M, 3), params -> (M,) int32

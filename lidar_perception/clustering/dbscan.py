@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 from lidar_perception.clustering.dense import dbscan_by_cells
 from lidar_perception.clustering.growing import dbscan_by_growing
+from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.geometry import horizontal_range
-from lidar_perception.params import DbscanParams
 
 
 def distance_aware_dbscan(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:

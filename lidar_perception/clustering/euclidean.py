@@ -25,7 +25,7 @@ from numba import njit
 
 from lidar_perception.clustering.cells import cells_of, crowded, gather
 from lidar_perception.clustering.grid import number_clusters, root
-from lidar_perception.params import EuclideanParams
+from lidar_perception.clustering.params import EuclideanParams
 
 SAMPLE, SIDES = 64, 5  # the first cells are 5 medians of a sample's nearest distances wide
 BUDGET = 20_000_000    # distances that are rather computed than to sort points into larger cells

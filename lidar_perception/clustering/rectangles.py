@@ -12,6 +12,7 @@ from numba import njit
 ANGLES = np.arange(90) * (np.pi / 180)
 CLOSEST = np.float32(0.01)  # m; d0: nearer to its side than this a point counts as this near
 
+
 @njit(cache=True, nogil=True)
 def _ordered(value):
     """The bits of a float32 to an integer that sorts as the number does (-0 as 0), and back."""

@@ -9,8 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from lidar_perception.clustering.params import BOX_SHAPES
 from lidar_perception.clustering.rectangles import grouped, rectangles
-from lidar_perception.params import BOX_SHAPES
 from lidar_perception.types import CLASSES
 
 # Class of a cluster by the diagonal of its box in x-y: paper B, Table 2, in metres. Its ranges

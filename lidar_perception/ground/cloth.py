@@ -16,7 +16,7 @@ from numba import njit
 
 from lidar_perception.ground.climbing import UNOBSERVED, climbed_cells
 from lidar_perception.ground.obstacle import at_rest
-from lidar_perception.params import ClothParams
+from lidar_perception.ground.params import ClothParams
 
 LEVELS = 6         # grids of the solver, each twice as coarse as the one before
 TOLERANCE = 0.001  # m that a particle may still move

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.params import PatchworkParams
+from lidar_perception.ground.params import PatchworkParams
 from lidar_perception.types import InputError
 
 _redirecting = threading.RLock()  # a caller may silence a whole run

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from lidar_perception.ground.cloth import segment_by_cloth
+from lidar_perception.ground.params import GroundParams, SensorPoseParams, ThresholdParams
 from lidar_perception.ground.patchwork import segment_by_patchwork
 from lidar_perception.ground.threshold import ransac_plane, segment_by_threshold
-from lidar_perception.params import GroundParams, SensorPoseParams, ThresholdParams
 from lidar_perception.types import LidarFrame, usable_returns
 
 METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool

@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.params import SensorPoseParams, ThresholdParams
+from lidar_perception.ground.params import ThresholdParams
+from lidar_perception.types import SENSOR_HEIGHT
 
-SENSOR_HEIGHT = SensorPoseParams().height
 MIN_POINTS = 3
 SAMPLE = 2048        # candidates on which trial planes are compared; the fit uses all of them
 CONFIDENCE = 0.9999  # of having drawn one triple without outliers

@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
-from lidar_perception.datasets.bag import Bag
+from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
 from lidar_perception.params import PlayerParams
 from lidar_perception.types import InputError

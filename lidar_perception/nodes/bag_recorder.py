@@ -8,10 +8,11 @@ from typing import Any
 
 from rclpy.qos import QoSProfile
 
-from lidar_perception.datasets.bag import LATCHED_QOS, SENSOR_QOS, BagWriter, typestore
+from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, BagWriter
 from lidar_perception.nodes.runtime import LATCHED, OK, RELIABLE, SENSOR_DATA, WARN, LidarNode
 from lidar_perception.params import RecorderParams
 from lidar_perception.types import InputError
+from lidar_perception.wire.codec import typestore
 from msg_utils.messages import message_class
 
 DISCOVERY_PERIOD = 0.2  # seconds between looks for the type of a topic that is not there yet

@@ -6,13 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.messages import column, to_frame
+from lidar_perception.candidates.pipeline import refined
+from lidar_perception.candidates.seed_sources import SeedSource
+from lidar_perception.candidates.segmented import Segmented, grounded_boxes
+from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.inputs import SeedInput
 from lidar_perception.nodes.outputs import CandidateOutputs
 from lidar_perception.nodes.runtime import CLOUD, LidarNode
 from lidar_perception.params import RefinementNodeParams
-from lidar_perception.pipeline import SeedSource, Segmented, grounded_boxes, refined, warm_up
 from lidar_perception.types import InputError
+from lidar_perception.wire.messages import column, to_frame
 from msg_utils.stamps import to_ns
 
 __all__ = ["CandidateRefinement", "warm_up"]

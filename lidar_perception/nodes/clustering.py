@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.candidates.segmented import explain_nothing, grounded_boxes
+from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.datasets.bag import bag_message, encode
-from lidar_perception.messages import column, spread, to_frame
 from lidar_perception.nodes.outputs import ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN, LidarNode
 from lidar_perception.params import ClusteringNodeParams
-from lidar_perception.pipeline import explain_nothing, grounded_boxes, warm_up
+from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.messages import column, spread, to_frame
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
 

@@ -9,12 +9,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from lidar_perception.messages import column, to_frame
 from lidar_perception.nodes.main import one_at_a_time
 from lidar_perception.nodes.outputs import DetectionOutputs
 from lidar_perception.nodes.runtime import CLOUD, ERROR, OK, WARN, LidarNode
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.types import Detections, InputError, LidarFrame
+from lidar_perception.wire.messages import column, to_frame
 from msg_utils.stamps import to_ns
 
 
@@ -72,7 +72,7 @@ class DetectorNode(LidarNode):
         weights = self.weights()
         import torch  # takes seconds, so it waits until there are weights
 
-        from lidar_perception.devices import chosen_device
+        from lidar_perception.detectors.devices import chosen_device
         # 0 leaves torch with what main.py sets in the environment, which is one.
         torch.set_num_threads(chosen.threads or len(os.sched_getaffinity(0)))
         device = chosen.device

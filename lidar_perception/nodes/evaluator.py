@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from lidar_perception.evaluation.candidates import CandidateReport
-from lidar_perception.files import write_text
-from lidar_perception.messages import to_detections, to_truth
 from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
 from lidar_perception.params import EvaluatorParams
+from lidar_perception.runs.files import write_text
+from lidar_perception.scoring.centres.report import CandidateReport
 from lidar_perception.types import PEDESTRIAN, InputError
+from lidar_perception.wire.messages import to_detections, to_truth
 from msg_utils.markers import from_marker_array
 
 WRITE_PERIOD = 5.0  # seconds

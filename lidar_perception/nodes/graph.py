@@ -15,9 +15,9 @@ from typing import Any
 
 import yaml
 
-from lidar_perception.params import STEPS
-from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
+from lidar_perception.candidates.params import STEPS
 from lidar_perception.types import InputError
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
 
 CAMERA = {"~/input/camera_info": CAMERA_INFO, "~/input/extrinsics": EXTRINSICS}
 

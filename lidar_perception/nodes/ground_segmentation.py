@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from lidar_perception.datasets.bag import bag_message, encode
+from lidar_perception.candidates.segmented import explain_nothing, points_in_view
+from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import fit_plane, inlier_share
-from lidar_perception.messages import spread
 from lidar_perception.nodes.inputs import CameraInput
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN, LidarNode
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import GroundNodeParams
-from lidar_perception.pipeline import explain_nothing, points_in_view, warm_up
+from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.messages import spread
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
 from msg_utils.stamps import to_ns
 

@@ -9,20 +9,21 @@ from functools import partial
 from typing import Any
 
 from lidar_perception.camera import Camera
-from lidar_perception.candidates.seeds import Seed, load_seed
-from lidar_perception.messages import camera_of, to_truth
-from lidar_perception.nodes.runtime import JUMP_NS, LATCHED, MARKERS, RELIABLE, LidarNode
-from lidar_perception.params import SeedParams, ViewParams
-from lidar_perception.pipeline import (
+from lidar_perception.candidates.params import SeedParams
+from lidar_perception.candidates.seed_sources import (
     SeedSource,
-    Segmented,
     automatic_seed,
     clicked_seed,
     fixed_seed,
     truth_seed,
 )
-from lidar_perception.topics import CLICK, TF_STATIC
+from lidar_perception.candidates.seeds import Seed, load_seed
+from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.nodes.runtime import JUMP_NS, LATCHED, MARKERS, RELIABLE, LidarNode
 from lidar_perception.types import PEDESTRIAN, InputError
+from lidar_perception.wire.messages import camera_of, to_truth
+from lidar_perception.wire.params import ViewParams
+from lidar_perception.wire.topics import CLICK, TF_STATIC
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import to_ns
 
@@ -173,5 +174,3 @@ def _missing(reason: str) -> SeedSource:
     def source(segmented: Segmented) -> Seed:
         raise InputError(reason)
     return source
-
-

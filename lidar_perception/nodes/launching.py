@@ -11,7 +11,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
-from lidar_perception.topics import POINTS
+from lidar_perception.wire.topics import POINTS
 
 Graph = Mapping[str, Mapping[str, str]]  # node -> remapping of its topics, see graph.py
 

@@ -36,15 +36,15 @@ PARAMS = {  # executable -> its parameters
     "clustering": "params.ClusteringNodeParams",
     "candidate_refinement": "params.RefinementNodeParams",
     "evaluator": "params.EvaluatorParams",
-    "perception": "params.PipelineParams",
-    "pointpillars_detector": "detection.detector_params.DetectorParams",
-    "pointnet_detector": "pointnet.params.PointNetDetectorParams",
+    "perception": "candidates.params.PipelineParams",
+    "pointpillars_detector": "detectors.pointpillars.params.DetectorParams",
+    "pointnet_detector": "detectors.pointnet.params.PointNetDetectorParams",
 }
 
 
 def help_text(name: str) -> str:
     """What --help prints: how to start the node, and its parameters."""
-    from lidar_perception.params import parameter_fields
+    from lidar_perception.param_fields import parameter_fields
     module, _, params = PARAMS[name].rpartition(".")
     params = getattr(importlib.import_module(f"lidar_perception.{module}"), params)
     lines = [f"Usage: {name} --ros-args [-p PARAMETER:=VALUE] [-r FROM:=TO] [--params-file YAML]",

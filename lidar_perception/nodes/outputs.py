@@ -11,10 +11,10 @@ from std_msgs.msg import Float64
 
 from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import class_by_diagonal
-from lidar_perception.datasets.bag import bag_message, encode
-from lidar_perception.messages import detection_markers
 from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
 from lidar_perception.types import CLASSES, Detections, InputError
+from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.messages import detection_markers
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys, to_marker_array
 from msg_utils.messages import message_class, ros_message

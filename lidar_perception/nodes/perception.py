@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from lidar_perception.datasets.bag import bag_message, encode
-from lidar_perception.messages import spread
+from lidar_perception.candidates.params import STEPS, PipelineParams
+from lidar_perception.candidates.pipeline import refined, segment
+from lidar_perception.candidates.seed_sources import SeedSource
+from lidar_perception.candidates.segmented import explain_nothing
+from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.inputs import CameraInput, SeedInput
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, LidarNode
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.params import STEPS, PipelineParams
-from lidar_perception.pipeline import SeedSource, explain_nothing, refined, segment, warm_up
+from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.messages import spread
 from msg_utils.point_cloud2 import add_columns
 from msg_utils.stamps import to_ns
 

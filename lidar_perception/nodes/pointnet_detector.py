@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams
+from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.nodes.detector_node import DetectorNode
-from lidar_perception.pointnet.params import STEPS, PointNetDetectorParams
-from lidar_perception.pointnet.weights_file import weights_file
 
 if TYPE_CHECKING:
-    from lidar_perception.pointnet.config import PointNetConfig
-    from lidar_perception.pointnet.detector import PointNetDetector as Detector
+    from lidar_perception.detectors.pointnet.config import PointNetConfig
+    from lidar_perception.detectors.pointnet.detector import PointNetDetector as Detector
 
 
 class PointNetDetector(DetectorNode):
@@ -26,7 +26,7 @@ class PointNetDetector(DetectorNode):
         return weights_file(self.params.pointnet)
 
     def load(self, weights: Path, device: str) -> Detector:
-        from lidar_perception.pointnet.detector import load_pointnet_detector
+        from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
         return load_pointnet_detector(weights, device, self.params)
 
     def name_of(self, config: PointNetConfig) -> str:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidar_perception.detection.detector_params import STEPS, DetectorParams
-from lidar_perception.detection.weights_file import weights_file
+from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
+from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.nodes.detector_node import DetectorNode
 
 if TYPE_CHECKING:
-    from lidar_perception.detection.config import NetworkConfig
-    from lidar_perception.detection.detector import Detector
+    from lidar_perception.detectors.pointpillars.config import NetworkConfig
+    from lidar_perception.detectors.pointpillars.detector import Detector
 
 
 class PointPillarsDetector(DetectorNode):
@@ -26,7 +26,7 @@ class PointPillarsDetector(DetectorNode):
         return weights_file(self.params.detection)
 
     def load(self, weights: Path, device: str) -> Detector:
-        from lidar_perception.detection.detector import load_detector
+        from lidar_perception.detectors.pointpillars.detector import load_detector
         return load_detector(weights, device, self.params)
 
     def name_of(self, config: NetworkConfig) -> str:

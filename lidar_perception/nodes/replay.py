@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 from statistics import median
 
+from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.nodes.graph import (
     SINGLE,
     STAGES,
@@ -18,10 +19,10 @@ from lidar_perception.nodes.graph import (
     wait_for,
 )
 from lidar_perception.nodes.main import use_large_shared_memory
-from lidar_perception.params import PipelineParams, flatten
-from lidar_perception.terminal import errors, progress
-from lidar_perception.topics import CAMERA_INFO, EXTRINSICS, TRUTH
+from lidar_perception.param_fields import flatten
+from lidar_perception.runs.terminal import errors, progress
 from lidar_perception.types import InputError
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, TRUTH
 
 START_TIMEOUT = 180.0   # seconds for all nodes to compile, come up and find each other
 SILENCE_TIMEOUT = 10.0  # seconds without a result after the last cloud

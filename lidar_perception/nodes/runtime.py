@@ -27,9 +27,9 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from std_msgs.msg import Float64
 
-from lidar_perception.datasets.bag import bag_message, decode, encode, typestore
-from lidar_perception.params import flatten, parameter_fields, with_values
+from lidar_perception.param_fields import flatten, parameter_fields, with_values
 from lidar_perception.types import InputError
+from lidar_perception.wire.codec import bag_message, decode, encode, typestore
 from msg_utils.messages import message_class
 
 CLOUD = "sensor_msgs/msg/PointCloud2"

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import height_problem, measured_height
-from lidar_perception.messages import intensity_problem, to_frame
-from lidar_perception.params import SensorPoseParams
 from lidar_perception.types import LidarFrame
+from lidar_perception.wire.messages import intensity_problem, to_frame
 
 CLOUDS = 5  # on which the height is measured
 

@@ -18,7 +18,7 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from lidar_perception.nodes.runtime import RELIABLE, SENSOR_DATA
-from lidar_perception.topics import POINTS
+from lidar_perception.wire.topics import POINTS
 
 DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from lidar_perception.datasets.kitti import KittiFrame
+from lidar_perception.data.kitti.folder import KittiFrame
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,8 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from lidar_perception.files import write_text
-from lidar_perception.resuming import differences, locked
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.resuming import differences, locked
 from lidar_perception.types import InputError
 
 NAME = "frames.jsonl"

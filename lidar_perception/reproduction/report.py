@@ -18,9 +18,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table as Grid
 
-from lidar_perception.files import write_bytes, write_text
 from lidar_perception.reproduction.experiment import Cell, Experiment, Figure, Section, Table
 from lidar_perception.reproduction.figures import draw
+from lidar_perception.runs.files import write_bytes, write_text
 
 LEGEND = ("A figure, [its 95 % interval] from drawing the frames anew with replacement "
           "(bootstrap), and the paper's figure. An interval from a few frames, or from frames that "

@@ -17,12 +17,12 @@ from uuid import uuid4
 from threadpoolctl import threadpool_limits
 
 from lidar_perception import __version__
-from lidar_perception.datasets.kitti import KittiFrame, labels_without_scan, open_kitti
-from lidar_perception.pipeline import warm_up
-from lidar_perception.processes import in_processes
+from lidar_perception.candidates.warm_up import warm_up
+from lidar_perception.data.kitti.folder import KittiFrame, labels_without_scan, open_kitti
 from lidar_perception.reproduction.experiment import Experiment
 from lidar_perception.reproduction.journal import journal
-from lidar_perception.terminal import track
+from lidar_perception.runs.processes import in_processes
+from lidar_perception.runs.terminal import track
 from lidar_perception.types import InputError
 
 CONNECT_S = 20.0  # for a Dask scheduler to answer and a first worker to come

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidar_perception.evaluation.matching import RANGE_NAMES
-from lidar_perception.reproduction import paper
 from lidar_perception.reproduction.experiment import Cell, Figure, Line, Panel, Section, Table
 from lidar_perception.reproduction.params import StmCpaParams
 from lidar_perception.reproduction.statistics import bootstrap, cells, curve, known, rates, stack
+from lidar_perception.scoring.centres import paper
+from lidar_perception.scoring.centres.matching import RANGE_NAMES
 
 NUMBERS = StmCpaParams()
 RATES = ("recall [%]", "precision [%]", "F1 [%]")

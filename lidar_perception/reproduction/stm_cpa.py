@@ -7,26 +7,28 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.candidates.boxes import height_matches, snap_to_ground
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.refine import STAGES, Candidates, refine
 from lidar_perception.candidates.seeds import Seed
+from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import oriented_boxes
-from lidar_perception.configurations import PAPER
-from lidar_perception.datasets.kitti import KittiFrame
-from lidar_perception.evaluation.matching import (
+from lidar_perception.data.kitti.folder import KittiFrame
+from lidar_perception.geometry import bev_and_3d_iou
+from lidar_perception.ground.threshold import fit_plane
+from lidar_perception.param_fields import flatten, with_values
+from lidar_perception.reproduction.experiment import Experiment
+from lidar_perception.reproduction.labelled import load_labelled, nearest_seed
+from lidar_perception.reproduction.params import StmCpaParams
+from lidar_perception.reproduction.stm_cpa_tables import sections
+from lidar_perception.scoring.centres.matching import (
     RANGE_NAMES,
     counts_by_range,
     match_centres,
     range_bins,
 )
-from lidar_perception.ground.threshold import fit_plane
-from lidar_perception.params import PipelineParams, flatten, with_values
-from lidar_perception.pipeline import Segmented, segment
-from lidar_perception.reproduction.experiment import Experiment
-from lidar_perception.reproduction.labelled import load_labelled, nearest_seed
-from lidar_perception.reproduction.params import StmCpaParams
-from lidar_perception.reproduction.stm_cpa_tables import sections
-from lidar_perception.rotated_iou import bev_and_3d_iou
 from lidar_perception.types import InputError
 
 NUMBERS = StmCpaParams()

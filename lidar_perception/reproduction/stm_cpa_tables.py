@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.candidates.refine import STAGES
-from lidar_perception.evaluation.matching import MAX_CENTRE_DISTANCE, RANGE_NAMES
-from lidar_perception.reproduction import paper
 from lidar_perception.reproduction.experiment import Cell, Figure, Line, Panel, Section, Table
 from lidar_perception.reproduction.params import StmCpaParams
 from lidar_perception.reproduction.search_tables import COUNTS, RATES, search_section
@@ -21,6 +19,8 @@ from lidar_perception.reproduction.statistics import (
     ratio,
     stack,
 )
+from lidar_perception.scoring.centres import paper
+from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, RANGE_NAMES
 
 NUMBERS = StmCpaParams()
 STAGE_TITLES = {"stage1": "1 height filter", "stage2": "2 STM", "final": "3 STM + CPA"}

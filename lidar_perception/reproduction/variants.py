@@ -9,13 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidar_perception.candidates.boxes import height_matches
-from lidar_perception.candidates.refine import group_points
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import refined, segment
+from lidar_perception.candidates.seed_sources import automatic_seed
 from lidar_perception.candidates.seeds import Seed, load_seed
+from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.candidates.silhouette import cpa_scales, silhouettes
-from lidar_perception.datasets.kitti import KittiFrame
-from lidar_perception.evaluation.matching import RANGE_NAMES, counts_by_range, match_centres
-from lidar_perception.params import PipelineParams, flatten, with_values
-from lidar_perception.pipeline import Segmented, automatic_seed, refined, segment
+from lidar_perception.data.kitti.folder import KittiFrame
+from lidar_perception.groups import group_points
+from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.experiment import (
     Cell,
     Experiment,
@@ -27,6 +29,7 @@ from lidar_perception.reproduction.experiment import (
 )
 from lidar_perception.reproduction.labelled import Labelled, load_labelled, nearest_seed
 from lidar_perception.reproduction.statistics import bootstrap, cells, known, rates, stack
+from lidar_perception.scoring.centres.matching import RANGE_NAMES, counts_by_range, match_centres
 from lidar_perception.types import InputError
 
 SHOWN = RANGE_NAMES[:4]  # beyond 60 m there is hardly anything to score

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidar_perception.datasets.kitti_calibration import KittiCalibration
-from lidar_perception.datasets.kitti_labels import DONT_CARE
-from lidar_perception.datasets.write_kitti import seen_by_camera
+from lidar_perception.camera import Calibration
+from lidar_perception.data.kitti.labels import DONT_CARE
+from lidar_perception.data.kitti.write import seen_by_camera
 from lidar_perception.types import GroundTruth
 
 # A camera of KITTI's field of view, level, 0.27 m ahead of the LiDAR and 0.08 m below it.
-FORWARD_CAMERA = KittiCalibration(
+FORWARD_CAMERA = Calibration(
     intrinsics=np.array([[720.0, 0, 621, 0], [0, 720, 187.5, 0], [0, 0, 1, 0]]),
     lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]),
     width=1242, height=375)

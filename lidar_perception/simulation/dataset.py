@@ -13,11 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.datasets import write_kitti, write_semantickitti
-from lidar_perception.processes import in_processes
+from lidar_perception.data import semantickitti
+from lidar_perception.data.kitti import write as write_kitti
+from lidar_perception.runs.folder import finish_frame
+from lidar_perception.runs.processes import in_processes
 from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
 from lidar_perception.simulation.drive import SimulatedScan, longest_drive, scan_at
-from lidar_perception.simulation.folder import finish_frame
 from lidar_perception.simulation.scene import ANY, Streets
 from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.types import InputError
@@ -79,12 +80,12 @@ def _semantic(folder: Path, plan: Plan, sequence: int, moment: int, scan: Simula
               cloud: np.ndarray, order: np.ndarray) -> dict[str, str]:
     digits = max(2, len(str((plan.frames - 1) // plan.streets_of)))
     name = f"sequences/{sequence:0{digits}}"
-    write_semantickitti.write_scan(folder / name, moment, cloud, scan.semantic[order],
+    semantickitti.write_scan(folder / name, moment, cloud, scan.semantic[order],
                                    scan.instance[order])
-    shares = {f"{name}/poses.txt": write_semantickitti.pose_line(scan.pose, FORWARD_CAMERA),
+    shares = {f"{name}/poses.txt": semantickitti.pose_line(scan.pose, FORWARD_CAMERA),
               f"{name}/times.txt": f"{moment / plan.sensor.rate:.6e}\n"}
     if moment == 0:
-        shares[f"{name}/calib.txt"] = write_semantickitti.calibration_text(FORWARD_CAMERA)
+        shares[f"{name}/calib.txt"] = semantickitti.calibration_text(FORWARD_CAMERA)
     return shares
 
 

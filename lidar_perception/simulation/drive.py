@@ -8,14 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidar_perception.datasets.semantickitti import MOVING
+from lidar_perception.data.semantickitti import MOVING
 from lidar_perception.simulation.pairs import View
 from lidar_perception.simulation.raycast import Hits, cast_batch
 from lidar_perception.simulation.returns import measure
 from lidar_perception.simulation.scene import ANY, SECONDS, Moment, Scene, Streets, make_scene
 from lidar_perception.simulation.sensor import HDL64E, Sensor
-from lidar_perception.topics import LIDAR_FRAME
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
+from lidar_perception.wire.topics import LIDAR_FRAME
 
 START_NS = 1_700_000_000 * 10**9
 LABEL_RANGE = 80.0  # metres; what is farther has no label, as in KITTI

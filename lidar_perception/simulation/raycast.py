@@ -15,15 +15,7 @@ import numpy as np
 import torch
 
 from lidar_perception.simulation.edges import Met, at_edges, footprint, merged
-from lidar_perception.simulation.pairs import (
-    Runs,
-    Scene,
-    View,
-    meetings,
-    runs_of,
-    scene_of,
-    shade,
-)
+from lidar_perception.simulation.pairs import Runs, Scene, View, meetings, runs_of, scene_of, shade
 from lidar_perception.simulation.sensor import STILL, Motion, Sensor
 from lidar_perception.simulation.solids import Solids
 from lidar_perception.simulation.terrain import Ground, GroundHits, cast_ground

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lidar_perception.types import InputError
+from lidar_perception.types import SENSOR_HEIGHT, InputError
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Sensor:
 
     elevations: tuple[float, ...]  # one per beam, descending; ring 0 is the highest
     azimuth_step: float            # between firings; rounded to a whole number in a turn
-    height: float = 1.73           # above the road
+    height: float = SENSOR_HEIGHT  # above the road
     min_range: float = 0.9
     max_range: float = 120.0
     range_noise: float = 0.02      # standard deviation
@@ -89,7 +89,6 @@ class Sensor:
         the sensor turns clockwise from the rear, and so looks ahead in the middle of the turn."""
         columns = self.columns
         return (columns // 2 - np.arange(columns)) % columns / (columns * self.rate)
-
 
     def open_rays(self) -> np.ndarray:
         """(columns, rings) bool: not blocked by the vehicle."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lidar_perception.datasets.to_bag import Scan
+from lidar_perception.data.to_bag import Scan
 from lidar_perception.simulation.camera import FORWARD_CAMERA, labels_in_view
 from lidar_perception.simulation.drive import longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Streets

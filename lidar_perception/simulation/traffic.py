@@ -7,11 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from lidar_perception.simulation.actors import SIGHT, Actor, Room
-from lidar_perception.simulation.shapes.cyclists import (
-    cyclist,
-    parked_bicycle,
-    parked_motorcycle,
-)
+from lidar_perception.simulation.shapes.cyclists import cyclist, parked_bicycle, parked_motorcycle
 from lidar_perception.simulation.shapes.furniture import bench
 from lidar_perception.simulation.shapes.heavy_vehicles import bus, tram, truck
 from lidar_perception.simulation.shapes.people import CARRIED, pedestrian, sitting

@@ -11,8 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidar_perception.geometry import to_box_frame, wrap_angle
-from lidar_perception.rotated_iou import bev_iou
+from lidar_perception.geometry import bev_iou, to_box_frame, wrap_angle
 from lidar_perception.training.params import AugmentParams, NoiseParams
 from lidar_perception.training.putting import TOUCH, inside
 

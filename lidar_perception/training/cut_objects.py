@@ -9,10 +9,10 @@ import numpy as np
 
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import extents
-from lidar_perception.detection.detector_params import EXPERT_CLUSTERING, EXPERT_GROUND
+from lidar_perception.detectors.pointnet.clusters import ground_under
+from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
+from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.pointnet.clusters import ground_under
-from lidar_perception.rotated_iou import bev_iou
 from lidar_perception.training.augment import Scene, grown
 from lidar_perception.training.database import THING, Database
 from lidar_perception.training.putting import inside

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader
 
-from lidar_perception.terminal import errors
+from lidar_perception.runs.terminal import errors
 from lidar_perception.training.augment import Scene
 from lidar_perception.types import InputError
 

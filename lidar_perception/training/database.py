@@ -9,8 +9,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from lidar_perception.files import write_bytes
-from lidar_perception.rotated_iou import bev_iou
+from lidar_perception.geometry import bev_iou
+from lidar_perception.runs.files import write_bytes
 from lidar_perception.training.augment import BORDER, Scene, grown, turned, with_reflector
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.putting import floor_under, put_among

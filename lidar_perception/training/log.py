@@ -7,7 +7,7 @@ import io
 from pathlib import Path
 from typing import Any, TextIO
 
-from lidar_perception.files import write_text
+from lidar_perception.runs.files import write_text
 from lidar_perception.types import InputError
 
 

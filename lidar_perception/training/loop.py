@@ -18,8 +18,8 @@ from typing import Any
 
 import torch
 
-from lidar_perception.files import remove_temporaries, write_bytes
-from lidar_perception.terminal import errors, progress
+from lidar_perception.runs.files import remove_temporaries, write_bytes
+from lidar_perception.runs.terminal import errors, progress
 from lidar_perception.training.log import Log
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.ranks import any_of, rank, wait

@@ -11,9 +11,9 @@ import numpy as np
 from torch import nn
 
 from lidar_perception import __version__
-from lidar_perception.checkpoint import Header, adopt, save_checkpoint
+from lidar_perception.detectors.checkpoint import Header, adopt, save_checkpoint
 from lidar_perception.param_fields import flatten
-from lidar_perception.terminal import errors
+from lidar_perception.runs.terminal import errors
 from lidar_perception.training.data import Batches
 from lidar_perception.training.params import LoopParams
 

@@ -18,17 +18,15 @@ from zipfile import BadZipFile
 import numpy as np
 
 from lidar_perception import __version__
-from lidar_perception.datasets.kitti import KittiFrame, open_kitti
-from lidar_perception.datasets.kitti_calibration import KittiCalibration
-from lidar_perception.files import write_bytes
+from lidar_perception.camera import Calibration
+from lidar_perception.data.kitti.folder import KittiFrame, open_kitti
+from lidar_perception.runs.files import write_bytes
 from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels, worth_a_label
 from lidar_perception.simulation.drive import longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Streets
 from lidar_perception.simulation.sensor import Sensor, sensor_named
 from lidar_perception.training.augment import Scene
-from lidar_perception.types import GroundTruth, InputError, LidarFrame
-
-HEIGHT = 1.73  # m: simulated sensors are mounted as KITTI's
+from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 
 
 class Judged(NamedTuple):
@@ -37,7 +35,7 @@ class Judged(NamedTuple):
     name: str
     frame: LidarFrame
     truth: GroundTruth
-    calibration: KittiCalibration
+    calibration: Calibration
 
 
 @dataclass(frozen=True)
@@ -131,7 +129,7 @@ class SimulatedScenes:
 
     @cached_property
     def _sensor(self) -> Sensor:
-        return replace(sensor_named(self.sensor), height=HEIGHT)
+        return replace(sensor_named(self.sensor), height=SENSOR_HEIGHT)
 
     def scene(self, i: int) -> Scene:
         """With the labels all around."""

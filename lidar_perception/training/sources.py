@@ -9,12 +9,7 @@ from typing import Any
 from lidar_perception.simulation.scene import Streets
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.params import DataParams
-from lidar_perception.training.scenes import (
-    KittiScenes,
-    SimulatedScenes,
-    kitti_names,
-    random_split,
-)
+from lidar_perception.training.scenes import KittiScenes, SimulatedScenes, kitti_names, random_split
 from lidar_perception.types import InputError
 
 SIM = "sim"  # the name of simulated streets where a folder could stand

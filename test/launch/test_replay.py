@@ -1,6 +1,6 @@
 """launch/replay.launch.py with a bag made here: candidates come, the bag is scored, all end with 0.
 
-Runs where launch_testing is installed (a full ROS 2); test_ros_graph.py tests the same scenario
+Runs where launch_testing is installed (a full ROS 2); test_graph.py tests the same scenario
 with plain processes everywhere.
 """
 
@@ -26,7 +26,7 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from visualization_msgs.msg import MarkerArray
 
 from launch import LaunchDescription
-from lidar_perception.datasets.to_bag import write_bag
+from lidar_perception.data.to_bag import write_bag
 from lidar_perception.nodes.graph import STAGES, result_topics
 from lidar_perception.simulation.scene import CROWDED
 from lidar_perception.simulation.to_bag import simulated_scans

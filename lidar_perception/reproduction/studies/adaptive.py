@@ -6,17 +6,12 @@ from collections.abc import Callable
 
 import numpy as np
 
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.seeds import Seed
-from lidar_perception.candidates.silhouette import (
-    COLUMNS,
-    ROWS,
-    covered,
-    silhouettes,
-    similarity,
-)
-from lidar_perception.configurations import PAPER
-from lidar_perception.params import PipelineParams, flatten
-from lidar_perception.pipeline import Segmented
+from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.candidates.silhouette import COLUMNS, ROWS, covered, silhouettes, similarity
+from lidar_perception.param_fields import flatten
 from lidar_perception.reproduction.labelled import Labelled, nearest_seed
 from lidar_perception.reproduction.variants import NOTHING, Found, clusters_as_tall, study
 from lidar_perception.types import InputError

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.candidates.confidence import confidence, shape_features
-from lidar_perception.candidates.refine import group_points
-from lidar_perception.configurations import BEST, PAPER
-from lidar_perception.datasets.kitti import KittiFrame
-from lidar_perception.params import flatten, with_values
-from lidar_perception.pipeline import refined
+from lidar_perception.candidates.configurations import BEST, PAPER
+from lidar_perception.candidates.pipeline import refined
+from lidar_perception.data.kitti.folder import KittiFrame
+from lidar_perception.groups import group_points
+from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.experiment import (
     Cell,
     Experiment,

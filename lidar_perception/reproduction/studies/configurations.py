@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.configurations import BEST, PAPER
-from lidar_perception.params import PipelineParams, flatten, with_values
-from lidar_perception.pipeline import Segmented
+from lidar_perception.candidates.configurations import BEST, PAPER
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.experiment import Experiment, Section
 from lidar_perception.reproduction.labelled import Labelled
 from lidar_perception.reproduction.variants import Found, by_settings, measure, sections

@@ -8,11 +8,12 @@ from collections.abc import Callable
 
 import numpy as np
 
+from lidar_perception.candidates.configurations import BEST, PAPER
+from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.seeds import MIN_POINTS, Seed
+from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.candidates.silhouette import cpa_scales, silhouettes, similarity
-from lidar_perception.configurations import BEST, PAPER
-from lidar_perception.params import PipelineParams, flatten, with_values
-from lidar_perception.pipeline import Segmented
+from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.labelled import Labelled, nearest_seed
 from lidar_perception.reproduction.variants import (
     NOTHING,

@@ -12,24 +12,19 @@ from scipy.special import expit, logit
 
 from lidar_perception.candidates.accumulation import accumulate, aligned, velocities
 from lidar_perception.candidates.boxes import snap_to_ground
+from lidar_perception.candidates.configurations import BEST
+from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import oriented_boxes
-from lidar_perception.configurations import BEST
-from lidar_perception.datasets.kitti import PERIOD_NS, KittiFrame
-from lidar_perception.evaluation.matching import match_centres
+from lidar_perception.data.kitti.folder import PERIOD_NS, KittiFrame
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import fit_plane
-from lidar_perception.params import flatten, with_values
-from lidar_perception.pipeline import Segmented, segment
+from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.experiment import Cell, Experiment, Section, Table
 from lidar_perception.reproduction.labelled import Labelled, load_labelled, nearest_seed
-from lidar_perception.reproduction.variants import (
-    Found,
-    found_with,
-    score,
-    sections,
-    seed_of,
-)
+from lidar_perception.reproduction.variants import Found, found_with, score, sections, seed_of
+from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
 
 SCANS = (2, 3, 5)

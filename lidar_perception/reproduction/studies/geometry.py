@@ -1,8 +1,8 @@
 """Question 6: how a silhouette is cut out. Stretched to the cluster or a window of fixed size,
 turned about z only or aligned with all principal axes."""
 
-from lidar_perception.configurations import PAPER
-from lidar_perception.params import with_values
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.param_fields import with_values
 from lidar_perception.reproduction.variants import compare
 
 STUDY = compare(

@@ -1,7 +1,7 @@
 """Question 2: does CPA do more than a stronger dilation would?"""
 
-from lidar_perception.configurations import PAPER
-from lidar_perception.params import with_values
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.param_fields import with_values
 from lidar_perception.reproduction.variants import compare
 
 CPA = PAPER.cpa.steps

@@ -5,15 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidar_perception.simulation.shapes.thing import (
-    GLASS,
-    METAL,
-    PLATE,
-    RUBBER,
-    block,
-    disc,
-    rod,
-)
+from lidar_perception.simulation.shapes.thing import GLASS, METAL, PLATE, RUBBER, block, disc, rod
 from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, part, parts
 
 BUILDING, FENCE, VEGETATION, POLE, SIGN, OTHER = 50, 51, 70, 80, 81, 99

@@ -1,0 +1,55 @@
+"""The order of the stages, in one place: one LiDAR frame in, pedestrian candidates out.
+
+    view -> ground -> clusters -> boxes snapped to the ground -> height -> STM -> CPA
+
+The nodes call the same stage functions one by one, so that the graph over DDS and this file give
+the same candidates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import perf_counter
+
+from lidar_perception.camera import Camera
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.refine import Candidates, refine
+from lidar_perception.candidates.seed_sources import SeedSource
+from lidar_perception.candidates.segmented import Segmented, grounded_boxes, points_in_view
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.types import LidarFrame
+
+
+def segment(frame: LidarFrame, camera: Camera | None = None,
+            params: PipelineParams = PipelineParams()) -> Segmented:
+    """Stages up to the boxes. InputError if the crop is on and there is no camera."""
+    t0 = perf_counter()
+    places, seen = points_in_view(frame, camera, params.view)
+    t1 = perf_counter()
+    ground = segment_ground(seen, params.ground)
+    t2 = perf_counter()
+    cluster_ids = cluster_obstacles(seen.xyz, ground, params.clustering)
+    t3 = perf_counter()
+    boxes = grounded_boxes(seen.xyz, ground, cluster_ids, params.boxes.shape)
+    t4 = perf_counter()
+    ms = dict(view=t1 - t0, ground=t2 - t1, clustering=t3 - t2, boxes=t4 - t3)
+    return Segmented(places, seen.xyz, ground, cluster_ids, boxes,
+                     {k: v * 1e3 for k, v in ms.items()})
+
+
+def find_candidates(frame: LidarFrame, seed: SeedSource, camera: Camera | None = None,
+                    params: PipelineParams = PipelineParams()) -> tuple[Segmented, Candidates]:
+    """The whole pipeline on one frame; ms of the result covers every step of params.STEPS.
+
+    InputError where the seed source has no seed for this frame.
+    """
+    segmented = segment(frame, camera, params)
+    return segmented, refined(segmented, seed, params)
+
+
+def refined(segmented: Segmented, seed: SeedSource,
+            params: PipelineParams = PipelineParams()) -> Candidates:
+    """The candidates among a frame's clusters. InputError where there is no seed."""
+    found = refine(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed(segmented), params)
+    return replace(found, ms={**segmented.ms, **found.ms})

@@ -1,0 +1,33 @@
+"""Compiles, or loads, what the candidates need before the first cloud."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidar_perception.camera import Camera
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import find_candidates
+from lidar_perception.candidates.seed_sources import automatic_seed
+from lidar_perception.candidates.seeds import seed_from_points
+from lidar_perception.param_fields import with_values
+from lidar_perception.types import LidarFrame
+from lidar_perception.wire.params import ViewParams
+
+
+def warm_up() -> None:
+    """Run every stage and method once on a few made-up points, so that compiled code is loaded (or
+    built and cached, the first time) before the first message arrives."""
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(-20, 20, (600, 3)) * [1, 1, 0.001] - [0, 0, 1.7]
+    person = rng.uniform(-0.5, 0.5, (400, 3)) * [0.5, 0.5, 1.7] + [8, 0, -0.8]
+    dense = rng.uniform(-0.05, 0.05, (2000, 3)) + [8, 2, 0]  # takes another way through DBSCAN
+    xyz = np.concatenate([flat, person, person + [12, 0, 0], dense]).astype(np.float32)
+    seed = seed_from_points(person.astype(np.float32), np.array([8, 0, -0.85, 1, 1, 1.7, 0]))
+    forward = Camera(np.array([[50, -100, 0, 0], [50, 0, -100, 0], [1, 0, 0, 0]], float), 100, 100)
+    base = PipelineParams(view=ViewParams(enabled=True))
+    for ground, clustering, boxes, sure in (("threshold", "dbscan", "axis_aligned", False),
+                                            ("cloth", "euclidean", "l_shape", True)):
+        params = with_values(base, {
+            "ground.method": ground, "clustering.method": clustering, "boxes.shape": boxes,
+            "confidence.enabled": sure, "seed.least_confidence": 0.0})
+        find_candidates(LidarFrame(xyz), automatic_seed(seed, params), forward, params)

@@ -1,0 +1,74 @@
+"""The numbers of the clustering methods, and the shape of boxes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lidar_perception.param_fields import MAX_INT, Params, param
+
+
+@dataclass(frozen=True)
+class DbscanParams(Params):
+    """Distance-aware DBSCAN (paper A, Section 3.3, Table 2)."""
+
+    range_limits: tuple[float, ...] = param(
+        (15.0, 30.0), "Horizontal ranges at which eps changes, ascending.", unit="m",
+        low=0.0, high=1e6)
+    eps: tuple[float, ...] = param(
+        (0.15, 0.30, 0.50), "Neighbourhood radius in each range band, one more than range_limits.",
+        unit="m", low=0.001, high=100.0)
+    min_samples: int = param(10, "Points within eps, itself included, that make a core point.",
+                             low=1, high=MAX_INT)
+    join_bands: bool = param(False, "Join clusters across a range limit where core points of both "
+                             "lie within the smaller eps; the paper cuts them there.")
+
+    def check(self) -> None:
+        if len(self.eps) != len(self.range_limits) + 1:
+            raise ValueError(f"eps has {len(self.eps)} values for {len(self.range_limits)} "
+                             "range_limits; give one more eps than range_limits")
+        if any(b <= a for a, b in zip(self.range_limits, self.range_limits[1:])):
+            raise ValueError(f"range_limits = {list(self.range_limits)} must ascend")
+
+
+@dataclass(frozen=True)
+class EuclideanParams(Params):
+    """Adaptive Euclidean clustering (paper C, Eq. 6 to 11)."""
+
+    threshold: str = param("local", "global: one distance for the whole cloud (Eq. 6). local: one "
+                           "for each point, from its neighbours (Eq. 11). fixed: `distance`.",
+                           choices=("global", "local", "fixed"))
+    distance: float = param(0.5, "The threshold, if it is fixed.", unit="m", low=0.001, high=10.0)
+    alpha: float = param(1.2, "Factor of the distance threshold (Eq. 6 and 11).",
+                         low=0.01, high=100.0)
+    beta: float = param(0.5, "MinPts = beta ln N: points within the threshold, itself included, "
+                        "from which a point makes others follow (Eq. 7).", low=0.0, high=1000.0)
+    gamma: float = param(0.8, "Clusters are merged when their centres are nearer than gamma times "
+                         "the mean of their diameters (Eq. 9); 0 merges none.", low=0.0, high=10.0)
+    radius: float = param(0.5, "Neighbours for the local threshold lie within this radius.",
+                          unit="m", low=0.001, high=10.0)
+    min_size: int = param(10, "Smaller clusters are dropped.", low=1, high=MAX_INT)
+
+
+CLUSTERING_METHODS = ("dbscan", "euclidean")
+
+
+@dataclass(frozen=True)
+class ClusteringParams(Params):
+    """Which points that are not ground belong together."""
+
+    method: str = param("dbscan", "dbscan: distance-aware DBSCAN (paper A). euclidean: adaptive "
+                        "Euclidean clustering (paper C).", choices=CLUSTERING_METHODS)
+    dbscan: DbscanParams = DbscanParams()
+    euclidean: EuclideanParams = EuclideanParams()
+
+
+BOX_SHAPES = ("axis_aligned", "min_area", "l_shape")
+
+
+@dataclass(frozen=True)
+class BoxParams(Params):
+    """Boxes of clusters."""
+
+    shape: str = param("axis_aligned", "axis_aligned: along x and y (paper A). min_area: the "
+                       "smallest rectangle. l_shape: along the two visible sides.",
+                       choices=BOX_SHAPES)

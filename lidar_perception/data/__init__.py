@@ -1,0 +1,1 @@
+"""Labelled frames: KITTI, nuScenes and SemanticKITTI folders, and rosbag2 bags."""

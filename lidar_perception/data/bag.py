@@ -1,0 +1,199 @@
+"""rosbag2 bags: MCAP and SQLite3 in, MCAP out, with or without ROS."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import yaml
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag2 import Reader, ReaderError
+
+from lidar_perception.types import InputError
+from lidar_perception.wire.codec import decode, encode, typestore
+
+# A KITTI cloud is 1.9 MB. Chunks that hold several compress better and are read in fewer steps.
+CHUNK_BYTES = 8 * 2**20
+
+# Quality of service as rosbag2 names it. Latched topics reach whoever subscribes later.
+SENSOR_QOS = dict(history="keep_last", depth=10, reliability="reliable", durability="volatile")
+LATCHED_QOS = dict(history="keep_last", depth=1, reliability="reliable",
+                   durability="transient_local")
+
+
+class _Plain(yaml.SafeDumper):
+    """YAML without anchors, as other readers of metadata.yaml expect it."""
+
+    def ignore_aliases(self, data: Any) -> bool:
+        return True
+
+
+def _yaml(content: Any) -> str:
+    return yaml.dump(content, Dumper=_Plain, sort_keys=False)
+
+
+class BagWriter:
+    """Writes a rosbag2 folder with one MCAP file: zstd chunks, checksums, metadata.yaml.
+
+    A context manager. The folder appears under its name once it is complete; after an exception
+    what was written so far is closed properly and left as NAME.incomplete.
+    """
+
+    def __init__(self, path: str | Path, *, force: bool = False):
+        self.path = Path(path)
+        if self.path.exists() and not force:
+            raise InputError(f"{self.path} exists already; give another name or --force")
+        if self.path.exists() and not (self.path / "metadata.yaml").is_file():
+            raise InputError(f"{self.path} is no bag, so it is not replaced; give another name")
+        self.partial = self.path.with_name(self.path.name + ".incomplete")
+        self.channels: dict[str, int] = {}
+        self.topics: list[dict] = []
+        self.times: list[int] = []
+
+    def __enter__(self) -> BagWriter:
+        try:
+            if self.partial.exists():
+                shutil.rmtree(self.partial)
+            self.partial.mkdir(parents=True)
+            self.file = open(self.partial / f"{self.path.name}.mcap", "wb")
+        except OSError as error:
+            raise InputError(f"cannot write the bag {self.path}: {error}") from None
+        self.mcap = Writer(self.file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self.mcap.start(profile="ros2", library="lidar_perception")
+        return self
+
+    def add_topic(self, topic: str, type_name: str, qos: dict = SENSOR_QOS) -> None:
+        definition, _ = typestore().generate_msgdef(type_name, ros_version=2)
+        schema = self.mcap.register_schema(type_name, "ros2msg", definition.encode())
+        profile = [_full_qos(qos)]
+        metadata = {"offered_qos_profiles": _yaml(profile),
+                    "topic_type_hash": typestore().hash_rihs01(type_name)}
+        channel = self.mcap.register_channel(topic, "cdr", schema, metadata)
+        self.channels[topic] = channel
+        self.topics.append({"topic_metadata": {
+            "name": topic, "type": type_name, "serialization_format": "cdr",
+            "offered_qos_profiles": profile,
+            "type_description_hash": typestore().hash_rihs01(type_name)}, "message_count": 0})
+
+    def write(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Append a message: an object of bag_message, or CDR bytes as they are."""
+        channel = self.channels[topic]
+        raw = message if isinstance(message, bytes) else encode(message)
+        self.mcap.add_message(channel, stamp_ns, raw, stamp_ns)
+        self.topics[list(self.channels).index(topic)]["message_count"] += 1
+        self.times.append(stamp_ns)
+
+    def __exit__(self, kind, error, trace) -> None:
+        start = min(self.times, default=0)
+        count = sum(t["message_count"] for t in self.topics)
+        span = {"starting_time": {"nanoseconds_since_epoch": start},
+                "duration": {"nanoseconds": max(self.times, default=0) - start},
+                "message_count": count}
+        name = f"{self.path.name}.mcap"
+        info = {"version": 9, "storage_identifier": "mcap", "relative_file_paths": [name], **span,
+                "topics_with_message_count": self.topics, "compression_format": "",
+                "compression_mode": "", "files": [{"path": name, **span}], "custom_data": None,
+                "ros_distro": "jazzy"}
+        self.mcap.add_metadata("rosbag2", {"serialized_metadata": _yaml(info)})
+        self.mcap.finish()
+        with self.file:
+            self.file.flush()
+            os.fsync(self.file.fileno())
+        with open(self.partial / "metadata.yaml", "w") as stream:
+            stream.write(_yaml({"rosbag2_bagfile_information": info}))
+            stream.flush()
+            os.fsync(stream.fileno())
+        if kind is None:
+            if self.path.exists():
+                shutil.rmtree(self.path)
+            self.partial.rename(self.path)
+
+
+def _full_qos(qos: dict) -> dict:
+    forever = {"sec": 9223372036, "nsec": 854775807}
+    return {**qos, "deadline": forever, "lifespan": forever, "liveliness": "automatic",
+            "liveliness_lease_duration": forever, "avoid_ros_namespace_conventions": False}
+
+
+class Bag:
+    """A bag open for reading; a context manager. topics maps name to type."""
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        source = _storage(self.path)
+        try:
+            self.reader = Reader(source)
+            self.reader.open()
+        except (ReaderError, OSError, AssertionError, ValueError, TypeError, KeyError) as error:
+            raise InputError(_unreadable(source, error)) from None
+        self.connections = list(self.reader.connections)
+        self.topics = {c.topic: c.msgtype for c in self.connections}
+        self.counts = {c.topic: c.msgcount for c in self.connections}
+
+    def __enter__(self) -> Bag:
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        self.reader.close()
+
+    @property
+    def start_ns(self) -> int:
+        return self.reader.start_time
+
+    @property
+    def end_ns(self) -> int:
+        return self.reader.end_time
+
+    def qos(self, topic: str) -> list:
+        """The profiles the topic was recorded with, as rosbags has them; maybe none."""
+        return next(c.ext.offered_qos_profiles for c in self.connections if c.topic == topic)
+
+    def require(self, topic: str) -> None:
+        """InputError that lists what there is, if the bag has no such topic."""
+        if topic not in self.topics:
+            have = ", ".join(f"{k} ({v})" for k, v in sorted(self.topics.items())) or "nothing"
+            raise InputError(f"{self.path} has no topic {topic}; it has {have}")
+
+    def raw(self, topics: Iterable[str] | None = None, start_ns: int | None = None,
+            stop_ns: int | None = None) -> Iterator[tuple[str, int, bytes]]:
+        """(topic, time, CDR bytes) in order of time; all topics by default."""
+        wanted = [c for c in self.connections if topics is None or c.topic in topics]
+        if not wanted:
+            return
+        try:
+            for connection, stamp, data in self.reader.messages(wanted, start_ns, stop_ns):
+                yield connection.topic, stamp, data
+        except Exception as error:  # rosbags lets through what zstd, struct and SQLite raise
+            raise InputError(_unreadable(self.path, error)) from None
+
+    def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
+        """(topic, time, message) of rosbags' classes."""
+        for topic, stamp, data in self.raw(topics):
+            try:
+                yield topic, stamp, decode(data, self.topics[topic])
+            except InputError as error:
+                raise InputError(f"{self.path}, topic {topic} at {stamp} ns: {error}") from None
+
+
+def _storage(path: Path) -> Path:
+    """The folder, or the one storage file in a folder without metadata.yaml."""
+    if not path.exists():
+        raise InputError(f"there is no bag {path}")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        files = [*path.glob("*.mcap"), *path.glob("*.db3")]
+        if len(files) != 1:
+            raise InputError(f"{path} has no metadata.yaml and {len(files)} storage files, so it "
+                             "is no rosbag2 bag; run 'ros2 bag reindex' or give one .mcap file")
+        return files[0]
+    if path.is_file() and path.suffix not in (".mcap", ".db3"):
+        raise InputError(f"{path} is no rosbag2 bag; give its folder, an .mcap or a .db3 file")
+    return path
+
+
+def _unreadable(path: Path, error: Exception) -> str:
+    reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+    return (f"the bag {path} is truncated or damaged ({reason}); "
+            "'mcap recover' may save what it holds")

@@ -1,0 +1,1 @@
+"""KITTI: the object, tracking and raw layouts, read and written."""

@@ -1,0 +1,1 @@
+"""nuScenes: tables, sweeps, labels and result files."""

@@ -1,0 +1,157 @@
+"""nuScenes folders: the key frames of its LiDAR, scene by scene.
+
+LIDAR_TOP looks with its x axis to the right and its y axis forward, and may lean a little. Here a
+frame is the sensor's place with the vehicle's axes (x forward, y left, z up): the points are turned
+by the calibration and not moved, and the ground lies sensor_height below the origin.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from lidar_perception.data.nuscenes.boxes import matrices
+from lidar_perception.data.nuscenes.labels import NuscenesLabels, read_labels
+from lidar_perception.data.nuscenes.tables import Tables
+from lidar_perception.types import GroundTruth, InputError, LidarFrame, usable_returns
+from lidar_perception.wire.topics import LIDAR_FRAME
+
+CHANNEL = "LIDAR_TOP"
+OWN_VEHICLE = 1.0       # metres: what is nearer in both x and y is a return of the vehicle itself
+FULL_REFLECTION = 255   # intensity
+
+
+@dataclass(frozen=True, eq=False)
+class NuscenesFrame:
+    """One key frame. token is the sample's; turn (3, 3) from the sensor's axes to the frame's;
+    pose (4, 4) from the frame to the global one; ego (3,) where the vehicle is there; labels()
+    are in the global frame, None where the version has none. Nothing is read before it is asked
+    for, and the labels of all frames together."""
+
+    name: str
+    token: str
+    points: Path
+    stamp_ns: int
+    turn: np.ndarray
+    pose: np.ndarray
+    ego: np.ndarray
+    sensor_height: float
+    labels: Callable[[], NuscenesLabels | None]
+
+    def cloud(self) -> np.ndarray:
+        """(N, 5) float32 [x y z intensity ring], as in the file: in the sensor's own axes,
+        intensity 0..255."""
+        return read_sweep(self.points)
+
+    def load(self) -> LidarFrame:
+        """The usable points without those on the vehicle itself."""
+        return self.load_rings()[0]
+
+    def load_rings(self) -> tuple[LidarFrame, np.ndarray]:
+        """As load, and the beam (N,) uint8 of each point, 0 is the lowest."""
+        cloud = self.cloud()
+        kept = usable_returns(cloud[:, :3])
+        kept &= (np.abs(cloud[:, :2]) >= OWN_VEHICLE).any(axis=1)
+        cloud = cloud.compress(kept, axis=0)
+        xyz = (cloud[:, :3].astype(np.float64) @ self.turn.T).astype(np.float32)
+        frame = LidarFrame(np.ascontiguousarray(xyz), cloud[:, 3] / np.float32(FULL_REFLECTION),
+                           self.stamp_ns, LIDAR_FRAME)
+        return frame, cloud[:, 4].astype(np.uint8)
+
+    def truth(self) -> GroundTruth | None:
+        """The labels in the frame's own coordinates, see NuscenesLabels.in_frame; also those
+        without points."""
+        labels = self.labels()
+        return None if labels is None else labels.in_frame(self.pose)
+
+
+def read_sweep(path: Path) -> np.ndarray:
+    """(N, 5) float32 [x y z intensity ring] of a .pcd.bin file."""
+    try:
+        raw = np.fromfile(path, np.float32)
+        size = path.stat().st_size
+    except OSError as error:
+        raise InputError(f"cannot read the sweep {path}: {error.strerror}; unpack the file blobs "
+                         "with samples/LIDAR_TOP there") from None
+    if size % 20:
+        raise InputError(f"{path} has {size} bytes, not a multiple of 20 (x y z intensity ring as "
+                         "float32); it was cut, download it again")
+    return raw.reshape(-1, 5)
+
+
+def open_nuscenes(root: str | Path, version: str = "v1.0-mini",
+                  scenes: Sequence[str] | None = None) -> list[NuscenesFrame]:
+    """The key frames of ROOT/VERSION, in the order of the scene table and of time; with scenes, of
+    these only and in their order. Sweeps and labels are read later. InputError says which folder,
+    table or scene is missing or wrong."""
+    tables = Tables(root, version)
+    names = dict(tables.rows("scene", "token", "name"))
+    rank = {name: i for i, name in enumerate(names.values() if scenes is None else scenes)}
+    if unknown := sorted(rank.keys() - set(names.values())):
+        raise InputError(f"{tables.folder} has no scene {unknown[0]} ({len(unknown)} such); its "
+                         f"scenes are {', '.join(list(names.values())[:3])} ...")
+    samples = sorted((rank[names[scene]], time, token) for token, time, scene in tables.rows(
+        "sample", "token", "timestamp", "scene_token") if names.get(scene) in rank)
+    if not samples:
+        raise InputError(f"{tables.folder} has no key frame" + (
+            " of the scenes that were named" if scenes is not None else "; download it again"))
+    scene_names, times = list(rank), {token: time for _, time, token in samples}
+    sweeps = _sweeps(tables, times)
+    mounts = _poses(tables, "calibrated_sensor", {mount for _, _, _, mount in sweeps.values()})
+    poses = _poses(tables, "ego_pose", {pose for _, _, pose, _ in sweeps.values()})
+    all_labels = functools.cache(functools.partial(read_labels, tables, times))
+    frames, counts = [], dict.fromkeys(rank.values(), 0)
+    for number, (scene, _, token) in enumerate(samples):
+        file, time, pose, mount = sweeps[token]
+        frames.append(NuscenesFrame(
+            f"{scene_names[scene]}/{counts[scene]:02}", token, tables.root / file, time * 1000,
+            mounts[mount][:3, :3], _at_sensor(poses[pose], mounts[mount]), poses[pose][:3, 3],
+            float(mounts[mount][2, 3]), functools.partial(_of_frame, all_labels, number)))
+        counts[scene] += 1
+    return frames
+
+
+def _of_frame(all_labels: Callable, number: int) -> NuscenesLabels | None:
+    labels = all_labels()
+    return None if labels is None else labels[number]
+
+
+def _at_sensor(ego: np.ndarray, mount: np.ndarray) -> np.ndarray:
+    """Pose of the sensor's place with the vehicle's axes."""
+    pose = ego.copy()
+    pose[:3, 3] += ego[:3, :3] @ mount[:3, 3]
+    return pose
+
+
+def _sweeps(tables: Tables, times: dict[str, int]) -> dict[str, tuple[str, int, str, str]]:
+    """By key frame: file, microseconds, and the tokens of the vehicle's pose and the sensor's
+    calibration."""
+    sensors = {token for token, channel in tables.rows("sensor", "token", "channel")
+               if channel == CHANNEL}
+    mounts = {token for token, sensor in tables.rows("calibrated_sensor", "token", "sensor_token")
+              if sensor in sensors}
+    sweeps = {sample: row for sample, key, *row in tables.rows(
+        "sample_data", "sample_token", "is_key_frame", "filename", "timestamp", "ego_pose_token",
+        "calibrated_sensor_token") if key and row[3] in mounts and sample in times}
+    if without := times.keys() - sweeps.keys():
+        raise InputError(f"{tables.path('sample_data')} has no {CHANNEL} of {len(without)} of "
+                         f"{len(times)} key frames, such as {min(without)}; download it again")
+    return sweeps
+
+
+def _poses(tables: Tables, table: str, wanted: set[str]) -> dict[str, np.ndarray]:
+    """By token: (4, 4) float64, to the vehicle from its sensor, or to the global frame from it."""
+    rows = {token: row for token, *row in tables.rows(table, "token", "translation", "rotation")
+            if token in wanted}
+    if without := wanted - rows.keys():
+        raise InputError(f"{tables.path(table)} has no row {min(without)} ({len(without)} such); "
+                         "download it again")
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, 3] = tables.numbers(table, "translation", [row[0] for row in rows.values()], 3)
+    poses[:, :3, :3] = matrices(tables.numbers(table, "rotation", [row[1] for row in rows.values()],
+                                               4))
+    return dict(zip(rows, poses))

@@ -1,0 +1,99 @@
+"""Result files of nuScenes' detection task: one JSON file, a list of boxes for each key frame."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from lidar_perception.data.nuscenes.boxes import ATTRIBUTES, NAMES, GlobalBoxes, in_global
+from lidar_perception.data.nuscenes.folder import NuscenesFrame
+from lidar_perception.runs.files import write_text
+from lidar_perception.types import CLASSES, Detections, InputError
+
+MOST_BOXES = 500    # of a frame
+# The classes of our detectors in the words of nuScenes; its bicycles have their riders inside.
+DETECTED = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle"}
+META = {"use_camera": False, "use_lidar": True, "use_radar": False, "use_map": False,
+        "use_external": True}
+
+
+def to_results(found: Detections, frame: NuscenesFrame) -> GlobalBoxes:
+    """Detections of a frame as nuScenes has them, without a velocity and an attribute. Only the
+    classes in DETECTED, and the best MOST_BOXES of them. InputError for numbers that are not
+    finite."""
+    if not (np.isfinite(found.boxes).all() and np.isfinite(found.scores).all()):
+        raise InputError(f"{frame.name}: a box or score of the detector is not finite; its weights "
+                         "or its input are broken")
+    kinds = np.array([NAMES.index(DETECTED[name]) if name in DETECTED else -1 for name in CLASSES])
+    kinds = kinds[found.class_ids]
+    chosen = np.flatnonzero(kinds >= 0)
+    chosen = chosen[np.argsort(-found.scores[chosen], kind="stable")][:MOST_BOXES]
+    return GlobalBoxes.of(*in_global(found.boxes[chosen], frame.pose), kinds[chosen],
+                          scores=found.scores[chosen])
+
+
+def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:
+    """Write the boxes by sample token. A velocity that is not known is NaN, which nuscenes-devkit
+    reads, and judges with an error of 1; strict readers of JSON do not."""
+    rows = {token: [{
+        "sample_token": token, "translation": centre, "size": [width, length, height],
+        "rotation": rotation, "velocity": velocity, "detection_name": NAMES[kind],
+        "detection_score": score, "attribute_name": ATTRIBUTES[attribute] if attribute >= 0 else ""}
+        for centre, (length, width, height), rotation, kind, attribute, velocity, score in zip(
+            *(column.tolist() for column in (boxes.centres, boxes.sizes, boxes.rotations,
+                                             boxes.kinds, boxes.attributes, boxes.velocities,
+                                             boxes.scores)))]
+        for token, boxes in results.items()}
+    write_text(path, json.dumps({"meta": META, "results": rows}))
+
+
+def read_results(path: Path, frames: list[NuscenesFrame]) -> list[GlobalBoxes]:
+    """The boxes of each frame; those of other frames are left out. InputError names the frame that
+    is missing and the box that is wrong."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"cannot read the results {path}: {error.strerror}") from None
+    except ValueError as error:
+        raise InputError(f"{path} is no JSON file ({error}); write the results again") from None
+    results = content.get("results") if isinstance(content, dict) else None
+    if not isinstance(results, dict):
+        raise InputError(f"{path} has no 'results'; it needs them in the format of nuScenes' "
+                         "detection task: {\"meta\": ..., \"results\": {sample token: [boxes]}}")
+    if missing := [f for f in frames if f.token not in results]:
+        raise InputError(f"{path} has no boxes of {missing[0].name}, sample {missing[0].token} "
+                         f"({len(missing)} of {len(frames)} such); a frame without detections "
+                         "needs an empty list, and --scenes says which scenes to score")
+    return [_boxes(f"{path}: {frame.name}", results[frame.token]) for frame in frames]
+
+
+def _boxes(where: str, rows: list) -> GlobalBoxes:
+    if not isinstance(rows, list) or len(rows) > MOST_BOXES:
+        raise InputError(f"{where}, needs a list of at most {MOST_BOXES} boxes; leave out those of "
+                         "the lowest scores")
+    try:
+        boxes = GlobalBoxes.of(
+            [row["translation"] for row in rows],
+            np.array([row["size"] for row in rows], float).reshape(-1, 3)[:, [1, 0, 2]],
+            [row["rotation"] for row in rows],
+            [NAMES.index(row["detection_name"]) for row in rows],
+            [ATTRIBUTES.index(name) if (name := row["attribute_name"]) else -1 for row in rows],
+            np.array([row["velocity"] for row in rows], float).reshape(-1, 2),
+            [row["detection_score"] for row in rows])
+    except KeyError as error:
+        raise InputError(f"{where}: a box has no {error}; boxes need sample_token, translation, "
+                         "size, rotation, velocity, detection_name, detection_score and "
+                         "attribute_name") from None
+    except (ValueError, TypeError) as error:
+        raise InputError(f"{where}: a box that cannot be read ({error}); write the results "
+                         "again") from None
+    finite = np.column_stack([boxes.centres, boxes.sizes, boxes.rotations, boxes.scores])
+    wrong = ~(np.isfinite(finite).all(axis=1) & (boxes.sizes > 0).all(axis=1)
+              & boxes.rotations.any(axis=1) & ~np.isinf(boxes.velocities).any(axis=1))
+    if wrong.any():
+        raise InputError(f"{where}, box {np.flatnonzero(wrong)[0]}: translation, size, rotation "
+                         "and score must be finite, sizes above 0, the rotation a quaternion, and "
+                         "the velocity finite or NaN")
+    return boxes

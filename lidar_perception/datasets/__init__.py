@@ -1,1 +1,0 @@
-"""Recorded data: KITTI folders and rosbag2 bags."""

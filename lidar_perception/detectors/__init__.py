@@ -1,0 +1,1 @@
+"""From a cloud to boxes: one contract, and every detector that fulfils it."""

@@ -1,0 +1,188 @@
+"""Weights on disk, of any network: safetensors with a JSON header that says which they are of."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar, Self, TypeVar
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from lidar_perception.runs.files import write_bytes
+from lidar_perception.types import InputError
+
+KEY = "lidar_perception"  # of the metadata, whose values are strings
+FORMAT = 1
+
+POINTPILLARS, POINTNET = "pointpillars", "pointnet"  # names of networks in headers
+USES = {  # name -> what it is, and where it is used
+    POINTPILLARS: ("PointPillars", "the node pointpillars_detector and detection.weights"),
+    POINTNET: ("PointNet", "the node pointnet_detector and pointnet.weights"),
+}
+
+
+@dataclass(frozen=True)
+class Header:
+    """What is known about weights. training: data, steps, time, seed; metrics: AP and the like, or
+    empty; commit: of the code that trained them. All of it can be JSON.
+
+    Each network has a header of its own, which says its name and how its config, a dataclass, is
+    read.
+    """
+
+    network: ClassVar[str]
+    read_config: ClassVar[Callable[[dict[str, Any], str], Any]]  # content, source -> config
+
+    config: Any
+    training: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    commit: str = ""
+
+    def text(self) -> str:
+        """As JSON."""
+        return json.dumps(dict(format=FORMAT, network=self.network,
+                               config=dataclasses.asdict(self.config), training=self.training,
+                               metrics=self.metrics, commit=self.commit))
+
+    @classmethod
+    def of_text(cls, text: str | None, source: str) -> Self:
+        """The inverse of text. InputError naming source, also if it is of another network."""
+        content = _content(text, source)
+        if content["network"] != cls.network:
+            what, use = USES[content["network"]]
+            wanted, own_use = USES[cls.network]
+            raise InputError(f"{source} holds a {what}, which is for {use}; {own_use} take a "
+                             f"{wanted}")
+        return cls(cls.read_config(content["config"], source), content["training"],
+                   content["metrics"], content["commit"])
+
+
+def _content(text: str | None, source: str) -> dict[str, Any]:
+    """The header's parts, all there, of a network that is known."""
+    try:
+        content = json.loads(text)
+        if content["format"] != FORMAT:
+            raise InputError(f"{source} has format {content['format']}, this version reads "
+                             f"{FORMAT}")
+        # The first files had no such key.
+        parts = {"network": content.get("network", POINTPILLARS),
+                 **{name: content[name] for name in ("config", "training", "metrics", "commit")}}
+        if parts["network"] not in USES:
+            raise InputError(f"{source} holds a network {parts['network']!r}, this version knows "
+                             f"{' and '.join(USES)}")
+        return parts
+    except InputError:
+        raise
+    except (TypeError, ValueError, KeyError, AttributeError):
+        raise InputError(f"{source} has no header of this package; use import-weights for "
+                         "weights of other projects") from None
+
+
+def network_of(path: str | Path) -> str:
+    """Which network a checkpoint is of, a name of USES. InputError if it cannot be read."""
+    return _content(_read(Path(path), tensors=False)[0], str(path))["network"]
+
+
+def save_checkpoint(path: str | Path, network: torch.nn.Module, header: Header,
+                    half: bool = False) -> None:
+    """Write the network's weights and header, so that path holds the old file or the whole new
+    one. half stores the weights of layers as float16; norms and biases stay float32."""
+    tensors = {name: _stored(value, half) for name, value in network.state_dict().items()}
+    write_bytes(path, save(tensors, {KEY: header.text()}))
+
+
+def _stored(value: torch.Tensor, half: bool) -> torch.Tensor:
+    value = value.detach().cpu()
+    if value.is_floating_point():
+        value = value.to(torch.float16 if half and value.ndim > 1 else torch.float32)
+    return value.contiguous()
+
+
+H = TypeVar("H", bound=Header)
+
+
+def read_header(path: str | Path, kind: type[H]) -> H:
+    """The header alone. InputError for a file that is missing, broken, without one, or of another
+    network."""
+    return kind.of_text(_read(Path(path), tensors=False)[0], str(path))
+
+
+def read(path: str | Path, kind: type[H]) -> tuple[H, dict[str, torch.Tensor]]:
+    """Header, and the tensors as they are stored, on the CPU. InputError as read_header."""
+    text, tensors = _read(Path(path))
+    return kind.of_text(text, str(path)), tensors
+
+
+def load(path: str | Path, kind: type[H], make: Callable[[Any], torch.nn.Module],
+         expected: Any = None) -> tuple[H, torch.nn.Module]:
+    """Header, and the network that make(config) gives with the weights of the file: float32 on the
+    CPU, in training mode. InputError as read_header, where the weights do not fit, and where the
+    config is another than expected."""
+    header, tensors = read(path, kind)
+    if expected is not None:
+        require_same(header.config, expected, str(path))
+    network = make(header.config)
+    state = {name: value.float() if value.is_floating_point() else value
+             for name, value in tensors.items()}
+    try:
+        network.load_state_dict(state)
+    except RuntimeError as error:
+        reason = str(error).splitlines()[1:2] or [str(error)]
+        raise InputError(f"the weights in {path} do not fit its header: {reason[0].strip()}"
+                         ) from None
+    return header, network
+
+
+def adopt(network: torch.nn.Module, path: str | Path, kind: type[Header]) -> tuple[int, int]:
+    """Begin with the weights of a checkpoint of a network of the kind, of any config: each layer of
+    the same name and shape is taken, of one with other inputs those that both have (new
+    ones begin at 0); the rest stays as it is. How many tensors were taken, and of how many.
+    InputError as read, and where nothing fits."""
+    _, tensors = read(path, kind)
+    state = network.state_dict()
+    taken = 0
+    for name, value in state.items():
+        found = tensors.get(name)
+        if found is None or found.ndim != value.ndim:
+            continue
+        if found.shape == value.shape:
+            value.copy_(found)
+        elif value.ndim > 1 and found.shape[0] == value.shape[0] and (
+                found.shape[2:] == value.shape[2:]):
+            common = min(found.shape[1], value.shape[1])
+            value.zero_()
+            value[:, :common] = found[:, :common]
+        else:
+            continue
+        taken += 1
+    if not taken:
+        raise InputError(f"no layer of {path} fits the network that is to be trained")
+    return taken, len(state)
+
+
+def require_same(found: Any, wanted: Any, source: str) -> None:
+    """InputError naming the first fields in which two configs differ, with both values."""
+    ours, theirs = dataclasses.asdict(wanted), dataclasses.asdict(found)
+    different = [name for name in ours if ours[name] != theirs[name]]
+    if different:
+        shown = "; ".join(f"{name} is {theirs[name]}, asked for was {ours[name]}"
+                          for name in different[:3])
+        raise InputError(f"{source} holds another network: {shown}")
+
+
+def _read(path: Path, tensors: bool = True) -> tuple[str | None, dict[str, torch.Tensor]]:
+    """The header's text, None if there is none, and the tensors."""
+    if not path.is_file():
+        raise InputError(f"there is no checkpoint {path}")
+    try:
+        with safe_open(path, "pt") as opened:
+            text = (opened.metadata() or {}).get(KEY)
+            names = opened.keys() if tensors and text else ()
+            return text, {name: opened.get_tensor(name) for name in names}
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path} is no checkpoint, or was cut short: {error}") from None

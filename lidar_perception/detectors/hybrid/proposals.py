@@ -1,0 +1,73 @@
+"""Proposals of another detector confirmed, or not, by the shape of what is in them."""
+
+from __future__ import annotations
+
+from time import perf_counter
+
+import numpy as np
+
+from lidar_perception.detectors.hybrid.judging import judged, known, seen_by
+from lidar_perception.detectors.hybrid.params import ConfirmingParams
+from lidar_perception.detectors.open import AnyDetector
+from lidar_perception.detectors.pointnet.clusters import Clusters
+from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.detectors.view import levelled_ground
+from lidar_perception.geometry import points_in_box
+from lidar_perception.types import Detections, LidarFrame
+
+
+class ConfirmedProposals:
+    """detector(frame) -> Detections, in the frame's own coordinates.
+
+    proposer: finds boxes. judge: whose network reads their points; its params say how the sensor
+    hangs and what is ground. Boxes stay the proposer's. ms and problem as of other detectors.
+    """
+
+    def __init__(self, proposer: AnyDetector, judge: PointNetDetector,
+                 params: ConfirmingParams = ConfirmingParams()):
+        self.proposer, self.judge, self.params = proposer, judge, params
+        self.ms: dict[str, float] = {}
+        self.problem: str | None = None
+
+    def __call__(self, frame: LidarFrame) -> Detections:
+        """The proposals by their combined score, best first."""
+        params, t0 = self.params, perf_counter()
+        proposals = self.proposer(frame)
+        self.problem = self.proposer.problem
+        t1 = perf_counter()
+        t2 = t3 = t1
+        if len(proposals):
+            pose = self.judge.params.ground.sensor_pose
+            seen = seen_by(self.judge, frame, pose)
+            ground = levelled_ground(seen, self.judge.params.ground)
+            obstacles = np.flatnonzero(~ground)
+            t2 = perf_counter()
+            clusters = points_of(proposals.boxes, frame.take(obstacles), seen.take(obstacles),
+                                 params.margin)
+            asked = np.flatnonzero((clusters.sizes >= params.least_points)
+                                   & known(self.judge, proposals.class_ids))
+            clusters = clusters.take(asked).on(seen.xyz.compress(ground, axis=0))
+            t3 = perf_counter()
+            scores = proposals.scores.copy()
+            scores[asked] = judged(self.judge, proposals[asked], clusters, params.weight)[0].scores
+            kept = np.flatnonzero(scores >= params.threshold)
+            kept = kept[np.argsort(-scores[kept], kind="stable")]
+            proposals = Detections(proposals.boxes[kept], proposals.class_ids[kept], scores[kept])
+        self.ms = {step: seconds * 1e3 for step, seconds in (
+            ("proposals", t1 - t0), ("ground", t2 - t1), ("clusters", t3 - t2),
+            ("network", perf_counter() - t3))}
+        return proposals
+
+
+def points_of(boxes: np.ndarray, frame: LidarFrame, seen: LidarFrame, margin: float) -> Clusters:
+    """One cluster for each of boxes (K, 7), in their order: the points of a frame within it, grown
+    by margin metres, with the coordinates and the intensity that `seen` has of the same points. A
+    point can be in several, and a cluster can be without points."""
+    inside = [np.flatnonzero(points_in_box(frame.xyz, box, margin)) for box in boxes]
+    rows = np.concatenate([np.zeros(0, np.int64), *inside])
+    points = np.zeros((len(rows), 4), np.float32)
+    points[:, :3] = seen.xyz[rows]
+    if seen.intensity is not None:
+        points[:, 3] = seen.intensity[rows]
+    first = np.concatenate([[0], np.cumsum([len(places) for places in inside])]).astype(np.int64)
+    return Clusters(points, first, np.arange(1, len(boxes) + 1))

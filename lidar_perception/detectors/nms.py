@@ -1,0 +1,51 @@
+"""Non-maximum suppression of turned boxes, exact, on the CPU.
+
+The few hundred boxes that are left after the score threshold are compared faster there than a GPU
+can be asked.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from lidar_perception.detectors.params import NmsParams
+from lidar_perception.geometry import bev_iou
+from lidar_perception.types import CLASSES, Detections
+
+
+def best_of_each(boxes: np.ndarray, scores: np.ndarray, kinds: np.ndarray,
+                 classes: tuple[str, ...], params: NmsParams) -> Detections:
+    """Detections, best first, of the boxes (N, 7) with scores (N,) that stay; kinds (N,) int are
+    places in classes."""
+    kept = suppressed(boxes, scores, kinds, params.iou, params.across_classes)[:params.max_boxes]
+    ids = np.array([CLASSES.index(name) for name in classes])
+    return Detections.of(boxes[kept], ids[kinds[kept]], scores[kept])
+
+
+def suppressed(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: float,
+               across_classes: bool = False) -> np.ndarray:
+    """(M,) int64 places of the boxes (N, 7) that stay, best score first; of equal scores the first.
+
+    A box goes if one that stays has a higher score, the same label (N,) int (any, with
+    across_classes) and an IoU above iou, seen from above.
+    """
+    order = np.argsort(-scores, kind="stable")
+    group = np.zeros(len(order), np.int64) if across_classes else np.asarray(labels)[order]
+    ordered = np.asarray(boxes, np.float64).reshape(-1, 7)[order]
+    stays = np.ones(len(order), np.bool_)
+    for label in np.unique(group):
+        members = np.flatnonzero(group == label)
+        stays[members] = _greedy(bev_iou(ordered[members], ordered[members]), iou)
+    return order[stays]
+
+
+@njit(cache=True, nogil=True)
+def _greedy(overlap, limit):
+    stays = np.ones(len(overlap), np.bool_)
+    for i in range(len(overlap)):
+        if stays[i]:
+            for j in range(i + 1, len(overlap)):
+                if overlap[i, j] > limit:
+                    stays[j] = False
+    return stays

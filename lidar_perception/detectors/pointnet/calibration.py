@@ -1,0 +1,48 @@
+"""Scores that mean what they say: 0.8 is right four times of five (Guo et al., ICML 2017)."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from lidar_perception.detectors.pointnet.network import PointNet
+
+STEPS = 60
+
+
+def calibrate(network: PointNet, logits: Tensor, labels: Tensor) -> None:
+    """Set the network's temperature and offsets so that its probabilities fit labels (B,) int64 of
+    logits (B, K + 1) best; labels below 0 do not count. Without labels nothing changes. Offsets
+    make up for classes that are rarer in the street than in training."""
+    known = labels >= 0
+    if not known.any():
+        return
+    logits, labels = logits[known].detach().double().cpu(), labels[known].cpu()
+    log_temperature = torch.zeros(1, dtype=torch.double, requires_grad=True)
+    offsets = torch.zeros(logits.shape[1], dtype=torch.double, requires_grad=True)
+    optimizer = torch.optim.LBFGS([log_temperature, offsets], max_iter=STEPS,
+                                  line_search_fn="strong_wolfe")
+
+    def loss() -> Tensor:
+        optimizer.zero_grad()
+        scaled = logits / log_temperature.clamp(-3, 3).exp() + offsets
+        # A class that nobody has would go to minus infinity.
+        value = functional.cross_entropy(scaled, labels) + 1e-3 * offsets.square().sum()
+        value.backward()
+        return value
+
+    optimizer.step(loss)
+    network.temperature.copy_(log_temperature.detach().clamp(-3, 3).exp())
+    network.offsets.copy_(offsets.detach())
+
+
+def calibration_error(probabilities: np.ndarray, labels: np.ndarray, bins: int = 10) -> float:
+    """Expected calibration error: the mean gap of the likeliest class's probability and how often
+    it is right, in bins of equal width; probabilities (B, K), labels (B,). 0 without any."""
+    best = probabilities.max(axis=1)
+    right = probabilities.argmax(axis=1) == labels
+    place = np.minimum((best * bins).astype(int), bins - 1)
+    gap = sum(abs(best[place == i].sum() - right[place == i].sum()) for i in range(bins))
+    return float(gap / max(len(labels), 1))

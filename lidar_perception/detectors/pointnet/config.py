@@ -1,0 +1,129 @@
+"""What a cluster network looks like: paper C's improved PointNet, its ablations and baselines.
+
+Paper C (Zhang et al., PLOS One 2026, e0348581) gives the parts (Eq. 13 to 19) but no widths. The
+switches are those of its Table 5; PointNet and PointNet++ (SSG) are settings of the same network.
+A checkpoint holds the dataclass as JSON, so that weights always come with their network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from lidar_perception.clustering.params import ClusteringParams, EuclideanParams
+from lidar_perception.detectors.config_json import config_of
+from lidar_perception.ground.params import GroundParams
+from lidar_perception.types import CLASSES, InputError
+
+# l w h in metres, means of KITTI's training labels (Geiger et al. 2012)
+MEAN_SIZES = {"Car": (3.88, 1.63, 1.53), "Pedestrian": (0.84, 0.66, 1.76),
+              "Cyclist": (1.76, 0.60, 1.74)}
+
+
+@dataclass(frozen=True)
+class PointNetConfig:
+    """A network that looks at one cluster.
+
+    name: what it is called. classes: those of its scores, background comes last.
+    dynamic_threshold, log_point_count: how clusters are made (Eq. 6, 7, 11), see clustering.
+    msg: points are grouped at all radii, else, where they are grouped, at the largest only.
+    mrg: features of coarser and of no grouping stand beside the fine ones, weighted by density
+    (Eq. 15, 17). skip: shallow features stand beside the deep ones (Eq. 16). grouped: without it,
+    msg and mrg, each point is by itself, as in PointNet.
+
+    points: most points of a cluster that are read (Eq. 13). centroids, coarse: places around which
+    points, and then centroids, are grouped. radii, coarse_radius in metres; neighbours,
+    coarse_neighbours: most points of a group. point_channels to head_channels: widths. yaw_bins:
+    parts of the circle. sizes: l w h of each class, metres, that sizes are relative to.
+    """
+
+    name: str = "improved"
+    classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist")
+    dynamic_threshold: bool = True
+    log_point_count: bool = True
+    msg: bool = True
+    mrg: bool = True
+    skip: bool = True
+    grouped: bool = True
+    points: int = 128
+    centroids: int = 32
+    coarse: int = 8
+    radii: tuple[float, ...] = (0.1, 0.2, 0.4)
+    neighbours: tuple[int, ...] = (8, 12, 16)
+    coarse_radius: float = 1.2
+    coarse_neighbours: int = 8
+    point_channels: tuple[int, ...] = (32, 64)
+    group_channels: tuple[int, ...] = (32, 32)
+    local_channels: int = 128
+    global_channels: int = 128
+    head_channels: tuple[int, ...] = (256, 128)
+    yaw_bins: int = 12
+    sizes: tuple[tuple[float, ...], ...] = tuple(MEAN_SIZES.values())
+
+    def __post_init__(self) -> None:
+        if unknown := [name for name in self.classes if name not in CLASSES]:
+            raise ValueError(f"there is no class {unknown[0]!r}; known are {', '.join(CLASSES)}")
+        if not self.classes or len(self.sizes) != len(self.classes):
+            raise ValueError("classes and sizes differ in length")
+        if len(self.radii) != len(self.neighbours):
+            raise ValueError("radii and neighbours differ in length")
+        if list(self.radii) != sorted(self.radii) or max(self.neighbours) > self.points:
+            raise ValueError("radii must rise, and neighbours be at most as many as points")
+        if not self.coarse <= self.centroids <= self.points:
+            raise ValueError("coarse must be at most centroids, and these at most points")
+
+    @property
+    def groups(self) -> tuple[tuple[float, int], ...]:
+        """(radius, most neighbours) of each scale in use; none for PointNet."""
+        scales = tuple(zip(self.radii, self.neighbours))
+        if self.msg:
+            return scales
+        return scales[-1:] if self.grouped or self.mrg else ()
+
+    @property
+    def clustering(self) -> ClusteringParams:
+        """How clusters are made for this network. Without dynamic_threshold one distance serves
+        all points, without log_point_count a point alone makes others follow."""
+        euclidean = EuclideanParams(
+            threshold="local" if self.dynamic_threshold else "fixed", gamma=0.0,
+            beta=EuclideanParams().beta if self.log_point_count else 0.0)
+        return ClusteringParams(method="euclidean", euclidean=euclidean)
+
+    @property
+    def ground(self) -> GroundParams:
+        return GroundParams(method="cloth")
+
+
+PLAIN = dict(msg=False, mrg=False, skip=False, grouped=False)
+ABLATIONS = {  # paper C, Table 5; where it does not say how clusters are made, as it proposes
+    "base": dict(dynamic_threshold=False, log_point_count=False, **PLAIN),
+    "dynamic-threshold": dict(log_point_count=False, **PLAIN),
+    "log-point-count": dict(dynamic_threshold=False, **PLAIN),
+    "skip": dict(msg=False, mrg=False, grouped=False),
+    "msg-mrg": dict(skip=False),
+    "msg-skip": dict(mrg=False),
+    "mrg-skip": dict(msg=False),
+    "improved": {},
+}
+NETWORKS = {
+    **ABLATIONS,
+    "pointnet": PLAIN,
+    "pointnet2": dict(msg=False, mrg=False, skip=False),  # PointNet++, single-scale grouping
+}
+
+
+def pointnet_config(name: str = "improved", **changes: Any) -> PointNetConfig:
+    """The config of a network of NETWORKS, with other fields changed. InputError for a name that is
+    none."""
+    if name not in NETWORKS:
+        raise InputError(f"there is no network {name!r}; choose one of {', '.join(NETWORKS)}")
+    try:
+        return replace(PointNetConfig(name=name, **NETWORKS[name]), **changes)
+    except (ValueError, TypeError) as error:
+        raise InputError(str(error)) from None
+
+
+def from_json(content: dict[str, Any], source: str = "the header") -> PointNetConfig:
+    """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
+    return config_of(PointNetConfig, content, source, {
+        "sizes": lambda sizes: tuple(map(tuple, sizes))})

@@ -1,0 +1,188 @@
+"""The improved PointNet of paper C (Eq. 13 to 17), its ablations and its baselines.
+
+    points -> PointMlp --------------------------+-> raw ----------------+
+                 +-> LocalNet (MSG, Eq. 14) -> max -> fine --------------+-> head -> class, box
+                         +-> CoarseNet (MRG, Eq. 15) -> max -> coarse ---+
+                 shallow features, skipped over (Eq. 16) ----------------+
+
+B clusters, N points, M centroids, k neighbours, C channels. A cluster with fewer than N points is
+filled up with its own, which change no maximum; `valid` is False for them, so that they are
+nobody's neighbours. Of neighbours out of reach the nearest one, which is the centroid itself, takes
+the place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.utils.fusion import fuse_linear_bn_eval
+
+from lidar_perception.detectors.pointnet.config import PointNetConfig
+
+POINT, CONTEXT = 5, 6   # numbers that describe a point, and a whole cluster; see clusters.py
+
+
+class Outputs(NamedTuple):
+    """logits (B, K + 1), background last; centres (B, 3), sizes (B, 3), yaw_bins (B, Y) and
+    yaw_residuals (B, Y) as in box_head.py."""
+
+    logits: Tensor
+    centres: Tensor
+    sizes: Tensor
+    yaw_bins: Tensor
+    yaw_residuals: Tensor
+
+
+class LinearNormRelu(nn.Sequential):
+    """A linear layer, batch norm over all but the last axis, ReLU."""
+
+    def __init__(self, channels: int, out: int):
+        super().__init__(nn.Linear(channels, out, bias=False), nn.BatchNorm1d(out),
+                         nn.ReLU(inplace=True))
+
+    def forward(self, x: Tensor) -> Tensor:
+        return super().forward(x.reshape(-1, x.shape[-1])).view(*x.shape[:-1], -1)
+
+
+def mlp(*channels: int) -> nn.Sequential:
+    """Layers from each width to the next."""
+    return nn.Sequential(*(LinearNormRelu(a, b) for a, b in pairwise(channels)))
+
+
+def nearest(centres: Tensor, xyz: Tensor, valid: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """squared (B, M, k) rising, and places (B, M, k), of the nearest of xyz (B, N, 3) to each
+    centre (B, M, 3), inf where no valid one is left; k = count."""
+    # Differences, not a matrix product: a point is at no distance from itself in any format.
+    squared = (centres[:, :, None] - xyz[:, None]).square().sum(dim=-1)    # (B, M, N)
+    squared = squared.masked_fill(~valid[:, None], torch.inf)
+    return squared.topk(count, dim=2, largest=False)
+
+
+def taken(values: Tensor, places: Tensor) -> Tensor:
+    """(B, M, k, C): rows of values (B, N, C) at places (B, M, k)."""
+    index = places.flatten(1)[..., None].expand(-1, -1, values.shape[-1])
+    return values.gather(1, index).view(*places.shape, -1)
+
+
+class LocalNet(nn.Module):
+    """Features around each centroid, grouped at each radius and weighted by density (Eq. 14, 17).
+
+    One search serves all radii, as they lie within each other.
+    """
+
+    def __init__(self, groups: Sequence[tuple[float, int]], channels: Sequence[int],
+                 point_channels: int, out: int):
+        super().__init__()
+        self.groups = list(groups)
+        self.nets = nn.ModuleList(mlp(POINT, *channels) for _ in groups)
+        self.join = mlp(len(groups) * channels[-1] + point_channels, out)
+
+    def forward(self, points: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
+        xyz, centres = points[..., :3], points[:, :count, :3]
+        squared, places = nearest(centres, xyz, valid, max(k for _, k in self.groups))
+        scales, density = [], []
+        for (radius, k), net in zip(self.groups, self.nets):
+            within = squared[..., :k] <= radius * radius                   # (B, M, k)
+            near = taken(points, torch.where(within, places[..., :k], places[..., :1]))
+            around = (near[..., :3] - centres[:, :, None]) / radius        # (B, M, k, 3)
+            scales.append(net(torch.cat([around, near[..., 3:]], dim=-1)).amax(dim=2))
+            density.append(within.sum(dim=-1) / (k * radius))
+        weights = torch.stack(density, dim=-1)                             # (B, M, scales)
+        weights = weights / weights.sum(dim=-1, keepdim=True) * len(self.groups)
+        scales = [scale * weights[..., i:i + 1] for i, scale in enumerate(scales)]
+        return self.join(torch.cat([*scales, features[:, :count]], dim=-1))  # (B, M, C)
+
+
+class CoarseNet(nn.Module):
+    """Features of centroids grouped around fewer of them (Eq. 15)."""
+
+    def __init__(self, channels: int, out: int, radius: float, neighbours: int):
+        super().__init__()
+        self.radius, self.neighbours = radius, neighbours
+        self.net = mlp(channels + 3, out)
+
+    def forward(self, xyz: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
+        centres = xyz[:, :count]
+        squared, places = nearest(centres, xyz, valid, self.neighbours)
+        places = torch.where(squared <= self.radius**2, places, places[..., :1])
+        around = (taken(xyz, places) - centres[:, :, None]) / self.radius
+        return self.net(torch.cat([around, taken(features, places)], dim=-1)).amax(dim=2)
+
+
+class PointNet(nn.Module):
+    """One cluster each: points (B, N, 5), valid (B, N) bool, context (B, 6) to Outputs."""
+
+    def __init__(self, config: PointNetConfig):
+        super().__init__()
+        self.config = config
+        shallow, local, wide = (config.point_channels[-1], config.local_channels,
+                                config.global_channels)
+        self.points = mlp(POINT, *config.point_channels)
+        self.local = self.coarse = self.raw = self.fine = None
+        found = 0
+        if config.groups:
+            self.local = LocalNet(config.groups, config.group_channels, shallow, local)
+            self.fine = mlp(local, wide)
+            found += wide
+        if config.mrg:
+            self.coarse = CoarseNet(local, wide, config.coarse_radius, config.coarse_neighbours)
+            found += wide
+        if config.mrg or not config.groups:
+            self.raw = mlp(shallow, wide)
+            found += wide
+        if config.skip:
+            found += shallow + (local if config.groups else 0)
+        kinds, bins = len(config.classes), config.yaw_bins
+        self.head = mlp(found + CONTEXT, *config.head_channels)
+        self.classes = nn.Linear(config.head_channels[-1], kinds + 1)
+        self.box = nn.Linear(config.head_channels[-1], 6 + 2 * bins)
+        # What calibration found: probabilities are softmax(logits / temperature + offsets).
+        self.register_buffer("temperature", torch.ones(1))
+        self.register_buffer("offsets", torch.zeros(kinds + 1))
+
+    def forward(self, points: Tensor, valid: Tensor, context: Tensor) -> Outputs:
+        config = self.config
+        features = self.points(points)                                     # (B, N, C)
+        found, shallow = [], [features.amax(dim=1)]
+        # Where points lie densely grouped features say more, else those of single points (Eq. 17).
+        dense = valid.float().mean(dim=1, keepdim=True)                    # (B, 1)
+        if self.local is not None:
+            local = self.local(points, features, valid, config.centroids)  # (B, M, C)
+            found.append(self.fine(local).amax(dim=1))                     # (B, C)
+            shallow.append(local.amax(dim=1))
+        if self.coarse is not None:
+            centroids, real = points[:, :config.centroids, :3], valid[:, :config.centroids]
+            coarse = self.coarse(centroids, local, real, config.coarse)    # (B, M', C)
+            found.append(coarse.amax(dim=1) * (0.5 + dense))
+        if self.raw is not None:
+            raw = self.raw(features).amax(dim=1)
+            found.append(raw * (1.5 - dense) if config.mrg else raw)
+        if config.skip:
+            found += shallow
+        x = self.head(torch.cat([*found, context], dim=1))
+        box = self.box(x)
+        bins = config.yaw_bins
+        return Outputs(self.classes(x), box[:, :3], box[:, 3:6], box[:, 6:6 + bins],
+                       box[:, 6 + bins:])
+
+    def probabilities(self, logits: Tensor) -> Tensor:
+        """(B, K + 1), calibrated."""
+        return torch.softmax(logits.float() / self.temperature + self.offsets, dim=1)
+
+
+def make_pointnet(config: PointNetConfig) -> PointNet:
+    """A network with random weights, in training mode."""
+    return PointNet(config)
+
+
+def fused(network: PointNet) -> PointNet:
+    """The network for inference, in place, with every batch norm inside the layer before it."""
+    network.eval()
+    for module in network.modules():
+        if isinstance(module, LinearNormRelu) and isinstance(module[1], nn.BatchNorm1d):
+            module[0], module[1] = fuse_linear_bn_eval(module[0], module[1]), nn.Identity()
+    return network

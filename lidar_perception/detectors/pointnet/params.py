@@ -1,0 +1,35 @@
+"""Parameters of the detector: flags, ROS parameters and docs are made from these fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lidar_perception.clustering.params import ClusteringParams
+from lidar_perception.detectors.params import NetworkParams
+from lidar_perception.detectors.pointnet.config import PointNetConfig
+from lidar_perception.ground.params import GroundParams
+from lidar_perception.param_fields import param
+from lidar_perception.wire.params import InputParams
+
+STEPS = ("preprocess", "ground", "clustering", "network", "postprocess")  # each has its time
+
+
+@dataclass(frozen=True)
+class PointNetParams(NetworkParams):
+    """Which network, where it runs, which clusters it reads, and what counts as found."""
+
+    least_points: int = param(5, "Clusters of fewer points are left out.", low=1, high=1_000_000)
+
+
+INPUT = InputParams()
+GROUND, CLUSTERING = PointNetConfig().ground, PointNetConfig().clustering
+
+
+@dataclass(frozen=True)
+class PointNetDetectorParams:
+    """All groups of the detector."""
+
+    input: InputParams = INPUT
+    ground: GroundParams = GROUND
+    clustering: ClusteringParams = CLUSTERING
+    pointnet: PointNetParams = PointNetParams()

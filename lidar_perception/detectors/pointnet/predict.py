@@ -1,0 +1,77 @@
+"""Clusters in, a class and a box for each out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from lidar_perception.detectors.nms import best_of_each
+from lidar_perception.detectors.params import NmsParams
+from lidar_perception.detectors.pointnet.box_head import decode
+from lidar_perception.detectors.pointnet.clusters import ClusterInput, Clusters, network_input
+from lidar_perception.detectors.pointnet.config import PointNetConfig
+from lidar_perception.detectors.pointnet.network import Outputs, PointNet
+from lidar_perception.types import Detections
+
+CHUNK = 256  # clusters at a time: bounds the memory, and the caches like it
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Of K clusters: probabilities (K, C + 1) float32 of the C classes of the config and of
+    background, calibrated; kinds (K,) int64 the likeliest class but background, or the one that was
+    asked about; boxes (K, 7) float32 if it is of that class, in the frame of the clusters."""
+
+    probabilities: np.ndarray
+    kinds: np.ndarray
+    boxes: np.ndarray
+
+    @property
+    def scores(self) -> np.ndarray:
+        """(K,) the probability of the class of kinds."""
+        return self.probabilities[np.arange(len(self.kinds)), self.kinds]
+
+    def take(self, chosen: np.ndarray) -> Predictions:
+        """Those of the clusters at places (M,)."""
+        return Predictions(self.probabilities[chosen], self.kinds[chosen], self.boxes[chosen])
+
+
+def found(predictions: Predictions, config: PointNetConfig, least: Sequence[float],
+          nms: NmsParams = NmsParams()) -> Detections:
+    """The boxes whose score is at least `least` of their class, (C,), the best of those that
+    overlap."""
+    chosen = np.flatnonzero(predictions.scores >= np.asarray(least)[predictions.kinds])
+    chosen = chosen[np.argsort(-predictions.scores[chosen], kind="stable")][:nms.candidates]
+    return best_of_each(predictions.boxes[chosen], predictions.scores[chosen],
+                        predictions.kinds[chosen], config.classes, nms)
+
+
+@torch.inference_mode()
+def predict(network: PointNet, clusters: Clusters, seed: int = 0, chunk: int = CHUNK,
+            kinds: np.ndarray | None = None) -> Predictions:
+    """What the network, in eval mode, makes of each cluster, of class kinds (K,) if they are given.
+    K may be 0."""
+    config, classes = network.config, len(network.config.classes)
+    if len(clusters) == 0:
+        return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64),
+                           np.zeros((0, 7), np.float32))
+    inputs = network_input(clusters, config.points, seed)
+    outputs = outputs_of(network, inputs, chunk)
+    probabilities = network.probabilities(outputs.logits).cpu().numpy()
+    if kinds is None:
+        kinds = probabilities[:, :classes].argmax(axis=1)
+    return Predictions(probabilities, kinds, decode(outputs, inputs, config, kinds))
+
+
+@torch.inference_mode()
+def outputs_of(network: PointNet, inputs: ClusterInput, chunk: int = CHUNK) -> Outputs:
+    """The network's outputs for one cluster or more."""
+    device, parts = network.temperature.device, []
+    for begin in range(0, len(inputs.points), chunk):
+        part = slice(begin, begin + chunk)
+        parts.append(network(*(torch.from_numpy(x[part]).to(device) for x in
+                               (inputs.points, inputs.valid, inputs.context))))
+    return Outputs(*(torch.cat(column) for column in zip(*parts)))

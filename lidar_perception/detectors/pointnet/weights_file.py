@@ -1,0 +1,22 @@
+"""Where the weights are, found without loading torch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.weights_file import existing
+from lidar_perception.types import InputError
+
+WEIGHTS = Path(__file__).parent / "weights" / "pointnet.safetensors"
+
+
+def weights_file(params: PointNetParams) -> Path:
+    """The file that params name, or else the one that comes with the package. InputError if it is
+    not there."""
+    if params.weights:
+        return existing(params.weights, "pointnet.weights")
+    if not WEIGHTS.is_file():
+        raise InputError("no PointNet weights come with the package; name a checkpoint with "
+                         "pointnet.weights")
+    return WEIGHTS

@@ -1,0 +1,175 @@
+"""What a network looks like: one dataclass for every version and size of EG-PointPillars.
+
+Paper B (Ahn, Kim, Park, CMC 2026, 87(1), 84) has PointPillars (v0) and four versions guided by
+ground segmentation and clustering. They are switches here; a checkpoint holds the dataclass as
+JSON, so that weights always come with their network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from lidar_perception.detectors.config_json import config_of
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError
+
+VERSIONS = {  # paper B, Table 3
+    "v0": dict(remove_ground=False, cluster_ids=False, pseudo_map=False, neck="deconv"),
+    "v1": dict(remove_ground=True, cluster_ids=False, pseudo_map=False, neck="fpn"),
+    "v2": dict(remove_ground=True, cluster_ids=True, pseudo_map=False, neck="fpn"),
+    "v3": dict(remove_ground=False, cluster_ids=True, pseudo_map=False, neck="fpn"),
+    "v4": dict(remove_ground=True, cluster_ids=False, pseudo_map=True, neck="fpn"),
+}
+SIZES = {
+    # Lang et al., CVPR 2019; paper B: 2C = 64 channels in the new neck
+    "full": dict(pillar_channels=64, map_channels=(16, 32, 64), block_channels=(64, 128, 256),
+                 block_layers=(3, 5, 5), deconv_channels=128, fpn_channels=64),
+    # the same grid with an eighth of the arithmetic, for two CPU cores; see docs/detection.md
+    "compact": dict(pillar_channels=16, map_channels=(8, 8), block_channels=(32, 64, 96),
+                    block_layers=(1, 3, 3), deconv_channels=32, fpn_channels=32),
+}
+
+XY_SCALE = 0.02  # of networks that are trained here
+
+
+@dataclass(frozen=True)
+class AnchorClass:
+    """The anchor boxes of one class, and the overlaps seen from above from which one is learned
+    as that class (matched) and below which as background (unmatched).
+
+    size l w h and z of the centre in metres, from a sensor at SENSOR_HEIGHT.
+    """
+
+    name: str
+    size: tuple[float, float, float]
+    z: float
+    matched: float
+    unmatched: float
+
+
+# Sizes and overlaps: Lang et al., Section 4.1 and its code. They stand on the ground.
+ANCHORS = (AnchorClass("Car", (3.9, 1.6, 1.56), 1.56 / 2 - SENSOR_HEIGHT, 0.6, 0.45),
+           AnchorClass("Pedestrian", (0.8, 0.6, 1.73), 1.73 / 2 - SENSOR_HEIGHT, 0.5, 0.35),
+           AnchorClass("Cyclist", (1.76, 0.6, 1.73), 1.73 / 2 - SENSOR_HEIGHT, 0.5, 0.35))
+
+
+@dataclass(frozen=True)
+class NetworkConfig:
+    """A network. version and size are its name; the other fields say what it is.
+
+    low, high: [x y z] of the corner points of what it sees, metres; cell: side of a pillar.
+    remove_ground: only points that are not ground come in; cluster_ids: each point has its
+    cluster's id, times id_scale, as a fifth input, 0 for ground and noise; pseudo_map: a branch
+    for the map of classified clusters. neck: 'deconv' (PointPillars) or 'fpn' (paper B, Eq. 1-8);
+    fusion in the fpn: 'add' or 'concat'. head_stride: of block_strides the first, as both necks
+    end at the finest block.
+
+    xy_scale: x and y of a point are multiplied by this before the first layer. With 1, as in the
+    papers and in imported weights, they are 50 times as large as the other inputs, and most of the
+    few channels of a compact network come to say where a pillar is, which its place says already.
+
+    max_points: points of a pillar that are read, in the order of the cloud; 0 reads all. Imported
+    weights need it, and the next two. zero_row: a pillar with fewer points than max_points also has
+    a point whose inputs are all 0, as in code that pads pillars. middle_z: points come with their
+    height above the middle of the range, too. anchors_at: 'cells' puts anchors on the middle of the
+    head's cells, 'ends' spreads them evenly from low to high. direction_offset: where the two bins
+    of heading begin, rad.
+    """
+
+    version: str = "v0"
+    size: str = "full"
+    remove_ground: bool = False
+    cluster_ids: bool = False
+    pseudo_map: bool = False
+    neck: str = "deconv"
+    fusion: str = "add"
+    low: tuple[float, float, float] = (0.0, -39.68, -3.0)
+    high: tuple[float, float, float] = (69.12, 39.68, 1.0)
+    cell: float = 0.16
+    xy_scale: float = 1.0
+    max_points: int = 0
+    zero_row: bool = False
+    middle_z: bool = False
+    id_scale: float = 0.01
+    pillar_channels: int = 64
+    map_channels: tuple[int, ...] = (16, 32, 64)
+    block_channels: tuple[int, ...] = (64, 128, 256)
+    block_layers: tuple[int, ...] = (3, 5, 5)
+    block_strides: tuple[int, ...] = (2, 2, 2)
+    deconv_channels: int = 128
+    fpn_channels: int = 64
+    anchors: tuple[AnchorClass, ...] = ANCHORS
+    yaws: tuple[float, ...] = (0.0, 1.5707963267948966)
+    anchors_at: str = "cells"
+    direction_offset: float = 0.7853981633974483
+
+    def __post_init__(self) -> None:
+        height, width = self.grid
+        total = 1
+        for stride in self.block_strides:
+            total *= stride
+        if height % total or width % total or height < total or width < total:
+            raise ValueError(f"a grid of {width} x {height} cells cannot be divided by {total}, "
+                             "the product of block_strides; change low, high or cell")
+        if not len(self.block_channels) == len(self.block_layers) == len(self.block_strides):
+            raise ValueError("block_channels, block_layers and block_strides differ in length")
+        if unknown := [name for name in self.classes if name not in CLASSES]:
+            raise ValueError(f"there is no class {unknown[0]!r}; known are {', '.join(CLASSES)}")
+        if self.zero_row and not self.max_points:
+            raise ValueError("zero_row needs max_points")
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        return tuple(anchor.name for anchor in self.anchors)
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """(H, W): cells along y and along x."""
+        return (round((self.high[1] - self.low[1]) / self.cell),
+                round((self.high[0] - self.low[0]) / self.cell))
+
+    @property
+    def head_grid(self) -> tuple[int, int]:
+        """(H, W) of the feature map that the head reads."""
+        stride = self.block_strides[0]
+        return self.grid[0] // stride, self.grid[1] // stride
+
+    @property
+    def point_columns(self) -> int:
+        """x y z intensity, and the cluster id."""
+        return 5 if self.cluster_ids else 4
+
+    @property
+    def offset_columns(self) -> int:
+        """x_c y_c z_c x_p y_p, and z_p."""
+        return 6 if self.middle_z else 5
+
+
+def network_config(version: str = "v0", size: str = "full",
+                   classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"),
+                   **changes: Any) -> NetworkConfig:
+    """The config of a version and size by name, for some of the three classes, with other fields
+    changed. InputError for a name that is none."""
+    for name, choices in (version, VERSIONS), (size, SIZES):
+        if name not in choices:
+            raise InputError(f"there is no {name!r}; choose one of {', '.join(choices)}")
+    anchors = {anchor.name: anchor for anchor in ANCHORS}
+    if not classes or (unknown := [name for name in classes if name not in anchors]):
+        raise InputError(f"there is no anchor for {unknown[0] if classes else 'no class'}; choose "
+                         f"some of {', '.join(anchors)}")
+    settings = dict(version=version, size=size, xy_scale=XY_SCALE,
+                    anchors=tuple(anchors[name] for name in classes), **VERSIONS[version],
+                    **SIZES[size])
+    try:
+        return NetworkConfig(**{**settings, **changes})
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def from_json(content: dict[str, Any], source: str = "the header") -> NetworkConfig:
+    """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
+    return config_of(NetworkConfig, content, source, {"anchors": _anchors})
+
+
+def _anchors(content: list[dict[str, Any]]) -> tuple[AnchorClass, ...]:
+    return tuple(AnchorClass(**{**anchor, "size": tuple(anchor["size"])}) for anchor in content)

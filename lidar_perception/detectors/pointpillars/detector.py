@@ -1,0 +1,184 @@
+"""A cloud in, boxes out: the network with its experts before it and NMS after it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.devices import CPU, chosen_device
+from lidar_perception.detectors.nms import best_of_each, suppressed
+from lidar_perception.detectors.pointpillars.anchors import make_anchors
+from lidar_perception.detectors.pointpillars.box_coder import decode
+from lidar_perception.detectors.pointpillars.checkpoint import Header, load_network
+from lidar_perception.detectors.pointpillars.expert import NetworkInput, network_input
+from lidar_perception.detectors.pointpillars.network import PointPillars, Prediction, fused
+from lidar_perception.detectors.pointpillars.params import STEPS, DetectionParams, DetectorParams
+from lidar_perception.detectors.pointpillars.pillars import Pillars, make_pillars
+from lidar_perception.detectors.pointpillars.weights_file import weights_file
+from lidar_perception.detectors.view import (
+    in_sensor_frame,
+    made_up_frame,
+    require_columns,
+    visible,
+    with_intensity_scaled,
+)
+from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError, LidarFrame
+
+
+class TorchNetwork:
+    """A network on a device, its norms folded into its layers."""
+
+    def __init__(self, network: PointPillars, device: torch.device = CPU):
+        self.network = fused(network).to(device)
+
+    def to(self, device: torch.device) -> None:
+        """Move to another device."""
+        self.network.to(device)
+
+    def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
+        features = self.network.features(pillars, maps)
+        head = self.network.head
+        return head.logits(features)[0], lambda anchors: head.boxes_at(features, anchors)
+
+
+class Detector(NetworkDetector):
+    """detector(frame) -> Detections, in the frame's own coordinates."""
+
+    def __init__(self, network: Any, header: Header, device: torch.device,
+                 params: DetectorParams = DetectorParams()):
+        super().__init__(header, device, params, STEPS)
+        self.network = network
+        self.anchors = make_anchors(self.config, device)
+
+    @property
+    def settings(self) -> DetectionParams:
+        """The network's own group of params."""
+        return self.params.detection
+
+    def __call__(self, frame: LidarFrame, ground: np.ndarray | None = None,
+                 cluster_ids: np.ndarray | None = None) -> Detections:
+        """The objects in a frame of N points. ground (N,) bool and cluster_ids (N,) int, 0 = none,
+        are computed if the version needs them and they are None. InputError for columns of another
+        length, and where CUDA has no memory left and the CPU may not take over."""
+        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
+        t0 = perf_counter()
+        pose = self.params.ground.sensor_pose
+        places, seen = visible(frame, self.config, pose)
+        seen = with_intensity_scaled(seen, self.settings.intensity_scale)
+        t1 = perf_counter()
+        inputs = network_input(
+            seen, self.config, None if ground is None else ground.take(places).astype(bool),
+            None if cluster_ids is None else cluster_ids.take(places),
+            self.params.ground, self.params.clustering)
+        t2 = perf_counter()
+        self.problem, self.best = self._problem(frame, seen, inputs) or self.fallback, {}
+        if len(inputs.points) == 0:
+            self.ms = dict(zip(STEPS, ((t1 - t0) * 1e3, (t2 - t1) * 1e3, 0.0, 0.0)))
+            return Detections.none()
+        with torch.inference_mode():
+            t3, t4, found = self.guarded(lambda: self._predict(inputs))
+            found = in_sensor_frame(found, pose)
+        t5 = perf_counter()
+        self.ms = dict(zip(STEPS, (
+            (t1 - t0 + t3 - t2) * 1e3, (t2 - t1) * 1e3, (t4 - t3) * 1e3, (t5 - t4) * 1e3)))
+        return found
+
+    def _predict(self, inputs: NetworkInput) -> tuple[float, float, Detections]:
+        """When the network began and ended, and what it found."""
+        points = torch.from_numpy(inputs.points).to(self.device)
+        maps = None
+        if inputs.cluster_map is not None:
+            maps = torch.from_numpy(inputs.cluster_map)[None].to(self.device)
+        pillars = make_pillars([points], self.config)
+        begun = self.now()
+        logits, boxes_at = self.network(pillars, maps)
+        ended = self.now()
+        return begun, ended, self._detections(logits, boxes_at)
+
+    def _detections(self, logits: Tensor, boxes_at: Callable) -> Detections:
+        settings = self.settings
+        limits = logits.new_tensor([_logit(settings.scores.of_class(name))
+                                    for name in self.config.classes])
+        chosen = torch.nonzero((logits >= limits).any(dim=1))[:, 0]
+        if len(chosen) == 0:
+            self.nothing_passed(torch.sigmoid(logits.amax(dim=0)).tolist())
+        best, kinds = logits[chosen].max(dim=1)
+        valid = torch.nonzero(best >= limits[kinds])[:, 0]
+        if len(valid) > settings.nms.candidates:
+            valid = valid[best[valid].topk(settings.nms.candidates).indices]
+        chosen, best, kinds = chosen[valid], best[valid], kinds[valid]
+        codes, directions = boxes_at(chosen)
+        boxes = decode(codes.float(), directions.argmax(dim=1), self.anchors[chosen],
+                       self.config.direction_offset).cpu().numpy()
+        scores, kinds = torch.sigmoid(best).cpu().numpy(), kinds.cpu().numpy()
+        return best_of_each(boxes, scores, kinds, self.config.classes, settings.nms)
+
+    def _problem(self, frame: LidarFrame, seen: LidarFrame, inputs: NetworkInput) -> str | None:
+        if len(frame) == 0:
+            return "the cloud is empty or has no finite point"
+        if len(seen) == 0:
+            low, high = self.config.low, self.config.high
+            return (f"no point lies in the network's range, x {low[0]:g} .. {high[0]:g}, y "
+                    f"{low[1]:g} .. {high[1]:g}, z {low[2]:g} .. {high[2]:g} m under a sensor "
+                    f"{SENSOR_HEIGHT} m high; is x forward, and ground.sensor_pose right?")
+        if len(inputs.points) == 0:
+            return ("every point in the network's range is ground; is the sensor mounted at "
+                    "another height or angle? set ground.sensor_pose")
+        if frame.intensity is None and self.settings.intensity_scale:
+            return "the cloud has no intensity, which the network was trained with; it reads zeros"
+        return None
+
+    def place(self, device: torch.device) -> None:
+        """Bring network and anchors to a device."""
+        self.network.to(device)
+        self.anchors = make_anchors(self.config, device)
+
+    def warm_up(self) -> None:
+        """Run every part once on made-up points, so that what is compiled is compiled."""
+        self(made_up_frame(self.params.ground.sensor_pose))
+        suppressed(np.ones((2, 7)), np.ones(2), np.zeros(2, int), 0.5)
+
+
+def _logit(score: float) -> float:
+    if score in (0.0, 1.0):
+        return math.copysign(math.inf, score - 0.5)
+    return math.log(score / (1 - score))
+
+
+def load_detector(path: str | Path = "", device: str = "auto",
+                  params: DetectorParams = DetectorParams()) -> Detector:
+    """A detector from a checkpoint (.safetensors) or an exported network (.onnx); with an empty
+    path the one that params name, or else the one that comes with the package. InputError where it
+    is missing, or not of the version and size that params ask for, or device is not there."""
+    path = Path(path) if str(path) not in ("", ".") else weights_file(params.detection)
+    if params.detection.threads:
+        torch.set_num_threads(params.detection.threads)
+    if path.suffix == ".onnx":
+        from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork
+        header, network = OnnxNetwork.load(path)
+        place = CPU
+        if device not in ("auto", "cpu"):
+            raise InputError(f"{path} runs in ONNX Runtime on the CPU, not on {device!r}; use the "
+                             "checkpoint it was exported from")
+    else:
+        place = chosen_device(device)
+        header, loaded = load_network(path)
+        network = TorchNetwork(loaded, CPU)
+    for name in "version", "size":
+        wanted, found = getattr(params.detection, name), getattr(header.config, name)
+        if wanted not in ("auto", found):
+            raise InputError(f"{path} holds {name} {found}, asked for was {wanted}; change "
+                             f"detection.{name} or detection.weights")
+    detector = Detector(network, header, CPU, params)
+    detector.move(place)
+    if params.detection.warm_up:
+        detector.warm_up()
+    return detector

@@ -1,0 +1,121 @@
+"""What the experts tell a network (paper B, Section 3): ground, clusters, a map of the clusters.
+
+Only the part of a cloud that the network sees is looked at. Columns that are known already, from
+the nodes ground_segmentation and clustering, are taken as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.clustering.params import ClusteringParams
+from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
+from lidar_perception.detectors.pointpillars.config import NetworkConfig
+from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
+from lidar_perception.detectors.view import levelled_ground
+from lidar_perception.ground.params import GroundParams
+from lidar_perception.types import CLASSES, LidarFrame
+
+SPARSE = 16  # largest number of a cluster, in points, up to which a table of all numbers is made
+MAP_CLASSES = ("Car", "Cyclist", "Pedestrian")  # channels: vehicle, two-wheeler, pedestrian
+
+
+@dataclass(frozen=True)
+class NetworkInput:
+    """points (N, 4 or 5) float32 [x y z intensity (cluster id)] as from a level sensor at
+    SENSOR_HEIGHT, metres; cluster_map (3, H, W) uint8, or None if the network has no such branch.
+    """
+
+    points: np.ndarray
+    cluster_map: np.ndarray | None = None
+
+
+def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | None = None,
+                  cluster_ids: np.ndarray | None = None,
+                  ground_params: GroundParams = EXPERT_GROUND,
+                  clustering: ClusteringParams = EXPERT_CLUSTERING) -> NetworkInput:
+    """The input arrays of a version, from the N points of `visible`.
+
+    ground (N,) bool and cluster_ids (N,) int, 0 = none, are computed if the version needs them and
+    they are None. The ids that are left are numbered anew from 1, in their order.
+    """
+    needs_clusters = config.cluster_ids or config.pseudo_map
+    if ground is None and (config.remove_ground or (needs_clusters and cluster_ids is None)):
+        ground = levelled_ground(seen, ground_params)
+    if needs_clusters and cluster_ids is None:
+        cluster_ids = cluster_obstacles(seen.xyz, ground, clustering)
+    if config.remove_ground:
+        obstacles = np.flatnonzero(~np.asarray(ground, bool))
+        seen = seen.take(obstacles)
+        cluster_ids = None if cluster_ids is None else cluster_ids.take(obstacles)
+    points = np.zeros((len(seen), config.point_columns), np.float32)
+    points[:, :3] = seen.xyz
+    if seen.intensity is not None:
+        points[:, 3] = seen.intensity
+    if needs_clusters:
+        cluster_ids = renumbered(cluster_ids)
+    if config.cluster_ids:
+        points[:, 4] = cluster_ids
+    return NetworkInput(points, draw_clusters(seen.xyz, cluster_ids, config)
+                        if config.pseudo_map else None)
+
+
+def renumbered(cluster_ids: np.ndarray) -> np.ndarray:
+    """(N,) int32: the ids above 0 as 1..K in their order; 0 and below become 0."""
+    ids = np.maximum(np.asarray(cluster_ids, np.int64), 0)
+    if ids.max(initial=0) > SPARSE * (len(ids) + 1):  # of another program, whose numbers are large
+        _, ids = np.unique(np.append(ids, 0), return_inverse=True)
+        ids = ids[:-1]
+    place = np.zeros(int(ids.max(initial=0)) + 1, np.int32)
+    place[ids] = 1
+    place[0] = 0
+    return np.where(ids > 0, np.cumsum(place)[ids], 0).astype(np.int32)
+
+
+def draw_clusters(xyz: np.ndarray, cluster_ids: np.ndarray, config: NetworkConfig) -> np.ndarray:
+    """(3, H, W) uint8, 0 or 1, H along y: the cluster 2D pseudo-map (paper B, Section 3.1.2).
+
+    Clusters 1..K of points (N, 3) with ids (N,) are classified by the diagonal of their smallest
+    rectangle, and drawn as filled ellipses into the channel of their class (MAP_CLASSES): the
+    cells whose middle lies in the ellipse, and the one that holds its centre.
+    """
+    kinds = class_by_diagonal(oriented_boxes(xyz, cluster_ids, "min_area"))
+    channels = np.full(len(kinds), -1)
+    for channel, name in enumerate(MAP_CLASSES):
+        channels[kinds == CLASSES.index(name)] = channel
+    image = np.zeros((len(MAP_CLASSES), *config.grid), np.uint8)
+    _fill_ellipses(image, ellipses(xyz, cluster_ids), channels, config.low[0], config.low[1],
+                   config.cell)
+    return image
+
+
+@njit(cache=True, nogil=True)
+def _fill_ellipses(image, shapes, channels, low_x, low_y, cell):
+    _, height, width = image.shape
+    for k in range(len(shapes)):
+        if channels[k] < 0:
+            continue
+        x, y, a, b, yaw = shapes[k]
+        layer = image[channels[k]]
+        row, column = int(np.floor((y - low_y) / cell)), int(np.floor((x - low_x) / cell))
+        if 0 <= row < height and 0 <= column < width:
+            layer[row, column] = 1
+        if b <= 0.0:
+            continue
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        reach_x, reach_y = np.hypot(a * cos, b * sin), np.hypot(a * sin, b * cos)
+        first_row = max(int(np.floor((y - reach_y - low_y) / cell)), 0)
+        last_row = min(int(np.floor((y + reach_y - low_y) / cell)), height - 1)
+        first_column = max(int(np.floor((x - reach_x - low_x) / cell)), 0)
+        last_column = min(int(np.floor((x + reach_x - low_x) / cell)), width - 1)
+        for i in range(first_row, last_row + 1):
+            dy = low_y + (i + 0.5) * cell - y
+            for j in range(first_column, last_column + 1):
+                dx = low_x + (j + 0.5) * cell - x
+                u, v = (cos * dx + sin * dy) / a, (cos * dy - sin * dx) / b
+                if u * u + v * v <= 1.0:
+                    layer[i, j] = 1

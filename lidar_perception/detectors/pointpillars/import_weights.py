@@ -1,0 +1,190 @@
+"""PointPillars weights of OpenPCDet and mmdetection3d (1.x) as checkpoints of ours.
+
+Both hold the same network under other names. What differs is converted where it can be, exactly:
+
+- Their points have a tenth input, the height above the middle of the range (middle_z of the
+  config). mmdetection3d puts x_p, y_p and z_p in the place of x, y and z: the weights of both are
+  added up.
+- They read the first 32 points of a pillar and fill it up with zeros that take part in the maximum:
+  max_points and zero_row of the config.
+- OpenPCDet spreads anchors from edge to edge, mmdetection3d puts them on the middles of cells; each
+  has its own origin of the two heading bins, and its own height of anchors. Boxes of mmdetection3d
+  stand on their z, but are coded by their centres, as ours are.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from lidar_perception.detectors.pointpillars.config import (
+    ANCHORS,
+    AnchorClass,
+    NetworkConfig,
+    network_config,
+)
+from lidar_perception.detectors.pointpillars.network import PointPillars, make_network
+from lidar_perception.types import InputError
+
+NORM_PARTS = ("weight", "bias", "running_mean", "running_var")
+MAX_POINTS = 32
+COLUMNS = 10  # x y z i, x_c y_c z_c, x_p y_p z_p
+
+
+@dataclass(frozen=True)
+class Project:
+    """How one project names and reads its PointPillars."""
+
+    name: str
+    points: str            # prefix of the linear layer of points and its norm
+    block: str             # prefix of block i, {i}
+    first: int             # place of the first convolution in a block
+    neck: str              # prefix of the neck's branch i, {i}
+    head: tuple[str, str, str]
+    classes: tuple[str, ...]
+    bottoms: dict[str, float]  # z of the bottom face of the anchors
+    anchors_at: str
+    direction_offset: float
+    centred_xyz: bool      # x_p y_p z_p stand in the place of x y z
+
+
+PROJECTS = (
+    Project("OpenPCDet", "vfe.pfn_layers.0.", "backbone_2d.blocks.{i}.", 1,
+            "backbone_2d.deblocks.{i}.",
+            ("dense_head.conv_cls", "dense_head.conv_box", "dense_head.conv_dir_cls"),
+            ("Car", "Pedestrian", "Cyclist"), dict(Car=-1.78, Pedestrian=-0.6, Cyclist=-0.6),
+            "ends", 0.78539, False),
+    Project("mmdetection3d", "voxel_encoder.pfn_layers.0.", "backbone.blocks.{i}.", 0,
+            "neck.deblocks.{i}.",
+            ("bbox_head.conv_cls", "bbox_head.conv_reg", "bbox_head.conv_dir_cls"),
+            ("Pedestrian", "Cyclist", "Car"), dict(Car=-1.78, Pedestrian=-0.6, Cyclist=-0.6),
+            "cells", -math.pi / 2, True),
+)
+
+
+def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[NetworkConfig,
+                                                                            PointPillars, str]:
+    """Config, network (v0 full) and the project's name of a .pth file with KITTI's range and 0.16 m
+    pillars. classes: in the order of training, if it is not the project's own. InputError for
+    another network, naming the first part that does not fit."""
+    path = Path(path)
+    state = _state(path)
+    project = next((p for p in PROJECTS if f"{p.points}linear.weight" in state), None)
+    if project is None:
+        raise InputError(f"{path} is no PointPillars of {' or '.join(p.name for p in PROJECTS)}: "
+                         f"it has no tensor {PROJECTS[0].points}linear.weight")
+    config = _config(project, _kinds(state, project, path), classes, path)
+    network = make_network(config)
+    taken, converted = {}, network.state_dict()
+    for ours, theirs in _names(project, config).items():
+        if theirs.endswith("num_batches_tracked") and theirs not in state:
+            continue  # torch before 0.4.1 had none
+        taken[theirs] = _tensor(state, theirs, path)
+        converted[ours] = taken[theirs]
+    linear = f"{project.points}linear.weight"
+    taken[linear] = _tensor(state, linear, path)
+    converted["pillar_net.linear.weight"] = _inputs_of_ours(taken[linear], project, path)
+    for name, wanted in network.state_dict().items():
+        if converted[name].shape != wanted.shape:
+            raise InputError(f"{path}: {name} would be {tuple(converted[name].shape)}, where "
+                             f"PointPillars has {tuple(wanted.shape)}")
+    left = [name for name in state if name not in taken and state[name].is_floating_point()]
+    if left:
+        raise InputError(f"{path} has {left[0]} and {len(left) - 1} more tensors that PointPillars "
+                         "has no place for; it is another network")
+    network.load_state_dict(converted)
+    return config, network, project.name
+
+
+def _state(path: Path) -> dict[str, Tensor]:
+    """The tensors of a .pth file, which is read without running what it may hold."""
+    if not path.is_file():
+        raise InputError(f"there is no file {path}")
+    try:
+        content: Any = torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, OSError) as error:
+        raise InputError(f"{path} cannot be read as weights only: "
+                         f"{str(error).splitlines()[0] if str(error) else type(error).__name__}; "
+                         "save its state_dict alone with torch.save and take that file") from None
+    for key in "model_state", "state_dict":
+        if isinstance(content, dict) and isinstance(content.get(key), dict):
+            content = content[key]
+    state = {str(name).removeprefix("module."): value for name, value in content.items()
+             if isinstance(value, Tensor)} if isinstance(content, dict) else {}
+    if not state:
+        raise InputError(f"{path} holds no state_dict")
+    return state
+
+
+def _tensor(state: dict[str, Tensor], name: str, path: Path) -> Tensor:
+    if name not in state:
+        raise InputError(f"{path} has no tensor {name}; it is another network")
+    return state[name].float() if state[name].is_floating_point() else state[name]
+
+
+def _kinds(state: dict[str, Tensor], project: Project, path: Path) -> int:
+    """Anchors at one place, from the seven numbers of each."""
+    outputs = len(_tensor(state, f"{project.head[1]}.weight", path))
+    if outputs % 14:
+        raise InputError(f"{path}: {project.head[1]} has {outputs} outputs, which is not 7 for "
+                         "each class and two headings")
+    return outputs // 7
+
+
+def _config(project: Project, kinds: int, classes: tuple[str, ...], path: Path) -> NetworkConfig:
+    names = classes or project.classes
+    if not classes and kinds == 2:
+        names = ("Car",)
+    if kinds != 2 * len(names):
+        raise InputError(f"{path} has {kinds} anchors at each place, so {kinds // 2} classes; name "
+                         f"them in the order of training instead of {', '.join(names)}")
+    known = {anchor.name: anchor for anchor in ANCHORS}
+    if unknown := [name for name in names if name not in known]:
+        raise InputError(f"there is no anchor for {unknown[0]!r}; choose of {', '.join(known)}")
+    anchors = tuple(AnchorClass(name, known[name].size, project.bottoms[name]
+                                + known[name].size[2] / 2, known[name].matched,
+                                known[name].unmatched) for name in names)
+    return network_config("v0", "full", xy_scale=1.0, anchors=anchors, max_points=MAX_POINTS,
+                          zero_row=True, middle_z=True, yaws=(0.0, 1.57),
+                          anchors_at=project.anchors_at,
+                          direction_offset=project.direction_offset)
+
+
+def _names(project: Project, config: NetworkConfig) -> dict[str, str]:
+    """Our names to theirs, of all tensors but the linear layer of points."""
+    names = {f"pillar_net.norm.{part}": f"{project.points}norm.{part}"
+             for part in (*NORM_PARTS, "num_batches_tracked")}
+
+    def layer(ours: str, theirs: str, place: int) -> None:
+        names[f"{ours}.0.weight"] = f"{theirs}{place}.weight"
+        for part in (*NORM_PARTS, "num_batches_tracked"):
+            names[f"{ours}.1.{part}"] = f"{theirs}{place + 1}.{part}"
+
+    for i, layers in enumerate(config.block_layers):
+        for j in range(layers + 1):  # convolution, norm, ReLU
+            layer(f"blocks.{i}.{j}", project.block.format(i=i), project.first + 3 * j)
+        layer(f"neck.ups.{i}", project.neck.format(i=i), 0)
+    for ours, theirs in zip(("scores", "codes", "directions"), project.head):
+        for part in ("weight", "bias"):
+            names[f"head.{ours}.{part}"] = f"{theirs}.{part}"
+    return names
+
+
+def _inputs_of_ours(weight: Tensor, project: Project, path: Path) -> Tensor:
+    """weight (C, 10) for our inputs."""
+    if weight.shape[1] != COLUMNS:
+        older = (" Weights of mmdetection3d 0.x have 9, and boxes of another order."
+                 if project.centred_xyz else "")
+        raise InputError(f"{path}: the points have {weight.shape[1]} inputs; only x y z intensity "
+                         f"and the offsets from mean and middle, {COLUMNS}, can be read.{older}")
+    if project.centred_xyz:
+        weight = weight.clone()
+        weight[:, 7:10] += weight[:, 0:3]
+        weight[:, 0:3] = 0
+    return weight

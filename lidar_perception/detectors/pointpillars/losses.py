@@ -1,0 +1,64 @@
+"""What a network is trained to lower (Lang et al., Section 3.2; focal loss: Lin et al. 2017)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from lidar_perception.detectors.pointpillars.network import Outputs
+from lidar_perception.detectors.pointpillars.targets import IGNORED, Targets
+
+CLASS_WEIGHT, BOX_WEIGHT, DIRECTION_WEIGHT = 1.0, 2.0, 0.2
+ALPHA, GAMMA = 0.25, 2.0
+SMOOTH = 1 / 9  # from here on the box loss is linear
+
+
+class Losses(NamedTuple):
+    """Scalars; total is the weighted sum of the others."""
+
+    total: Tensor
+    classes: Tensor
+    boxes: Tensor
+    directions: Tensor
+
+
+def detection_loss(outputs: Outputs, targets: Targets, kinds: Tensor) -> Losses:
+    """Scores: the focal losses of the anchors of each class, divided by the number of those that
+    have an object, averaged over the classes. Boxes and directions: the mean over all anchors that
+    have an object. Numbers are at least 1 a cloud. kinds (A,) of anchors.anchor_classes.
+
+    So classes weigh alike where they are told from the background. Lang et al. divide scores by
+    the anchors of all classes, too; a car is on ten times as many of them as a pedestrian.
+    """
+    positive = targets.labels >= 0                                       # (B, A)
+    logits = outputs.logits.float()
+    clouds, _, classes = logits.shape
+    count = logits.new_zeros(classes).index_add_(0, kinds, positive.sum(dim=0).to(logits))
+    share = (count.clamp(min=clouds) * classes).reciprocal()[kinds]      # (A,)
+    wanted = functional.one_hot(targets.labels.clamp(min=0), classes).to(logits.dtype)
+    focal = focal_loss(logits, wanted * positive[..., None]).sum(dim=2)  # (B, A)
+    scores = ((focal * (targets.labels != IGNORED)).sum(dim=0) * share).sum()
+    number = count.sum().clamp(min=clouds)
+    codes, bins = targets.codes[positive], targets.bins[positive]        # (P, 7), (P,)
+    found = outputs.codes.float()[positive]
+    # sin(a - b), so that a box turned by half a circle costs nothing here
+    difference = torch.cat([found[:, :6] - codes[:, :6],
+                            torch.sin(found[:, 6:] - codes[:, 6:])], dim=1)
+    boxes = functional.smooth_l1_loss(difference, torch.zeros_like(difference), beta=SMOOTH,
+                                      reduction="sum") / number
+    headings = functional.cross_entropy(outputs.directions.float()[positive], bins,
+                                        reduction="sum") / number
+    total = CLASS_WEIGHT * scores + BOX_WEIGHT * boxes + DIRECTION_WEIGHT * headings
+    return Losses(total, scores, boxes, headings)
+
+
+def focal_loss(logits: Tensor, wanted: Tensor) -> Tensor:
+    """Elementwise; wanted is 0 or 1."""
+    entropy = functional.binary_cross_entropy_with_logits(logits, wanted, reduction="none")
+    score = torch.sigmoid(logits)
+    miss = wanted * (1 - score) + (1 - wanted) * score
+    weight = wanted * ALPHA + (1 - wanted) * (1 - ALPHA)
+    return weight * miss**GAMMA * entropy

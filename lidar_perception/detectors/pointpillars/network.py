@@ -1,0 +1,233 @@
+"""PointPillars (Lang et al., CVPR 2019) and EG-PointPillars (paper B), the whole network.
+
+    points -> PillarNet -> pseudo-image --+-> blocks -> neck -> head -> scores, codes, directions
+    map of clusters -> MapNet (V4) -------+
+
+B clouds, N points, H x W pillars, C channels, K classes, A anchors. Images are channels-last in
+memory. Assigning targets, losses and decoding boxes are elsewhere.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
+
+from lidar_perception.detectors.pointpillars.config import NetworkConfig
+from lidar_perception.detectors.pointpillars.pillars import Pillars
+
+NORM = dict(eps=1e-3, momentum=0.01)
+CODE, BINS = 7, 2      # numbers that describe a box, and halves of the circle of headings
+PRIOR = 0.01           # score of every anchor before training
+
+# What a detector asks of a network, torch's or an exported one: logits (A, K) of one cloud, and
+# codes (M, 7) and directions (M, 2) at anchors (M,).
+Prediction = tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]
+
+
+class Outputs(NamedTuple):
+    """logits (B, A, K), codes (B, A, 7), directions (B, A, 2); anchors as in make_anchors."""
+
+    logits: Tensor
+    codes: Tensor
+    directions: Tensor
+
+
+class ConvNormRelu(nn.Sequential):
+    """A convolution, batch norm, ReLU."""
+
+    def __init__(self, conv: nn.Module):
+        super().__init__(conv, nn.BatchNorm2d(conv.out_channels, **NORM), nn.ReLU(inplace=True))
+
+
+def conv3x3(channels: int, out: int, stride: int = 1) -> ConvNormRelu:
+    """A 3 x 3 convolution, norm and ReLU."""
+    return ConvNormRelu(nn.Conv2d(channels, out, 3, stride, padding=1, bias=False))
+
+
+class PillarNet(nn.Module):
+    """A linear layer for each point, and the largest value of each pillar, in its place."""
+
+    def __init__(self, config: NetworkConfig):
+        super().__init__()
+        self.config = config
+        self.linear = nn.Linear(config.point_columns + config.offset_columns,
+                                config.pillar_channels, bias=False)
+        self.norm = nn.BatchNorm1d(config.pillar_channels, **NORM)
+
+    @torch.autocast("cuda", enabled=False)
+    @torch.autocast("cpu", enabled=False)  # where x is 60 m, 16 bits would leave 25 cm of it
+    def forward(self, pillars: Pillars) -> Tensor:
+        # The clusters' numbers come last, so that versions with and without share a beginning.
+        points = pillars.points
+        inputs = torch.cat([points[:, :2] * self.config.xy_scale, points[:, 2:4], pillars.offsets,
+                            points[:, 4:] * self.config.id_scale], dim=1)      # (N, 9 to 11)
+        values = functional.relu(self.norm(self.linear(inputs)))   # (N, C)
+        height, width = pillars.grid
+        count = pillars.batch * height * width
+        image = values.new_zeros(count, values.shape[1])           # (B * H * W, C), empty is 0
+        if self.config.zero_row:
+            image = self._zero_rows(image, pillars.cells, inputs[:1])
+        # No value is below 0, so the zeros of an empty pillar take nothing from a full one.
+        image.scatter_reduce_(0, pillars.cells[:, None].expand_as(values), values, "amax")
+        return image.view(pillars.batch, height, width, -1).permute(0, 3, 1, 2)  # (B, C, H, W)
+
+    def _zero_rows(self, image: Tensor, cells: Tensor, like: Tensor) -> Tensor:
+        """image (B * H * W, C) with the value of an all-zero point where a pillar is not full."""
+        ones = torch.ones_like(cells, dtype=image.dtype)
+        sizes = image.new_zeros(len(image)).scatter_add(0, cells, ones)
+        partly = ((sizes > 0) & (sizes < self.config.max_points))[:, None]
+        zero = functional.relu(self.norm(self.linear(torch.zeros_like(like))))
+        return image + partly * zero
+
+
+class MapNet(nn.Sequential):
+    """Cluster Map Feature Net (paper B, Section 3.1.2): 3 channels, one a class, to C."""
+
+    def __init__(self, channels: Sequence[int]):
+        super().__init__(*(conv3x3(a, b) for a, b in zip((3, *channels), channels)))
+
+    def forward(self, maps: Tensor) -> Tensor:  # (B, 3, H, W) uint8
+        maps = maps.to(next(self.parameters()).dtype)
+        return super().forward(maps.contiguous(memory_format=torch.channels_last))  # (B, C, H, W)
+
+
+class DeconvNeck(nn.Module):
+    """PointPillars' neck: every block's map up to the first one's size, side by side."""
+
+    def __init__(self, channels: Sequence[int], strides: Sequence[int], out: int):
+        super().__init__()
+        scales = [math.prod(strides[1:i + 1]) for i in range(len(strides))]  # 1, 2, 4
+        self.ups = nn.ModuleList(
+            ConvNormRelu(nn.ConvTranspose2d(c, out, scale, scale, bias=False))
+            for c, scale in zip(channels, scales))
+        self.channels = out * len(channels)
+
+    def forward(self, maps: list[Tensor]) -> Tensor:  # finest first: H/2, H/4, H/8
+        return torch.cat([up(x) for up, x in zip(self.ups, maps)], dim=1)  # (B, 3 * out, H/2, W/2)
+
+
+class FpnNeck(nn.Module):
+    """The neck of V1 to V4 (paper B, Eq. 1 to 8): from the coarsest map, each is doubled
+    bilinearly and joined with the next finer one."""
+
+    def __init__(self, channels: Sequence[int], strides: Sequence[int], out: int, fusion: str):
+        super().__init__()
+        self.laterals = nn.ModuleList(nn.Conv2d(c, out, 1) for c in channels)
+        self.scales, self.fusion = list(strides[1:]), fusion
+        self.out = conv3x3(out * (1 if fusion == "add" else len(channels)), out)
+        self.channels = out
+
+    def forward(self, maps: list[Tensor]) -> Tensor:  # finest first: H/2, H/4, H/8
+        levels = [lateral(x) for lateral, x in zip(self.laterals, maps)]  # (B, 2C, ...) each
+        joined = levels.pop()
+        for scale, level in zip(reversed(self.scales), reversed(levels)):
+            joined = functional.interpolate(joined, scale_factor=float(scale), mode="bilinear")
+            joined = joined + level if self.fusion == "add" else torch.cat([joined, level], dim=1)
+        return self.out(joined)  # (B, 2C, H/2, W/2)
+
+
+class Head(nn.Module):
+    """Single-shot head: one 1 x 1 convolution each for class, box and heading.
+
+    A box is needed only where a class has a score, so a detector asks for scores everywhere and
+    for boxes at a few anchors.
+    """
+
+    def __init__(self, channels: int, kinds: int, classes: int):
+        super().__init__()
+        self.kinds, self.classes = kinds, classes  # kinds: anchors at one place
+        self.scores = nn.Conv2d(channels, kinds * classes, 1)
+        self.codes = nn.Conv2d(channels, kinds * CODE, 1)
+        self.directions = nn.Conv2d(channels, kinds * BINS, 1)
+        nn.init.normal_(self.scores.weight, std=0.01)
+        nn.init.constant_(self.scores.bias, -math.log((1 - PRIOR) / PRIOR))
+        nn.init.normal_(self.codes.weight, std=0.001)
+
+    def forward(self, features: Tensor) -> Outputs:
+        return Outputs(_by_anchor(self.scores(features), self.classes),
+                       _by_anchor(self.codes(features), CODE),
+                       _by_anchor(self.directions(features), BINS))
+
+    def logits(self, features: Tensor) -> Tensor:
+        """(B, A, K) as in forward."""
+        return _by_anchor(self.scores(features), self.classes)
+
+    def boxes_at(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
+        """codes (M, 7) and directions (M, 2) of anchors (M,) of the only cloud."""
+        places, kinds = anchors // self.kinds, anchors % self.kinds
+        rows = features[0].flatten(1)[:, places].T  # (M, C)
+
+        def one(conv: nn.Conv2d, width: int) -> Tensor:
+            weight = conv.weight.view(self.kinds, width, -1)[kinds]  # (M, width, C)
+            bias = conv.bias.view(self.kinds, width)[kinds]
+            return torch.baddbmm(bias[:, :, None], weight, rows[:, :, None])[:, :, 0]
+
+        return one(self.codes, CODE), one(self.directions, BINS)
+
+
+def _by_anchor(x: Tensor, width: int) -> Tensor:
+    """(B, kinds * width, H, W) to (B, H * W * kinds, width)."""
+    return x.permute(0, 2, 3, 1).reshape(len(x), -1, width)
+
+
+class PointPillars(nn.Module):
+    """The network of parts that fit together; make_network builds them from a config."""
+
+    def __init__(self, pillar_net: nn.Module, map_net: nn.Module | None,
+                 blocks: Sequence[nn.Module], neck: nn.Module, head: nn.Module):
+        super().__init__()
+        self.pillar_net, self.map_net = pillar_net, map_net
+        self.blocks, self.neck, self.head = nn.ModuleList(blocks), neck, head
+
+    def features(self, pillars: Pillars, maps: Tensor | None = None) -> Tensor:
+        """(B, neck.channels, H/2, W/2); maps (B, 3, H, W) uint8 for V4."""
+        x = self.pillar_net(pillars)                            # (B, C, H, W)
+        if self.map_net is not None:
+            x = torch.cat([x, self.map_net(maps)], dim=1)       # (B, C + C', H, W)
+        levels = []
+        for block in self.blocks:
+            x = block(x)                                        # H/2, H/4, H/8
+            levels.append(x)
+        return self.neck(levels)
+
+    def forward(self, pillars: Pillars, maps: Tensor | None = None) -> Outputs:
+        return self.head(self.features(pillars, maps))
+
+
+def make_network(config: NetworkConfig) -> PointPillars:
+    """A network with random weights, in training mode."""
+    map_net = MapNet(config.map_channels) if config.pseudo_map else None
+    channels = config.pillar_channels + (config.map_channels[-1] if config.pseudo_map else 0)
+    blocks = []
+    for out, layers, stride in zip(config.block_channels, config.block_layers,
+                                   config.block_strides):
+        blocks.append(nn.Sequential(conv3x3(channels, out, stride),
+                                    *(conv3x3(out, out) for _ in range(layers))))
+        channels = out
+    neck = (DeconvNeck(config.block_channels, config.block_strides, config.deconv_channels)
+            if config.neck == "deconv" else
+            FpnNeck(config.block_channels, config.block_strides, config.fpn_channels,
+                    config.fusion))
+    head = Head(neck.channels, len(config.anchors) * len(config.yaws), len(config.anchors))
+    network = PointPillars(PillarNet(config), map_net, blocks, neck, head)
+    return network.to(memory_format=torch.channels_last)
+
+
+def fused(network: PointPillars) -> PointPillars:
+    """A copy for inference, with every batch norm inside the layer before it."""
+    network = copy.deepcopy(network).eval()
+    for module in network.modules():
+        if isinstance(module, ConvNormRelu):
+            module[0] = fuse_conv_bn_eval(module[0], module[1],
+                                          transpose=isinstance(module[0], nn.ConvTranspose2d))
+            module[1] = nn.Identity()
+    net = network.pillar_net
+    net.linear, net.norm = fuse_linear_bn_eval(net.linear, net.norm), nn.Identity()
+    return network.to(memory_format=torch.channels_last)

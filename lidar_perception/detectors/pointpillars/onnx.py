@@ -1,0 +1,106 @@
+"""Networks as ONNX: export, and ONNX Runtime in the place of torch.
+
+The graph begins with the points, already sorted into pillars, and ends with the head's outputs. It
+has one loop-free operation that is not in every runtime, ScatterElements with reduction max (opset
+18). Pillars and boxes are made outside.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from lidar_perception.detectors.pointpillars.checkpoint import KEY, Header
+from lidar_perception.detectors.pointpillars.network import PointPillars, Prediction, fused
+from lidar_perception.detectors.pointpillars.pillars import Pillars
+from lidar_perception.runs.files import write_bytes
+from lidar_perception.types import InputError
+
+OPSET = 18
+OUTPUTS = ["logits", "codes", "directions"]
+
+
+class OneCloud(nn.Module):
+    """The network for one cloud, with tensors only."""
+
+    def __init__(self, network: PointPillars, grid: tuple[int, int]):
+        super().__init__()
+        self.network, self.grid = network, grid
+
+    def forward(self, points: Tensor, offsets: Tensor, cells: Tensor,
+                cluster_map: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        return tuple(self.network(Pillars(points, offsets, cells, 1, self.grid), cluster_map))
+
+
+def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None:
+    """Write network for one cloud: points (N, 4 or 5), offsets (N, 5 or 6) float32 and cells (N,)
+    int64 of pillars.Pillars, for V4 cluster_map (1, 3, H, W) uint8, to logits (1, A, K), codes
+    (1, A, 7), directions (1, A, 2). The header is metadata. InputError without the packages of
+    [onnx]."""
+    try:
+        import onnx
+        import onnxscript  # noqa: F401
+    except ImportError:
+        raise InputError("export onnx needs the packages of the extra [onnx]: pip install "
+                         "'lidar_perception[onnx]'") from None
+    config, count = header.config, 100
+    inputs = {"points": torch.zeros(count, config.point_columns), "offsets":
+              torch.zeros(count, config.offset_columns), "cells": torch.arange(count)}
+    free = {name: {0: torch.export.Dim("points_in_range", min=1)} for name in inputs}
+    if config.pseudo_map:
+        inputs["cluster_map"] = torch.zeros(1, 3, *config.grid, dtype=torch.uint8)
+        free["cluster_map"] = None
+    logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            OneCloud(fused(network), config.grid).eval(), tuple(inputs.values()), dynamo=True,
+            verbose=False, opset_version=OPSET, input_names=list(inputs), output_names=OUTPUTS,
+            dynamic_shapes=free)
+    model = program.model_proto
+    onnx.helper.set_model_props(model, {KEY: header.text()})
+    onnx.checker.check_model(model)
+    write_bytes(path, model.SerializeToString())
+
+
+class OnnxNetwork:
+    """An exported network in ONNX Runtime, on the CPU."""
+
+    def __init__(self, session):
+        self.session = session
+        self.inputs = [i.name for i in session.get_inputs()]
+
+    @staticmethod
+    def load(path: str | Path) -> tuple[Header, OnnxNetwork]:
+        """Header and network. InputError without onnxruntime, or for another file."""
+        try:
+            import onnxruntime
+        except ImportError:
+            raise InputError(f"{path} needs onnxruntime: pip install 'lidar_perception[onnx]'"
+                             ) from None
+        if not Path(path).is_file():
+            raise InputError(f"there is no exported network {path}")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = torch.get_num_threads()
+        try:
+            session = onnxruntime.InferenceSession(str(path), options,
+                                                   providers=["CPUExecutionProvider"])
+        except Exception as error:  # its errors have no common base
+            reason = str(error).splitlines()[0]
+            raise InputError(f"ONNX Runtime cannot read {path}: {reason}") from None
+        text = session.get_modelmeta().custom_metadata_map.get(KEY)
+        return Header.of_text(text, str(path)), OnnxNetwork(session)
+
+    def to(self, device: torch.device) -> None:
+        """Stays on the CPU."""
+
+    def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
+        given = dict(points=pillars.points, offsets=pillars.offsets, cells=pillars.cells,
+                     cluster_map=maps)
+        logits, codes, directions = map(torch.from_numpy, self.session.run(
+            OUTPUTS, {name: given[name].numpy() for name in self.inputs}))
+        return logits[0], lambda anchors: (codes[0, anchors], directions[0, anchors])

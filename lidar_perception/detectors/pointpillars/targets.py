@@ -1,0 +1,90 @@
+"""Which anchor is to find which object (Lang et al., Section 4.1; SECOND's matching)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from lidar_perception.detectors.pointpillars.box_coder import encode
+from lidar_perception.detectors.pointpillars.config import NetworkConfig
+
+BACKGROUND, IGNORED = -1, -2
+
+
+class Targets(NamedTuple):
+    """What B clouds shall give: labels (B, A) int64, a class of the config, BACKGROUND or IGNORED;
+    codes (B, A, 7) and bins (B, A) of box_coder, 0 where the label is no class."""
+
+    labels: Tensor
+    codes: Tensor
+    bins: Tensor
+
+
+def assign(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor) -> Targets:
+    """Targets (B = 1) of one cloud with boxes (M, 7) and labels (M,) int64 into config.classes.
+
+    anchors (A, 7) of make_anchors. Each class is matched by itself: an anchor whose best overlap
+    is at least `matched` takes that object, one below `unmatched` is background, between them
+    neither; besides, every object takes the anchors that overlap it most. Overlaps are seen from
+    above, of boxes turned to the nearer axis. Objects without size are left out.
+    """
+    out_labels = labels.new_full((len(anchors),), BACKGROUND)
+    codes = anchors.new_zeros(len(anchors), 7)
+    bins = labels.new_zeros(len(anchors))
+    usable = (boxes[:, 3:6] > 0).all(dim=1) & torch.isfinite(boxes).all(dim=1)
+    for index, spec in enumerate(config.anchors):
+        objects = boxes[usable & (labels == index)].to(anchors.dtype)
+        mine = anchors_near(anchors, config, objects, index)
+        if len(mine) == 0:
+            continue
+        overlap = nearest_axis_iou(anchors[mine], objects)  # (A', M')
+        best, chosen = overlap.max(dim=1)
+        most = overlap.max(dim=0).values
+        forced = (overlap == most) & (most > 0)
+        chosen = torch.where(forced.any(dim=1), forced.int().argmax(dim=1), chosen)
+        positive = forced.any(dim=1) | (best >= spec.matched)
+        out_labels[mine[(best >= spec.unmatched) & ~positive]] = IGNORED
+        taken, target = mine[positive], objects[chosen[positive]]
+        out_labels[taken] = index
+        codes[taken], bins[taken] = encode(target, anchors[taken], config.direction_offset)
+    return Targets(out_labels[None], codes[None], bins[None])
+
+
+def anchors_near(anchors: Tensor, config: NetworkConfig, boxes: Tensor, index: int) -> Tensor:
+    """Places (A',) int64, rising, of the anchors of class `index` that may overlap a box of (M, 7);
+    all others overlap none. Most of a street is empty, so this saves most of the work."""
+    kinds = len(config.anchors) * len(config.yaws)
+    cells = anchors.view(*config.head_grid, kinds, 7)
+    reach = (boxes[:, 3:5].amax(dim=1) + max(config.anchors[index].size[:2])) / 2
+    column = (cells[0, :, 0, 0, None] - boxes[:, 0]).abs() <= reach          # (W, M)
+    row = (cells[:, 0, 0, 1, None] - boxes[:, 1]).abs() <= reach             # (H, M)
+    near = (row[:, None] & column).any(dim=2).flatten()                      # (H * W,)
+    first = torch.nonzero(near) * kinds + index * len(config.yaws)           # (cells, 1)
+    return (first + torch.arange(len(config.yaws), device=anchors.device)).reshape(-1)
+
+
+def stacked(targets: Sequence[Targets]) -> Targets:
+    """The targets of several clouds as one batch."""
+    return Targets(*(torch.cat(parts) for parts in zip(*targets)))
+
+
+def nearest_axis_iou(boxes: Tensor, others: Tensor) -> Tensor:
+    """(N, M) IoU, seen from above, of boxes (N, 7) and others (M, 7), each turned to the nearer of
+    the two axes."""
+    (low, high), (other_low, other_high) = _upright(boxes), _upright(others)
+    shared = (torch.minimum(high[:, None], other_high) - torch.maximum(low[:, None], other_low))
+    shared = shared.clamp_(min=0).prod(dim=2)
+    area, other_area = (high - low).prod(dim=1), (other_high - other_low).prod(dim=1)
+    return shared / (area[:, None] + other_area - shared)
+
+
+def _upright(boxes: Tensor) -> tuple[Tensor, Tensor]:
+    """low (N, 2) and high (N, 2) of boxes (N, 7) turned to the nearer axis."""
+    folded = torch.remainder(boxes[:, 6] + math.pi / 2, math.pi) - math.pi / 2
+    across = (folded.abs() > math.pi / 4)[:, None]
+    half = torch.where(across, boxes[:, [4, 3]], boxes[:, [3, 4]]) / 2
+    return boxes[:, :2] - half, boxes[:, :2] + half

@@ -1,0 +1,77 @@
+"""From a sensor's frame to what a network sees of it, and back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from lidar_perception.detectors.pointpillars.config import NetworkConfig
+from lidar_perception.ground.params import GroundParams, SensorPoseParams
+from lidar_perception.ground.segment import level, segment_ground
+from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError, LidarFrame
+
+
+def visible(frame: LidarFrame, config: NetworkConfig,
+            pose: SensorPoseParams = SensorPoseParams()) -> tuple[np.ndarray, LidarFrame]:
+    """places (M,) int64 of the frame's points in the network's range, and the frame of these, its
+    coordinates levelled and as from SENSOR_HEIGHT. Points that are not finite are left out."""
+    shift = np.float32(pose.height - SENSOR_HEIGHT)
+    xyz = level(frame.xyz, pose)
+    with np.errstate(invalid="ignore"):
+        inside = np.ones(len(xyz), bool)
+        for axis, offset in enumerate((0, 0, shift)):
+            values = xyz[:, axis]
+            inside &= (values >= config.low[axis] - offset) & (values < config.high[axis] - offset)
+    places = np.flatnonzero(inside)
+    seen = frame.take(places)
+    return places, replace(seen, xyz=xyz.take(places, axis=0) + np.array([0, 0, shift], np.float32))
+
+
+def levelled(frame: LidarFrame, pose: SensorPoseParams) -> LidarFrame:
+    """All points of the frame, as from a level sensor at SENSOR_HEIGHT."""
+    xyz, shift = level(frame.xyz, pose), np.float32(pose.height - SENSOR_HEIGHT)
+    return replace(frame, xyz=xyz + np.array([0, 0, shift], np.float32) if shift else xyz)
+
+
+def in_sensor_frame(found: Detections, pose: SensorPoseParams) -> Detections:
+    """Boxes as from a level sensor at SENSOR_HEIGHT, to those of a sensor with this pose."""
+    boxes = found.boxes.copy()
+    boxes[:, 2] -= pose.height - SENSOR_HEIGHT
+    if pose.roll or pose.pitch:
+        back = level(np.eye(3, dtype=np.float32), pose).T
+        heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], axis=1) @ back[:2]
+        boxes[:, :3] = boxes[:, :3] @ back
+        boxes[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
+    return Detections(boxes, found.class_ids, found.scores)
+
+
+def with_intensity_scaled(frame: LidarFrame, factor: float) -> LidarFrame:
+    """The frame with its intensity times factor; itself where it has none."""
+    if frame.intensity is None:
+        return frame
+    return replace(frame, intensity=frame.intensity * np.float32(factor))
+
+
+def require_columns(frame: LidarFrame, **columns: np.ndarray | None) -> None:
+    """InputError naming a column, if there is one, that has not a value for each point."""
+    for name, column in columns.items():
+        if column is not None and len(column) != len(frame):
+            raise InputError(f"{name} has {len(column)} values for {len(frame)} points")
+
+
+def made_up_frame(pose: SensorPoseParams) -> LidarFrame:
+    """Flat ground and a thing on it, for a first run of a detector."""
+    rng = np.random.default_rng(0)
+    flat = rng.uniform(0, 40, (2000, 3)) * [1, 1, 0.001] - [0, 20, SENSOR_HEIGHT]
+    thing = rng.uniform(-0.5, 0.5, (400, 3)) + [8, 0, -0.8]
+    xyz = np.concatenate([flat, thing]).astype(np.float32)
+    xyz[:, 2] -= pose.height - SENSOR_HEIGHT
+    return LidarFrame(xyz, np.zeros(len(xyz), np.float32))
+
+
+def levelled_ground(seen: LidarFrame, params: GroundParams) -> np.ndarray:
+    """(N,) bool: the ground of a frame that is levelled and as from SENSOR_HEIGHT, whatever pose
+    params give its sensor."""
+    return segment_ground(seen, replace(params, sensor_pose=SensorPoseParams(
+        height=SENSOR_HEIGHT)))

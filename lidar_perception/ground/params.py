@@ -1,0 +1,100 @@
+"""The numbers of the ground methods, and how the sensor is mounted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lidar_perception.param_fields import MAX_INT, Params, param
+from lidar_perception.types import SENSOR_HEIGHT
+
+
+@dataclass(frozen=True)
+class SensorPoseParams(Params):
+    """How the sensor is mounted. The algorithms see the levelled cloud; nothing that is published
+    moves."""
+
+    height: float = param(SENSOR_HEIGHT, "Height of the sensor above the ground. Checked against "
+                          "the first clouds; a warning gives the measured one.", unit="m",
+                          low=0.0, high=50.0)
+    roll: float = param(0.0, "Rotation of the sensor about its x axis, as in a URDF's rpy; pi is "
+                        "upside down.", unit="rad", low=-3.1416, high=3.1416)
+    pitch: float = param(0.0, "Rotation of the sensor about its y axis, as in a URDF's rpy; "
+                         "positive looks down.", unit="rad", low=-1.58, high=1.58)
+
+
+@dataclass(frozen=True)
+class ThresholdParams(Params):
+    """Height threshold and RANSAC plane (paper A, Sections 3.2 and 3.4, Table 2)."""
+
+    max_height: float = param(0.43, "The plane is looked for among points lower than this above "
+                              "the ground at the sensor. 0.43 m under a sensor 1.73 m high is the "
+                              "paper's z < -1.3.", unit="m", low=-10.0, high=100.0)
+    inlier_distance: float = param(0.1, "A point this near the plane, vertically, is ground.",
+                                   unit="m", low=0.001, high=2.0)
+    max_iterations: int = param(2000, "RANSAC trials at most; it stops as soon as another trial "
+                                "would hardly help.", low=1, high=100_000)
+    max_slope: float = param(30.0, "Planes steeper than this are not ground.", unit="deg",
+                             low=0.0, high=89.0)
+    seed: int = param(0, "Seed of the random trials.", low=0, high=MAX_INT)
+
+
+@dataclass(frozen=True)
+class PatchworkParams(Params):
+    """Patchwork++: a plane in each sector of concentric zones (Lee et al., IROS 2022)."""
+
+    min_range: float = param(2.7, "Points nearer than this are not ground.", unit="m",
+                             low=0.0, high=50.0)
+    max_range: float = param(80.0, "Points farther than this are not ground.", unit="m",
+                             low=5.0, high=1000.0)
+    inlier_distance: float = param(0.125, "A point this near its sector's plane is ground.",
+                                   unit="m", low=0.001, high=2.0)
+    seed_distance: float = param(0.125, "Points this far above the lowest ones start the plane of "
+                                 "a sector.", unit="m", low=0.001, high=2.0)
+    uprightness: float = param(0.707, "Least z of the normal of a ground plane; 0.707 is 45 "
+                               "degrees.", low=0.0, high=1.0)
+    remove_reflections: bool = param(True, "Leave out points below the ground that come from "
+                                     "reflections (RNR). Needs intensity.")
+
+    def check(self) -> None:
+        if self.max_range <= self.min_range:
+            raise ValueError(f"max_range = {self.max_range} must be above min_range = "
+                             f"{self.min_range}")
+
+
+@dataclass(frozen=True)
+class ClothParams(Params):
+    """Cloth simulation (paper C, Eq. 2 and 3; Zhang et al., Remote Sensing 2016)."""
+
+    resolution: float = param(0.5, "Distance of the cloth's particles.", unit="m",
+                              low=0.1, high=10.0)
+    max_range: float = param(100.0, "Half the side of the cloth; points beyond it are not ground.",
+                             unit="m", low=1.0, high=500.0)
+    class_threshold: float = param(0.2, "A point this near the cloth, vertically, is ground.",
+                                   unit="m", low=0.001, high=5.0)
+    curvature: float = param(0.1, "How sharply gravity bends the cloth where nothing holds it; "
+                             "less is stiffer.", unit="1/m", low=0.0001, high=10.0)
+
+    slope: float = param(0.08, "Where the ground climbs faster than the cloth can bend, it goes on "
+                         "from what the cloth touches with a slope of up to this; 0: it does not.",
+                         low=0.0, high=2.0)
+
+    def check(self) -> None:
+        if (cells := (2 * self.max_range / self.resolution) ** 2) > 4_000_000:
+            raise ValueError(f"resolution = {self.resolution} m over max_range = {self.max_range} "
+                             f"m makes {cells:.0f} particles, more than 4 million; raise the one "
+                             "or lower the other")
+
+
+GROUND_METHODS = ("threshold", "patchwork", "cloth")
+
+
+@dataclass(frozen=True)
+class GroundParams(Params):
+    """Which points are ground."""
+
+    method: str = param("threshold", "threshold: one plane (paper A). patchwork: Patchwork++ "
+                        "(paper B). cloth: cloth simulation (paper C).", choices=GROUND_METHODS)
+    sensor_pose: SensorPoseParams = SensorPoseParams()
+    threshold: ThresholdParams = ThresholdParams()
+    patchwork: PatchworkParams = PatchworkParams()
+    cloth: ClothParams = ClothParams()

@@ -1,0 +1,1 @@
+"""Running things: files, processes, resuming, the terminal."""

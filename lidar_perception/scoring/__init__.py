@@ -1,0 +1,1 @@
+"""Detections, ground and clusters against labels."""

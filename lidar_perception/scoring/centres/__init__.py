@@ -1,0 +1,1 @@
+"""Paper A's protocol: pedestrians by centre distance."""

@@ -1,0 +1,1 @@
+"""Every detector on the same frames, side by side."""

@@ -1,0 +1,171 @@
+"""Tables and a figure of the comparison of all detectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+
+from lidar_perception.scoring.average_precision import FEW
+from lidar_perception.scoring.comparison.outcomes import AP_ROWS
+from lidar_perception.scoring.kitti.protocol import RELAXED, SCORED, STRICT
+from lidar_perception.scoring.kitti.tables import CENTRE_F1
+from lidar_perception.scoring.pictures import save_picture
+from lidar_perception.scoring.tables import narrow_table, print_skipped
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+SHORT = {"bev": "BEV", "3d": "3D", "bev_relaxed": "BEV", "3d_relaxed": "3D"}
+FAMILIES = {  # beginning of a name -> colour (Okabe and Ito, 2008) and marker; the first that fits
+    "STM-CPA +": ("#cc79a7", "D"), "PP ": ("#cc79a7", "D"), "STM-CPA": ("#009e73", "s"),
+    "PointPillars": ("#0072b2", "o"), "PointNet": ("#d55e00", "^"),
+}
+
+
+def print_comparison(content: dict, console: Console) -> None:
+    """Average precision, pedestrians by centre distance, times, and what is missing."""
+    _print_precision(content, console)
+    _print_pedestrians(content, console)
+    for reason in dict.fromkeys(each["reason"] for each in content["missing"]):
+        names = [each["name"] for each in content["missing"] if each["reason"] == reason]
+        console.print(f"[yellow]missing[/]: {', '.join(names)}: {escape(reason)}")
+    failed = [f"{name}: {line}" for name, row in content["rows"].items() for line in row["failed"]]
+    print_skipped([*content["skipped"], *failed], console)
+
+
+def _print_precision(content: dict, console: Console) -> None:
+    titles = [title for name in SCORED for title in (name[:3], "", "", "")]
+    table = narrow_table(f"AP (R40, moderate), {content['frames']} frames", "", *titles, width=5)
+    table.add_row("", *(SHORT[row] for _ in SCORED for row in AP_ROWS), style="dim")
+    table.add_row("overlap above", *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}"
+                                     for name in SCORED for row in AP_ROWS), style="dim",
+                  end_section=True)
+    for name, row in content["rows"].items():
+        table.add_row(name, *(_number(None if row["ap"][each] is None else
+                                      row["ap"][each][which]["moderate"])
+                              for each in SCORED for which in AP_ROWS))
+    counts = {name: content["objects"][name]["moderate"] for name in SCORED}
+    table.caption = "Labels: " + ", ".join(
+        f"{name} {n}{'*' * (0 < n < FEW)}" for name, n in counts.items()) + (
+        ". BEV: from above, 3D: in space. * too few for KITTI's own sampling of recall, so read "
+        "off the whole curve. A dash: not a class of the detector, or no label.")
+    console.print(table)
+
+
+def _print_pedestrians(content: dict, console: Console) -> None:
+    centres = content["pedestrians"]
+    table = narrow_table(f"Pedestrians within 1.0 m ({centres['ground_truth']} in "
+                         f"{centres['frames']} frames), and time of a whole detector", "",
+                         "score", "TP", "FP", "FN", "prec.", "recall", "F1", "best", "from", "ms",
+                         "runs", "failed", width=4)
+    for name, row in content["rows"].items():
+        used, best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
+        table.add_row(name, f"{used['score']:.2f}", *(str(used[k]) for k in ("tp", "fp", "fn")),
+                      *(f"{100 * used[k]:.1f}" for k in ("precision", "recall", "f1")),
+                      f"{100 * best['f1']:.1f}", _number(best["score"]), _number(row["ms"]),
+                      str(row["frames"]), str(len(row["failed"])))
+    table.add_section()
+    for name, f1 in CENTRE_F1.items():
+        table.add_row(f"paper: {name}", *[""] * 6, f"{100 * f1:.1f}", style="dim")
+    table.caption = (
+        "score: from which a detection counts when the detector is in use. best: the highest F1 "
+        "that another choice, `from`, reaches on these labels. ms: median of the frames it was run "
+        "on. STM-CPA takes its seed from the labels, which also says which frames have a "
+        "pedestrian; `auto` finds it itself. The paper's figures are those of its 1779 frames.")
+    console.print(table)
+
+
+def draw_comparison(path: str | Path, content: dict) -> None:
+    """Write a PNG: F1 of pedestrians, and mean AP in space, against ms a frame; every name has a
+    place of its own at the right."""
+    import matplotlib
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    rows = {name: row for name, row in content["rows"].items() if row["ms"] is not None}
+    centres = content["pedestrians"]
+    figure, (left, right) = plt.subplots(1, 2, figsize=(15, 6.4), dpi=120, layout="constrained")
+    _draw(left, {name: (row["ms"], 100 * row["pedestrian_centres"]["operating"]["f1"],
+                        100 * row["pedestrian_centres"]["best"]["f1"])
+                 for name, row in rows.items()},
+          "filled: in use, hollow: at its best score", room=0.31)
+    left.set(title=f"F1 of {centres['ground_truth']} pedestrians in {centres['frames']} frames",
+             ylabel="F1 within 1.0 m [%]")
+    for value in dict.fromkeys(round(100 * f1) for f1 in CENTRE_F1.values()):
+        names = [name for name, f1 in CENTRE_F1.items() if round(100 * f1) == value]
+        left.axhline(value, color="#bbbbbb", linewidth=0.8, linestyle=":", zorder=0)
+        left.annotate(f"paper: {', '.join(names)}", (0.01, value), fontsize=7, color="#888888",
+                      xycoords=("axes fraction", "data"), va="bottom")
+    _draw(right, {name: (row["ms"], row["mean_ap"]["3d"], row["mean_ap"]["3d_relaxed"])
+                  for name, row in rows.items() if row["mean_ap"]["3d"] is not None},
+          "filled: overlap 0.7 (Car) and 0.5, hollow: 0.5 and 0.25")
+    right.set(title=f"Mean AP in space, moderate, {content['frames']} frames",
+              ylabel="mean AP of three classes [%]")
+    save_picture(path, figure)
+
+
+def _draw(axes: Axes, points: dict[str, tuple[float, float, float]], legend: str,
+          room: float = 0.0) -> None:
+    """Points (ms, value, other value) by name on a log axis, and the names beside the axes; a share
+    `room` of the axis stays free at the left."""
+    axes.set(xscale="log", xlabel=f"ms a frame, median ({legend})", ylim=(-3, 103))
+    axes.grid(color="#eeeeee", which="both", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    if not points:
+        axes.text(0.5, 0.5, "no detector of all three classes", transform=axes.transAxes,
+                  ha="center", color="#888888")
+        return
+    ms = [x for x, _, _ in points.values()]
+    low, high = min(ms) / 1.6, max(ms) * 1.6
+    axes.set_xlim(low / (high / low) ** (room / (1 - room)), high)
+    axes.xaxis.set_major_locator(_ticks(*axes.get_xlim()))
+    axes.xaxis.set_major_formatter("{x:g}")
+    axes.xaxis.set_minor_formatter("")
+    places = spread([y for _, y, _ in points.values()], -2, 102, 4.0)
+    for (name, (x, y, other)), place in zip(points.items(), places):
+        color, marker = next(style for begin, style in FAMILIES.items() if name.startswith(begin))
+        axes.plot([x, x], [y, other], color=color, linewidth=0.8, alpha=0.6)
+        axes.plot(x, other, marker, color=color, markerfacecolor="white", markersize=6)
+        axes.plot(x, y, marker, color=color, markersize=6)
+        axes.annotate(f"{name}  {y:.1f}", (x, y), (1.03, place), fontsize=8, color=color,
+                      textcoords=("axes fraction", "data"), va="center", annotation_clip=False,
+                      arrowprops=dict(arrowstyle="-", color=color, linewidth=0.4, alpha=0.5,
+                                      relpos=(0, 0.5), shrinkA=1, shrinkB=3))
+
+
+def _ticks(low: float, high: float):
+    from matplotlib.ticker import FixedLocator
+    return FixedLocator([step * 10.0 ** power for power in range(-3, 7) for step in (1, 2, 5)
+                         if low <= step * 10.0 ** power <= high])
+
+
+def spread(values: Sequence[float], low: float, high: float, gap: float) -> np.ndarray:
+    """(N,) places as near to the values (N,) as they can be, in the same order, at least gap apart
+    and within low .. high; nearer to each other than gap only where there is no room for all."""
+    count = len(values)
+    gap = min(gap, (high - low) / max(count - 1, 1))
+    order = np.argsort(values, kind="stable")
+    # Without the gaps the places must only not fall (isotonic regression by pools).
+    wanted = np.asarray(values, float)[order] - gap * np.arange(count)
+    pools: list[list[float]] = []
+    for value in wanted:
+        pools.append([value, 1])
+        while len(pools) > 1 and pools[-2][0] > pools[-1][0]:
+            mean, size = pools.pop()
+            before, earlier = pools[-1]
+            pools[-1] = [(before * earlier + mean * size) / (earlier + size), earlier + size]
+    level = np.repeat([mean for mean, _ in pools], [int(size) for _, size in pools])
+    places = np.empty(count)
+    places[order] = np.clip(level, low, high - gap * max(count - 1, 0)) + gap * np.arange(count)
+    return places
+
+
+def _number(value: float | None) -> str:
+    """Five characters: 84.00, 100.0."""
+    return "-" if value is None else f"{value:.2f}"[:5].rstrip(".")

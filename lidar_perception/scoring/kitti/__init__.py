@@ -1,0 +1,1 @@
+"""The protocol of KITTI's object benchmark."""

@@ -1,0 +1,131 @@
+"""Labels and detections as KITTI's benchmark compares them: upright in the camera's frame, with
+2D boxes, alpha, truncation and occlusion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from lidar_perception.camera import Calibration
+from lidar_perception.data.kitti.labels import to_labels
+from lidar_perception.data.kitti.write import image_boxes
+from lidar_perception.geometry import wrap_angle
+from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
+
+NO_ANGLE = -10.0          # KITTI's alpha where there is none
+# Truncation levels of the tracking layout: 0 inside, 1 across the border of the image, 2 ends of
+# tracks; of the raw one: 2 outside, 99 behind. From 2 on nobody is asked to find the object.
+LEFT_OUT = 2
+
+
+@dataclass(frozen=True)
+class CameraObjects:
+    """K objects of one frame.
+
+    class_ids (K,) int32 into CLASSES. boxes (K, 7) float64 [x y z l w h yaw], metres: the camera's
+    frame with x forward, y left, z up (without a calibration the LiDAR's); sides of 0 where only a
+    2D box is known. image_boxes (K, 4) float64 [left top right bottom] pixels: 0 for an object
+    outside the image, endless without a calibration. alpha (K,) radians, NaN where unknown.
+    truncated (K,) 0..1, occluded (K,) int 0..3. scores (K,) float64, 1 for labels. regions (R, 4):
+    2D boxes of DontCare regions.
+    """
+
+    class_ids: np.ndarray
+    boxes: np.ndarray
+    image_boxes: np.ndarray
+    alpha: np.ndarray
+    truncated: np.ndarray
+    occluded: np.ndarray
+    scores: np.ndarray
+    regions: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.class_ids)
+
+    @property
+    def pixels_high(self) -> np.ndarray:
+        """(K,) float64 height of the 2D boxes."""
+        return self.image_boxes[:, 3] - self.image_boxes[:, 1]
+
+    def take(self, places: np.ndarray) -> CameraObjects:
+        """The objects at places (M,), with all regions."""
+        return CameraObjects(**{f.name: getattr(self, f.name).take(places, axis=0)
+                                for f in fields(self) if f.name != "regions"},
+                             regions=self.regions)
+
+    @staticmethod
+    def together(parts: list[CameraObjects]) -> CameraObjects:
+        """The objects of one frame or more, behind one another."""
+        return CameraObjects(*(np.concatenate([getattr(part, f.name) for part in parts])
+                               for f in fields(CameraObjects)))
+
+
+def scored_labels(detections: Detections) -> GroundTruth:
+    """Detections as labels with a score."""
+    return GroundTruth.of(detections.boxes, detections.class_ids,
+                          [{"score": float(score)} for score in detections.scores])
+
+
+def camera_objects(objects: GroundTruth, calibration: Calibration | None) -> CameraObjects:
+    """Labels, or detections with their score in extras; notes come last.
+
+    What a label file says is taken as it is; what it does not say (a 2D box, alpha) is computed
+    from the box. Truncation, too, is computed where the number is a level and no share, as in the
+    tracking and raw layouts: the share of the projected box that lies outside the image.
+    InputError where a box or a score is not finite.
+    """
+    scores = np.array([extra.get("score", 1.0) for extra in _extras(objects)])
+    bad = ~np.isfinite(scores)
+    bad[:len(objects)] |= ~np.isfinite(objects.boxes).all(axis=1)
+    if bad.any():
+        raise InputError(f"box {np.argmax(bad) + 1} of {len(bad)} or its score is not finite; a "
+                         "detector must leave such boxes out")
+    if calibration is None:
+        return _without_camera(objects, scores[:len(objects)])
+    labels = to_labels(objects, calibration.lidar_to_camera)
+    projected, outside = np.zeros((len(labels), 4)), np.zeros(len(labels))
+    pixels, outside[:len(objects)] = image_boxes(objects.boxes, calibration)
+    projected[:len(objects)] = np.nan_to_num(pixels)
+
+    given = _columns(labels, "bbox", 4)
+    has_pixels = (given[:, 2:] > given[:, :2]).all(axis=1, keepdims=True)
+    sides = np.maximum(_columns(labels, "dimensions", 3), 0)
+    place, turn = _columns(labels, "location", 3), _columns(labels, "rotation_y")
+    alpha = _columns(labels, "alpha")
+    whole = sides.all(axis=1)  # not a 2D box only
+    computed = np.where(whole, wrap_angle(turn - np.arctan2(place[:, 0], place[:, 2])), np.nan)
+    return CameraObjects(
+        class_ids=np.array([CLASSES.index(label["class"]) for label in labels], np.int32),
+        boxes=np.column_stack([place[:, 2], -place[:, 0], sides[:, 0] / 2 - place[:, 1],
+                               sides[:, [2, 1, 0]], -turn - np.pi / 2]),
+        image_boxes=np.where(has_pixels, given, projected),
+        alpha=np.where(alpha > NO_ANGLE, alpha, computed),
+        truncated=np.array([_share_outside(e, o) for e, o in zip(_extras(objects), outside)]),
+        occluded=_columns(labels, "occluded").astype(int),
+        scores=scores,
+        regions=given[np.array([label["class"] == "DontCare" for label in labels], bool)])
+
+
+def _without_camera(objects: GroundTruth, scores: np.ndarray) -> CameraObjects:
+    count = len(objects)
+    return CameraObjects(
+        objects.class_ids, objects.boxes, np.tile([-np.inf, -np.inf, np.inf, np.inf], (count, 1)),
+        np.full(count, np.nan), np.zeros(count),
+        np.array([extra.get("occluded", 0) for extra in objects.extras], int), scores,
+        np.zeros((0, 4)))
+
+
+def _extras(objects: GroundTruth) -> list[dict]:
+    return [*objects.extras, *(extra for _, extra in objects.notes)]
+
+
+def _share_outside(extra: dict, projected: float) -> float:
+    if "track_id" not in extra and "truncated" in extra:
+        return extra["truncated"]
+    return 1.0 if extra.get("truncated", 0) >= LEFT_OUT else projected
+
+
+def _columns(labels: list[dict], name: str, count: int = 0) -> np.ndarray:
+    values = np.array([label[name] for label in labels])
+    return values.reshape(-1, count) if count else values

@@ -1,0 +1,109 @@
+"""Detections against labels: KITTI's average precision, and pedestrians by centre distance.
+
+Frames are added one by one; content() is what the JSON file holds.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidar_perception.camera import Calibration
+from lidar_perception.scoring.centres.scores import CentreScores
+from lidar_perception.scoring.kitti.camera_objects import camera_objects, scored_labels
+from lidar_perception.scoring.kitti.matched_heights import heights_off, matched_heights
+from lidar_perception.scoring.kitti.protocol import (
+    DIFFICULTIES,
+    RELAXED,
+    SCORED,
+    STRICT,
+    ComparedFrame,
+    Comparison,
+    Precision,
+    compare,
+    precision,
+)
+from lidar_perception.types import PEDESTRIAN, Detections, GroundTruth, InputError
+
+# Row of the JSON file: metric and overlap.
+ROWS = {"image": ("image", STRICT), "bev": ("bev", STRICT), "3d": ("3d", STRICT),
+        "bev_relaxed": ("bev", RELAXED), "3d_relaxed": ("3d", RELAXED)}
+
+
+@dataclass
+class DetectionReport:
+    """Frames, and what could not be scored; ms of the detector by frame, where it was run here."""
+
+    frames: list[ComparedFrame] = field(default_factory=list)
+    pedestrians: CentreScores = field(default_factory=CentreScores)
+    ms: list[float] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    with_camera: bool = True
+
+    def add(self, name: str, truth: GroundTruth, found: Detections | GroundTruth,
+            calibration: Calibration | None = None) -> None:
+        """One frame. found: detections, or labels with a score in extras (a result file).
+
+        With a calibration, detections outside the image are ignored, as labels end there. Without
+        one there are no scores in the image, and the difficulty is that of occlusion alone.
+        InputError, with the frame's name, for a number that is not finite.
+        """
+        found = scored_labels(found) if isinstance(found, Detections) else found
+        try:
+            true_objects, objects = (camera_objects(x, calibration) for x in (truth, found))
+        except InputError as error:
+            raise InputError(f"{name}: {error}") from None
+        self.frames.append(compare(true_objects, objects))
+        self.with_camera &= calibration is not None
+        chosen = found.class_ids == PEDESTRIAN
+        chosen &= objects.pixels_high[:len(found)] > 0
+        self.pedestrians.add(truth.of_class(PEDESTRIAN), found.boxes[chosen],
+                             objects.scores[:len(found)][chosen])
+
+    def content(self) -> dict:
+        """What the JSON file holds; ap in percent."""
+        result = {"frames": len(self.frames), "ap": {}, "map_3d": None, "matched": {},
+                  "diagnosis": [], "pedestrian_centres": self.pedestrians.content(),
+                  "ms": float(np.median(self.ms)) if self.ms else None, "skipped": self.skipped}
+        if self.frames:
+            together = Comparison.of(self.frames)
+            result["ap"] = {name: self._class_content(together, name) for name in SCORED}
+            result["map_3d"] = mean_3d(result["ap"])
+            result["matched"] = {name: matched_heights(self.frames, name) for name in SCORED}
+            result["diagnosis"] = [line for name in SCORED if (line := heights_off(
+                name, result["ap"][name], result["matched"][name]))]
+        return result
+
+    def _class_content(self, together: Comparison, name: str) -> dict:
+        rows = {row: {level: precision(together, name, metric, overlaps[name], level)
+                      for level in DIFFICULTIES}
+                for row, (metric, overlaps) in ROWS.items()
+                if self.with_camera or metric != "image"}
+        content = {row: {"overlap": ROWS[row][1][name],
+                         **{level: _numbers(value) for level, value in levels.items()}}
+                   for row, levels in rows.items()}
+        if "image" in rows:
+            content["aos"] = {level: _angle_numbers(value)
+                              for level, value in rows["image"].items()}
+        return content
+
+
+def _numbers(value: Precision | None) -> dict | None:
+    return None if value is None else {
+        "objects": value.objects, "r11": value.r11, "r40": value.r40,
+        "official_r11": value.official_r11, "official_r40": value.official_r40}
+
+
+def _angle_numbers(value: Precision | None) -> dict | None:
+    return None if value is None or math.isnan(value.aos_r40) else {
+        "objects": value.objects, "r11": value.aos_r11, "r40": value.aos_r40}
+
+
+def mean_3d(ap: dict) -> dict | None:
+    """r11 and r40: means of 3D AP over the classes and difficulties with objects, as the mAP of
+    the EG-PointPillars paper; None without objects."""
+    rows = [row for name in SCORED for level in DIFFICULTIES if (row := ap[name]["3d"][level])]
+    return {key: float(np.mean([row[key] for row in rows])) for key in ("r11", "r40")} if rows \
+        else None

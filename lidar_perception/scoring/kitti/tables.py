@@ -1,0 +1,106 @@
+"""Tables of detections against labels, beside the figures of the papers."""
+
+from __future__ import annotations
+
+from rich.console import Console
+from rich.markup import escape
+
+from lidar_perception.scoring.average_precision import FEW
+from lidar_perception.scoring.kitti.protocol import DIFFICULTIES
+from lidar_perception.scoring.tables import narrow_table, print_skipped
+
+# The EG-PointPillars paper, Table 5: AP in space at 0.7 (Car) and 0.5; easy, moderate, hard. It
+# does not say at how many recall points.
+COLUMNS = ("Car", "Cyclist", "Pedestrian")
+PAPER = {
+    "PointPillars": ((84.00, 72.89, 68.24), (80.57, 61.96, 58.32), (52.66, 47.09, 43.21)),
+    "V1": ((86.94, 76.06, 68.77), (79.53, 61.85, 58.18), (56.12, 50.96, 46.56)),
+    "V2": ((86.16, 76.01, 68.69), (82.79, 65.31, 62.01), (55.68, 50.05, 44.68)),
+    "V3": ((84.23, 74.82, 68.13), (81.37, 64.81, 61.37), (55.60, 50.81, 45.47)),
+    "V4": ((86.69, 76.44, 74.93), (81.21, 66.74, 61.91), (56.73, 52.31, 46.92)),
+}
+PAPER_MAP = {"PointPillars": 63.21, "V1": 65.00, "V2": 65.71, "V3": 65.18, "V4": 67.09}
+# The STM-CPA paper, Tables 6 and 7: F1 of pedestrians within 1.0 m.
+CENTRE_F1 = {"STM-CPA": 0.521, "PointPillars": 0.52, "AVOD": 0.48, "PointCNN": 0.37,
+             "F-PointNet": 0.33}
+TITLES = {"image": "2D box", "aos": "orientation", "bev": "from above", "3d": "in space",
+          "bev_relaxed": "from above", "3d_relaxed": "in space"}
+
+
+def print_detection_report(content: dict, console: Console) -> None:
+    """Average precision by class and difficulty, the papers' figures, and what was noticed."""
+    _print_precision(content, console)
+    _print_paper(content, console)
+    _print_centres(content["pedestrian_centres"], console)
+    for line in content["diagnosis"]:
+        console.print(f"[yellow]{escape(line)}[/]")
+    if content["ms"] is not None:
+        console.print(f"detector: {content['ms']:.1f} ms a frame (median)")
+    print_skipped(content["skipped"], console)
+
+
+def _print_precision(content: dict, console: Console) -> None:
+    table = narrow_table(f"KITTI average precision, {content['frames']} frames", "", "overlap",
+                         "", "R40", "", "", "R11", "", width=6)
+    table.add_row("", "", *("easy", "mod.", "hard") * 2, style="dim")
+    for name, rows in content["ap"].items():
+        counts = [level["objects"] if level else 0 for level in _levels(rows["3d"])]
+        table.add_row(name, "", *(f"{n}{'*' * (0 < n < FEW)}" for n in counts), "", "", "",
+                      style="bold")
+        for row, title in TITLES.items():
+            if row in rows:
+                overlap = rows["image" if row == "aos" else row]["overlap"]
+                table.add_row(f"  {title}", f"{overlap:g}", *(
+                    _cell(level, key) for key in ("r40", "r11") for level in _levels(rows[row])))
+        table.add_section()
+    table.caption = ("Beside the class: labels of each difficulty. * too few for KITTI's own "
+                     "sampling of recall, so read off the whole curve.")
+    console.print(table)
+
+
+def _print_paper(content: dict, console: Console) -> None:
+    titles = [f"{name[:3]} {level[0].upper()}" for name in COLUMNS for level in DIFFICULTIES]
+    table = narrow_table("AP in space beside Table 5 of the EG-PointPillars paper", "", *titles,
+                         "mAP", width=5)
+    for key in ("r40", "r11"):
+        cells = [_cell(level, key) for name in COLUMNS
+                 for level in _levels(content["ap"][name]["3d"])]
+        mean = content["map_3d"]
+        table.add_row(f"here, {key.upper()}", *cells, _number(mean[key]) if mean else "-",
+                      style="bold")
+    for name, classes in PAPER.items():
+        table.add_row(name, *(f"{v:.2f}" for levels in classes for v in levels),
+                      f"{PAPER_MAP[name]:.2f}", style="dim")
+    table.caption = ("Easy, moderate, hard; Car at overlap 0.7, the others at 0.5. The paper does "
+                     "not say whether at 11 or 40 recall points.")
+    console.print(table)
+
+
+def _print_centres(centres: dict, console: Console) -> None:
+    if centres["ground_truth"] == 0:
+        return
+    table = narrow_table(
+        f"Pedestrians within 1.0 m: {centres['ground_truth']} in {centres['frames']} frames",
+        "detections", "TP", "FP", "FN", "prec.", "recall", "F1", width=7)
+    rows = {"all": centres["of_all"]["all"]}
+    if centres["best_score"] is not None:
+        rows[f"score {centres['best_score']:.3g} and more"] = centres["at_best_score"]["all"]
+    for title, row in rows.items():
+        table.add_row(title, *(str(row[k]) for k in ("tp", "fp", "fn")),
+                      *(f"{100 * row[k]:.1f}" for k in ("precision", "recall", "f1")))
+    table.caption = "F1 in the STM-CPA paper: " + ", ".join(
+        f"{name} {100 * f1:.1f}" for name, f1 in CENTRE_F1.items())
+    console.print(table)
+
+
+def _levels(row: dict) -> list[dict | None]:
+    return [row[level] for level in DIFFICULTIES]
+
+
+def _cell(level: dict | None, key: str) -> str:
+    return "-" if level is None else _number(level[key])
+
+
+def _number(value: float) -> str:
+    """Five characters: 84.00, 100.0."""
+    return f"{value:.2f}"[:5]

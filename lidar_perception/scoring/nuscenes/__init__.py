@@ -1,0 +1,1 @@
+"""The protocol of nuScenes' detection task."""

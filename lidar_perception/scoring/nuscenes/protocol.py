@@ -1,0 +1,157 @@
+"""The detection task of nuScenes: what is found by centre distance, how precise, how well placed.
+
+Caesar et al., CVPR 2020, Section 3.1, with the numbers of the configuration detection_cvpr_2019 of
+nuscenes-devkit. Detections of a class take, by falling score, the nearest object of their frame
+that is left, if it is near enough on the ground plane. Average precision is the area under the
+curve above a recall and a precision of 0.1, and is averaged over four distances. The errors of the
+true positives are those at 2 m: at every recall the mean over all hits of that score or more, and
+of these the mean above a recall of 0.1.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
+from lidar_perception.geometry import points_in_box
+
+# Metres from the vehicle up to which a class counts.
+RANGES = {"car": 50.0, "truck": 50.0, "bus": 50.0, "trailer": 50.0, "construction_vehicle": 50.0,
+          "pedestrian": 40.0, "motorcycle": 40.0, "bicycle": 40.0, "traffic_cone": 30.0,
+          "barrier": 30.0}
+DISTANCES = (0.5, 1.0, 2.0, 4.0)    # metres between centres, below which a detection is a hit
+ERROR_DISTANCE = 2.0                # of the hits whose errors are taken
+RECALLS = np.linspace(0.0, 1.0, 101)
+FIRST_RECALL = 11                   # the first place of RECALLS above the least recall of 0.1
+LEAST_PRECISION = 0.1
+AP_WEIGHT = 5                       # of mAP in NDS, beside one for each of ERRORS
+IN_RACKS = ("bicycle", "motorcycle")  # not counted inside a bicycle rack
+
+# translation m, scale 1 - IoU of the aligned boxes, orientation rad, velocity m/s, attribute
+# 1 - accuracy
+ERRORS = ("ate", "ase", "aoe", "ave", "aae")
+UNDEFINED = {"traffic_cone": ("aoe", "ave", "aae"), "barrier": ("ave", "aae")}
+HALF_TURNS = ("barrier",)           # look the same from both sides
+
+
+def counted(boxes: GlobalBoxes, ego: np.ndarray, racks: GlobalBoxes) -> np.ndarray:
+    """(K,) bool of the labels or detections of one frame: those of a class, within its range of the
+    vehicle at ego (>=2,), not known to be without points, and no bicycle in a rack."""
+    ranges = np.array([RANGES[name] for name in NAMES] + [0.0])[boxes.kinds]  # the last is kind -1
+    away = np.sqrt(((boxes.centres[:, :2] - ego[:2]) ** 2).sum(axis=1))
+    kept = (away < ranges) & (boxes.points != 0)
+    cycles = np.isin(boxes.kinds, [NAMES.index(name) for name in IN_RACKS])
+    for rack in np.column_stack([racks.centres, racks.sizes, racks.yaws]):
+        kept &= ~(cycles & points_in_box(boxes.centres, rack))
+    return kept
+
+
+@dataclass(frozen=True)
+class ClassScores:
+    """One class: objects to be found, detections, AP (0..1) at each of DISTANCES, and the five
+    errors, NaN where the class has none. Nothing found is AP 0 and errors 1, as is nothing to be
+    found."""
+
+    objects: int
+    detections: int
+    ap: dict[float, float]
+    errors: dict[str, float]
+
+    @property
+    def mean_ap(self) -> float:
+        return float(np.mean([*self.ap.values()]))
+
+
+def class_scores(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: GlobalBoxes,
+                 found_frames: np.ndarray) -> ClassScores:
+    """Scores of the class called name, over counted boxes of all frames: truth (M) and found (K),
+    with the numbers of their frames (M,), ascending, and (K,), int."""
+    kind = NAMES.index(name)
+    truth, true_frames = truth[truth.kinds == kind], true_frames[truth.kinds == kind]
+    found, found_frames = found[found.kinds == kind], found_frames[found.kinds == kind]
+    order = np.argsort(found.scores, kind="stable")[::-1]
+    found, found_frames = found[order], found_frames[order]
+    frames = max(true_frames.max(initial=-1), found_frames.max(initial=-1)) + 1
+    first = np.searchsorted(true_frames, np.arange(frames + 1))
+    ap, errors = {}, {}
+    for distance in DISTANCES:
+        places = _hits(found.centres, found_frames, truth.centres, first, distance)
+        precision, confidence = _curves(places >= 0, found.scores, len(truth))
+        above = np.maximum(precision[FIRST_RECALL:] - LEAST_PRECISION, 0)
+        ap[distance] = float(above.mean()) / (1 - LEAST_PRECISION)
+        if distance == ERROR_DISTANCE:
+            hits = found[places >= 0]
+            errors = {error: _at_recalls(values, hits.scores, confidence) for error, values in
+                      hit_errors(truth[places[places >= 0]], hits, name in HALF_TURNS).items()}
+    errors |= dict.fromkeys(UNDEFINED.get(name, ()), math.nan)
+    return ClassScores(len(truth), len(found), ap, errors)
+
+
+@njit(cache=True, nogil=True)
+def _hits(centres, frames, true_centres, first, most):
+    """(K,) int64 row of the object that each detection hits, -1 without one; detections by falling
+    score, objects of frame f in rows first[f] .. first[f + 1]."""
+    places, taken = np.full(len(centres), -1), np.zeros(len(true_centres), np.bool_)
+    for i in range(len(centres)):
+        best, least = -1, np.inf
+        for j in range(first[frames[i]], first[frames[i] + 1]):
+            away = np.sqrt((centres[i, 0] - true_centres[j, 0]) ** 2
+                           + (centres[i, 1] - true_centres[j, 1]) ** 2)
+            if not taken[j] and away < least:
+                best, least = j, away
+        if least < most:
+            places[i], taken[best] = best, True
+    return places
+
+
+def _curves(hit: np.ndarray, scores: np.ndarray, objects: int) -> tuple[np.ndarray, np.ndarray]:
+    """Precision and score (101,) at RECALLS, read off between the detections (K,), which come by
+    falling score; 0 at a recall that is not reached."""
+    if not hit.any():
+        return np.zeros(len(RECALLS)), np.zeros(len(RECALLS))
+    hits = np.cumsum(hit)
+    recall = hits / objects
+    precision = hits / np.arange(1, len(hit) + 1)
+    return (np.interp(RECALLS, recall, precision, right=0),
+            np.interp(RECALLS, recall, scores, right=0))
+
+
+def _at_recalls(values: np.ndarray, scores: np.ndarray, confidence: np.ndarray) -> float:
+    """Mean of an error over the recalls that are reached, from FIRST_RECALL on, where at each the
+    error is the mean of all hits (H,) up to it; NaN are left out, and 1 is where all are."""
+    reached = np.flatnonzero(confidence)
+    last = reached[-1] if len(reached) else 0
+    if last < FIRST_RECALL or np.isnan(values).all():
+        return 1.0
+    known = np.cumsum(~np.isnan(values))
+    so_far = np.nancumsum(values) / np.maximum(known, 1)
+    curve = np.interp(confidence[::-1], scores[::-1], so_far[::-1])[::-1]
+    return float(curve[FIRST_RECALL:last + 1].mean())
+
+
+def hit_errors(truth: GlobalBoxes, found: GlobalBoxes, half_turns: bool) -> dict[str, np.ndarray]:
+    """The ERRORS (H,) float64 of pairs of boxes, NaN where the true velocity or attribute, or the
+    velocity found, is not known. With half_turns a box that is turned by pi is the same."""
+    shared = np.minimum(truth.sizes, found.sizes).prod(axis=1)
+    union = truth.sizes.prod(axis=1) + found.sizes.prod(axis=1) - shared
+    period = np.pi if half_turns else 2 * np.pi
+    turned = (truth.yaws - found.yaws + period / 2) % period - period / 2
+    differs = (truth.attributes != found.attributes).astype(float)
+    return {"ate": np.hypot(*(truth.centres - found.centres)[:, :2].T), "ase": 1 - shared / union,
+            "aoe": np.abs(turned), "ave": np.hypot(*(truth.velocities - found.velocities).T),
+            "aae": np.where(truth.attributes < 0, np.nan, differs)}
+
+
+def summary(scores: dict[str, ClassScores]) -> dict[str, float]:
+    """map, the mean of each of ERRORS over the classes that have it, and nds, nuScenes' detection
+    score: the mean of mAP, five times, and of 1 - error, at least 0, for each error. 0..1."""
+    result = {"map": float(np.mean([s.mean_ap for s in scores.values()]))}
+    for error in ERRORS:
+        result[error] = float(np.nanmean([s.errors[error] for s in scores.values()]))
+    parts = [max(0.0, 1.0 - result[error]) for error in ERRORS]
+    result["nds"] = (AP_WEIGHT * result["map"] + sum(parts)) / (AP_WEIGHT + len(parts))
+    return result

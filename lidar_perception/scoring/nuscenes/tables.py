@@ -1,0 +1,53 @@
+"""The table of detections against the labels of nuScenes, beside a paper's figures."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from lidar_perception.scoring.nuscenes.protocol import DISTANCES, ERRORS
+from lidar_perception.scoring.nuscenes.report import OURS
+from lidar_perception.scoring.tables import narrow_table, print_skipped
+
+# The improved-PointNet paper on nuScenes. It names neither the split nor the classes, and gives no
+# AOE, AVE and AAE.
+PAPER = {"map": 92.68, "ate": 0.298, "ase": 0.218, "nds": 83.45}
+
+
+def print_nuscenes_report(content: dict, console: Console) -> None:
+    """AP at each distance and the errors, by class and over all, and what was left out."""
+    table = narrow_table(f"nuScenes detection, {content['frames']} frames", "", "labels",
+                         *(f"{d:g}m" for d in DISTANCES), "mAP", *(e.upper() for e in ERRORS),
+                         "NDS", width=4)
+    for name, row in content["classes"].items():
+        table.add_row(name.replace("construction_vehicle", "constr. veh.").replace("_", " "),
+                      str(row["objects"]), *(f"{ap:.3g}" for ap in row["ap"].values()),
+                      _number(row["mean_ap"]), *_errors(row), style="" if name in OURS else "dim")
+    table.add_section()
+    for key, title in ("all", "all ten"), ("ours", "our three"):
+        objects = sum(row["objects"] for name, row in content["classes"].items()
+                      if key == "all" or name in OURS)
+        table.add_row(title, str(objects), *[""] * len(DISTANCES), *_means(content[key]),
+                      style="bold")
+    table.add_row("the paper", "", *[""] * len(DISTANCES), *_means(PAPER), style="dim")
+    table.caption = (
+        "AP in percent by centre distance; ATE m, ASE 1 - IoU, AOE rad, AVE m/s, AAE 1 - accuracy. "
+        "A class that is not detected has AP 0 and errors 1. Our three: car, pedestrian, bicycle "
+        "(our Cyclist), no figure of nuScenes' ranking. Without velocities and attributes AVE and "
+        "AAE are 1, and NDS is 80 at most. The paper names neither its classes nor its split.")
+    console.print(table)
+    if content["ms"] is not None:
+        console.print(f"detector: {content['ms']:.1f} ms a frame (median)")
+    print_skipped(content["skipped"], console)
+
+
+def _means(row: dict) -> list[str]:
+    return [_number(row["map"]), *_errors(row), _number(row["nds"])]
+
+
+def _errors(row: dict) -> list[str]:
+    return ["-" if row.get(name) is None else f"{row[name]:.2f}"[:4] for name in ERRORS]
+
+
+def _number(value: float) -> str:
+    """Five characters: 84.00, 100.0."""
+    return f"{value:.2f}"[:5]

@@ -1,0 +1,1 @@
+"""Ground, clusters and points against labels."""

@@ -1,0 +1,135 @@
+"""Which class clusters and their points are of, and how often a network says so (paper C)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.camera import Camera
+from lidar_perception.detectors.pointnet.clusters import Clusters
+from lidar_perception.detectors.pointnet.predict import Predictions
+from lidar_perception.geometry import points_in_box
+from lidar_perception.types import CLASSES, GroundTruth
+
+UNKNOWN = -1              # a label of which nothing is said
+SURE, UNSURE = 0.5, 0.15  # a cluster with this share of its points in a box is that object, with
+                          # less than the second it is background
+BORDER = 0.05             # m: points so near to a box are taken for its own, as labels are rounded
+NEITHER = ("Van", "Person_sitting", "Tram", "Truck")  # look like a class, and are none of it
+LEAST_POINTS = 10         # clusters with fewer do not count
+
+
+def labelled(clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray,
+             classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """labels (K,) int64 of clusters into classes, their number for background, UNKNOWN for what is
+    neither; owners (K,) int64: which of boxes (M, 7), of class_ids (M,) into CLASSES, each is of,
+    -1 for none. Of several boxes the one with most of its points counts."""
+    count, background = len(clusters), len(classes)
+    number = np.repeat(np.arange(count), clusters.sizes)
+    share, owners = np.zeros(count), np.full(count, -1)
+    sizes = np.maximum(clusters.sizes, 1)
+    for i, box in enumerate(boxes):
+        inside = points_in_box(clusters.points[:, :3], box, BORDER)
+        part = np.bincount(number[inside], minlength=count) / sizes
+        more = part > share
+        share[more], owners[more] = part[more], i
+    kinds = np.append(kinds_of(class_ids, classes), background)
+    labels = np.where(share >= SURE, kinds[owners], UNKNOWN)
+    labels[share < UNSURE] = background
+    owners[(labels == UNKNOWN) | (labels == background)] = -1
+    return labels, owners
+
+
+def point_labels(xyz: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
+                 classes: Sequence[str]) -> np.ndarray:
+    """(N,) int64 of points (N, 3): the class whose box they are in, else their number for
+    background; UNKNOWN for those in a box that is neither."""
+    labels = np.full(len(xyz), len(classes))
+    for kind, box in zip(kinds_of(class_ids, classes), boxes):
+        labels[points_in_box(xyz, box, BORDER)] = kind
+    return labels
+
+
+def uncared(truth: GroundTruth, camera: Camera, xyz: np.ndarray) -> np.ndarray:
+    """(N,) bool: points (N, 3) in regions of the image where nothing is labelled (DontCare)."""
+    regions = [extra["bbox"] for name, extra in truth.notes if name == "DontCare"]
+    return camera.in_regions(xyz, np.array(regions, float))
+
+
+def unknown_where(labels: np.ndarray, clusters: Clusters, uncared: np.ndarray,
+                  background: int) -> np.ndarray:
+    """labels (K,) of clusters with UNKNOWN for background of which half of the points or more are
+    not cared for, uncared (P,) bool."""
+    number = np.repeat(np.arange(len(clusters)), clusters.sizes)
+    share = np.bincount(number, uncared, minlength=len(clusters)) / np.maximum(clusters.sizes, 1)
+    return np.where((labels == background) & (share >= 0.5), UNKNOWN, labels)
+
+
+def kinds_of(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
+    """(M,) int64 into classes of class_ids (M,) into CLASSES; their number for what is background,
+    UNKNOWN for what looks like a class and is none."""
+    return np.array([classes.index(name) if name in classes else
+                     UNKNOWN if name in NEITHER else len(classes)
+                     for name in (CLASSES[i] for i in class_ids)], np.int64)
+
+
+@dataclass
+class ClusterScores:
+    """Counts (K + 1, K + 1) by true and by found class, background last, of clusters and of all
+    points."""
+
+    classes: tuple[str, ...]
+    frames: int = 0
+    clusters: np.ndarray = field(init=False)
+    points: np.ndarray = field(init=False)
+    skipped: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        count = len(self.classes) + 1
+        self.clusters, self.points = (np.zeros((count, count), np.int64) for _ in range(2))
+
+    def add(self, clusters: Clusters, labels: np.ndarray, predictions: Predictions,
+            point_truth: np.ndarray, cluster_ids: np.ndarray) -> None:
+        """One frame: clusters with labels, what the network says of them, and of all N points the
+        labels and the numbers of their clusters, 0 for none."""
+        kinds = predictions.probabilities.argmax(axis=1)
+        counted = (labels >= 0) & (clusters.sizes >= LEAST_POINTS)
+        np.add.at(self.clusters, (labels[counted], kinds[counted]), 1)
+        largest = max(int(cluster_ids.max(initial=0)), int(clusters.ids.max(initial=0)))
+        of_number = np.full(largest + 1, len(self.classes))
+        of_number[clusters.ids] = kinds
+        known = point_truth >= 0
+        np.add.at(self.points, (point_truth[known], of_number[cluster_ids[known]]), 1)
+        self.frames += 1
+
+    def content(self) -> dict[str, Any]:
+        """As JSON; shares in percent, None without objects."""
+        return {"frames": self.frames, "classes": [*self.classes, "background"],
+                "least_points": LEAST_POINTS, "clusters": _scores(self.clusters, self.classes),
+                "points": _scores(self.points, self.classes), "skipped": self.skipped}
+
+
+def _scores(confusion: np.ndarray, classes: Sequence[str]) -> dict[str, Any]:
+    """accuracy; by class, and as the mean of the classes that occur, precision, recall, F1, IoU."""
+    right = np.diag(confusion)
+    true, said = confusion.sum(axis=1), confusion.sum(axis=0)
+    rows = {}
+    for i, name in enumerate(classes):
+        rows[name] = {"objects": int(true[i]), "precision": _percent(right[i], said[i]),
+                      "recall": _percent(right[i], true[i]),
+                      "f1": _percent(2 * right[i], true[i] + said[i]),
+                      "iou": _percent(right[i], true[i] + said[i] - right[i])}
+    found = [row for row in rows.values() if row["objects"]]
+    mean = {key: float(np.mean([row[key] or 0.0 for row in found])) if found else None
+            for key in ("precision", "recall", "f1", "iou")}
+    count = len(classes)
+    return {"confusion": confusion.tolist(), "accuracy": _percent(right.sum(), confusion.sum()),
+            "object_accuracy": _percent(right[:count].sum(), true[:count].sum()),
+            "by_class": rows, "mean": mean}
+
+
+def _percent(part: int, whole: int) -> float | None:
+    return 100.0 * float(part) / float(whole) if whole else None

@@ -1,0 +1,244 @@
+"""Ground and clusters against labels: of every point (SemanticKITTI), or boxes (KITTI, bags).
+
+Ground is counted under three protocols, since vegetation moves F1 by points. Ground are road,
+parking, sidewalk, other-ground, lane-marking and terrain; unlabelled points and outliers are left
+out. Vegetation is
+
+    without vegetation     left out too (Patchwork++, Lee et al., IROS 2022, Section IV-A);
+    with vegetation        ground where lower than z = -1.3 m in the LiDAR frame, which is 0.43 m
+                           above the road, else not ground (Patchwork, Lim et al., RA-L 2021);
+    vegetation not ground  not ground, the class as it is.
+
+A cluster and an object are compared by the points they share: IoU = |C and O| / |C or O|, and a
+hit is an IoU above one half, so that no cluster is the hit of two objects. Points of an object
+that the ground method took away count as missed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from lidar_perception.data.semantickitti import GROUND, MOVING, THINGS, UNLABELLED, VEGETATION
+from lidar_perception.geometry import horizontal_range, points_in_box
+from lidar_perception.types import CLASSES, GroundTruth
+
+PROTOCOLS = ("without vegetation", "with vegetation", "vegetation not ground")
+LOW_VEGETATION_Z = -1.3  # metres in the LiDAR frame of KITTI, 1.73 m above the road
+
+HIT_IOU = 0.5
+MIN_POINTS = 10      # objects with fewer points are not looked for
+BOTTOM = 0.2         # metres above the bottom of a box up to which its points may be the road's
+MARGIN = 0.2         # a cluster is judged if most of it is in labelled boxes grown by this
+PIECE = 0.1          # a cluster with this share of an object's points is a piece of it
+RANGE_NAMES = ("0-15", "15-30", "30-45", "45+")
+RANGE_LIMITS = np.array([15.0, 30.0, 45.0])
+
+
+def true_ground(semantic: np.ndarray, z: np.ndarray,
+                protocol: str) -> tuple[np.ndarray, np.ndarray]:
+    """ground (N,) bool and counted (N,) bool of points with classes semantic (N,) and heights
+    z (N,) metres in the LiDAR frame. What is not counted is neither ground nor not ground."""
+    ground, counted = np.isin(semantic, GROUND), ~np.isin(semantic, UNLABELLED)
+    vegetation = semantic == VEGETATION
+    if protocol == "without vegetation":
+        counted &= ~vegetation
+    elif protocol == "with vegetation":
+        ground |= vegetation & (z < LOW_VEGETATION_Z)
+    return ground, counted
+
+
+def ground_counts(found: np.ndarray, ground: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """(4,) int64 [tp fp fn tn] of found (N,) bool."""
+    case = np.where(ground, np.where(found, 0, 2), np.where(found, 1, 3))
+    return np.bincount(case.compress(counted), minlength=4)
+
+
+def ground_row(counts: np.ndarray) -> dict:
+    """Counts (4,) and their ratios for the JSON file. A ratio without cases is 0."""
+    tp, fp, fn, tn = counts.tolist()
+    return dict(tp=tp, fp=fp, fn=fn, tn=tn, precision=_ratio(tp, tp + fp),
+                recall=_ratio(tp, tp + fn), f1=_ratio(2 * tp, 2 * tp + fp + fn),
+                accuracy=_ratio(tp + tn, tp + fp + fn + tn))
+
+
+@dataclass
+class GroundReport:
+    """Counts of one ground method by protocol, all points of all scans together."""
+
+    counts: dict[str, np.ndarray] = field(
+        default_factory=lambda: {name: np.zeros(4, np.int64) for name in PROTOCOLS})
+    ms: list[float] = field(default_factory=list)
+
+    def add(self, found: np.ndarray, semantic: np.ndarray, z: np.ndarray, ms: float) -> None:
+        """One scan: found (N,) bool, classes (N,), heights (N,), time of the method."""
+        for name, counts in self.counts.items():
+            counts += ground_counts(found, *true_ground(semantic, z, name))
+        self.ms.append(ms)
+
+    def content(self) -> dict:
+        """What the JSON file holds."""
+        return {"scans": len(self.ms), "ms": _median(self.ms),
+                "protocols": {name: ground_row(c) for name, c in self.counts.items()}}
+
+
+@dataclass(frozen=True)
+class Objects:
+    """K labelled objects among N points.
+
+    owner (N,) int32: the object 1..K whose point it is, or 0. region (N,) int32: owner, and also
+    the points that speak neither for nor against a cluster of that object. near (N,) bool: points
+    where a cluster is judged. counted (N,) bool: the others are left out altogether, as nobody
+    knows what they are. classes K names; ranges (K,) metres, horizontally.
+    """
+
+    owner: np.ndarray
+    region: np.ndarray
+    near: np.ndarray
+    counted: np.ndarray
+    classes: tuple[str, ...]
+    ranges: np.ndarray
+
+
+def objects_in_boxes(xyz: np.ndarray, truth: GroundTruth) -> Objects:
+    """Objects of labelled boxes, without DontCare, with at least MIN_POINTS points.
+
+    A box stands on the road and holds some of it, so an object's points are those more than
+    BOTTOM above its bottom face; those below are neutral. A point in two boxes belongs to the
+    smaller one.
+    """
+    owner, region = np.zeros((2, len(xyz)), np.int32)
+    for k in np.argsort(-np.prod(truth.boxes[:, 3:6], axis=1), kind="stable"):
+        box = truth.boxes[k]
+        if CLASSES[truth.class_ids[k]] != "DontCare":
+            inside = points_in_box(xyz, box)
+            region[inside] = k + 1
+            owner[inside] = np.where(xyz[inside, 2] > box[2] - box[5] / 2 + BOTTOM, k + 1, 0)
+    chosen = np.flatnonzero(np.bincount(owner, minlength=len(truth) + 1)[1:] >= MIN_POINTS)
+    near = np.zeros(len(xyz), bool)
+    for box in truth.boxes[chosen]:
+        near |= points_in_box(xyz, box, MARGIN)
+    return Objects(_renumbered(owner, chosen + 1), _renumbered(region, chosen + 1), near,
+                   np.ones(len(xyz), bool), tuple(truth.labels[k] for k in chosen),
+                   np.hypot(*truth.boxes[chosen, :2].T))
+
+
+def objects_of_instances(xyz: np.ndarray, semantic: np.ndarray, instance: np.ndarray) -> Objects:
+    """Objects of SemanticKITTI with at least MIN_POINTS points: things of one class and instance,
+    moving or not. Left out: unlabelled points, outliers, things without an instance, and objects
+    of fewer points."""
+    table = np.zeros(1 << 16, np.int32)
+    table[list(THINGS)] = list(THINGS)
+    table[list(MOVING)] = list(MOVING.values())
+    thing = table[semantic]
+    keys, which, counts = np.unique(np.where((thing > 0) & (instance > 0),
+                                             thing << 16 | instance, 0),
+                                    return_inverse=True, return_counts=True)
+    chosen = np.flatnonzero((keys > 0) & (counts >= MIN_POINTS))
+    owner = _renumbered(which.reshape(-1), chosen)
+    sums = [np.bincount(owner, axis, minlength=len(chosen) + 1)[1:] for axis in xyz[:, :2].T]
+    centres = np.stack(sums, axis=1) / counts[chosen, None]
+    counted = (owner > 0) | ((thing == 0) & ~np.isin(semantic, UNLABELLED))
+    return Objects(owner, owner, owner > 0, counted,
+                   tuple(THINGS[key >> 16] for key in keys[chosen].tolist()),
+                   horizontal_range(centres))
+
+
+@dataclass(frozen=True)
+class ClusterScore:
+    """Clusters of one frame against K objects.
+
+    iou (K,) with the best cluster, 0 without one; pieces (K,) int: clusters with at least PIECE of
+    the object's points; shared (K,) bool: the best cluster is a piece of another object too.
+    clusters: how many there are; judged: those with most of their points near objects.
+    """
+
+    iou: np.ndarray
+    pieces: np.ndarray
+    shared: np.ndarray
+    clusters: int
+    judged: int
+
+
+def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
+    """cluster_ids (N,) int, 0 = none; which number a cluster has does not matter."""
+    clusters = len(np.unique(cluster_ids[cluster_ids > 0]))
+    ids, owner, region, near = (a.compress(objects.counted) for a in (
+        cluster_ids, objects.owner, objects.region, objects.near))
+    size = np.bincount(ids, minlength=1)
+    shape = (len(objects.classes) + 1, len(size))
+    inside, common = (np.bincount(o * shape[1] + ids.astype(np.int64),
+                                  minlength=shape[0] * shape[1]).reshape(shape)[1:]
+                      for o in (region, owner))
+    points = common.sum(axis=1, keepdims=True)
+    common[:, 0] = 0  # no cluster
+    iou = common / (size + points - inside)
+    piece = (common > 0) & (common >= PIECE * points)
+    best = iou.max(axis=1, keepdims=True)
+    shared = (iou == best) & piece & (piece.sum(axis=0) > 1)
+    judged = 2 * np.bincount(ids, near, minlength=1)[1:] > size[1:]
+    return ClusterScore(best[:, 0], piece.sum(axis=1), shared.any(axis=1), clusters,
+                        int(judged.sum()))
+
+
+@dataclass
+class ClusterReport:
+    """Scores of one clustering method over the frames."""
+
+    frames: list[tuple[Objects, ClusterScore]] = field(default_factory=list)
+    ms: list[float] = field(default_factory=list)
+
+    def add(self, cluster_ids: np.ndarray, objects: Objects, ms: float) -> None:
+        """One frame: cluster_ids (N,), its objects, time of the method."""
+        self.frames.append((objects, score_clusters(cluster_ids, objects)))
+        self.ms.append(ms)
+
+    def content(self) -> dict:
+        """What the JSON file holds. precision: share of the judged clusters that are hits."""
+        classes = np.array([c for objects, _ in self.frames for c in objects.classes], str)
+        bins = np.searchsorted(RANGE_LIMITS, _joined(o.ranges for o, _ in self.frames), "right")
+        columns = [_joined(getattr(score, name) for _, score in self.frames)
+                   for name in ("iou", "pieces", "shared")]
+        everything = _object_row(*columns)
+        clusters, judged = (sum(getattr(score, name) for _, score in self.frames)
+                            for name in ("clusters", "judged"))
+        hits = everything["hits"]
+        return {"frames": len(self.frames), "ms": _median(self.ms), "clusters": clusters,
+                "clusters_per_frame": _ratio(clusters, len(self.frames)),
+                "judged_clusters": judged, **everything, "precision": _ratio(hits, judged),
+                "f1": _ratio(2 * hits, judged + everything["objects"]),
+                "by_class": {str(name): _object_row(*(c[classes == name] for c in columns))
+                             for name in np.unique(classes)},
+                "by_range": {name: _object_row(*(c[bins == i] for c in columns))
+                             for i, name in enumerate(RANGE_NAMES)}}
+
+
+def _object_row(iou: np.ndarray, pieces: np.ndarray, shared: np.ndarray) -> dict:
+    """mean_pieces is over the objects that have a piece; 1 is none cut, None without any."""
+    count, hits = len(iou), int(np.sum(iou > HIT_IOU))
+    over, under = int(np.sum(pieces > 1)), int(np.sum(shared))
+    return dict(objects=count, hits=hits, recall=_ratio(hits, count),
+                mean_iou=_ratio(float(np.sum(iou)), count),
+                over_segmented=over, over_segmentation=_ratio(over, count),
+                mean_pieces=float(np.mean(pieces[pieces > 0])) if (pieces > 0).any() else None,
+                under_segmented=under, under_segmentation=_ratio(under, count))
+
+
+def _renumbered(ids: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """(N,) int32: 1.. in the order of chosen where ids (N,) is among them, else 0."""
+    table = np.zeros(max(ids.max(initial=0), chosen.max(initial=0)) + 1, np.int32)
+    table[chosen] = np.arange(1, len(chosen) + 1)
+    return table[ids]
+
+
+def _joined(parts) -> np.ndarray:
+    return np.concatenate([np.zeros(0), *parts])
+
+
+def _median(values: list[float]) -> float | None:
+    return float(np.median(values)) if values else None
+
+
+def _ratio(part: float, whole: float) -> float:
+    return part / whole if whole else 0.0

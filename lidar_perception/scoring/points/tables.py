@@ -1,0 +1,112 @@
+"""Tables and a picture of ground and clusters against labels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+
+from lidar_perception.scoring.pictures import save_picture
+from lidar_perception.scoring.points.segmentation import HIT_IOU, MIN_POINTS, PROTOCOLS, true_ground
+from lidar_perception.scoring.tables import narrow_table, print_skipped
+from lidar_perception.types import LidarFrame
+
+# Patchwork++ on sequences 00 to 10 of SemanticKITTI, mean of the sequences, in percent: precision,
+# recall, F1. The first from the paper (IROS 2022, Table I), the second from its repository.
+PUBLISHED = {"without vegetation": (94.92, 98.18, 96.51), "with vegetation": (93.72, 92.33, 92.87)}
+SOURCES = {"semantic_kitti": "SemanticKITTI instances", "kitti": "KITTI boxes",
+           "bag": "boxes of the bag"}
+
+
+def print_scores(content: dict, ground_method: str, console: Console) -> None:
+    """Tables of ground, and of clusters for each source."""
+    if content["ground"]:
+        _print_ground(content["ground"], console)
+    for source, reports in content["clusters"].items():
+        _print_clusters(reports, f"Clusters against {SOURCES[source]}, ground by {ground_method}",
+                        console)
+    print_skipped(content["skipped"], console)
+
+
+def _print_ground(reports: dict, console: Console) -> None:
+    scans = max(report["scans"] for report in reports.values())
+    table = narrow_table(f"Ground of SemanticKITTI, {_count(scans, 'scan')}", "vegetation is",
+                         "prec.", "recall", "F1", "acc.", "TP", "FP", "FN", "ms")
+    titles = dict(zip(PROTOCOLS, ("left out", "ground if below -1.3 m", "not ground")))
+    for protocol in PROTOCOLS:
+        table.add_row(titles[protocol], style="bold")
+        for name, report in reports.items():
+            row = report["protocols"][protocol]
+            table.add_row(f"  {name}", *_percent(row, "precision", "recall", "f1", "accuracy"),
+                          *(str(row[k]) for k in ("tp", "fp", "fn")), _ms(report))
+        if protocol in PUBLISHED:
+            table.add_row("  Patchwork++ published", *(f"{v:.1f}" for v in PUBLISHED[protocol]),
+                          style="dim")
+    table.caption = ("Ground: road, parking, sidewalk, other-ground, lane-marking, terrain. ms are "
+                     "for one scan. Published: mean of the sequences 00 to 10.")
+    console.print(table)
+
+
+def _print_clusters(reports: dict, title: str, console: Console) -> None:
+    frames = max(report["frames"] for report in reports.values())
+    table = narrow_table(f"{title}, {_count(frames, 'frame')}", "method", "objects", "hits",
+                         "recall", "prec.", "F1", "IoU", "over", "under", "found", "ms")
+    for name, report in reports.items():
+        table.add_row(name, *_object_cells(report), f"{report['clusters_per_frame']:.1f}",
+                      _ms(report), style="bold")
+        parts = {**report["by_class"], **{f"{r} m": row for r, row in report["by_range"].items()}}
+        for part, row in parts.items():
+            if row["objects"]:
+                table.add_row(f"  {part}", *_object_cells(row))
+        table.add_section()
+    table.caption = (f"Objects with {MIN_POINTS} points or more; hit: IoU above {HIT_IOU} with one "
+                     "cluster. over: cut in pieces; under: in one cluster with another; found: "
+                     "clusters a frame; ms: a frame.")
+    console.print(table)
+
+
+def _object_cells(row: dict) -> list[str]:
+    """Precision and F1 are known for all objects together only."""
+    judged = _percent(row, "precision", "f1") if "precision" in row else ("", "")
+    return [str(row["objects"]), str(row["hits"]), *_percent(row, "recall"), *judged,
+            *_percent(row, "mean_iou", "over_segmentation", "under_segmentation")]
+
+
+def _percent(row: dict, *keys: str) -> list[str]:
+    return [f"{100 * row[key]:.1f}" for key in keys]
+
+
+def _ms(report: dict) -> str:
+    return f"{report['ms']:.{0 if report['ms'] >= 100 else 1}f}"
+
+
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"
+
+
+def draw_ground(path: Path, name: str, frame: LidarFrame, semantic: np.ndarray,
+                found: dict[str, np.ndarray], max_range: float = 50.0) -> None:
+    """Write a PNG: the scan from above, for each method what it found (N,) of the true ground.
+    x (forward) points up, y (left) to the left, metres. Vegetation is left out of the count."""
+    import matplotlib
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    true, counted = true_ground(semantic, frame.xyz[:, 2], "without vegetation")
+    figure, rows = plt.subplots(1, len(found), figsize=(7 * len(found), 7.6), dpi=110,
+                                squeeze=False, layout="constrained")
+    for axes, (method, ground) in zip(rows[0], found.items()):
+        for mask, color, label, size in (
+                (~counted, "#dddddd", "not counted", 0.2),
+                (counted & ~true & ~ground, "#b0b0b0", "not ground", 0.3),
+                (counted & true & ground, "#009e73", "ground, found", 0.3),
+                (counted & true & ~ground, "#0072b2", "ground, missed", 1.2),
+                (counted & ~true & ground, "#d55e00", "found, but not ground", 1.2)):
+            axes.scatter(-frame.xyz[mask, 1], frame.xyz[mask, 0], s=size, c=color, linewidths=0,
+                         label=f"{label} ({int(mask.sum())})")
+        axes.set(xlim=(-max_range, max_range), ylim=(-max_range, max_range), aspect="equal",
+                 xlabel="right [m]", ylabel="forward [m]", title=f"{method}, scan {name}")
+        for handle in axes.legend(loc="upper right", framealpha=0.9).legend_handles:
+            handle.set_sizes([30])
+    save_picture(path, figure)

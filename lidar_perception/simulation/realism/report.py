@@ -1,0 +1,183 @@
+"""Tables and a picture of simulated against real scans."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from lidar_perception.scoring.pictures import save_picture
+from lidar_perception.simulation.realism.compare import LEAST_SAMPLES, factor_off
+from lidar_perception.simulation.realism.scan_statistics import CURVES
+
+WORST = 25
+REAL, SIMULATED, WRONG = "#0072b2", "#d55e00", "#b00000"
+PANELS = 5  # in a row
+
+
+def print_realism(content: dict, console: Console) -> None:
+    """What was compared, a table of the curves and one of the worst bins, and the summary."""
+    for side in ("real", "simulated"):
+        row = content[side]
+        objects = ", ".join(f"{count} {name}" for name, count in row["objects"].items())
+        console.print(f"{side}: {row['scans']} scans, {row['whole_scans']} of them whole; "
+                      f"{objects}; {row['pedestrian_frames']} scans with a pedestrian",
+                      soft_wrap=True)
+    _print_curves(content, console)
+    _print_worst(content, console)
+    skipped = content["real"]["skipped"] + content["simulated"]["skipped"]
+    for line in skipped[:5]:
+        console.print(f"[yellow]skipped[/]: {escape(line)}", soft_wrap=True)
+    if len(skipped) > 5:
+        console.print(f"[yellow]skipped[/]: {len(skipped) - 5} more, see the JSON file")
+    console.print(summary(content), style="bold", soft_wrap=True)
+
+
+def summary(content: dict) -> str:
+    """How many of the judged bins are right, and how many plausible."""
+    return (f"{content['within']} of {content['judged']} bins within 20 % of the real median, "
+            f"{content['plausible']} with those within its 95 % interval")
+
+
+def typical_factor(curve: dict) -> float | None:
+    """Median of the factors by which the judged bins are off; None without judged bins."""
+    factors = sorted(factor_off(b) for b in curve["bins"] if b["within"] is not None)
+    return factors[len(factors) // 2] if factors else None
+
+
+def _print_curves(content: dict, console: Console) -> None:
+    table = _table("Simulated against real, worst curves first",
+                   "curve", "within 20 %", "typical", "worst at", "ratio")
+    judged = [c for c in content["curves"].values() if c["judged"]]
+    for curve in sorted(judged, key=lambda c: (c["share"], -typical_factor(c))):
+        worst = max((b for b in curve["bins"] if b["within"] is not None), key=factor_off)
+        table.add_row(_title(curve), f"{curve['within']} of {curve['judged']}",
+                      _factor(typical_factor(curve)), worst["bin"], _ratio(worst))
+    unknown = sum(not curve["judged"] and not CURVES[name].histogram
+                  for name, curve in content["curves"].items())
+    table.caption = ("typical: the median factor between simulated and real. ratio: simulated / "
+                     f"real at the worst bin. {unknown} curves have no bin with {LEAST_SAMPLES} "
+                     "real samples.")
+    console.print(table)
+
+
+def _print_worst(content: dict, console: Console) -> None:
+    bins = [(curve, b) for curve in content["curves"].values() for b in curve["bins"]
+            if b["within"] is False]
+    table = _table(f"The {min(WORST, len(bins))} worst bins of {len(bins)} not within 20 %",
+                   "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio")
+    for curve, b in sorted(bins, key=lambda item: -factor_off(item[1]))[:WORST]:
+        table.add_row(_title(curve), b["bin"],
+                      *(cell for side in ("real", "simulated") for cell in _cells(b[side])),
+                      _ratio(b))
+    table.caption = "Median and spread of the scans or objects, n of them."
+    if bins:
+        console.print(table)
+
+
+def _title(curve: dict) -> str:
+    by = " by elevation" if curve["axis"].startswith("elevation") else ""
+    return curve["title"].removesuffix(" [m]") + by
+
+
+def _cells(side: dict) -> list[str]:
+    spread = "" if side["low"] is None else f"{_number(side['low'])}..{_number(side['high'])}"
+    return [_number(side["median"]), spread, str(side["n"])]
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.0f}" if value >= 100 else f"{value:.2g}"
+
+
+def _factor(value: float) -> str:
+    return "-" if math.isinf(value) else f"{value:.2f}"
+
+
+def _ratio(b: dict) -> str:
+    return "-" if b["ratio"] is None else f"{b['ratio']:.2f}"
+
+
+def _table(title: str, first: str, *others: str) -> Table:
+    table = Table(title=title, box=SIMPLE_HEAD, padding=0, caption_justify="left")
+    table.add_column(first, overflow="fold")
+    for name in others:
+        table.add_column(name, justify="right", no_wrap=True)
+    return table
+
+
+def draw_realism(path: Path, content: dict) -> None:
+    """Write a PNG: every curve of real and simulated, median and 10 to 90 %."""
+    import matplotlib
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.patches import Patch
+
+    rows = math.ceil(len(content["curves"]) / PANELS)
+    figure, grid = plt.subplots(rows, PANELS, figsize=(4.4 * PANELS, 3.0 * rows), dpi=100,
+                                squeeze=False, layout="constrained")
+    for axes, (name, curve) in zip(grid.flat, content["curves"].items()):
+        (_draw_histogram if CURVES[name].histogram else _draw_curve)(axes, curve, CURVES[name].log)
+    for axes in grid.flat[len(content["curves"]):]:
+        axes.set_visible(False)
+    handles = [Patch(color=REAL, label="real"), Patch(color=SIMULATED, label="simulated"),
+               Patch(color="#eeeeee", label=f"fewer than {LEAST_SAMPLES} real samples"),
+               Patch(color=WRONG, label="red title: most bins are wrong")]
+    figure.legend(handles=handles, loc="outside lower right", ncols=4, fontsize=13)
+    figure.suptitle(f"{summary(content)}; {content['real']['scans']} real "
+                    f"scans, {content['simulated']['scans']} simulated\nmedian and 10 to 90 % of "
+                    "the scans or objects; [bins within 20 % / bins judged]", x=0.01, ha="left",
+                    fontsize=15)
+    save_picture(path, figure)
+
+
+def _draw_curve(axes, curve: dict, log: bool) -> None:
+    """One panel; bins with too few real samples to be judged are grey."""
+    places = range(len(curve["bins"]))
+    for side, color, shift in (("real", REAL, -0.08), ("simulated", SIMULATED, 0.08)):
+        median, low, high = (_column(curve, side, key) for key in ("median", "low", "high"))
+        x = [p + shift for p in places]
+        ranges = len(x) - (curve["bins"][-1]["bin"] == "all")  # no line leads to `all`
+        axes.plot(x[:ranges], median[:ranges], color=color, linewidth=1.6)
+        axes.plot(x, median, "o", color=color, markersize=4)
+        spread = [[max(m - a, 0) for m, a in zip(median, low)],
+                  [max(b - m, 0) for m, b in zip(median, high)]]
+        axes.errorbar(x, median, spread, fmt="none", ecolor=color, elinewidth=1, alpha=0.6,
+                      capsize=2)
+    for i in places:
+        if curve["bins"][i]["within"] is None:
+            axes.axvspan(i - 0.5, i + 0.5, color="#eeeeee", linewidth=0)
+    if log:
+        axes.set_yscale("symlog", linthresh=10)
+    axes.set_xticks(places, [b["bin"] for b in curve["bins"]], fontsize=8,
+                    rotation=60 if len(places) > 9 else 30 if len(places) > 6 else 0)
+    axes.set_xlim(-0.5, len(places) - 0.5)
+    verdict = f"{curve['within']}/{curve['judged']}" if curve["judged"] else "not judged"
+    wrong = curve["judged"] and curve["share"] < 0.5
+    _frame(axes, curve, f"{curve['title']}  [{verdict}]", WRONG if wrong else "black")
+
+
+def _draw_histogram(axes, curve: dict, _log: bool) -> None:
+    """One panel; the bars start at the names of their bins."""
+    places = range(len(curve["bins"]))
+    for side, color, alpha in (("real", REAL, 0.5), ("simulated", SIMULATED, 0.35)):
+        share = _column(curve, side, "median")
+        axes.bar(places, share, width=1.0, align="edge", color=color, alpha=alpha, linewidth=0)
+        axes.step([*places, len(places)], [*share, share[-1]], where="post", color=color)
+    axes.set_xticks(places[::4], [b["bin"] for b in curve["bins"]][::4], fontsize=8)
+    _frame(axes, curve, curve["title"], "black")
+
+
+def _frame(axes, curve: dict, title: str, color: str) -> None:
+    axes.set_ylim(bottom=0)
+    axes.set_xlabel(curve["axis"], fontsize=9)
+    axes.tick_params(axis="y", labelsize=8)
+    axes.grid(color="#dddddd", linewidth=0.5, axis="y")
+    axes.set_title(title, fontsize=10.5, color=color)
+
+
+def _column(curve: dict, side: str, key: str) -> list[float]:
+    return [math.nan if b[side][key] is None else b[side][key] for b in curve["bins"]]

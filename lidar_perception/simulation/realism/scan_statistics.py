@@ -1,0 +1,188 @@
+"""What a scan and its labelled objects are like, as numbers by range, angle or quantile.
+
+A scan or an object gives a curve one row of values (B,), one a bin; NaN is no sample.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from lidar_perception.candidates.boxes import height_matches
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.refine import STAGES
+from lidar_perception.data.recording import Recorded
+from lidar_perception.geometry import box_corners, horizontal_range, points_in_box, to_box_frame
+from lidar_perception.ground.params import GroundParams
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.scoring.centres.matching import RANGE_NAMES
+from lidar_perception.simulation.realism.roughness import roughness
+from lidar_perception.types import LidarFrame
+
+CLASSES = ("Car", "Pedestrian", "Cyclist")
+PERSON_HEIGHT = 1.7       # metres; the seed's height for the height filter of paper A's stage 1
+SECTORS, WHOLE = 36, 27   # of a turn; a scan with points in fewer is cropped to a camera's view
+LEAST_POINTS = 5          # of an object whose extent or intensity is measured
+LEAST_IN_BIN = 50         # points of a scan in a range bin whose ground share is measured
+QUERIES, LEAST_QUERIES = 600, 10  # points in a range bin whose neighbour is measured
+RANGES = np.array([0.0, 5, 10, 15, 20, 30, 40, 60, 80, np.inf])
+OBJECT_RANGES = np.array([0.0, 10, 20, 30, 45, 60])
+ELEVATIONS = np.arange(-26.0, 4.1, 2.0)
+QUANTILES = (5, 25, 50, 75, 95)
+INTENSITIES = np.arange(20) * 0.05 - 0.005  # between the steps of KITTI's reflectance
+INTENSITY_STEP = 0.01
+ROUGH_STEP = 0.002        # metres
+BELT = 0.65               # of an object's height; above it a car has windows
+SCORES = {"precision": ("tp", "fp"), "recall": ("tp", "fn"), "f1": ("tp", "fp", "fn")}
+
+
+def _names(limits: np.ndarray) -> tuple[str, ...]:
+    return tuple(f"{a:g}+" if math.isinf(b) else f"{a:g}-{b:g}" for a, b in pairwise(limits))
+
+
+@dataclass(frozen=True)
+class Curve:
+    """What is measured, over which bins. log: it spans decades. step: a difference as small as
+    that means nothing. histogram: shares, whose mean is taken and which are not judged."""
+
+    title: str
+    bins: tuple[str, ...]
+    axis: str = "range [m]"
+    log: bool = False
+    step: float = 0.0
+    histogram: bool = False
+
+
+_BY_RANGE, _BY_OBJECT_RANGE = _names(RANGES), _names(OBJECT_RANGES)
+_BY_QUANTILE = tuple(f"{q}%" for q in QUANTILES)
+_BY_INTENSITY = tuple(f"{i * 0.05:.2f}" for i in range(20))
+_LIT = ("ground", "above ground", *CLASSES)
+CURVES = {
+    "scan points": Curve("points a scan", ("all",), ""),
+    "points": Curve("points", _BY_RANGE, log=True),
+    "elevation": Curve("points", tuple(f"{a:g}..{a + 2:g}" for a in ELEVATIONS[:-1]),
+                       "elevation [deg]", log=True),
+    "ground share": Curve("share of points on the ground", _BY_RANGE),
+    "roughness": Curve("scatter about the ground of 1 m2, 75 % [m]", _BY_RANGE, step=ROUGH_STEP),
+    "neighbour": Curve("distance to the nearest point [m]", _BY_RANGE),
+    "clusters": Curve("clusters", _BY_RANGE),
+    "person clusters": Curve("clusters as high as a person", _BY_RANGE),
+    **{f"{name} density": Curve(f"{name}: points a square degree", _BY_OBJECT_RANGE)
+       for name in CLASSES},
+    **{f"{what} intensity": Curve(f"intensity, {what}", _BY_QUANTILE, "quantile",
+                                  step=INTENSITY_STEP) for what in _LIT},
+    **{f"{what} intensity histogram": Curve(f"share of points, {what}", _BY_INTENSITY, "intensity",
+                                            histogram=True) for what in _LIT},
+    **{f"{name} {what}": Curve(f"{name}: {title}", _BY_OBJECT_RANGE, log="points" in what)
+       for name in CLASSES for what, title in (
+           ("points", "points, not occluded"), ("points of all", "points, all"),
+           ("height", "height seen / box"), ("length", "length seen / box"),
+           ("width", "width seen / box"), ("above", "points above 0.65 of the height"))},
+    **{f"{stage} {score}": Curve(f"paper A, {stage}: {score}", (*RANGE_NAMES, "all"))
+       for stage in STAGES for score in SCORES},
+}
+
+
+def is_whole(frame: LidarFrame) -> bool:
+    """Whether the points lie all around the sensor, not in a camera's view only."""
+    turn = np.arctan2(frame.xyz[:, 1], frame.xyz[:, 0]) / (2 * np.pi) + 0.5
+    return len(np.unique((turn * SECTORS).astype(int) % SECTORS)) >= WHOLE
+
+
+def scan_rows(frame: LidarFrame, params: PipelineParams = PipelineParams()) -> dict:
+    """Curve to its rows (1, B) of one whole scan; params are those of the clusters. Ground is what
+    the cloth finds."""
+    xyz, bins = frame.xyz, len(RANGES) - 1
+    reach = horizontal_range(xyz)
+    where, elevation = _bin(reach, RANGES), np.degrees(np.arctan2(xyz[:, 2], reach))
+    count = np.bincount(where, minlength=bins)
+    ground = segment_ground(frame, GroundParams(method="cloth"))
+    on_ground = np.bincount(where.compress(ground), minlength=bins)
+    boxes = segment(frame, params=params).boxes
+    at = _bin(horizontal_range(boxes), RANGES)
+    person = height_matches(boxes, PERSON_HEIGHT, params.height)
+    rows = {"scan points": [len(xyz)], "points": count,
+            "elevation": np.histogram(elevation, ELEVATIONS)[0],
+            "ground share": np.where(count >= LEAST_IN_BIN, on_ground / np.maximum(count, 1),
+                                     np.nan),
+            "roughness": roughness(xyz, RANGES),
+            "neighbour": _neighbours(xyz, where),
+            "clusters": np.bincount(at, minlength=bins),
+            "person clusters": np.bincount(at[person], minlength=bins)}
+    if frame.intensity is not None:
+        for name, mask in (("ground", ground), ("above ground", ~ground)):
+            rows.update(_intensity(name, frame.intensity.compress(mask)))
+    return {curve: np.atleast_2d(np.asarray(row, float)) for curve, row in rows.items()}
+
+
+def object_rows(recorded: Recorded) -> dict:
+    """Curve to the rows (K, B) of the labelled objects with a point that the camera sees whole: of
+    the others KITTI's labels and cropped scans hold a part. Occluded ones, as their labels say,
+    count for `points of all` and intensity only."""
+    rows: dict[str, list] = {}
+    frame, truth = recorded.frame, recorded.truth
+    bins = len(_BY_OBJECT_RANGE)
+    for i, (box, name) in enumerate(zip(truth.boxes, truth.labels)):
+        place = _bin(horizontal_range(box[None]), OBJECT_RANGES)[0]
+        if name not in CLASSES or place == bins or not _seen_whole(recorded, box):
+            continue
+        inside = np.flatnonzero(points_in_box(frame.xyz, box))
+        if len(inside) == 0:
+            continue
+        values = {"points of all": len(inside)}
+        if truth.extras[i].get("occluded", 0) == 0:
+            values |= {"points": len(inside), "density": len(inside) / square_degrees(box)}
+            if len(inside) >= LEAST_POINTS:
+                own = to_box_frame(frame.xyz[inside].astype(float), box) / box[3:6]
+                values |= dict(zip(("length", "width", "height"), np.ptp(own, axis=0)))
+                values["above"] = (own[:, 2] > BELT - 0.5).mean()
+        new = {f"{name} {what}": np.where(np.arange(bins) == place, value, np.nan)
+               for what, value in values.items()}
+        if frame.intensity is not None and len(inside) >= LEAST_POINTS:
+            new |= _intensity(name, frame.intensity[inside])
+        for curve, row in new.items():
+            rows.setdefault(curve, []).append(row)
+    return {curve: np.array(values) for curve, values in rows.items()}
+
+
+def square_degrees(box: np.ndarray) -> float:
+    """Of the sensor's view that a standing rectangle, as wide and high as box (7,) looks from the
+    sensor, covers at the range of its centre."""
+    reach = np.hypot(box[0], box[1])
+    turned = box[6] - np.arctan2(box[1], box[0])
+    width = box[3] * abs(np.sin(turned)) + box[4] * abs(np.cos(turned))
+    return float(np.prod(np.degrees(2 * np.arctan2([width / 2, box[5] / 2], reach))))
+
+
+def _seen_whole(recorded: Recorded, box: np.ndarray) -> bool:
+    return recorded.camera is None or recorded.camera.in_view(box_corners(box[None])[0]).all()
+
+
+def _bin(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
+    """(N,) index of the bin; len(limits) - 1 beyond the last."""
+    return np.searchsorted(limits, values, side="right") - 1
+
+
+def _neighbours(xyz: np.ndarray, where: np.ndarray) -> np.ndarray:
+    row = np.full(len(RANGES) - 1, np.nan)
+    tree = cKDTree(xyz)
+    for i in range(len(row)):
+        members = np.flatnonzero(where == i)
+        chosen = members[np.linspace(0, len(members) - 1, min(len(members), QUERIES)).astype(int)]
+        if len(chosen) >= LEAST_QUERIES:
+            row[i] = np.median(tree.query(xyz[chosen], k=2)[0][:, 1])
+    return row
+
+
+def _intensity(name: str, values: np.ndarray) -> dict:
+    """The quantiles and the histogram of the points' intensity (N,)."""
+    if len(values) == 0:
+        return {}
+    count = np.bincount(np.maximum(_bin(values, INTENSITIES), 0), minlength=len(INTENSITIES))
+    return {f"{name} intensity": np.quantile(values, np.array(QUANTILES) / 100),
+            f"{name} intensity histogram": count / len(values)}

@@ -1,0 +1,1 @@
+"""What the cluster network is trained with."""

@@ -1,0 +1,118 @@
+"""Scenes to labelled clusters, cut by the package's own ground and clustering, with a cache.
+
+So a network sees the errors that it will see later: objects in pieces, objects merged, background.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from lidar_perception import __version__
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
+from lidar_perception.detectors.pointnet.config import PointNetConfig
+from lidar_perception.geometry import points_in_box
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.runs.files import write_bytes
+from lidar_perception.scoring.points.clusters import labelled
+from lidar_perception.training.augment import Scene
+from lidar_perception.types import CLASSES, LidarFrame
+
+AROUND = 0.3  # m: points so near to an object are looked at, too
+
+
+@dataclass(frozen=True)
+class CutScene:
+    """K clusters with labels (K,) int64 of evaluation.clusters.labelled; boxes (K, 7) float64 of
+    the objects, 0 where there is none. loose (K,) bool: not made by clustering but all around an
+    object that is not ground."""
+
+    clusters: Clusters
+    labels: np.ndarray
+    boxes: np.ndarray
+    loose: np.ndarray
+
+
+@dataclass(frozen=True)
+class CutScenes:
+    """scene(i): the clusters of a scene of `scenes`, as a network of the config is to see them, of
+    least_points or more. cache: folder for them, or None."""
+
+    scenes: Any
+    config: PointNetConfig
+    least_points: int = 5
+    cache: Path | None = None
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def judged(self, i: int) -> Any:
+        """The scan that it is cut from, with what evaluation needs."""
+        return self.scenes.judged(i)
+
+    def scene(self, i: int) -> CutScene:
+        """InputError naming the file that cannot be used."""
+        path = self._path(i)
+        if path is not None and path.is_file():
+            try:
+                return _read(path)
+            except (OSError, ValueError, KeyError, EOFError, BadZipFile):
+                path.unlink(missing_ok=True)  # it is made again
+        made = cut(self.scenes.scene(i), self.config, self.least_points)
+        if path is not None:
+            _write(path, made)
+        return made
+
+    def _path(self, i: int) -> Path | None:
+        if self.cache is None:
+            return None
+        made = (self.scenes, self.config.ground, self.config.clustering, self.config.classes,
+                self.least_points, __version__)
+        return self.cache / f"{hashlib.sha1(repr(made).encode()).hexdigest()[:12]}_{i:08}.npz"
+
+
+def cut(scene: Scene, config: PointNetConfig, least_points: int) -> CutScene:
+    """The clusters of a scene, and after them the points around each object that is wanted."""
+    frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
+    ground = segment_ground(frame, config.ground)
+    clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering),
+                           least_points, ground)
+    labels, owners = labelled(clusters, scene.boxes, scene.class_ids, config.classes)
+    boxes = np.zeros((len(clusters), 7))
+    boxes[owners >= 0] = scene.boxes[owners[owners >= 0]]
+    ids, around = np.zeros(len(frame), np.int64), []
+    for i in np.flatnonzero(scene.wanted):
+        name = CLASSES[scene.class_ids[i]]
+        inside = points_in_box(frame.xyz, scene.boxes[i], AROUND) & (ids == 0) & ~ground
+        if name in config.classes and inside.sum() >= least_points:
+            around.append(i)
+            ids[inside] = len(around)
+    loose = clusters_of(frame, ids, ground=ground)
+    kinds = [config.classes.index(CLASSES[scene.class_ids[i]]) for i in around]
+    both = Clusters(np.concatenate([clusters.points, loose.points]),
+                    np.concatenate([clusters.first, clusters.first[-1] + loose.first[1:]]),
+                    np.concatenate([clusters.ids, np.full(len(loose), -1)]),
+                    np.concatenate([clusters.ground, loose.ground]))
+    return CutScene(both, np.concatenate([labels, np.array(kinds, np.int64)]),
+                    np.concatenate([boxes, scene.boxes[around].reshape(-1, 7)]),
+                    np.arange(len(both)) >= len(clusters))
+
+
+def _write(path: Path, scene: CutScene) -> None:
+    content = io.BytesIO()
+    np.savez(content, **vars(scene.clusters), labels=scene.labels, boxes=scene.boxes,
+             loose=scene.loose)
+    write_bytes(path, content.getbuffer())
+
+
+def _read(path: Path) -> CutScene:
+    with np.load(path) as arrays:
+        clusters = Clusters(*(arrays[name] for name in ("points", "first", "ids", "ground")))
+        return CutScene(clusters, arrays["labels"], arrays["boxes"], arrays["loose"])

@@ -1,0 +1,1 @@
+"""What PointPillars is trained with."""

@@ -1,0 +1,200 @@
+"""What PointPillars brings to the training loop: its samples, loss, validation and checkpoints."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
+from lidar_perception.detectors.pointpillars.checkpoint import Header
+from lidar_perception.detectors.pointpillars.config import NetworkConfig
+from lidar_perception.detectors.pointpillars.detector import Detector, TorchNetwork
+from lidar_perception.detectors.pointpillars.expert import network_input
+from lidar_perception.detectors.pointpillars.losses import detection_loss
+from lidar_perception.detectors.pointpillars.network import PointPillars, make_network
+from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.detectors.pointpillars.pillars import make_pillars
+from lidar_perception.detectors.pointpillars.targets import (
+    BACKGROUND,
+    IGNORED,
+    Targets,
+    anchors_near,
+    assign,
+    nearest_axis_iou,
+    stacked,
+)
+from lidar_perception.detectors.view import visible
+from lidar_perception.param_fields import with_values
+from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
+from lidar_perception.scoring.kitti.report import DetectionReport
+from lidar_perception.training.augment import Scene, augmented, faced
+from lidar_perception.training.data import Batches, JudgedScenes, loaded
+from lidar_perception.training.database import Database, with_objects
+from lidar_perception.training.params import AugmentParams, PointPillarsTraining
+from lidar_perception.training.putting import inside
+from lidar_perception.training.record import begun_with, keeper, metrics_of
+from lidar_perception.training.run import Task
+from lidar_perception.training.scenes import Judged
+from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
+
+# Boxes of low score cost precision only where recall has ended; fewer of them are quicker.
+VALIDATED = with_values(DetectorParams(), {
+    **{f"detection.scores.{name}": 0.1 for name in ("car", "pedestrian", "cyclist", "other")},
+    "detection.warm_up": False})
+LIKE = {other: name for name, other in NEIGHBOURS.items()}  # Van: Car, Person_sitting: Pedestrian
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One scene for the network: points and cluster_map as in expert.NetworkInput; boxes (M, 7)
+    float32, labels (M,) int64 into the config's classes; counted (M,) bool: to be found, the others
+    may be found or not."""
+
+    points: np.ndarray
+    cluster_map: np.ndarray | None
+    boxes: np.ndarray
+    labels: np.ndarray
+    counted: np.ndarray
+
+
+@dataclass(frozen=True)
+class Preparation:
+    """scene, rng -> Sample: augmented, cropped to what the network sees, with the experts' columns.
+    database: file of objects to put in, or None."""
+
+    config: NetworkConfig
+    augment: AugmentParams
+    least_points: int = 5
+    database: Path | None = None
+
+    @cached_property
+    def _objects(self) -> Database | None:
+        return None if self.database is None else Database.load(self.database)
+
+    def __getstate__(self) -> dict:
+        return {k: v for k, v in self.__dict__.items() if k != "_objects"}
+
+    def __call__(self, scene: Scene, rng: np.random.Generator) -> Sample:
+        """InputError if the network would see no point."""
+        low, high = np.array(self.config.low), np.array(self.config.high)
+        scene = faced(scene, self.augment, low, high, rng)
+        if self._objects is not None and rng.random() < self.augment.crowded:
+            scene = with_objects(scene, self._objects, self.augment, low, high, rng)
+        scene = augmented(scene, self.augment, rng)
+        frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
+        _, seen = visible(frame, self.config)
+        inputs = network_input(seen, self.config)
+        if len(inputs.points) < 2:
+            raise InputError("a scene has no point where the network looks")
+        boxes, labels, counted = self._objects_to_find(scene, seen.xyz)
+        return Sample(inputs.points, inputs.cluster_map, boxes, labels, counted)
+
+    def _objects_to_find(self, scene: Scene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
+        low, high = np.array(self.config.low), np.array(self.config.high)
+        names = [CLASSES[i] for i in scene.class_ids]
+        labels = np.array([self._label(LIKE.get(name, name)) for name in names], np.int64)
+        within = ((scene.boxes[:, :2] >= low[:2]) & (scene.boxes[:, :2] < high[:2])).all(axis=1)
+        kept = np.flatnonzero(within & (labels >= 0))
+        counted = [bool(scene.wanted[i]) and names[i] not in LIKE
+                   and len(inside(xyz, scene.boxes[i], 0.0)) >= self.least_points
+                   for i in kept]
+        return scene.boxes[kept].astype(np.float32), labels[kept], np.array(counted, bool)
+
+    def _label(self, name: str) -> int:
+        return self.config.classes.index(name) if name in self.config.classes else -1
+
+
+def narrowed(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig:
+    """The config with a range that ends so far ahead and to each side, metres, made longer to whole
+    cells of the coarsest map, and at most as far as before; 0 leaves it."""
+    step = config.cell * np.prod(config.block_strides)
+
+    def whole(length: float) -> float:
+        return float(np.ceil(round(length / step, 6)) * step)
+
+    x, y = whole(ahead), whole(aside)
+    low, high = list(config.low), list(config.high)
+    if ahead:
+        high[0] = min(high[0], low[0] + x)
+    if aside:
+        low[1], high[1] = max(low[1], -y), min(high[1], y)
+    return replace(config, low=tuple(low), high=tuple(high))
+
+
+def targets_of(sample: Sample, anchors: Tensor, config: NetworkConfig) -> Targets:
+    """The targets of one sample. Anchors on objects that are not counted are neither object nor
+    background."""
+    boxes = torch.from_numpy(sample.boxes).to(anchors.device)
+    labels = torch.from_numpy(sample.labels).to(anchors.device)
+    counted = torch.from_numpy(sample.counted).to(anchors.device)
+    targets = assign(anchors, config, boxes[counted], labels[counted])
+    found = targets.labels[0]
+    for index, spec in enumerate(config.anchors):
+        others = boxes[~counted & (labels == index)]
+        mine = anchors_near(anchors, config, others, index)
+        if len(mine):
+            near = nearest_axis_iou(anchors[mine], others).max(dim=1).values >= spec.unmatched
+            near &= found[mine] == BACKGROUND
+            found[mine[near]] = IGNORED
+    return targets
+
+
+def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
+    """loss(network, samples) -> total, parts, as the loop wants it."""
+    anchors, kinds = make_anchors(config, device), anchor_classes(config, device)
+
+    def loss(network: nn.Module, samples: Sequence[Sample]) -> tuple[Tensor, dict[str, Tensor]]:
+        pillars = make_pillars([torch.from_numpy(s.points).to(device) for s in samples], config)
+        maps = None
+        if config.pseudo_map:
+            maps = torch.from_numpy(np.stack([s.cluster_map for s in samples])).to(device)
+        targets = stacked([targets_of(sample, anchors, config) for sample in samples])
+        losses = detection_loss(network(pillars, maps), targets, kinds)
+        return losses.total, {"classes": losses.classes.detach(), "boxes": losses.boxes.detach(),
+                              "directions": losses.directions.detach()}
+
+    return loss
+
+
+def judged_scan(source: Any, i: int) -> Judged:
+    """Scene i of a source, to validate on. InputError naming the file that cannot be used."""
+    return source.judged(i)
+
+
+def score_detector(detector: Callable[[LidarFrame], Detections], scenes: JudgedScenes,
+                   jobs: int = 0) -> DetectionReport:
+    """The detector on every scene, by KITTI's protocol."""
+    report = DetectionReport()
+    for item, in loaded(scenes, ([n] for n in range(len(scenes))), jobs):
+        report.skipped += item.skipped
+        if item.sample is not None:
+            name, frame, truth, calibration = item.sample
+            report.add(name, truth, detector(frame), calibration)
+    return report
+
+
+def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batches,
+              validation: JudgedScenes, out: Path, device: torch.device, about: dict[str, Any],
+              commit: str = "", init: Path | None = None) -> Task:
+    """The task of training a network of a config. about: what the header says of the data; a
+    resumed run must have the same. init: checkpoint to begin with, see checkpoint.adopt. Weights
+    are written to out/best.safetensors and out/last.safetensors."""
+    torch.manual_seed(params.seed)
+    network = begun_with(make_network(config), init, Header)
+    network = network.to(device, memory_format=torch.channels_last)
+
+    def validate(module: PointPillars) -> dict[str, float]:
+        detector = Detector(TorchNetwork(module, device), Header(config), device, VALIDATED)
+        content = score_detector(detector, validation, batches.jobs).content()
+        return metrics_of(content, params.score, config.classes)
+
+    seen = narrowed(config, params.ahead, params.aside)
+    return Task(network, make_loss(seen, device), batches, validate,
+                keeper(out, Header, config, params, batches, about, commit), batches.epoch, about)

@@ -1,0 +1,55 @@
+"""Messages to CDR bytes and back, without ROS: the classes of rosbags, for nodes and bags alike."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
+
+from lidar_perception.types import InputError
+
+
+@functools.cache
+def typestore():
+    """ROS 2 Jazzy's message types, as rosbags knows them."""
+    return get_typestore(Stores.ROS2_JAZZY)
+
+
+def bag_message(type_name: str, /, **fields: Any) -> Any:
+    """A message of rosbags' own class; fields that are not given are zero, empty or False."""
+    names = {}
+    for name, kind in typestore().fielddefs[type_name][1]:
+        names[name] = fields.pop(name) if name in fields else _zero(kind)
+    if fields:
+        raise TypeError(f"{type_name} has no field {next(iter(fields))!r}")
+    return typestore().types[type_name](**names)
+
+
+def encode(message: Any) -> bytes:
+    """CDR of a message of rosbags' class."""
+    return bytes(typestore().serialize_cdr(message, message.__msgtype__))
+
+
+def decode(data: bytes, type_name: str) -> Any:
+    """Message of rosbags' class from CDR; arrays are views of data. InputError if it is broken."""
+    try:
+        return typestore().deserialize_cdr(data, type_name)
+    except Exception as error:  # rosbags raises whatever struct, numpy or its own code raise
+        raise InputError(f"{len(data)} bytes are no {type_name} ({error})") from None
+
+
+def _zero(kind: tuple) -> Any:
+    node, detail = kind
+    if node == Nodetype.BASE:
+        name = detail[0]
+        return {"string": "", "bool": False}.get(name, 0.0 if name.startswith("float") else 0)
+    if node == Nodetype.NAME:
+        return bag_message(detail)
+    element, count = detail
+    count = count if node == Nodetype.ARRAY else 0
+    if element[0] == Nodetype.BASE and element[1][0] != "string":
+        return np.zeros(count, element[1][0].replace("octet", "uint8"))
+    return [_zero(element) for _ in range(count)]

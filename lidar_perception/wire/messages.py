@@ -1,0 +1,159 @@
+"""ROS messages <-> the core's types, for nodes and bags alike (either kind of message class)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.camera import Calibration, Camera
+from lidar_perception.types import (
+    CLASSES,
+    Detections,
+    GroundTruth,
+    InputError,
+    LidarFrame,
+    usable_returns,
+)
+from lidar_perception.wire.topics import CAMERA_FRAME
+from msg_utils.markers import MarkedObjects, to_marker_array
+from msg_utils.point_cloud2 import CloudError, columns, to_array, xyz
+from msg_utils.stamps import to_ns
+
+INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # the first that the cloud has
+
+
+def to_frame(msg: Any, intensity_max: float | None = None) -> tuple[LidarFrame, np.ndarray]:
+    """The usable points of a PointCloud2 and their places (N,) in the cloud; if the cloud has a
+    column in_view, only the points where it is not 0. InputError for a broken cloud.
+
+    intensity_max: the value that means 1; 0 takes the largest value of an integer field, and 1
+    for a float field; None does not read intensity.
+    """
+    try:
+        points = to_array(msg)
+        places = None
+        if "in_view" in (points.dtype.names or ()):
+            places = np.flatnonzero(points["in_view"])
+            points = points.take(places)
+        coordinates = xyz(points)
+        intensity = None if intensity_max is None else _intensity(points, intensity_max)
+    except CloudError as error:
+        raise InputError(str(error)) from None
+    usable = usable_returns(coordinates)
+    if not usable.all():
+        kept = np.flatnonzero(usable)
+        places = kept if places is None else places.take(kept)
+        coordinates = coordinates.take(kept, axis=0)
+        intensity = None if intensity is None else intensity.take(kept)
+    frame = LidarFrame(coordinates, intensity, to_ns(msg.header.stamp), msg.header.frame_id)
+    return frame, np.arange(len(points)) if places is None else places
+
+
+def _intensity(points: np.ndarray, full: float) -> np.ndarray | None:
+    """(N,) float32, 1 where the field has the value `full`; None without such a field."""
+    name = next((n for n in INTENSITY_FIELDS if n in (points.dtype.names or ())), None)
+    if name is None:
+        return None
+    if full == 0.0:
+        kind = points.dtype[name]
+        full = np.iinfo(kind).max if kind.kind in "iu" else 1.0
+    return columns(points, (name,))[:, 0] / np.float32(full)
+
+
+def intensity_problem(frame: LidarFrame) -> str | None:
+    """What is wrong with the scale of the intensity, with the remedy; None if nothing is."""
+    largest = 0.0 if frame.intensity is None else float(frame.intensity.max(initial=0.0))
+    if largest <= 1.5:
+        return None
+    return (f"intensity goes up to {largest:g} where 1 is expected; set input.intensity_max "
+            "(255 for most drivers)")
+
+
+def spread(values: np.ndarray | int, places: np.ndarray, msg: Any, dtype: str) -> np.ndarray:
+    """Values (N,) at places (N,) as a column of the whole cloud msg; 0 elsewhere."""
+    column = np.zeros(msg.height * msg.width, dtype)
+    column[places] = values
+    return column
+
+
+def column(msg: Any, name: str, places: np.ndarray) -> np.ndarray | None:
+    """(N,) values of a field at places (N,); None where the cloud has no such field. InputError if
+    it holds more than one number a point."""
+    points = to_array(msg)
+    if name not in (points.dtype.names or ()):
+        return None
+    if points.dtype[name].shape:
+        raise InputError(f"field '{name}' has count > 1; a single number is needed")
+    return points[name].take(places)
+
+
+def camera_of(info: Any, transform: Any) -> Camera:
+    """Camera from CameraInfo and the TransformStamped between the LiDAR frame and the camera's,
+    in either direction. InputError when P is empty or the frames do not fit."""
+    intrinsics = np.asarray(info.p, float).reshape(3, 4)
+    if intrinsics[0, 0] <= 0 or info.width == 0 or info.height == 0:
+        raise InputError("CameraInfo has no projection matrix P or no image size; calibrate the "
+                         "camera or set view.enabled to false")
+    t, q = transform.transform.translation, transform.transform.rotation
+    rotation, translation = np.array([q.x, q.y, q.z, q.w]), np.array([t.x, t.y, t.z])
+    if not abs(np.linalg.norm(rotation) - 1) < 1e-3:
+        raise InputError("the LiDAR-to-camera transform has no unit quaternion")
+    parent, child = transform.header.frame_id, transform.child_frame_id
+    if info.header.frame_id == parent:  # the LiDAR's pose in the camera frame: turn it round
+        return Camera.of_lidar_pose(intrinsics, rotation, translation, info.width, info.height)
+    if info.header.frame_id != child:
+        raise InputError(f"CameraInfo is in frame '{info.header.frame_id}' but the transform links "
+                         f"'{parent}' and '{child}'")
+    return Camera.of(intrinsics, rotation, translation, info.width, info.height)
+
+
+def camera_info(calibration: Calibration, header: Any, make: Any) -> Any:
+    """CameraInfo of the calibration's rectified image, without distortion."""
+    p = calibration.intrinsics
+    return make("sensor_msgs/msg/CameraInfo", header=header, height=calibration.height,
+                width=calibration.width, distortion_model="plumb_bob", d=np.zeros(5),
+                k=p[:, :3].ravel().copy(), r=np.eye(3).ravel(), p=p.ravel().copy())
+
+
+def extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
+    """TransformStamped: the camera frame in the LiDAR frame of header."""
+    rotation, translation = calibration.pose
+    x, y, z = map(float, translation)
+    qx, qy, qz, qw = map(float, rotation)
+    return make("geometry_msgs/msg/TransformStamped", header=header, child_frame_id=CAMERA_FRAME,
+                transform=make("geometry_msgs/msg/Transform",
+                               translation=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
+                               rotation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz,
+                                             w=qw)))
+
+
+def truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()) -> Any:
+    """MarkerArray of the labels. Objects keep the marker id of their track."""
+    ids = [extra.get("track_id") for extra in truth.extras]
+    if None in ids or len(set(zip(truth.labels, ids))) < len(ids):
+        ids = None
+    return to_marker_array(truth.boxes, truth.labels, header=header, make=make, ids=ids,
+                           extras=truth.extras, notes=truth.notes, previous=previous)
+
+
+def to_truth(objects: MarkedObjects) -> GroundTruth:
+    """Labels from markers; objects of unknown class are Misc."""
+    return GroundTruth.of(objects.boxes, _class_ids(objects.labels), objects.extras, objects.notes)
+
+
+def to_detections(objects: MarkedObjects) -> Detections:
+    """Detections from markers; objects of unknown class are Misc."""
+    return Detections.of(objects.boxes, np.array(_class_ids(objects.labels), np.int32),
+                         objects.scores)
+
+
+def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = ()) -> Any:
+    """MarkerArray of detections; previous as in to_marker_array."""
+    labels = [CLASSES[i] for i in detections.class_ids]
+    return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
+                           previous=previous)
+
+
+def _class_ids(labels: list[str]) -> list[int]:
+    return [CLASSES.index(x if x in CLASSES else "Misc") for x in labels]

@@ -1,0 +1,295 @@
+"""Laws of what `best` adds: silhouettes in metres, confidence, automatic seeds."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samples import DATA, needs_data
+
+from lidar_perception.candidates.confidence import (
+    SEED_KNOTS,
+    SHAPE_KNOTS,
+    _models,
+    confidence,
+    shape_features,
+)
+from lidar_perception.candidates.configurations import BEST, PAPER
+from lidar_perception.candidates.params import PipelineParams, StmParams
+from lidar_perception.candidates.pipeline import refined, segment
+from lidar_perception.candidates.refine import refine
+from lidar_perception.candidates.seed_sources import automatic_seed, truth_seed
+from lidar_perception.candidates.seeds import load_seed, own_cluster, seed_from_points
+from lidar_perception.candidates.silhouette import (
+    COLUMNS,
+    HEIGHT,
+    ROWS,
+    WIDTH,
+    from_pixels,
+    silhouettes,
+    similarity,
+    to_pixels,
+)
+from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.param_fields import with_values
+from lidar_perception.types import PEDESTRIAN, LidarFrame
+
+few = settings(max_examples=30, database=None)
+seeds = st.integers(0, 2**32 - 1)
+METRIC = with_values(PipelineParams(), {"stm.window": "metric", "stm.spread": True,
+                                        "stm.dilations": 0})
+FLOOR = -1.7
+STEP = np.radians([METRIC.resolution.azimuth_step, METRIC.resolution.elevation_step])
+
+
+def board(far, width=0.5, height=1.7, bearing=0.0, offset=0.3):
+    """Points of an upright board, as a sensor with METRIC's resolution sees it from far metres."""
+    y = (np.arange(-width / 2, width / 2, far * STEP[0])[:, None] + offset * far * STEP[0])
+    z = FLOOR + np.arange(0, height, far * STEP[1])[None] + offset * far * STEP[1]
+    y, z = (a.ravel() for a in np.broadcast_arrays(y, z))
+    keep = (np.abs(y) <= width / 2) & (z <= FLOOR + height)
+    cos, sin = np.cos(bearing), np.sin(bearing)
+    return np.stack([far * cos - y * sin, far * sin + y * cos, z], 1)[keep].astype(np.float32)
+
+
+def draw(xyz, params=METRIC, floor=FLOOR):
+    return silhouettes(xyz, np.array([0, len(xyz)]), np.ones((1, 1)), np.array([floor]), params)[0]
+
+
+def box_of(far, width=0.5, height=1.7):
+    return np.array([[far, 0, FLOOR + height / 2, 0.3, width, height, 0]], np.float32)
+
+
+# --- silhouettes in metres -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("far", [6.0, 15.0, 30.0])
+@pytest.mark.parametrize("width, height", [(0.5, 1.7), (0.9, 1.2), (1.2, 2.2)])
+def test_a_board_covers_its_size_wherever_it_is(far, width, height):
+    pixels = to_pixels(draw(board(far, width, height)))
+    rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
+    cell = far * STEP
+    assert np.ptp(columns) + 1 == pytest.approx(width / WIDTH * COLUMNS, abs=2 + cell[0] * 20)
+    assert np.ptp(rows) + 1 == pytest.approx(height / HEIGHT * ROWS,
+                                             abs=2 + cell[1] / HEIGHT * ROWS)
+    assert pixels[np.ix_(rows, columns)].mean() > 0.99  # no stripes
+
+
+def test_spread_points_make_near_and_far_alike_where_bare_points_do_not():
+    near, far = board(7.0), board(26.0)
+    bare = PipelineParams()
+    assert similarity(draw(far, bare)[None], draw(near, bare))[0] < 0.75
+    assert similarity(draw(far)[None], draw(near))[0] > 0.9
+
+
+@few
+@given(seeds)
+def test_a_metric_silhouette_moves_with_the_ground(seed):
+    rng = np.random.default_rng(seed)
+    xyz = board(rng.uniform(5, 30), bearing=0.0) + rng.normal(0, 0.02, (1, 3)).astype(np.float32)
+    up = np.float32(rng.integers(-8, 8) / 4)  # exact in float32
+    moved = xyz + np.float32([0, 0, up])
+    shared = similarity(draw(moved, floor=FLOOR + float(up))[None], draw(xyz))[0]
+    assert shared > 0.97
+
+
+def test_what_is_outside_the_window_is_not_drawn():
+    inside, tall = board(10.0), board(10.0, height=4.0)
+    assert to_pixels(draw(tall))[0].any()
+    above = tall[tall[:, 2] > FLOOR + HEIGHT + 0.2]
+    assert not draw(above).any()
+    both = draw(np.concatenate([inside, inside + np.float32([0, 0, 3.0])]))
+    np.testing.assert_array_equal(both, draw(inside))
+
+
+@few
+@given(seeds, st.integers(0, 6))
+def test_shifts_take_the_best_of_the_moved_images(seed, shifts):
+    rng = np.random.default_rng(seed)
+    pixels, template = (rng.random((ROWS, COLUMNS)) < 0.2 for _ in range(2))
+    best = 0.0
+    for columns in range(-shifts, shifts + 1):
+        moved = np.zeros_like(pixels)
+        if columns >= 0:
+            moved[:, columns:] = pixels[:, :COLUMNS - columns]
+        else:
+            moved[:, :columns] = pixels[:, -columns:]
+        best = max(best, (moved & template).sum() / np.sqrt(pixels.sum() * template.sum()))
+    found = similarity(from_pixels(pixels)[None], from_pixels(template), StmParams(shifts=shifts))
+    assert found[0] == pytest.approx(best, abs=1e-12)
+
+
+def test_hidden_legs_do_not_matter_where_only_what_is_seen_is_compared():
+    whole = board(12.0, width=0.4)
+    legs = whole[:, 2] < FLOOR + 0.8
+    head = np.concatenate([whole[~legs], board(12.0, 0.4, 1.7)[:0]])
+    seen = with_values(METRIC, {"stm.seen_only": True})
+    alike = [similarity(draw(head)[None], draw(whole), params.stm)[0] for params in (METRIC, seen)]
+    assert alike[0] < 0.85 and alike[1] > 0.99
+    again = similarity(draw(whole)[None], draw(head), seen.stm)[0]
+    assert again == pytest.approx(alike[1], abs=1e-12)  # whichever of the two is hidden
+
+
+def test_principal_axes_undo_a_tilt_and_yaw_does_not():
+    rng = np.random.default_rng(0)
+    upright = rng.normal(size=(600, 3)) * [0.05, 0.2, 0.6] + [10, 0, 0]
+    angle = 0.5
+    tilt = np.array([[1, 0, 0], [0, np.cos(angle), -np.sin(angle)],
+                     [0, np.sin(angle), np.cos(angle)]])
+    tilted = (upright - [10, 0, 0]) @ tilt.T + [10, 0, 0]
+    images = {axis: [draw(xyz.astype(np.float32), with_values(PipelineParams(), {"stm.axis": axis}))
+                     for xyz in (upright, tilted)] for axis in ("yaw", "pca")}
+    alike = {axis: similarity(a[None], b)[0] for axis, (a, b) in images.items()}
+    assert alike["pca"] > 0.97 > 0.9 > alike["yaw"]
+
+
+def test_every_dilation_adds_a_border():
+    xyz = board(15.0)
+    images = [to_pixels(draw(xyz, with_values(PipelineParams(), {"stm.dilations": n})))
+              for n in range(4)]
+    for small, large in pairwise(images):
+        assert (large[small]).all() and large.sum() >= small.sum()
+
+
+# --- confidence ----------------------------------------------------------------------------
+
+
+def features_of(clusters, boxes):
+    start = np.cumsum([0] + [len(c) for c in clusters])
+    return shape_features(np.concatenate(clusters), start, np.concatenate(boxes), BEST)
+
+
+def test_features_of_a_board_are_its_measures():
+    shape = {k: v[0] for k, v in features_of([board(12.0, 0.6, 1.7)], [box_of(12.0, 0.6)]).items()}
+    assert set(shape) == set(SHAPE_KNOTS)
+    assert shape["range_m"] == pytest.approx(12.0, abs=0.05)
+    assert shape["height_m"] == pytest.approx(1.7, abs=12 * STEP[1])
+    assert shape["length_m"] == pytest.approx(0.6, abs=0.08) and shape["width_m"] < 0.05
+    assert shape["area_m2"] == pytest.approx(0.6 * 1.7, rel=0.1)
+    assert shape["fill"] == pytest.approx(1.15, abs=0.2) and shape["lopsided"] < 0.05
+    assert shape["hidden_below_m"] == pytest.approx(0.0, abs=12 * STEP[1])
+
+
+@few
+@given(seeds)
+def test_features_and_confidence_are_each_clusters_own(seed):
+    rng = np.random.default_rng(seed)
+    far = rng.uniform(5, 40, 4)
+    clusters = [board(f, rng.uniform(0.3, 2), rng.uniform(0.5, 2.5)) for f in far]
+    boxes = [box_of(f) for f in far]
+    together = features_of(clusters, boxes)
+    order = rng.permutation(4)
+    again = features_of([clusters[i] for i in order], [boxes[i] for i in order])
+    for name, values in together.items():
+        np.testing.assert_array_equal(again[name], values[order])
+    for extra in ((), (rng.random(4), rng.normal(0, 0.3, 4))):
+        likely = confidence(together, *extra)
+        assert likely.shape == (4,) and ((likely > 0) & (likely < 1)).all()
+
+
+def test_no_clusters_have_no_features():
+    none = shape_features(np.zeros((0, 3), np.float32), np.array([0]), np.zeros((0, 7)), BEST)
+    assert all(v.shape == (0,) for v in none.values()) and confidence(none).shape == (0,)
+
+
+def test_a_single_point_has_finite_features():
+    shape = features_of([np.float32([[9, 0, -1]])], [box_of(9.0)])
+    assert all(np.isfinite(v).all() for v in shape.values()) and np.isfinite(confidence(shape))[0]
+
+
+def test_the_models_have_every_curve_and_likeness_makes_surer():
+    models = _models()
+    assert set(models["shape"]["curves"]) == set(SHAPE_KNOTS)
+    assert set(models["seed"]["curves"]) == set(SHAPE_KNOTS) | set(SEED_KNOTS)
+    for model in (models["shape"], models["seed"]):
+        for name, curve in model["curves"].items():
+            assert tuple(curve["knots"]) == ({**SHAPE_KNOTS, **SEED_KNOTS})[name]
+            assert len(curve["values"]) == len(curve["knots"])
+    alike = models["seed"]["curves"]["similarity"]["values"]
+    assert alike == sorted(alike) and alike[-1] > alike[0]
+
+
+def two_people():
+    """Points of a person and of a like one beside, where each begins, and their boxes."""
+    xyz = np.concatenate([board(9.0), board(9.0, offset=0.7) + np.float32([0, 3, 0])])
+    first = len(board(9.0))
+    return xyz, np.array([0, first, len(xyz)]), np.concatenate([box_of(9.0), box_of(9.0)])
+
+
+def test_a_seeds_own_cluster_is_known_by_its_points_whatever_is_with_them():
+    xyz, start, boxes = two_people()
+    seed = seed_from_points(xyz[:start[1]], boxes[0])
+    assert own_cluster(seed, xyz, start).tolist() == [True, False]
+    most = seed_from_points(xyz[:int(0.6 * start[1])], boxes[0])
+    assert own_cluster(most, xyz, start).tolist() == [True, False]
+    elsewhere = seed_from_points(xyz[:start[1]] + np.float32(1e-3), boxes[0])
+    assert not own_cluster(elsewhere, xyz, start).any()
+    assert own_cluster(seed, np.zeros((0, 3), np.float32), np.array([0])).shape == (0,)
+
+
+@pytest.mark.parametrize("certain", [True, False])
+def test_a_certain_seed_is_a_pedestrian_and_another_is_judged_by_its_shape(certain):
+    xyz, start, boxes = two_people()
+    boxes[1, 1] += 3.0
+    ids = np.repeat(np.int32([1, 2]), np.diff(start))
+    params = with_values(BEST, {"confidence.threshold": 0.0})
+    seed = seed_from_points(xyz[:start[1]], boxes[0], certain)
+    scores = refine(xyz, ids, boxes, seed, params).final.scores
+    shape = confidence(shape_features(xyz, start, boxes, BEST))
+    assert scores[0] == pytest.approx(1.0 if certain else shape[0], abs=1e-6)
+    assert scores[1] == pytest.approx(refine(
+        xyz, ids, boxes, seed_from_points(xyz[:start[1]] + np.float32([0, 0.5, 0]), boxes[0]),
+        params).final.scores[1], abs=0.05)
+
+
+# --- the configuration ---------------------------------------------------------------------
+
+
+def test_stages_of_best_are_accepted_by_confidence():
+    people = [board(8.0), board(16.0), board(11.0, width=1.8)]
+    xyz = np.concatenate([p + np.float32([0, 6 * i - 6, 0]) for i, p in enumerate(people)])
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(2, 30, 6000), rng.uniform(-20, 20, 6000),
+                            np.full(6000, FLOOR)]).astype(np.float32)
+    params = with_values(BEST, {"view.enabled": False, "confidence.threshold": 0.0})
+    s = segment(LidarFrame(np.concatenate([xyz, flat])), params=params)
+    seed = seed_from_points(people[0] + np.float32([0, -6, 0]),
+                            box_of(8.0)[0] + np.float32([0, -6, 0, 0, 0, 0, 0]))
+    all_ = refined(s, lambda _: seed, params).final
+    assert len(all_) >= 3
+    limit = float(np.sort(all_.scores)[-2:].mean())
+    some = refined(s, lambda _: seed, with_values(params, {"confidence.threshold": limit})).final
+    assert 0 < len(some) < len(all_)
+    assert sorted(some.scores) == sorted(all_.scores[all_.scores >= np.float32(limit)])
+
+
+def test_an_automatic_seed_is_the_likeliest_cluster_or_the_template():
+    template = load_seed()
+    params = with_values(BEST, {"view.enabled": False})
+    empty = segment(LidarFrame(np.zeros((0, 3), np.float32)), params=params)
+    assert automatic_seed(template, params)(empty) is template
+    one = segment(LidarFrame(np.concatenate([
+        board(9.0, 0.55), np.float32([[x, y, FLOOR] for x in np.arange(3, 20, 0.4)
+                                      for y in np.arange(-8, 8, 0.4)])])), params=params)
+    assert automatic_seed(template, with_values(params, {"seed.least_confidence": 1.0}))(one) \
+        is template
+    own = automatic_seed(template, with_values(params, {"seed.least_confidence": 0.0}))(one)
+    assert own is not template and np.hypot(*own.xyz[:, :2].mean(axis=0)) == pytest.approx(9, abs=1)
+
+
+@needs_data
+def test_best_finds_more_of_the_real_pedestrians_than_paper():
+    hits = dict.fromkeys(("paper", "best"), 0)
+    for frame in open_kitti(DATA / "kitti_object"):
+        truth = frame.truth().of_class(PEDESTRIAN)
+        if len(truth) == 0:
+            continue
+        for name, params in (("paper", PAPER), ("best", BEST)):
+            s = segment(frame.load(), frame.calibration().camera(), params)
+            found = refined(s, truth_seed(truth), params).final.boxes
+            near = np.linalg.norm(found[:, None, :3] - truth[None, :, :3], axis=2) <= 1.0
+            hits[name] += int(near.any(axis=0).sum())
+    assert hits["best"] > hits["paper"] > 0

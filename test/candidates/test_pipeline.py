@@ -1,0 +1,91 @@
+"""Laws of the whole candidate pipeline."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from candidate_samples import boxes_at, floor, person, scene
+
+from lidar_perception.camera import Camera
+from lidar_perception.candidates.params import STEPS, PipelineParams
+from lidar_perception.candidates.pipeline import find_candidates, segment
+from lidar_perception.candidates.seed_sources import clicked_seed, fixed_seed, truth_seed
+from lidar_perception.candidates.seeds import seed_from_points
+from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.wire.params import ViewParams
+
+
+def template():
+    return fixed_seed(seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0]))
+
+
+@pytest.mark.parametrize("xyz", [np.zeros((0, 3)), np.float32([[5, 0, -1]]),
+                                 np.float32([[5, 0, -1.7]]), floor()],
+                         ids=["empty", "one point", "one low point", "only ground"])
+def test_frames_without_objects_give_empty_results_of_the_right_shape(xyz):
+    s, found = find_candidates(LidarFrame(xyz.astype(np.float32)), template())
+    assert isinstance(s, Segmented)
+    assert s.places.tolist() == list(range(len(xyz))) and s.xyz.shape == (len(xyz), 3)
+    assert s.ground.shape == (len(xyz),) and s.ground.dtype == bool
+    assert s.cluster_ids.shape == (len(xyz),) and s.cluster_ids.dtype == np.int32
+    assert s.boxes.shape == (0, 7) and s.boxes.dtype == np.float32
+    for stage in (found.stage1, found.stage2, found.final):
+        assert stage.boxes.shape == (0, 7) and stage.boxes.dtype == np.float32
+        assert stage.class_ids.shape == stage.scores.shape == (0,)
+    assert tuple(found.ms) == STEPS
+
+
+def test_without_a_seed_the_frame_is_an_input_error():
+    with pytest.raises(InputError, match="no Pedestrian"):
+        find_candidates(LidarFrame(scene()), truth_seed(np.zeros((0, 7))))
+    with pytest.raises(InputError, match="no clusters"):
+        find_candidates(LidarFrame(floor().astype(np.float32)), clicked_seed(np.zeros(3)))
+
+
+CROP = PipelineParams(view=ViewParams(enabled=True))
+
+
+def test_the_crop_without_a_camera_is_an_input_error_that_names_the_remedy():
+    with pytest.raises(InputError, match=r"view\.enabled"):
+        find_candidates(LidarFrame(scene()), template(), params=CROP)
+
+
+def test_the_crop_is_the_pipeline_on_the_points_in_view():
+    # A camera at the sensor that looks along x: its x is -y, its y is -z, its z is x.
+    axes = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    intrinsics = np.array([[600, 0, 500], [0, 600, 300], [0, 0, 1]])
+    camera = Camera(np.column_stack([intrinsics @ axes, np.zeros(3)]), 1000, 600)
+    xyz = scene()
+    inside = camera.in_view(xyz)
+    assert 0 < inside.sum() < len(xyz)
+    cropped, found = find_candidates(LidarFrame(xyz), template(), camera, CROP)
+    np.testing.assert_array_equal(cropped.places, np.flatnonzero(inside))
+    alone, expected = find_candidates(LidarFrame(xyz[inside]), template())
+    np.testing.assert_array_equal(cropped.xyz, alone.xyz)
+    np.testing.assert_array_equal(cropped.cluster_ids, alone.cluster_ids)
+    np.testing.assert_array_equal(found.final.boxes, expected.final.boxes)
+    empty, _ = find_candidates(LidarFrame(np.zeros((0, 3), np.float32)), template(), camera, CROP)
+    assert empty.xyz.shape == (0, 3)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_result_does_not_depend_on_the_order_of_the_points(seed):
+    xyz = scene()
+    order = np.random.default_rng(seed).permutation(len(xyz))
+    s, found = find_candidates(LidarFrame(xyz), template())
+    t, shuffled = find_candidates(LidarFrame(xyz[order]), template())
+    np.testing.assert_array_equal(t.ground, s.ground[order])
+    np.testing.assert_array_equal(t.cluster_ids > 0, s.cluster_ids[order] > 0)
+    for name in ("stage1", "stage2", "final"):
+        a, b = (getattr(c, name) for c in (found, shuffled))
+        assert len(a) == len(b) > 0
+        i, j = np.lexsort(a.boxes.T), np.lexsort(b.boxes.T)
+        np.testing.assert_allclose(a.boxes[i], b.boxes[j], rtol=0, atol=1e-5)
+        np.testing.assert_allclose(a.scores[i], b.scores[j], rtol=0, atol=1e-5)
+
+
+def test_ground_points_belong_to_no_cluster_and_ids_count_the_boxes():
+    s = segment(LidarFrame(scene()))
+    assert not (s.ground & (s.cluster_ids > 0)).any()
+    assert np.unique(s.cluster_ids).tolist() == list(range(len(s.boxes) + 1))

@@ -1,0 +1,289 @@
+"""The command line: help, results, exit codes and one line for what is wrong."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import click
+import pytest
+from cli_samples import exit_of
+from click.testing import CliRunner
+from samples import LABELS, WALKER, object_folder, walker_label, write
+
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.cli.main import COMMANDS, cli
+from lidar_perception.data.bag import Bag
+from lidar_perception.param_fields import parameter_fields
+from lidar_perception.wire.topics import POINTS, TRUTH
+
+STAGES = ("stage1", "stage2", "final")
+RANGES = ("0-15", "15-30", "30-45", "45-60", "60+")
+ROW = {"tp", "fp", "fn", "precision", "recall", "f1", "centre_error_m"}
+
+
+def commands(group: click.Group, path: tuple = ()) -> list[tuple]:
+    """(words, command) of everything that is no group. What hands its arguments on to another
+    program, --help too, is left out."""
+    context, found = click.Context(group), []
+    for name in group.list_commands(context):
+        command = group.get_command(context, name)
+        if isinstance(command, click.Group):
+            found += commands(command, (*path, name))
+        elif command.context_settings.get("help_option_names") != []:
+            found.append(((*path, name), command))
+    return found
+
+
+LEAVES = commands(cli)
+
+
+def run(*arguments) -> str:
+    """Standard output of a command that succeeds."""
+    result = CliRunner().invoke(cli, [str(a) for a in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def evaluate(tmp_path, *arguments) -> dict:
+    path = tmp_path / "made/by/evaluate/scores.json"
+    run("evaluate", "candidates", "--json", path, *arguments)
+    return json.loads(path.read_text())
+
+
+def scores(content: dict) -> dict:
+    """What does not depend on the clock."""
+    return {k: v for k, v in content.items() if k != "ms"}
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory):
+    """Two scans of a pedestrian, 3D-object layout."""
+    return object_folder(tmp_path_factory.mktemp("kitti"), walker_label() + "\n")
+
+
+@pytest.fixture(scope="module")
+def bag(kitti, tmp_path_factory):
+    path = tmp_path_factory.mktemp("bags") / "drive"
+    run("convert", "kitti", kitti, "--out", path)
+    return path
+
+
+@pytest.mark.parametrize("words", [words for words, _ in LEAVES], ids=" ".join)
+def test_every_command_explains_itself_with_an_example(words):
+    text = run(*words, "--help")
+    assert "Usage: " in text and "Example" in text and f"lidar-perception {' '.join(words)}" in text
+
+
+def test_the_overview_shows_every_command():
+    text = run("--help")
+    assert {words[0] for words, _ in LEAVES} < {*COMMANDS}
+    for name, (_, summary) in COMMANDS.items():
+        assert f"  {name} " in text and summary.split(".")[0] in " ".join(text.split())
+    assert "lidar-perception" in run("--version")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_a_docstring(name):
+    assert cli.get_command(click.Context(cli), name).help
+
+
+def test_every_parameter_has_a_flag_that_says_its_default():
+    command = dict(LEAVES)["evaluate", "candidates"]
+    helps = {option.name: option.help for option in command.params}
+    for name, f in parameter_fields(PAPER).items():
+        assert f.metadata["doc"] in helps[name.replace(".", "_")]
+    assert helps["seed_source"].endswith("Default: ground_truth.")
+    assert helps["ground_threshold_seed"].endswith("Default: 0.")
+    assert helps["view_enabled"].endswith("Default: on.")
+    assert helps["clustering_dbscan_eps"].endswith("Default: 0.15,0.3,0.5.")
+
+
+def test_convert_makes_a_bag_of_every_scan(kitti, bag):
+    with Bag(bag) as opened:
+        assert opened.counts[POINTS] == opened.counts[TRUTH] == 2
+
+
+def test_convert_takes_as_many_frames_as_asked_for(kitti, tmp_path):
+    text = run("convert", "kitti", kitti, "--out", tmp_path / "bag", "--frames", 1)
+    assert "1 scans of 1" in text.replace("\n", "")
+    with Bag(tmp_path / "bag") as opened:
+        assert opened.counts[POINTS] == 1
+
+
+def test_convert_leaves_out_what_is_broken_and_says_so(tmp_path, monkeypatch, capsys):
+    root = object_folder(tmp_path / "kitti", LABELS)
+    broken = write(root / "training/velodyne/000000.bin", b"123")
+    assert exit_of(monkeypatch, "convert", "kitti", root, "--out", tmp_path / "bag") == 1
+    text = capsys.readouterr().out.replace("\n", "")
+    assert "1 scans of 2" in text and str(broken) in text
+    with Bag(tmp_path / "bag") as opened:
+        assert opened.counts[POINTS] == 1
+
+
+def test_convert_replaces_a_bag_only_by_force(kitti, tmp_path, monkeypatch):
+    command = ("convert", "kitti", kitti, "--out", tmp_path / "bag", "--frames", 1)
+    assert [exit_of(monkeypatch, *command), exit_of(monkeypatch, *command),
+            exit_of(monkeypatch, *command, "--force")] == [0, 2, 0]
+
+
+def test_info_shows_topics_types_counts_and_length(bag, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    text = run("info", bag)
+    rows = {line.split("│")[1].strip(): line for line in text.splitlines() if "│ /" in line}
+    with Bag(bag) as opened:
+        assert {*rows} == {*opened.topics}
+        for topic, kind in opened.topics.items():
+            assert kind in rows[topic] and f" {opened.counts[topic]} " in rows[topic]
+    assert "reliable, transient_local" in rows["/tf_static"]
+    assert "reliable, volatile" in rows[POINTS]
+    assert "0.1 s" in text
+
+
+def test_the_scores_are_those_of_the_two_pedestrians(kitti, tmp_path):
+    content = evaluate(tmp_path, "--kitti", kitti)
+    assert (content["frames"], content["ground_truth"], content["skipped"]) == (2, 2, [])
+    assert content["ground_truth_by_range"] == {r: 2 if r == "0-15" else 0 for r in RANGES}
+    for stage in STAGES:
+        assert content[stage].keys() == {*RANGES, "all"}
+        assert all(content[stage][r].keys() == ROW for r in content[stage])
+        for r in RANGES:
+            row = content[stage][r]
+            assert row["tp"] + row["fn"] == content["ground_truth_by_range"][r]
+    for count in ("tp", "fp", "fn"):
+        assert all(content[s]["all"][count] == sum(content[s][r][count] for r in RANGES)
+                   for s in STAGES)
+    assert content["final"]["0-15"]["recall"] == 1  # the seed is the pedestrian itself
+    assert content["final"]["0-15"]["centre_error_m"] < WALKER[3]
+    assert content["ms"]["total"] > 0 and all(ms >= 0 for ms in content["ms"].values())
+
+
+def test_a_bag_has_the_scores_of_the_folder_it_was_made_of(kitti, bag, tmp_path):
+    assert scores(evaluate(tmp_path, "--bag", bag)) == scores(evaluate(tmp_path, "--kitti", kitti))
+
+
+def test_evaluate_prints_what_it_writes(bag, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    text = run("evaluate", "candidates", "--bag", bag, "--png", tmp_path / "a/picture.png")
+    assert "2 pedestrians in 2 frames" in text
+    assert (tmp_path / "a/picture.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize("flags", [
+    ("--clustering-dbscan-min-samples", 100_000),
+    ("--height-tolerance", 0, "--seed-source", "file"),
+    ("--clustering-dbscan-eps", "0.001,0.001,0.001"),
+    ("--no-view-enabled", "--ground-threshold-max-height", -10,
+     "--clustering-dbscan-range-limits", "5,7")])
+def test_flags_reach_the_pipeline(bag, tmp_path, flags):
+    changed = scores(evaluate(tmp_path, "--bag", bag, *flags))
+    assert changed["ground_truth"] == 2
+    assert changed != scores(evaluate(tmp_path, "--bag", bag))
+
+
+def test_without_core_points_there_are_no_candidates(bag, tmp_path):
+    content = evaluate(tmp_path, "--bag", bag, "--clustering-dbscan-min-samples", 100_000)
+    for stage in STAGES:
+        row = content[stage]["all"]
+        assert (row["tp"], row["fp"], row["fn"], row["f1"]) == (0, 0, 2, 0)
+        assert row["centre_error_m"] is None
+
+
+def test_a_config_says_the_same_as_flags_and_flags_win(bag, tmp_path):
+    flag = "--clustering-dbscan-min-samples"
+    file = write(tmp_path / "p.yaml",
+                 "/**:\n  ros__parameters:\n    clustering.dbscan.min_samples: 100000\n")
+    no_clusters = scores(evaluate(tmp_path, "--bag", bag, flag, 100_000))
+    assert scores(evaluate(tmp_path, "--bag", bag, "--config", file)) == no_clusters
+    assert scores(evaluate(tmp_path, "--bag", bag, "--config", file, flag, 10)) == scores(
+        evaluate(tmp_path, "--bag", bag))
+
+
+def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
+    root = object_folder(tmp_path / "kitti", walker_label(), count=3)
+    write(root / "training/velodyne/000001.bin", b"123")
+    content = evaluate(tmp_path, "--kitti", root)
+    assert content["frames"] == 2
+    line, = content["skipped"]
+    assert "000001.bin" in line
+
+
+BAD_INPUTS = {
+    "missing bag": (["info", "{tmp}/none"], "there is no bag {tmp}/none"),
+    "no bag": (["info", "{tmp}"], "{tmp} has no metadata.yaml"),
+    "missing kitti": (["convert", "kitti", "{tmp}/none", "--out", "{tmp}/o"], "{tmp}/none"),
+    "no kitti": (["convert", "kitti", "{tmp}", "--out", "{tmp}/o"], "no KITTI scans"),
+    "existing out": (["convert", "kitti", "{kitti}", "--out", "{bag}"], "exists already"),
+    "out is a file": (["convert", "kitti", "{kitti}", "--out", "{kitti}/training/calib/000000.txt",
+                       "--force"], "is no bag"),
+    "out under a file": (["convert", "kitti", "{kitti}", "--out",
+                          "{kitti}/training/calib/000000.txt/o"], "cannot write"),
+    "out of range": (["evaluate", "candidates", "--bag", "{bag}", "--ground-cloth-resolution",
+                      "99"], "ground.cloth.resolution = 99.0 is outside 0.1 .. 10.0"),
+    "lengths": (["evaluate", "candidates", "--bag", "{bag}", "--clustering-dbscan-eps", "0.1"],
+                "one more eps than range_limits"),
+    "missing config": (["evaluate", "candidates", "--bag", "{bag}", "--config", "{tmp}/none"],
+                       "{tmp}/none"),
+    "missing template": (["evaluate", "candidates", "--bag", "{bag}", "--seed-source", "file",
+                          "--seed-file", "{tmp}/none"], "{tmp}/none"),
+    "json under a file": (["evaluate", "candidates", "--bag", "{bag}", "--json",
+                           "{kitti}/training/calib/000000.txt/o"], "cannot write"),
+    "json is a folder": (["evaluate", "candidates", "--bag", "{bag}", "--json", "{tmp}"],
+                         "cannot write {tmp}"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INPUTS)
+def test_bad_input_is_one_line_on_stderr_and_exit_code_2(case, kitti, bag, tmp_path, monkeypatch,
+                                                         capsys):
+    def fill(text):
+        return text.format(tmp=tmp_path, kitti=kitti, bag=bag)
+
+    arguments, words = BAD_INPUTS[case]
+    assert exit_of(monkeypatch, *map(fill, arguments)) == 2
+    line, = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("Error: ") and fill(words) in line
+
+
+def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch, capsys):
+    root = object_folder(tmp_path / "kitti", "")
+    assert exit_of(monkeypatch, "evaluate", "candidates", "--kitti", root, "--json",
+                   tmp_path / "s.json") == 2
+    assert "no frame with a Pedestrian label" in capsys.readouterr().err
+    assert json.loads((tmp_path / "s.json").read_text())["frames"] == 0
+
+
+@pytest.mark.parametrize("arguments, words", [
+    (["bogus"], "No such command 'bogus'"),
+    (["evaluate", "candidates"], "give either --kitti ROOT or --bag FILE"),
+    (["evaluate", "candidates", "--kitti", "a", "--bag", "b"], "give either"),
+    (["evaluate", "candidates", "--bag", "b", "--clustering-dbscan-min-samples", "few"], "'few'"),
+    (["evaluate", "candidates", "--bag", "b", "--clustering-dbscan-eps", "0.1,wide"],
+     "list of numbers"),
+    (["evaluate", "candidates", "--bag", "b", "--seed-source", "luck"], "'luck'"),
+    (["convert", "kitti", "a", "--out", "b", "--frames", "0"], "0 is not in the range"),
+    (["convert", "kitti", "a"], "--out"),
+    (["run", "bogus"], "'bogus'"),
+])
+def test_a_command_that_cannot_be_used_is_exit_code_2(arguments, words, monkeypatch, capsys):
+    assert exit_of(monkeypatch, *arguments) == 2
+    assert words in capsys.readouterr().err.splitlines()[-1]
+
+
+@pytest.mark.parametrize("arguments, code, words", [
+    (["--version"], 0, ""), (["info", "none"], 2, "Error: there is no bag none\n")])
+def test_the_process_ends_with_the_code(arguments, code, words, tmp_path):
+    done = subprocess.run([sys.executable, "-m", "lidar_perception.cli.main", *arguments],
+                          cwd=tmp_path, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (code, words)
+
+
+def test_real_scans_are_scored_alike_from_folder_and_bag(data, tmp_path):
+    root = data / "kitti_object"
+    run("convert", "kitti", root, "--out", tmp_path / "bag", "--frames", 6)
+    content = evaluate(tmp_path, "--bag", tmp_path / "bag")
+    labels = [path.read_text() for path in sorted(root.glob("training/label_2/*.txt"))[:6]]
+    counts = [sum(line.startswith("Pedestrian ") for line in text.splitlines()) for text in labels]
+    assert content["frames"] == sum(n > 0 for n in counts)
+    assert content["ground_truth"] == sum(counts)

@@ -1,0 +1,29 @@
+"""The command line as a test calls it."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+from click.testing import CliRunner
+
+from lidar_perception.cli.main import cli, main
+
+
+def exit_of(monkeypatch, *arguments) -> int:
+    """The exit code of `lidar-perception ARGUMENTS`, run in this process."""
+    monkeypatch.setattr(sys, "argv", ["lidar-perception", *map(str, arguments)])
+    try:
+        main()
+    except SystemExit as stop:
+        return stop.code or 0
+    return 0
+
+
+def evaluate_detection(tmp_path, *arguments):
+    """The JSON file and the output of `evaluate detection`, which must succeed."""
+    path = tmp_path / "made/scores.json"
+    result = CliRunner().invoke(cli, ["evaluate", "detection", "--json", str(path),
+                                      *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return json.loads(path.read_text()), result.stdout

@@ -1,0 +1,353 @@
+"""Laws of DBSCAN and distance-aware DBSCAN, against scikit-learn's."""
+
+from __future__ import annotations
+
+import multiprocessing
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samples import DATA, needs_data
+from scipy.spatial import cKDTree
+from sklearn.cluster import DBSCAN
+
+from lidar_perception.clustering.dbscan import dbscan, distance_aware_dbscan
+from lidar_perception.clustering.dense import dbscan_by_cells
+from lidar_perception.clustering.growing import dbscan_by_growing
+from lidar_perception.clustering.params import DbscanParams
+from lidar_perception.ground.threshold import segment_by_threshold
+
+SCANS = DATA / "kitti_object/training/velodyne_reduced"
+few = settings(max_examples=40, database=None)
+
+
+def reference(xyz, eps, min_samples):
+    """scikit-learn's labels, noise 0. It computes in float64, as ours."""
+    if len(xyz) == 0:
+        return np.zeros(0, np.int32)
+    model = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree")
+    return model.fit_predict(np.asarray(xyz, np.float64)) + 1
+
+
+def core_mask(xyz, eps, min_samples):
+    tree = cKDTree(np.asarray(xyz, np.float64))
+    return tree.query_ball_point(tree.data, eps, return_length=True) >= min_samples
+
+
+def partition(labels):
+    """The clusters as a set of sets of places, whatever their numbers."""
+    return {frozenset(np.flatnonzero(labels == k).tolist()) for k in np.unique(labels) if k > 0}
+
+
+def blobs(rng, centres, size, spread):
+    """Points (N, 3) float32 around centres (K, 3), and which centre each belongs to."""
+    centres = np.asarray(centres, float)
+    xyz = np.repeat(centres, size, axis=0) + rng.uniform(-spread, spread, (size * len(centres), 3))
+    return xyz.astype(np.float32), np.repeat(np.arange(len(centres)), size)
+
+
+def assert_same(xyz, eps, min_samples):
+    found = dbscan(xyz, eps, min_samples)
+    assert found.dtype == np.int32 and found.shape == (len(xyz),)
+    np.testing.assert_array_equal(found, reference(xyz, eps, min_samples))
+
+
+@few
+@given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.floats(0.05, 1.5), st.integers(1, 12),
+       st.sampled_from([0.0, 50.0, 3000.0]))
+def test_labels_are_those_of_sklearn_on_random_points(seed, count, eps, min_samples, offset):
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(-2, 2, (count, 3)) * rng.choice([0.1, 1.0, 2.0], 3) + offset
+    assert_same(xyz.astype(np.float32), eps, min_samples)
+
+
+@few
+@given(st.integers(0, 2**32 - 1), st.integers(1, 500), st.integers(1, 4), st.integers(1, 30))
+def test_labels_are_those_of_sklearn_on_a_grid_where_most_distances_tie(seed, count, reach,
+                                                                        min_samples):
+    # Multiples of 1/4: every distance is exact, and many are exactly eps.
+    xyz = np.random.default_rng(seed).integers(-6, 7, (count, 3)).astype(np.float32) / 4
+    assert_same(xyz, reach / 4, min_samples)
+
+
+@pytest.mark.parametrize("min_samples", [2, 5, 6, 7, 27])
+def test_border_points_go_to_the_first_cluster_that_touches_them(min_samples):
+    # Dense balls so close that most border points lie between two of them.
+    rng = np.random.default_rng(3)
+    xyz, _ = blobs(rng, [[0, 0, 0], [0.9, 0, 0], [0, 0.9, 0], [0.9, 0.9, 0.2]], 40, 0.25)
+    bridge = rng.uniform(-0.2, 1.1, (60, 3)).astype(np.float32)
+    mixed = rng.permutation(np.concatenate([xyz, bridge]))
+    for eps in (0.15, 0.25, 0.35):
+        assert_same(mixed, eps, min_samples)
+
+
+@pytest.mark.parametrize("name, xyz", [
+    ("empty", np.zeros((0, 3))),
+    ("one point", np.ones((1, 3))),
+    ("all equal", np.full((50, 3), 7.3)),
+    ("at the origin", np.zeros((50, 3))),
+    ("two places", np.repeat([[0.0, 0, 0], [1, 1, 1]], 20, axis=0)),
+    ("two places within eps", np.repeat([[0.0, 0, 0], [0.25, 0, 0]], 20, axis=0)),
+    ("two clusters at one place", np.concatenate([np.eye(3)] * 10)),
+    ("line", np.linspace(0, 8, 33)[:, None] * [1, 0, 0]),
+    ("slanted line", np.linspace(0, 8, 65)[:, None] * [1, 2, -3]),
+    ("column", np.linspace(0, 8, 129)[:, None] * [0, 0, 1]),
+    ("plane", np.stack([*np.mgrid[0:4:0.25, 0:4:0.25], np.zeros((16, 16))], -1).reshape(-1, 3)),
+])
+@pytest.mark.parametrize("min_samples", [1, 2, 3, 10, 100])
+def test_labels_are_those_of_sklearn_on_degenerate_clouds(name, xyz, min_samples):
+    for eps in (0.125, 0.25, 0.5):
+        assert_same(np.asarray(xyz, np.float32), eps, min_samples)
+
+
+def test_doubling_every_point_and_min_samples_keeps_the_clusters():
+    rng = np.random.default_rng(5)
+    xyz = rng.uniform(-1, 1, (300, 3)).astype(np.float32)
+    once = dbscan(xyz, 0.3, 5)
+    np.testing.assert_array_equal(dbscan(np.repeat(xyz, 2, axis=0), 0.3, 10), np.repeat(once, 2))
+
+
+@needs_data
+@pytest.mark.parametrize("scan", [0, 11, 23])
+def test_labels_are_those_of_sklearn_on_real_clouds(scan):
+    raw = np.fromfile(sorted(SCANS.glob("*.bin"))[scan], np.float32).reshape(-1, 4)
+    xyz = raw[:, :3][~segment_by_threshold(np.ascontiguousarray(raw[:, :3]))]
+    params = DbscanParams()
+    found = distance_aware_dbscan(xyz, params)
+    assert found.max() > 20
+    np.testing.assert_array_equal(found, banded_reference(xyz, params))
+
+
+def banded_reference(xyz, params):
+    """Each band by itself, ids going on. The range is the float32 one, as documented."""
+    limits = [-np.inf, *params.range_limits, np.inf]
+    ranges = np.sqrt(xyz[:, 0] * xyz[:, 0] + xyz[:, 1] * xyz[:, 1])
+    labels, last = np.zeros(len(xyz), int), 0
+    for low, high, eps in zip(limits, limits[1:], params.eps):
+        members = (ranges >= low) & (ranges < high)
+        found = reference(xyz[members], eps, params.min_samples)
+        labels[members] = np.where(found > 0, found + last, 0)
+        last = labels.max(initial=0)
+    return labels
+
+
+@few
+@given(st.integers(0, 2**32 - 1), st.integers(0, 600), st.integers(1, 8))
+def test_distance_aware_is_sklearn_in_each_band(seed, count, min_samples):
+    rng = np.random.default_rng(seed)
+    xyz = (rng.uniform(-6, 6, (count, 3)) * [1, 1, 0.2]).astype(np.float32)
+    params = DbscanParams(range_limits=(2.0, 3.5, 5.0), eps=(0.2, 0.5, 0.3, 0.8),
+                          min_samples=min_samples)
+    np.testing.assert_array_equal(distance_aware_dbscan(xyz, params),
+                                  banded_reference(xyz, params))
+
+
+@pytest.mark.parametrize("limit, at", [(15.0, [15, 0]), (15.0, [0, -15]), (15.0, [9, 12]),
+                                       (30.0, [-18, 24])])
+def test_a_point_at_exactly_a_range_limit_belongs_to_the_far_band(limit, at):
+    # Pairs 0.25 m apart are clusters only beyond the limit, where eps is larger.
+    at = np.array([*at, 0], np.float32)
+    inner = at * np.float32(1 - 1e-6)
+    assert np.hypot(*inner[:2]) < limit
+    params = DbscanParams(range_limits=(limit,), eps=(0.15, 0.30), min_samples=2)
+    up = np.array([0, 0, 0.25], np.float32)
+    assert distance_aware_dbscan(np.stack([at, at + up]), params).tolist() == [1, 1]
+    assert distance_aware_dbscan(np.stack([inner, inner + up]), params).tolist() == [0, 0]
+    assert distance_aware_dbscan(np.stack([inner, at + up]), params).tolist() == [0, 0]
+
+
+def test_a_cluster_across_a_range_limit_is_cut_there():
+    xyz = np.zeros((200, 3), np.float32)
+    xyz[:, 0] = np.linspace(14, 16, 200)
+    labels = distance_aware_dbscan(xyz, DbscanParams())
+    assert labels.tolist() == [1] * int((xyz[:, 0] < 15).sum()) + [2] * int((xyz[:, 0] >= 15).sum())
+
+
+JOIN = DbscanParams(join_bands=True)
+
+
+def slow_join(xyz, labels, params):
+    """Clusters of neighbouring bands with a pair of points within the smaller eps become one."""
+    band = np.searchsorted(params.range_limits, np.hypot(*xyz[:, :2].T.astype(np.float32)), "right")
+    joined = {frozenset([k]) for k in range(1, labels.max(initial=0) + 1)}
+    for i, j in zip(*np.nonzero(np.abs(band[:, None] - band) == 1)):
+        reach = min(params.eps[band[i]], params.eps[band[j]])
+        if labels[i] and labels[j] and np.linalg.norm(xyz[i].astype(float) - xyz[j]) <= reach:
+            both = {s for s in joined if labels[i] in s or labels[j] in s}
+            joined = joined - both | {frozenset().union(*both)}
+    return {frozenset(np.flatnonzero(np.isin(labels, [*s])).tolist()) for s in joined}
+
+
+@few
+@given(st.integers(0, 2**32 - 1), st.integers(0, 150))
+def test_join_bands_joins_what_touches_across_a_limit_and_nothing_else(seed, count):
+    rng = np.random.default_rng(seed)
+    xyz = (rng.uniform(-6, 6, (count, 3)) * [1, 1, 0.1]).astype(np.float32)
+    cut = DbscanParams(range_limits=(2.0, 4.0), eps=(0.9, 0.7, 1.0), min_samples=3)
+    labels = distance_aware_dbscan(xyz, cut)
+    found = distance_aware_dbscan(xyz, DbscanParams(cut.range_limits, cut.eps, 3, join_bands=True))
+    assert partition(found) == slow_join(xyz, labels, cut)
+    np.testing.assert_array_equal(found > 0, labels > 0)
+    first = [np.flatnonzero(found == k)[0] for k in range(1, found.max(initial=0) + 1)]
+    assert len(set(found.tolist()) - {0}) == len(first)
+
+
+def test_join_bands_makes_one_of_a_cluster_across_a_limit():
+    xyz = np.zeros((200, 3), np.float32)
+    xyz[:, 0] = np.linspace(14, 16, 200)
+    assert distance_aware_dbscan(xyz, JOIN).tolist() == [1] * 200
+    gap = xyz[(xyz[:, 0] < 14.9) | (xyz[:, 0] > 15.1)]  # 0.2 m: more than the smaller eps
+    assert distance_aware_dbscan(gap, JOIN).max() == 2
+
+
+def test_without_limits_distance_aware_is_plain_dbscan():
+    xyz = np.random.default_rng(1).uniform(-20, 20, (2000, 3)).astype(np.float32)
+    params = DbscanParams(range_limits=(), eps=(2.0,), min_samples=4)
+    np.testing.assert_array_equal(distance_aware_dbscan(xyz, params), dbscan(xyz, 2.0, 4))
+
+
+@pytest.mark.parametrize("far", [[1e5, 0, 0], [0, -1e5, 0], [0, 0, 1e5], [-7e4, 7e4, -1e3]])
+def test_an_outlier_100_km_away_changes_nothing_near(far):
+    xyz = np.random.default_rng(7).uniform(-2, 2, (800, 3)).astype(np.float32)
+    labels = dbscan(xyz, 0.4, 5)
+    for place in (0, 400, 800):
+        found = dbscan(np.insert(xyz, place, np.float32(far), axis=0), 0.4, 5)
+        assert found[place] == 0
+        np.testing.assert_array_equal(np.delete(found, place), labels)
+    banded = distance_aware_dbscan(np.concatenate([xyz, np.float32([far])]))
+    np.testing.assert_array_equal(banded[:-1], distance_aware_dbscan(xyz))
+
+
+def test_clusters_100_km_away_are_found_as_near_ones_are():
+    # Steps of 1/64 m are exact in float32 out there.
+    rng = np.random.default_rng(8)
+    xyz = (rng.integers(-64, 64, (400, 3)) / 64).astype(np.float32)
+    moved = xyz + np.float32([8e4, -6e4, 16])
+    np.testing.assert_array_equal(dbscan(moved, 0.25, 5), reference(moved, 0.25, 5))
+    assert partition(dbscan(moved, 0.25, 5)) == partition(dbscan(xyz, 0.25, 5))
+
+
+@few
+@given(st.integers(0, 2**32 - 1))
+def test_permuting_points_permutes_the_core_partition_and_the_noise(seed):
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(-1, 1, (250, 3)).astype(np.float32)
+    order = rng.permutation(len(xyz))
+    eps, min_samples = 0.35, 6
+    core = core_mask(xyz, eps, min_samples)
+    labels = dbscan(xyz, eps, min_samples)
+    back = np.empty_like(labels)
+    back[order] = dbscan(xyz[order], eps, min_samples)
+    assert partition(np.where(core, labels, 0)) == partition(np.where(core, back, 0))
+    np.testing.assert_array_equal(labels == 0, back == 0)
+
+
+@few
+@given(st.integers(0, 2**32 - 1), st.integers(1, 300), st.integers(1, 8))
+def test_ids_are_1_to_K_by_first_core_point_and_every_cluster_has_a_core(seed, count, min_samples):
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform(-2, 2, (count, 3)).astype(np.float32)
+    labels = dbscan(xyz, 0.5, min_samples)
+    core = core_mask(xyz, 0.5, min_samples)
+    assert np.unique(labels[labels > 0]).tolist() == list(range(1, labels.max() + 1))
+    firsts = [np.flatnonzero(core & (labels == k))[0] for k in range(1, labels.max() + 1)]
+    assert firsts == sorted(firsts)
+    banded = distance_aware_dbscan(xyz, DbscanParams(range_limits=(1.0,), eps=(0.3, 0.6),
+                                                     min_samples=min_samples))
+    assert np.unique(banded[banded > 0]).tolist() == list(range(1, banded.max() + 1))
+
+
+def test_min_samples_1_leaves_no_noise_and_gives_the_connected_components():
+    xyz = np.random.default_rng(2).uniform(-3, 3, (400, 3)).astype(np.float32)
+    labels = dbscan(xyz, 0.5, 1)
+    assert labels.min() == 1
+    pairs = cKDTree(xyz.astype(float)).query_pairs(0.5, output_type="ndarray")
+    assert len(pairs) and (labels[pairs[:, 0]] == labels[pairs[:, 1]]).all()
+    np.testing.assert_array_equal(labels, reference(xyz, 0.5, 1))
+
+
+def test_more_min_samples_than_points_is_all_noise():
+    xyz = np.zeros((9, 3), np.float32)
+    assert not dbscan(xyz, 1.0, 10).any()
+    assert not dbscan(xyz, 1.0, 2**31 - 1).any()
+    assert not distance_aware_dbscan(xyz).any()
+
+
+CENTRES = np.array([[5, 3, 0], [6.5, -4, 0.5], [-9, 2, -1], [-20, -11, 0], [33, 20, 1], [1, 25, 0]])
+
+
+@pytest.mark.parametrize("turn", [[[0, -1], [1, 0]], [[-1, 0], [0, -1]], [[0, 1], [-1, 0]]])
+def test_quarter_turns_about_z_keep_the_clusters(turn):
+    xyz, _ = blobs(np.random.default_rng(11), CENTRES, 300, 0.25)
+    turned = xyz.copy()
+    turned[:, :2] = xyz[:, :2] @ np.array(turn, np.float32).T  # exact
+    labels = distance_aware_dbscan(xyz)
+    np.testing.assert_array_equal(distance_aware_dbscan(turned), labels)
+    assert labels.max() == len(CENTRES)
+
+
+@few
+@given(*[st.floats(-500, 500)] * 3)
+def test_translation_keeps_well_separated_clusters(x, y, z):
+    xyz, blob = blobs(np.random.default_rng(13), CENTRES, 60, 0.2)
+    labels = dbscan(xyz + np.float32([x, y, z]), 0.4, 5)
+    assert partition(labels) == partition(blob + 1)
+
+
+def test_input_of_any_layout_and_dtype_gives_the_same_labels_and_stays_unchanged():
+    xyz = np.random.default_rng(17).uniform(-1, 1, (300, 3)).astype(np.float32)
+    labels, before = dbscan(xyz, 0.3, 4), xyz.copy()
+    np.testing.assert_array_equal(dbscan(np.asfortranarray(xyz), 0.3, 4), labels)
+    np.testing.assert_array_equal(dbscan(xyz.astype(np.float64), 0.3, 4), labels)
+    wide = np.concatenate([xyz, xyz], axis=1)
+    np.testing.assert_array_equal(distance_aware_dbscan(wide[:, :3]), distance_aware_dbscan(xyz))
+    read_only = xyz.copy()
+    read_only.flags.writeable = False
+    np.testing.assert_array_equal(dbscan(read_only, 0.3, 4), labels)
+    np.testing.assert_array_equal(xyz, before)
+
+
+def test_a_million_equal_points_are_one_cluster():
+    # A list of neighbours for each would be a million millions.
+    assert (dbscan(np.full((1_000_000, 3), 1.7, np.float32), 0.15, 10) == 1).all()
+
+
+def test_two_dense_places_within_eps_are_one_cluster_however_many_points():
+    xyz = np.zeros((400_000, 3), np.float32)
+    xyz[::2, 1] = 0.14
+    assert (dbscan(xyz, 0.15, 10) == 1).all()
+
+
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 300),
+       scale=st.sampled_from([0.3, 1.0, 4.0]), eps=st.sampled_from([0.1, 0.25, 0.5]),
+       min_samples=st.integers(1, 12))
+@settings(max_examples=100)
+def test_by_cells_and_by_pairs_the_labels_are_scikit_learns(seed, n, scale, eps, min_samples):
+    rng = np.random.default_rng(seed)
+    xyz = (rng.random((n, 3)) * scale).astype(np.float32)
+    if seed % 2:
+        xyz = np.round(xyz * 20) / np.float32(20)  # many ties at exactly eps
+    expected = DBSCAN(eps=eps, min_samples=min_samples, algorithm="kd_tree").fit(xyz).labels_ + 1
+    np.testing.assert_array_equal(dbscan_by_cells(xyz, eps, min_samples), expected)
+    np.testing.assert_array_equal(dbscan_by_growing(xyz, eps, min_samples), expected)
+
+
+def test_dense_points_are_refused_by_pairs_before_they_cost_much():
+    assert dbscan_by_growing(np.zeros((100_000, 3), np.float32), 0.5, 10) is None
+
+
+def test_a_forked_process_clusters_too():
+    """It has none of the threads that its parent keeps for the bands."""
+    xyz = np.random.default_rng(0).uniform(-40, 40, (500, 3)).astype(np.float32)
+    labels = distance_aware_dbscan(xyz)
+    child = multiprocessing.get_context("fork").Process(target=_same, args=(xyz, labels))
+    child.start()
+    child.join(30)
+    if child.is_alive():
+        child.kill()
+    assert child.exitcode == 0
+
+
+def _same(xyz, labels):
+    np.testing.assert_array_equal(distance_aware_dbscan(xyz), labels)

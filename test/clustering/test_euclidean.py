@@ -1,0 +1,175 @@
+"""Adaptive Euclidean clustering (paper C): equal to a plain SciPy reading of the same equations."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmark.plain_euclidean import euclidean as plain
+from lidar_perception.clustering.euclidean import euclidean
+from lidar_perception.clustering.params import EuclideanParams
+
+LOCAL = EuclideanParams()
+SETTINGS = [LOCAL, replace(LOCAL, gamma=0.0), replace(LOCAL, threshold="global", gamma=0.0),
+            replace(LOCAL, threshold="global", min_size=3), replace(LOCAL, beta=0.0, min_size=1)]
+NAMES = ["local", "local, not merged", "global, not merged", "global", "no MinPts"]
+
+
+def blobs(seed, centres, count=200, spread=0.15):
+    rng = np.random.default_rng(seed)
+    centres = np.asarray(centres, float)
+    points = centres[:, None] + rng.normal(0, spread, (len(centres), count, 3))
+    return points.reshape(-1, 3).astype(np.float32)
+
+
+def scene(seed, count=3000):
+    """Dense and thin clusters, lines, walls, single points."""
+    rng = np.random.default_rng(seed)
+    return np.concatenate([
+        blobs(seed, rng.uniform(-20, 20, (8, 3)) * [1, 1, 0.1], count // 10, 0.2),
+        blobs(seed + 1, rng.uniform(-40, 40, (5, 3)) * [1, 1, 0.1], 12, 0.4),
+        np.stack([np.linspace(-10, 10, 100), np.full(100, 5.0), np.zeros(100)], axis=1),
+        rng.uniform(-30, 30, (100, 3)),
+    ]).astype(np.float32)
+
+
+def same_partition(a, b):
+    pairs = np.unique(np.stack([a, b], axis=1), axis=0)
+    return (len(pairs) == len(np.unique(a)) == len(np.unique(b))
+            and np.array_equal(a == 0, b == 0))
+
+
+DEGENERATE = {
+    "empty": np.zeros((0, 3)),
+    "one point": np.ones((1, 3)),
+    "two points": np.array([[0, 0, 0], [1, 0, 0]]),
+    "all equal": np.full((500, 3), 3.3),
+    "collinear": np.arange(200)[:, None] * [0.1, 0.2, 0.0],
+    "a plane of equal distances": np.stack(np.meshgrid(*[np.arange(20) * 0.25] * 2, [0]),
+                                           axis=-1).reshape(-1, 3),
+    "coincident clusters": np.repeat(np.array([[0, 0, 0], [5, 0, 0]]), 50, axis=0),
+    "far apart": np.array([[0, 0, 0]] * 12 + [[1e6, 0, 0]] * 12 + [[-1e6, 1e6, 100]]),
+    "one dense, one far": np.concatenate([blobs(0, [[0, 0, 0]], 300, 0.01),
+                                          [[3000, 0, 0], [3003, 0, 0]]]),
+}
+
+
+@pytest.mark.parametrize("params", SETTINGS, ids=NAMES)
+@pytest.mark.parametrize("xyz", DEGENERATE.values(), ids=DEGENERATE)
+def test_degenerate_clouds_give_the_labels_of_the_plain_reading(xyz, params):
+    xyz = np.asarray(xyz, np.float32)
+    labels = euclidean(xyz, params)
+    assert labels.dtype == np.int32 and labels.shape == (len(xyz),)
+    np.testing.assert_array_equal(labels, plain(xyz, params))
+
+
+@pytest.mark.parametrize("params", SETTINGS, ids=NAMES)
+@pytest.mark.parametrize("seed", range(3))
+def test_scenes_give_the_labels_of_the_plain_reading(seed, params):
+    labels = euclidean(scene(seed), params)
+    np.testing.assert_array_equal(labels, plain(scene(seed), params))
+    assert labels.max() > 3 and ((labels == 0).any() or params.beta == 0)  # it says something
+
+
+@settings(max_examples=150)
+@given(st.data())
+def test_any_cloud_gives_the_labels_of_the_plain_reading(data):
+    """Coordinates on a coarse lattice: equal distances and thresholds met exactly are common."""
+    count = data.draw(st.integers(1, 60))
+    step = data.draw(st.sampled_from([0.05, 0.125, 0.3, 2.0]))
+    rows = data.draw(st.lists(st.tuples(*[st.integers(-6, 6)] * 3), min_size=count,
+                              max_size=count))
+    params = EuclideanParams(
+        threshold=data.draw(st.sampled_from(["global", "local"])),
+        alpha=data.draw(st.sampled_from([0.5, 1.0, 1.2, 3.0])),
+        beta=data.draw(st.sampled_from([0.0, 0.5, 1.5])),
+        gamma=data.draw(st.sampled_from([0.0, 0.8, 2.0])),
+        radius=data.draw(st.sampled_from([0.125, 0.5])),
+        min_size=data.draw(st.integers(1, 6)))
+    xyz = (np.array(rows) * step).astype(np.float32)
+    np.testing.assert_array_equal(euclidean(xyz, params), plain(xyz, params))
+
+
+@pytest.mark.parametrize("threshold", ["local", "global"])
+def test_a_real_scan_gives_the_labels_of_the_plain_reading(threshold, data):
+    from lidar_perception.ground.params import GroundParams
+    from lidar_perception.ground.segment import segment_ground
+    from lidar_perception.types import LidarFrame
+    path = next((data / "kitti_object").rglob("velodyne/*.bin"))
+    points = np.fromfile(path, np.float32).reshape(-1, 4)
+    frame = LidarFrame(xyz=np.ascontiguousarray(points[:, :3]),
+                       intensity=np.ascontiguousarray(points[:, 3]))
+    ground = segment_ground(frame, GroundParams(method="cloth"))
+    xyz = frame.xyz[~ground][::3]
+    params = replace(LOCAL, threshold=threshold, gamma=0.0 if threshold == "global" else 0.8)
+    np.testing.assert_array_equal(euclidean(xyz, params), plain(xyz, params))
+
+
+@pytest.mark.parametrize("params", SETTINGS, ids=NAMES)
+def test_permuting_the_points_permutes_the_labels(params):
+    xyz, order = scene(5), np.random.default_rng(0).permutation(len(scene(5)))
+    a, b = euclidean(xyz, params)[order], euclidean(xyz[order], params)
+    assert same_partition(a, b)
+    first = b[np.sort(np.unique(b, return_index=True)[1])]
+    assert np.array_equal(first[first > 0], np.arange(1, b.max() + 1))  # by their first point
+
+
+@pytest.mark.parametrize("params", SETTINGS[:2], ids=NAMES[:2])
+def test_moving_and_turning_the_cloud_changes_nothing(params):
+    """Of clusters that no rounding can join or part."""
+    xyz = blobs(3, [[0, 0, 0], [8, 0, 0], [0, 9, 1], [-7, -7, 0]])
+    turn = np.array([[np.cos(0.7), -np.sin(0.7), 0], [np.sin(0.7), np.cos(0.7), 0], [0, 0, 1]])
+    moved = (xyz.astype(float) @ turn.T + [30, -20, 1]).astype(np.float32)
+    labels = euclidean(xyz, params)
+    assert labels.max() >= 4
+    # The axis-aligned diameter of the merging depends on the direction; the clusters do not.
+    without = replace(params, gamma=0.0)
+    assert (euclidean(xyz, without) == euclidean(moved, without)).mean() > 0.999
+    np.testing.assert_array_equal(euclidean(xyz + np.float32([16, -32, 0]), params) > 0, labels > 0)
+
+
+def test_far_outliers_change_nothing_near_with_the_local_threshold():
+    xyz, far = scene(2), np.float32([[5e4, 0, 0], [0, -9e4, 10], [1e5, 1e5, 1e5]])
+    # MinPts = beta ln N counts all points (Eq. 7): three more do not pass the next integer here.
+    assert np.ceil(0.5 * np.log(len(xyz))) == np.ceil(0.5 * np.log(len(xyz) + 3))
+    labels = euclidean(np.concatenate([xyz, far]), LOCAL)
+    np.testing.assert_array_equal(labels[:-3], euclidean(xyz, LOCAL))
+    assert not labels[-3:].any()
+
+
+def test_min_size_drops_clusters_and_nothing_else():
+    xyz, base = scene(1), replace(LOCAL, gamma=0.0)
+    every = euclidean(xyz, replace(base, min_size=1))
+    size = np.bincount(every)[every]
+    for least in (2, 10, 40):
+        labels = euclidean(xyz, replace(base, min_size=least))
+        assert same_partition(labels, np.where(size >= least, every, 0))
+
+
+def test_gamma_merges_what_lies_nearer_than_the_mean_of_the_diameters():
+    """Two boxes of diagonal 2: centres 1.5 apart are nearer than 0.8 times 2, 1.7 apart not."""
+    def walls(distance):
+        line = np.linspace(-1, 1, 60)
+        one = np.stack([np.zeros(60), line, np.zeros(60)], axis=1)
+        return np.concatenate([one, one + [distance, 0, 0]]).astype(np.float32)
+    params = replace(LOCAL, radius=0.3)
+    assert euclidean(walls(1.5), params).max() == 1
+    assert euclidean(walls(1.7), params).max() == 2
+    assert euclidean(walls(1.5), replace(params, gamma=0.0)).max() == 2
+
+
+def test_the_local_threshold_follows_the_density():
+    """Points 0.4 m apart, as on a far car, are one cluster beside walls with points 2 cm apart;
+    one threshold for all of them finds only the dense ones: why Eq. 11 is the default."""
+    def wall(x, step):
+        y, z = np.meshgrid(np.arange(0, 2.01, step), np.arange(0, 1.61, step))
+        return np.stack([np.full(y.size, x), y.ravel(), z.ravel()], axis=1)
+    xyz = np.concatenate([wall(0, 0.02), wall(40, 0.4)]).astype(np.float32)
+    labels = euclidean(xyz, LOCAL)
+    assert labels.max() == 2 and (labels == 0).sum() < 5  # corners have few neighbours
+    one = euclidean(xyz, replace(LOCAL, threshold="global"))
+    assert one.max() == 1 and not one[-30:].any()

@@ -1,0 +1,173 @@
+"""Bags: what was written is read, by us and by others."""
+
+from __future__ import annotations
+
+import numpy as np
+import yaml
+from bag_samples import LATCHED, message_bytes, same_cloud, scans
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from samples import STAMP, png_header, scene, write
+
+from lidar_perception.data.bag import LATCHED_QOS, Bag, BagWriter
+from lidar_perception.data.recording import open_recording
+from lidar_perception.data.to_bag import Scan, write_bag
+from lidar_perception.types import GroundTruth
+from lidar_perception.wire.codec import typestore
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, IMAGE, POINTS, TRUTH
+from msg_utils.point_cloud2 import to_array
+
+
+def test_a_recording_gives_back_the_scans(written):
+    recording = open_recording(bag=written)
+    assert recording.count == 3
+    for scan, read in zip(scans(), recording, strict=True):
+        assert same_cloud(scan.cloud, read.frame.xyz)
+        assert (read.frame.stamp_ns, read.frame.frame_id) == (scan.stamp_ns, "velodyne")
+        assert (read.truth is None) == (scan.truth is None)
+        if scan.truth is not None:
+            np.testing.assert_allclose(read.truth.boxes, scan.truth.boxes, atol=1e-12)
+            assert read.truth.labels == scan.truth.labels
+        np.testing.assert_allclose(read.camera.projection, scan.calibration.camera().projection,
+                                   atol=1e-9)
+        assert (read.camera.width, read.camera.height) == (scan.calibration.width,
+                                                           scan.calibration.height)
+
+
+def test_clouds_are_in_the_bag_bit_by_bit_with_intensity(tmp_path):
+    cloud = np.array([[1, 2, 3, 0.5], [np.nan, -0.0, np.inf, -1], [0, 0, 0, 0]], np.float32)
+    write_bag(tmp_path / "bag", [Scan(cloud, STAMP), Scan(cloud[:0], STAMP + 1)])
+    with Bag(tmp_path / "bag") as bag:
+        full, empty = [to_array(msg) for _, _, msg in bag.messages({POINTS})]
+    assert full.dtype.names == ("x", "y", "z", "intensity") and len(empty) == 0
+    assert full.tobytes() == cloud.tobytes()
+
+
+def test_what_a_scan_lacks_is_not_in_the_bag(tmp_path):
+    write_bag(tmp_path / "bag", [Scan(scene(), STAMP)])
+    read, = open_recording(bag=tmp_path / "bag")
+    assert read.truth is None and read.camera is None
+    with Bag(tmp_path / "bag") as bag:
+        assert {t for t, _, _ in bag.raw()} == {POINTS}
+
+
+def test_empty_labels_are_not_missing_labels(tmp_path):
+    write_bag(tmp_path / "bag", [Scan(scene(), STAMP, GroundTruth.of([], []))])
+    read, = open_recording(bag=tmp_path / "bag")
+    assert len(read.truth) == 0
+
+
+def test_images_are_in_the_bag_byte_by_byte(tmp_path):
+    image = write(tmp_path / "image.png", png_header(3, 2) + b"pixels")
+    write_bag(tmp_path / "bag", [Scan(scene(), STAMP, image=image)])
+    with Bag(tmp_path / "bag") as bag:
+        (_, stamp, msg), = bag.messages({IMAGE})
+    assert (bytes(msg.data), msg.format, stamp) == (image.read_bytes(), "png", STAMP)
+
+
+def test_a_calibration_is_written_when_it_changes_and_before_its_cloud(written):
+    order = [(t, s) for t, s, _ in message_bytes(written)]
+    for topic in LATCHED:
+        assert [s for t, s in order if t == topic] == [STAMP, STAMP + 2 * 10**8]
+    for stamp in (STAMP, STAMP + 2 * 10**8):
+        assert order.index((CAMERA_INFO, stamp)) < order.index((POINTS, stamp))
+
+
+def test_rosbags_reads_the_bag(written):
+    with AnyReader([written]) as reader:
+        got = [(c.topic, s, bytes(data)) for c, s, data in reader.messages()]
+        types = {c.topic: c.msgtype for c in reader.connections}
+        for connection, _, data in reader.messages():
+            reader.deserialize(data, connection.msgtype)
+    assert got == message_bytes(written)
+    assert types[POINTS] == "sensor_msgs/msg/PointCloud2"
+
+
+def test_mcap_reads_the_bag_and_its_checksums_hold(written):
+    with open(written / "drive.mcap", "rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        got = [(channel.topic, m.log_time, m.data, channel.message_encoding, schema.encoding)
+               for schema, channel, m in reader.iter_messages(log_time_order=False)]
+        assert reader.get_header().profile == "ros2"
+    assert sorted(got) == sorted((*row, "cdr", "ros2msg") for row in message_bytes(written))
+
+
+def test_chunks_are_zstd_and_hold_more_than_one_cloud(tmp_path):
+    cloud = np.random.default_rng(0).random((60_000, 4), np.float32)
+    count = write_bag(tmp_path / "bag", (Scan(cloud, STAMP + i) for i in range(12)))
+    with open(tmp_path / "bag/bag.mcap", "rb") as stream:
+        chunks = make_reader(stream).get_summary().chunk_indexes
+    assert {c.compression for c in chunks} == {"zstd"}
+    assert 1 < len(chunks) < count / 2
+
+
+def test_calibrations_are_latched_and_clouds_are_not(written):
+    with Bag(written) as bag:
+        for topic in bag.topics:
+            quality, = bag.qos(topic)
+            latched = quality.durability.name == "TRANSIENT_LOCAL"
+            assert latched == (topic in LATCHED)
+            assert quality.reliability.name == "RELIABLE"
+    with open(written / "drive.mcap", "rb") as stream:
+        channels = make_reader(stream).get_summary().channels.values()
+    for channel in channels:
+        quality, = yaml.safe_load(channel.metadata["offered_qos_profiles"])
+        assert (quality["durability"] == "transient_local") == (channel.topic in LATCHED)
+
+
+def test_metadata_counts_what_is_in_the_file(written):
+    info = yaml.safe_load((written / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    rows = message_bytes(written)
+    counts = {t["topic_metadata"]["name"]: t["message_count"]
+              for t in info["topics_with_message_count"]}
+    assert counts == {topic: sum(t == topic for t, _, _ in rows) for topic in counts}
+    assert counts[POINTS] == 3 and counts[TRUTH] == 2 and IMAGE not in counts
+    assert info["message_count"] == len(rows)
+    assert info["starting_time"]["nanoseconds_since_epoch"] == min(s for _, s, _ in rows)
+    assert info["duration"]["nanoseconds"] == max(s for _, s, _ in rows) - STAMP
+    assert info["relative_file_paths"] == ["drive.mcap"]
+    with Bag(written) as bag:
+        assert (bag.start_ns, bag.counts) == (STAMP, counts)
+
+
+def test_a_bag_without_messages_is_a_bag(tmp_path):
+    assert write_bag(tmp_path / "bag", []) == 0
+    assert list(open_recording(bag=tmp_path / "bag")) == []
+
+
+def test_bags_of_sqlite_are_read_alike(written, tmp_path):
+    with Writer(tmp_path / "sql", version=9, storage_plugin=StoragePlugin.SQLITE3) as bag, \
+            Reader(written) as reader:
+        copies = {c.topic: bag.add_connection(c.topic, c.msgtype, typestore=typestore())
+                  for c in reader.connections}
+        for connection, stamp, data in reader.messages():
+            bag.write(copies[connection.topic], stamp, data)
+    for a, b in zip(open_recording(bag=written), open_recording(bag=tmp_path / "sql"),
+                    strict=True):
+        assert same_cloud(a.frame.xyz, b.frame.xyz)
+        assert np.array_equal(a.camera.projection, b.camera.projection)
+        assert (a.truth is None) == (b.truth is None)
+
+
+def test_raw_takes_topics_and_a_window_of_time(written):
+    rows = message_bytes(written)
+    with Bag(written) as bag:
+        assert list(bag.raw({POINTS, TRUTH})) == [r for r in rows if r[0] in (POINTS, TRUTH)]
+        assert list(bag.raw(set())) == []
+        low, high = STAMP + 1, STAMP + 2 * 10**8
+        assert list(bag.raw(None, low, high)) == [r for r in rows if low <= r[1] < high]
+
+
+def test_labels_may_come_after_their_cloud(written, tmp_path):
+    with BagWriter(tmp_path / "late") as bag:
+        bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+        bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")
+        bag.add_topic(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", LATCHED_QOS)
+        bag.add_topic(EXTRINSICS, "geometry_msgs/msg/TransformStamped", LATCHED_QOS)
+        for topic, stamp, data in message_bytes(written):
+            if topic in bag.channels:
+                bag.write(topic, stamp + (topic != POINTS) * 5 * 10**7, data)
+    read = list(open_recording(bag=tmp_path / "late"))
+    assert [r.truth is not None for r in read] == [True, False, True]
+    assert all(r.camera is not None for r in read)

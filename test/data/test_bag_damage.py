@@ -1,0 +1,149 @@
+"""Bags that stand in the way, are damaged, or are none: nothing is lost, and each is named."""
+
+from __future__ import annotations
+
+import shutil
+
+import pytest
+from bag_samples import message_bytes, same_cloud, scans
+from mcap.reader import make_reader
+from samples import header, scene, write
+
+from lidar_perception.data.bag import Bag, BagWriter
+from lidar_perception.data.recording import open_recording
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.types import InputError
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.topics import POINTS
+from msg_utils.point_cloud2 import from_array
+
+
+def test_an_existing_bag_is_replaced_only_by_force(tmp_path):
+    path = tmp_path / "bag"
+    write_bag(path, scans(1))
+    before = message_bytes(path)
+    with pytest.raises(InputError, match=r"exists already.*--force"):
+        write_bag(path, scans(2))
+    assert message_bytes(path) == before
+    write_bag(path, scans(2), force=True)
+    assert open_recording(bag=path).count == 2
+
+
+@pytest.mark.parametrize("make", [lambda p: write(p / "bag", b"text"),
+                                  lambda p: write(p / "bag/notes.txt", b"text")])
+def test_force_replaces_nothing_but_bags(tmp_path, make):
+    kept = make(tmp_path)
+    with pytest.raises(InputError, match="is no bag"):
+        write_bag(tmp_path / "bag", scans(1), force=True)
+    assert kept.read_bytes() == b"text"
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_an_exception_leaves_the_old_bag_and_an_incomplete_one_that_can_be_read(tmp_path, force):
+    path = tmp_path / "bag"
+    if force:
+        write_bag(path, scans(1))
+    before = message_bytes(path) if force else None
+
+    def failing():
+        yield from scans(2)
+        raise RuntimeError("power cut")
+
+    with pytest.raises(RuntimeError, match="power cut"):
+        write_bag(path, failing(), force=force)
+    assert len(list(open_recording(bag=tmp_path / "bag.incomplete"))) == 2
+    assert (message_bytes(path) == before) if force else not path.exists()
+    write_bag(path, scans(3), force=force)  # what is left over is no obstacle
+    assert open_recording(bag=path).count == 3
+    assert not (tmp_path / "bag.incomplete").exists()
+
+
+def test_a_place_that_cannot_hold_a_bag_is_named(tmp_path):
+    write(tmp_path / "file", b"")
+    with pytest.raises(InputError, match=r"cannot write the bag .*file/bag"):
+        write_bag(tmp_path / "file/bag", scans(1))
+
+
+def test_a_folder_without_metadata_is_read_by_its_one_file(written, tmp_path):
+    shutil.copy(written / "drive.mcap", tmp_path)
+    assert message_bytes(tmp_path) == message_bytes(written)
+    assert message_bytes(tmp_path / "drive.mcap") == message_bytes(written)
+    shutil.copy(written / "drive.mcap", tmp_path / "second.mcap")
+    with pytest.raises(InputError, match=r"no metadata\.yaml and 2 storage files"):
+        Bag(tmp_path)
+
+
+@pytest.mark.parametrize("name, make, words", [
+    ("missing", lambda p: None, "there is no bag"),
+    ("folder", lambda p: p.mkdir(), "no metadata.yaml and 0 storage files"),
+    ("cloud.bin", lambda p: write(p, b"1234"), "is no rosbag2 bag"),
+    ("empty.mcap", lambda p: write(p, b""), "truncated or damaged"),
+    ("text.mcap", lambda p: write(p, b"text " * 100), "truncated or damaged"),
+    ("text.db3", lambda p: write(p, b"text " * 100), "truncated or damaged"),
+    ("bag", lambda p: write(p / "metadata.yaml", "text"), "truncated or damaged"),
+    ("bag", lambda p: write(p / "metadata.yaml", "a: [\n"), "truncated or damaged"),
+])
+def test_what_is_no_bag_is_named_in_one_line(tmp_path, name, make, words):
+    make(tmp_path / name)
+    with pytest.raises(InputError) as error:
+        Bag(tmp_path / name)
+    assert str(tmp_path / name) in str(error.value) and words in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_bag_without_its_file_is_damaged(written, tmp_path):
+    shutil.copy(written / "metadata.yaml", tmp_path)
+    with pytest.raises(InputError, match="truncated or damaged"):
+        message_bytes(tmp_path)
+
+
+@pytest.mark.parametrize("folder", [True, False])
+def test_a_bag_that_was_cut_anywhere_is_damaged(written, tmp_path, folder):
+    raw = (written / "drive.mcap").read_bytes()
+    if folder:
+        shutil.copy(written / "metadata.yaml", tmp_path)
+    path = tmp_path / "drive.mcap"
+    for size in [*range(0, len(raw), 9973), *range(len(raw) - 12, len(raw))]:
+        path.write_bytes(raw[:size])
+        with pytest.raises(InputError, match="truncated or damaged"):
+            message_bytes(tmp_path if folder else path)
+
+
+def test_a_byte_that_flipped_is_never_a_traceback(written, tmp_path):
+    raw = (written / "drive.mcap").read_bytes()
+    with open(written / "drive.mcap", "rb") as stream:
+        chunk = make_reader(stream).get_summary().chunk_indexes[0].chunk_start_offset
+    damaged, path = 0, tmp_path / "drive.mcap"
+    for at in [*range(chunk, chunk + 100), *range(0, len(raw), len(raw) // 30)]:
+        path.write_bytes(raw[:at] + bytes([raw[at] ^ 0x55]) + raw[at + 1:])
+        try:
+            with Bag(path) as bag:
+                list(bag.messages(bag.topics))
+        except InputError as error:
+            damaged += 1
+            assert "\n" not in str(error)
+    assert damaged > 40
+
+
+def test_a_bag_without_clouds_says_what_it_has(tmp_path):
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/text", "std_msgs/msg/String")
+        bag.write("/text", 1, bag_message("std_msgs/msg/String", data="hello"))
+    with pytest.raises(InputError) as error:
+        open_recording(bag=tmp_path / "bag")
+    for word in (str(tmp_path / "bag"), "no topic /points", "/text (std_msgs/msg/String)"):
+        assert word in str(error.value)
+
+
+def test_a_cloud_that_cannot_be_used_leaves_the_others(tmp_path):
+    cloud = scene()[:, :2].copy().view([("x", "<f4"), ("y", "<f4")]).reshape(-1)
+    write_bag(tmp_path / "bag", scans(1))
+    with BagWriter(tmp_path / "mixed") as bag:
+        bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+        bag.write(POINTS, 1, from_array(cloud, header(bag_message, 1), bag_message))
+        for topic, _, data in message_bytes(tmp_path / "bag"):
+            if topic == POINTS:
+                bag.write(POINTS, 2, data)
+    flat, good = open_recording(bag=tmp_path / "mixed")
+    assert isinstance(flat, InputError) and "no field 'z'" in str(flat)
+    assert same_cloud(scene(), good.frame.xyz)

@@ -1,0 +1,97 @@
+"""KITTI folders with something broken or missing: it is named, and the other frames go on."""
+
+from __future__ import annotations
+
+import pytest
+from kitti_samples import LAYOUTS, TRACKING_LABELS, TRACKLETS, raw_folder
+from samples import LABELS, calibration_text, object_folder, write
+
+from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.recording import open_recording
+from lidar_perception.data.to_bag import kitti_scan
+from lidar_perception.types import InputError
+
+PARTS = {  # broken file -> its new content (None: removed), and words of the message
+    "velodyne/000000.bin": [(b"123", "multiple of 16")],
+    "calib/000000.txt": [
+        (None, "cannot read"), (b"\xff\xfe\x00", "cannot read"), ("", "no P2"),
+        (calibration_text().replace("P2", "P3"), "no P2 of 12 numbers"),
+        (calibration_text().replace("R0_rect", "x"), "no R0_rect of 9 numbers"),
+        (calibration_text().replace("Tr_velo_to_cam", "x"), "no Tr_velo_to_cam of 12 numbers"),
+        (calibration_text().replace("P2: ", "P2: 1 "), "no P2 of 12 numbers"),
+        (calibration_text().replace("P2: 721.5377", "P2: wide"), "no P2 of 12 numbers"),
+    ],
+    "label_2/000000.txt": [
+        (LABELS + "Car 0 0 0\n", ":4 is no KITTI label"),
+        (LABELS.replace("1.52", "tall"), ":2 is no KITTI label"),
+        ("\n" + LABELS.replace("Car", "Unicorn"), ":3 has the unknown class 'Unicorn'"),
+        (b"\xff\xfe\x00", "cannot read"),
+    ],
+}
+
+
+@pytest.mark.parametrize("file, content, words", [
+    (file, content, words) for file, cases in PARTS.items() for content, words in cases])
+def test_a_broken_file_is_named_and_the_other_frames_go_on(tmp_path, file, content, words):
+    root = object_folder(tmp_path)
+    path = root / "training" / file
+    path.unlink()
+    if content is not None:
+        write(path, content)
+    with pytest.raises(InputError) as error:
+        kitti_scan(open_kitti(root)[0])
+    assert str(path) in str(error.value) and words in str(error.value)
+    assert "\n" not in str(error.value)
+    broken, good = open_recording(kitti=root)
+    assert isinstance(broken, InputError) and str(path) in str(broken)
+    assert good.name == "000001"
+
+
+@pytest.mark.parametrize("layout, file, content, words", [
+    ("tracking", "training/calib/0000.txt", "", "no P2"),
+    ("tracking", "training/label_02/0000.txt", "0 1 Car", ":1 is no KITTI label"),
+    ("tracking", "training/label_02/0000.txt", "zero " + TRACKING_LABELS[2:],
+     ":1 is no tracking label"),
+    ("tracking", "training/label_02/0000.txt", "\n7\n", ":2 is no tracking label"),
+    ("raw", "2011_09_26/calib_cam_to_cam.txt", "", "no S_rect_02"),
+    ("raw", "2011_09_26/calib_velo_to_cam.txt", "", "no R of 9 numbers"),
+    ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml", "<cut", "cannot read"),
+    ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml", "<a/>", "cannot read"),
+    ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml",
+     TRACKLETS.replace(">Pedestrian<", ">Unicorn<"), "cannot read"),
+])
+def test_a_broken_file_of_a_sequence_is_named(tmp_path, layout, file, content, words):
+    root = LAYOUTS[layout](tmp_path)
+    write(root / file, content)
+    with pytest.raises(InputError) as error:
+        kitti_scan(open_kitti(root)[0])
+    assert str(root / file) in str(error.value) and words in str(error.value)
+
+
+@pytest.mark.parametrize("text", [None, "yesterday\n" * 3, "2011-09-26 13:02:25.5\n"])
+def test_broken_time_stamps_are_named(tmp_path, text):
+    path = next(raw_folder(tmp_path).rglob("timestamps.txt"))
+    path.unlink()
+    if text is not None:
+        write(path, text)
+    with pytest.raises(InputError, match=r"velodyne_points/timestamps\.txt"):
+        open_kitti(tmp_path)
+
+
+@pytest.mark.parametrize("layout, scan", [
+    ("tracking", "training/velodyne/0000/notes.bin"),
+    ("raw", "2011_09_26/2011_09_26_drive_0001_sync/velodyne_points/data/notes.bin")])
+def test_a_scan_whose_name_is_no_number_is_named(tmp_path, layout, scan):
+    root = LAYOUTS[layout](tmp_path)
+    write(root / scan, b"")
+    with pytest.raises(InputError, match=r"notes\.bin"):
+        open_kitti(root)
+
+
+@pytest.mark.parametrize("make", [lambda p: p, lambda p: p / "missing",
+                                  lambda p: write(p / "file", b"")])
+def test_what_is_no_kitti_folder_is_named(tmp_path, make):
+    root = make(tmp_path)
+    with pytest.raises(InputError, match="KITTI") as error:
+        open_kitti(root)
+    assert str(root) in str(error.value)

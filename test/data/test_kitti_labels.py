@@ -1,0 +1,162 @@
+"""KITTI labels: as text, as boxes and as markers they say the same, in every layout."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+from kitti_samples import (
+    LAYOUTS,
+    each_layout,
+    over_the_wire,
+    raw_folder,
+    same,
+    text_of,
+    tracking_folder,
+)
+from samples import AXES, LABELS, LIDAR_TO_CAMERA, object_folder, write
+
+from lidar_perception.data.kitti.calibration import read_calibration
+from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.kitti.labels import (
+    format_label,
+    parse,
+    read_object_labels,
+    read_tracking_labels,
+    to_ground_truth,
+    to_labels,
+)
+from lidar_perception.geometry import box_corners
+from lidar_perception.types import CLASSES, GroundTruth
+
+
+def hundredths(low: int, high: int):
+    return st.integers(low, high).map(lambda n: f"{n / 100:.2f}")
+
+
+@st.composite
+def label_lines(draw) -> str:
+    if draw(st.booleans()):
+        bbox = [draw(hundredths(0, 120000)) for _ in range(4)]
+        return f"DontCare -1 -1 -10 {' '.join(bbox)} -1 -1 -1 -1000 -1000 -1000 -10"
+    return " ".join([
+        draw(st.sampled_from(CLASSES[:-1])), draw(hundredths(0, 100)), str(draw(st.integers(0, 3))),
+        draw(hundredths(-314, 314)), *(draw(hundredths(0, 120000)) for _ in range(4)),
+        *(draw(hundredths(30, 2000)) for _ in range(3)), draw(hundredths(-5000, 5000)),
+        draw(hundredths(-300, 500)), draw(hundredths(100, 8000)), draw(hundredths(-314, 314))])
+
+
+@given(st.lists(label_lines(), max_size=6))
+def test_labels_through_truth_and_markers_come_back_as_the_same_text(lines):
+    truth = to_ground_truth([parse(line) for line in lines], LIDAR_TO_CAMERA)
+    received = over_the_wire(truth)
+    assert same(received, truth)
+    expected = sorted(lines, key=lambda line: line.startswith("DontCare"))  # notes come last
+    assert text_of(truth) == text_of(received) == expected
+
+
+@given(label_lines().filter(lambda line: not line.startswith("DontCare")))
+def test_a_label_can_be_computed_from_its_box(line):
+    label = parse(line)
+    truth = to_ground_truth([label], LIDAR_TO_CAMERA)
+    again, = to_labels(GroundTruth.of(truth.boxes, truth.class_ids), LIDAR_TO_CAMERA)
+    assert again["class"] == label["class"]
+    np.testing.assert_allclose(again["dimensions"], label["dimensions"], atol=1e-9)
+    np.testing.assert_allclose(again["location"], label["location"], atol=1e-9)
+    assert abs(np.sin((again["rotation_y"] - label["rotation_y"]) / 2)) < 0.0025
+    x, _, z = label["location"]  # alpha is the heading seen along the ray to the object
+    assert abs(np.sin((again["alpha"] - (again["rotation_y"] - np.arctan2(x, z))) / 2)) < 1e-9
+    assert -np.pi <= again["alpha"] <= np.pi
+
+
+@given(label_lines().filter(lambda line: not line.startswith("DontCare")))
+def test_boxes_have_the_corners_of_the_development_kit(line):
+    """computeBox3D.m, with a camera that is level."""
+    label = parse(line)
+    level = np.eye(4)
+    level[:3] = np.column_stack([AXES, [0.1, -0.2, -0.3]])
+    h, w, length = label["dimensions"]
+    cos, sin = np.cos(label["rotation_y"]), np.sin(label["rotation_y"])
+    x = length / 2 * np.array([1, 1, -1, -1, 1, 1, -1, -1])
+    y = h * np.array([0, 0, 0, 0, -1, -1, -1, -1])
+    z = w / 2 * np.array([1, -1, -1, 1, 1, -1, -1, 1])
+    camera = np.stack([cos * x + sin * z, y, cos * z - sin * x]).T + label["location"]
+    lidar = (camera - level[:3, 3]) @ level[:3, :3]
+    ours = box_corners(to_ground_truth([label], level).boxes)[0]
+    distance = np.linalg.norm(ours[:, None] - lidar, axis=2)
+    assert distance.min(axis=0).max() < 1e-9 and distance.min(axis=1).max() < 1e-9
+
+
+def test_object_labels_are_those_of_the_frame(tmp_path):
+    root = object_folder(tmp_path)
+    write(root / "training/label_2/000001.txt", "")
+    first, second = open_kitti(root)
+    assert text_of(first.truth()) == LABELS.splitlines()
+    assert len(second.truth()) == 0 and second.truth().notes == ()
+
+
+def test_tracking_labels_are_those_of_the_sequence_and_frame(tmp_path):
+    first, second, third, *other = [f.truth() for f in open_kitti(tracking_folder(tmp_path))]
+    assert first.labels == ["Pedestrian"] and first.extras[0]["track_id"] == 3
+    assert [name for name, _ in first.notes] == ["DontCare"]
+    assert len(second) == 0
+    assert third.labels == ["Person_sitting"] and third.extras[0]["track_id"] == 4
+    assert other == [None, None]  # this sequence has no label file
+    assert all(same(over_the_wire(t), t) for t in (first, second, third))
+
+
+def test_tracklets_are_boxes_on_their_bottom_face(tmp_path):
+    first, second, third = [f.truth() for f in open_kitti(raw_folder(tmp_path))]
+    assert len(first) == 0
+    np.testing.assert_allclose(second.boxes, [[8, -1, -0.8, 0.9, 0.5, 1.8, 0.5]])
+    assert second.extras[0] == {"track_id": 0, "occluded": 1, "truncated": 0.0}
+    assert third.labels == ["Pedestrian", "Person_sitting"]
+    np.testing.assert_allclose(third.boxes, [[9, -1, -0.8, 0.9, 0.5, 1.8, 0.6],
+                                             [5, 2, -1.0, 0.8, 0.6, 1.2, -3]])
+    assert [e["track_id"] for e in third.extras] == [0, 1]
+    assert same(over_the_wire(third), third)
+
+
+@each_layout
+def test_folders_without_labels_have_none(tmp_path, layout):
+    root = LAYOUTS[layout](tmp_path)
+    for path in [*root.rglob("label_*/*.txt"), *root.rglob("tracklet_labels.xml")]:
+        path.unlink()
+    assert [f.truth() for f in open_kitti(root)] == [None] * len(open_kitti(root))
+
+
+def test_real_object_labels_come_back_as_the_same_text(data):
+    folder = data / "kitti_object/training"
+    paths = sorted(folder.glob("label_2/*.txt"))
+    assert paths
+    for path in paths:
+        to_camera = read_calibration(folder / "calib" / path.name).lidar_to_camera
+        truth = over_the_wire(read_object_labels(path, to_camera))
+        lines = [line for line in path.read_text().splitlines() if line]
+        assert sorted(format_label(x) for x in to_labels(truth, to_camera)) == sorted(lines), path
+
+
+def test_real_tracking_labels_come_back_as_the_same_numbers(data):
+    folder = data / "kitti_tracking/training"
+    to_camera = read_calibration(folder / "calib/0000.txt").lidar_to_camera
+    path = folder / "label_02/0000.txt"
+    back = [[frame, x["track_id"], x["class"], x["truncated"], x["occluded"], x["alpha"],
+             *x["bbox"], *x["dimensions"], *x["location"], x["rotation_y"]]
+            for frame, truth in read_tracking_labels(path, to_camera).items()
+            for x in to_labels(over_the_wire(truth), to_camera)]
+    lines = [line.split() for line in path.read_text().splitlines()]
+    read = [[int(f), int(t), name, *map(float, rest)] for f, t, name, *rest in lines]
+    assert sorted(back, key=str) == sorted(
+        [[*row[:4], int(row[4]), *row[5:]] for row in read], key=str)
+
+
+def test_real_labels_computed_from_their_boxes_are_the_same_to_two_decimals(data):
+    folder = data / "kitti_object/training"
+    for path in sorted(folder.glob("label_2/*.txt")):
+        to_camera = read_calibration(folder / "calib" / path.name).lidar_to_camera
+        truth = read_object_labels(path, to_camera)
+        for box, extra in zip(truth.boxes, truth.extras):
+            again, = to_labels(GroundTruth.of([box], [0]), to_camera)
+            for name in ("dimensions", "location"):
+                np.testing.assert_allclose(again[name], extra[name], atol=0.005)
+            assert abs(np.sin((again["rotation_y"] - extra["rotation_y"]) / 2)) < 0.0025, path

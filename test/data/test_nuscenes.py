@@ -1,0 +1,322 @@
+"""nuScenes folders: points and boxes share a frame, tables are read in any order and in pieces, and
+what is missing or wrong is named."""
+
+from __future__ import annotations
+
+import copy
+import json
+
+import numpy as np
+import nuscenes_folder as folder
+import nuscenes_reference as reference
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from lidar_perception.data.nuscenes import labels as nuscenes_labels
+from lidar_perception.data.nuscenes import tables as nuscenes_tables
+from lidar_perception.data.nuscenes.boxes import (
+    ATTRIBUTES,
+    CATEGORIES,
+    NAMES,
+    GlobalBoxes,
+    in_frame,
+    in_global,
+)
+from lidar_perception.data.nuscenes.folder import OWN_VEHICLE, open_nuscenes, read_sweep
+from lidar_perception.data.nuscenes.tables import Tables
+from lidar_perception.geometry import box_corners, points_in_box, wrap_angle
+from lidar_perception.types import InputError
+
+TABLES = folder.made_tables(seed=3, frames=4, objects=30)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    return folder.save(tmp_path_factory.mktemp("nuscenes"), TABLES)
+
+
+@pytest.fixture
+def changed(tmp_path):
+    """Write the tables after a change, without sweeps."""
+    def write(change=lambda tables: None, version=folder.VERSION):
+        tables = copy.deepcopy(TABLES)
+        change(tables)
+        return folder.save(tmp_path / "changed", tables, version, sweeps=False)
+    return write
+
+
+def labels_of(frame):
+    return [row for row in TABLES["sample_annotation"] if row["sample_token"] == frame.token]
+
+
+def same_frames(a, b):
+    return [f.token for f in a] == [f.token for f in b] and all(
+        f.name == g.name and f.points.name == g.points.name and f.stamp_ns == g.stamp_ns
+        and np.array_equal(f.pose, g.pose) and np.array_equal(f.truth().boxes, g.truth().boxes)
+        for f, g in zip(a, b))
+
+
+def test_key_frames_come_by_scene_and_time(root):
+    frames = open_nuscenes(root)
+    assert [f.name for f in frames] == [f"{s}/{i:02}" for s in folder.SCENES for i in range(4)]
+    assert [f.token for f in frames] == [f"s{s}k{i}" for s in range(2) for i in range(4)]
+    assert all(f.points.parent == root / "samples/LIDAR_TOP" and f.points.exists() for f in frames)
+    assert frames[0].stamp_ns == next(r["timestamp"] for r in TABLES["sample_data"]) * 1000
+    assert {f.sensor_height for f in frames} == {folder.SENSOR[2]}
+
+
+def test_points_made_inside_a_box_are_inside_it_when_read(root):
+    boxes = 0
+    for frame in open_nuscenes(root):
+        (scan, rings), truth, rows = frame.load_rings(), frame.truth(), labels_of(frame)
+        assert len(truth) == len(rows)
+        for i, (box, extras) in enumerate(zip(truth.boxes, truth.extras)):
+            row = TABLES["sample_annotation"].index(rows[i])
+            assert extras["lidar_points"] == rows[i]["num_lidar_pts"]
+            if np.abs(box[:2]).max() > 10 and extras["lidar_points"]:
+                inside = points_in_box(scan.xyz, box) & (rings == row % 32)
+                assert inside.sum() >= folder.POINTS_IN_BOX
+                boxes += 1
+    assert boxes > 100
+
+
+def test_y_of_the_sensor_is_forward_and_x_is_right(changed):
+    def straight(tables):
+        for row in tables["calibrated_sensor"]:
+            row["rotation"] = [np.sqrt(0.5), 0, 0, -np.sqrt(0.5)]
+    frame = open_nuscenes(changed(straight))[0]
+    frame.points.parent.mkdir(parents=True)
+    np.array([[0, 10, -1, 51, 4], [3, 5, 0, 255, 31], [0.5, 0.5, 0, 9, 1], [0, 0, 0, 0, 0],
+              [np.nan, 1, 1, 1, 1], [0, -1.5, 0, 0, 7]], np.float32).tofile(frame.points)
+    scan, rings = frame.load_rings()
+    np.testing.assert_allclose(scan.xyz, [[10, 0, -1], [5, -3, 0], [-1.5, 0, 0]], atol=1e-6)
+    np.testing.assert_allclose(scan.intensity, [0.2, 1, 0], atol=1e-7)
+    assert rings.tolist() == [4, 31, 7] and scan.xyz.dtype == scan.intensity.dtype == np.float32
+    assert frame.cloud().shape == (6, 5) and scan.stamp_ns == frame.stamp_ns
+
+
+def test_returns_of_the_vehicle_itself_are_left_out(root):
+    frame = open_nuscenes(root)[0]
+    cloud, scan = frame.cloud(), frame.load()
+    own = (np.abs(cloud[:, :2]) < OWN_VEHICLE).all(axis=1)
+    assert own.sum() >= 50 and len(scan) == len(cloud) - own.sum()
+
+
+def test_the_global_pose_takes_boxes_of_a_frame_to_the_labels(root):
+    for frame in open_nuscenes(root):
+        rows, truth = labels_of(frame), frame.truth()
+        centres, sizes, rotations = in_global(truth.boxes, frame.pose)
+        np.testing.assert_allclose(centres, [r["translation"] for r in rows], atol=1e-9)
+        np.testing.assert_allclose(sizes[:, [1, 0, 2]], [r["size"] for r in rows])
+        for row, rotation in zip(rows, rotations):
+            assert abs(np.dot(row["rotation"], rotation)) > 1 - 1e-3  # leans as the vehicle does
+            assert abs(wrap_angle(reference.yaw(row["rotation"]) - reference.yaw(rotation))) < 1e-3
+        assert np.linalg.norm(frame.pose[:3, 3] - frame.ego) == pytest.approx(
+            np.linalg.norm(folder.SENSOR))
+
+
+angles = st.floats(-3.1, 3.1)
+
+
+@settings(max_examples=50)
+@given(st.integers(0, 2**32 - 1), angles, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
+def test_to_the_global_frame_and_back(seed, yaw, pitch, roll):
+    rng = np.random.default_rng(seed)
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("zyx", [yaw, pitch, roll]).as_matrix()
+    pose[:3, 3] = rng.uniform(-2000, 2000, 3)
+    boxes = np.column_stack([rng.uniform(-50, 50, (5, 3)), rng.uniform(0.3, 9, (5, 3)),
+                             rng.uniform(-3.1, 3.1, 5)])
+    made = GlobalBoxes.of(*in_global(boxes, pose), 0)
+    np.testing.assert_allclose(in_frame(made, pose), boxes, atol=1e-8)
+    # The same solid: its corners move as points do.
+    corners = box_corners(boxes)
+    for box, centre, rotation, own in zip(boxes, made.centres, made.rotations, corners):
+        signs = np.array([[x, y, z] for z in (-1, 1) for x, y in ((1, 1), (-1, 1), (-1, -1),
+                                                                   (1, -1))]) / 2
+        there = Rotation.from_quat(np.roll(rotation, -1)).apply(signs * box[3:6]) + centre
+        np.testing.assert_allclose(own @ pose[:3, :3].T + pose[:3, 3], there, atol=1e-8)
+
+
+def test_an_empty_frame_has_no_boxes():
+    assert len(GlobalBoxes.none()) == 0 and in_frame(GlobalBoxes.none(), np.eye(4)).shape == (0, 7)
+    assert [a.shape for a in in_global(np.zeros((0, 7)), np.eye(4))] == [(0, 3), (0, 3), (0, 4)]
+    assert len(GlobalBoxes.together([])) == 0
+
+
+def test_velocities_are_those_of_a_second_reading(root):
+    times = {r["token"]: r["timestamp"] for r in TABLES["sample"]}
+    rows = {r["token"]: r for r in TABLES["sample_annotation"]}
+    known = unknown = 0
+    for frame in open_nuscenes(root):
+        for row, found in zip(labels_of(frame), frame.labels().boxes.velocities):
+            expected = reference.velocity(row, rows, times)
+            if expected is None:
+                assert np.isnan(found).all()
+                unknown += 1
+            else:
+                np.testing.assert_allclose(found, expected, atol=1e-5)
+                known += 1
+    assert known > 50 and unknown > 10
+
+
+def test_labels_have_their_names(root):
+    tracks = {}
+    for frame in open_nuscenes(root):
+        truth = frame.truth()
+        for row, extras, label in zip(labels_of(frame), truth.extras, truth.labels):
+            category = folder.category_of(TABLES, row)
+            assert extras["category"] == category
+            assert extras["detection_name"] == CATEGORIES.get(category)
+            names = [TABLES["attribute"][int(t[1:])]["name"] for t in row["attribute_tokens"]]
+            assert extras["attribute"] == (names[0] if names else None)
+            assert extras["points"] == row["num_lidar_pts"] + row["num_radar_pts"]
+            assert tracks.setdefault(row["instance_token"], extras["track_id"]) == extras[
+                "track_id"]
+            expected = {"vehicle.car": "Car", "vehicle.truck": "Truck", "vehicle.bicycle":
+                        "Cyclist" if names == ["cycle.with_rider"] else "Misc"}.get(
+                category, "Pedestrian" if "pedestrian" in category else "Misc")
+            assert label == expected
+        assert len(frame.labels().racks()) == sum(
+            folder.category_of(TABLES, row) == "static_object.bicycle_rack"
+            for row in labels_of(frame))
+    assert len(set(tracks.values())) == len(tracks)
+    assert set(CATEGORIES.values()) == set(NAMES) and len(ATTRIBUTES) == 8
+
+
+def test_the_order_of_rows_does_not_matter(root, changed):
+    def shuffle(tables):
+        rng = np.random.default_rng(5)
+        for name, rows in tables.items():
+            if name not in ("scene", "sample_annotation"):
+                rng.shuffle(rows)
+    assert same_frames(open_nuscenes(changed(shuffle)), open_nuscenes(root))
+
+
+def test_chosen_scenes_come_in_their_order(root):
+    frames = open_nuscenes(root)
+    assert same_frames(open_nuscenes(root, scenes=folder.SCENES[::-1]), frames[4:] + frames[:4])
+    assert same_frames(open_nuscenes(root, scenes=folder.SCENES[1:]), frames[4:])
+
+
+@pytest.mark.parametrize("chunk", [1000, 1777])
+def test_a_table_may_be_read_in_pieces_of_any_size(root, monkeypatch, chunk):
+    whole = open_nuscenes(root)
+    monkeypatch.setattr(nuscenes_tables, "CHUNK", chunk)
+    monkeypatch.setattr(nuscenes_labels, "BLOCK", 7)
+    assert same_frames(open_nuscenes(root), whole)
+
+
+def test_a_table_on_one_line_or_empty(tmp_path):
+    (tmp_path / "v").mkdir()
+    for text, rows in ('[{"a":1,"b":"x, ] y"},{"b":2,"a":0}]', [(1, "x, ] y"), (0, 2)]), (
+            " [ ] \n", []):
+        (tmp_path / "v/t.json").write_text(text)
+        assert list(Tables(tmp_path, "v").rows("t", "a", "b")) == rows
+
+
+def test_a_version_without_labels_has_frames_all_the_same(changed):
+    root = changed(lambda tables: tables["sample_annotation"].clear())
+    assert {f.truth() for f in open_nuscenes(root)} == {None}
+    root = changed(lambda tables: tables.pop("sample_annotation"), "v1.0-test")
+    frames = open_nuscenes(root, "v1.0-test")
+    assert len(frames) == 8 and frames[0].truth() is None
+
+
+def drop(table, token):
+    def change(tables):
+        tables[table] = [row for row in tables[table] if row["token"] != token]
+    return change
+
+
+def put(table, **values):
+    return lambda tables: tables[table][0].update(values)
+
+
+@pytest.mark.parametrize("change, words", [
+    (lambda t: t.pop("ego_pose"), "ego_pose.json"),
+    (lambda t: t.pop("sample_annotation"), "cannot read the table .*sample_annotation.json"),
+    (lambda t: t["sample"].clear(), "no key frame"),
+    (lambda t: t["sample"][2].pop("timestamp"), "sample.json: row 2 has no timestamp"),
+    (lambda t: t["sample"].insert(1, 7), "sample.json: row 1 has no token"),
+    (drop("sample_data", "s0k1topTrue"), "no LIDAR_TOP of 1 of 8 key frames, such as s0k1"),
+    (drop("ego_pose", "s0k1topTrue"), "ego_pose.json has no row s0k1topTrue"),
+    (drop("instance", "s0o0"), "the instance s0o0 of s0o0k"),
+    (drop("category", "c0"), "has no category"),
+    (put("sample_annotation", prev="gone"), "the label gone is named"),
+    (put("sample_annotation", rotation=[0, 0, 0, 0]), "a rotation is not a quaternion"),
+    (put("sample_annotation", size=[1, 2]), "a size is not 3 finite numbers"),
+    (put("sample_annotation", translation=[1, None, 2]), "a translation is not"),
+    (put("ego_pose", translation="x"), "ego_pose.json: a translation is not 3 finite"),
+    (put("calibrated_sensor", rotation=[1, 0, 0, float("nan")]), "a rotation is not"),
+])
+def test_tables_that_are_wrong_are_named(changed, change, words):
+    with pytest.raises(InputError, match=words) as caught:
+        open_nuscenes(changed(change))[0].truth()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("damage", [
+    lambda text: text[:len(text) // 2], lambda text: "", lambda text: "{}",
+    lambda text: text.replace("token", "tok\x00en", 1), lambda text: text.rstrip("]\n"),
+])
+def test_tables_that_are_cut_are_named(changed, damage):
+    root = changed()
+    path = root / folder.VERSION / "ego_pose.json"
+    path.write_text(damage(path.read_text()))
+    with pytest.raises(InputError, match=r"ego_pose.json .*download the tables of v1.0-mini") as c:
+        open_nuscenes(root)
+    assert "\n" not in str(c.value)
+
+
+def test_damage_in_a_large_table_is_found_without_reading_on(changed, monkeypatch):
+    root = changed()
+    path = root / folder.VERSION / "ego_pose.json"
+    text = json.dumps(TABLES["ego_pose"] * 50).replace("{", "{?", 1)
+    path.write_bytes(text.encode() + b"\xff")  # who reads to the end stumbles over this first
+    monkeypatch.setattr(nuscenes_tables, "CHUNK", 1000)
+    with pytest.raises(InputError, match=r"ego_pose.json is cut or damaged"):
+        open_nuscenes(root)
+
+
+def test_wrong_folders_and_scenes_are_named(root, tmp_path):
+    for place, version, words in (
+            (tmp_path / "none", "v1.0-mini", "none is not a folder"),
+            (root, "v1.0-trainval", "no folder v1.0-trainval; its versions are: v1.0-mini"),
+            (root, "", "no folder without a name"),
+            (root / "samples", "v1.0-mini", "give the folder that holds v1.0-mini")):
+        with pytest.raises(InputError, match=words):
+            open_nuscenes(place, version)
+    with pytest.raises(InputError, match=r"no scene scene-0001 \(1 such\); its scenes are"):
+        open_nuscenes(root, scenes=["scene-0103", "scene-0001"])
+
+
+def test_sweeps_that_are_missing_or_cut_are_named(changed):
+    frame = open_nuscenes(changed())[0]
+    with pytest.raises(InputError, match=r"cannot read the sweep .*s0k0topTrue.pcd.bin"):
+        frame.load()
+    frame.points.parent.mkdir(parents=True)
+    frame.points.write_bytes(bytes(50))
+    with pytest.raises(InputError, match=r"50 bytes, not a multiple of 20 .* download it again"):
+        frame.load()
+    frame.points.write_bytes(b"")
+    assert len(frame.load()) == 0
+
+
+def test_a_real_sweep(data, changed):
+    path, = (data / "nuscenes").glob("*.pcd.bin")
+    frame = open_nuscenes(changed())[0]
+    frame.points.parent.mkdir(parents=True)
+    frame.points.symlink_to(path)
+    scan, rings = frame.load_rings()
+    assert len(read_sweep(path)) == 34688 and 25_000 < len(scan) < 34688
+    assert 0 <= scan.intensity.min() and 0.5 < scan.intensity.max() <= 1
+    assert set(rings) == set(range(32))
+    # The ground lies where the calibration says, and higher rings look higher.
+    near = np.hypot(scan.xyz[:, 0], scan.xyz[:, 1]) < 12
+    heights = scan.xyz[near & (scan.xyz[:, 2] < -1), 2]
+    assert np.median(heights) == pytest.approx(-folder.SENSOR[2], abs=0.15)
+    elevation = np.arctan2(scan.xyz[:, 2], np.linalg.norm(scan.xyz[:, :2], axis=1))
+    assert (np.diff([np.median(elevation[rings == r]) for r in range(32)]) > 0).all()

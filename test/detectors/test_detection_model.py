@@ -1,0 +1,272 @@
+"""Laws of PointPillars: configs, pillars, the network."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from detection_samples import BOXES, LABELS, lively, tiny, two_objects
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidar_perception.detectors.checkpoint import require_same
+from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
+from lidar_perception.detectors.pointpillars.box_coder import decode
+from lidar_perception.detectors.pointpillars.config import (
+    SIZES,
+    VERSIONS,
+    from_json,
+    network_config,
+)
+from lidar_perception.detectors.pointpillars.losses import detection_loss
+from lidar_perception.detectors.pointpillars.network import fused, make_network
+from lidar_perception.detectors.pointpillars.pillars import first_of_each, make_pillars
+from lidar_perception.detectors.pointpillars.targets import assign
+from lidar_perception.geometry import wrap_angle
+from lidar_perception.types import InputError
+
+few = settings(max_examples=25, database=None)
+seeds = st.integers(0, 2**32 - 1)
+pytestmark = pytest.mark.usefixtures("one_thread")
+each_version = pytest.mark.parametrize("version", VERSIONS)
+
+
+def some_points(config, count=600, seed=0, margin=0.0) -> torch.Tensor:
+    """Points all over the range, grown by margin; a few in each pillar they touch."""
+    rng = torch.Generator().manual_seed(seed)
+    low, high = torch.tensor(config.low) - margin, torch.tensor(config.high) + margin
+    points = torch.rand(count, config.point_columns, generator=rng)
+    points[:, :3] = low + points[:, :3] * (high - low)
+    near = points[:count - count // 2, :2]
+    points[count // 2:, :2] = near + 0.002 * ((low + high)[:2] / 2 - near)
+    return points
+
+
+def some_map(config, seed=0) -> torch.Tensor | None:
+    rng = torch.Generator().manual_seed(seed)
+    return (torch.randint(0, 2, (1, 3, *config.grid), generator=rng, dtype=torch.uint8)
+            if config.pseudo_map else None)
+
+
+# configs
+
+
+@each_version
+@pytest.mark.parametrize("size", SIZES)
+def test_a_config_survives_json(version, size):
+    config = network_config(version, size, classes=("Cyclist", "Car"))
+    assert from_json(dataclasses.asdict(config)) == config
+    assert config.classes == ("Cyclist", "Car") and config.grid == (496, 432)
+
+
+def test_versions_are_those_of_the_paper():
+    switches = {v: [s[k] for k in ("remove_ground", "cluster_ids", "pseudo_map", "neck")]
+                for v, s in VERSIONS.items()}
+    assert switches == {"v0": [False, False, False, "deconv"], "v1": [True, False, False, "fpn"],
+                        "v2": [True, True, False, "fpn"], "v3": [False, True, False, "fpn"],
+                        "v4": [True, False, True, "fpn"]}
+
+
+def test_the_full_baseline_has_as_many_weights_as_pointpillars():
+    # 4.8 million: Lang et al. with three classes, six anchors and a direction
+    counted = sum(p.numel() for p in make_network(network_config("v0", "full")).parameters())
+    by_hand = (9 * 64 + 2 * 64                                                 # points
+               + sum(9 * a * b + n * 9 * b * b + 2 * b * (n + 1)               # blocks
+                     for a, b, n in ((64, 64, 3), (64, 128, 5), (128, 256, 5)))
+               + sum(c * 128 * s * s + 2 * 128 for c, s in ((64, 1), (128, 2), (256, 4)))
+               + 385 * 6 * (3 + 7 + 2))                                        # head
+    assert counted == by_hand
+
+
+@pytest.mark.parametrize("change, words", [
+    (dict(version="v9"), "no 'v9'"), (dict(classes=("Dog",)), "Dog"), (dict(classes=()), "class"),
+    (dict(cell=0.17), "cannot be divided"), (dict(zero_row=True), "max_points")])
+def test_a_config_that_cannot_be_is_refused(change, words):
+    with pytest.raises(InputError, match=words):
+        network_config(**{"version": "v1", **change})
+
+
+def test_another_network_is_refused_with_both_values():
+    with pytest.raises(InputError, match=r"f\.st .*version is v4, asked for was v2"):
+        require_same(network_config("v4"), network_config("v2"), "f.st")
+
+
+# pillars
+
+
+def test_pillars_know_their_points():
+    config = tiny("v0")
+    points = some_points(config, margin=1.0)
+    points[3, 0], points[4, 2], points[5, 3] = torch.nan, torch.inf, torch.nan
+    pillars = make_pillars([points], config)
+    low, high = torch.tensor(config.low), torch.tensor(config.high)
+    inside = ((points[:, :3] >= low) & (points[:, :3] < high)).all(1) & points.isfinite().all(1)
+    assert torch.equal(pillars.points, points[inside]) and 0 < inside.sum() < len(points) - 3
+    height, width = config.grid
+    assert pillars.cells.min() >= 0 and pillars.cells.max() < height * width
+    for cell in pillars.cells.unique():
+        members = pillars.cells == cell
+        xyz, offsets = pillars.points[members][:, :3], pillars.offsets[members]
+        middle = low[:2] + (torch.stack([cell % width, cell // width]) + 0.5) * config.cell
+        torch.testing.assert_close(offsets[:, :3], xyz - xyz.mean(0), atol=1e-5, rtol=0)
+        torch.testing.assert_close(offsets[:, 3:], xyz[:, :2] - middle, atol=1e-5, rtol=0)
+        assert offsets[:, 3:].abs().max() <= config.cell / 2 + 1e-5
+
+
+@few
+@given(seeds, st.integers(1, 5))
+def test_the_first_points_of_each_pillar_are_those_of_a_loop(seed, most):
+    cells = torch.from_numpy(np.random.default_rng(seed).integers(0, 9, 50))
+    counts, kept = {}, []
+    for i, cell in enumerate(cells.tolist()):
+        counts[cell] = counts.get(cell, 0) + 1
+        if counts[cell] <= most:
+            kept.append(i)
+    assert first_of_each(cells, most).tolist() == kept
+
+
+def test_the_order_of_the_points_makes_no_difference():
+    config = tiny("v0")
+    network, points = lively(config), some_points(config)
+    image = network.pillar_net(make_pillars([points], config))
+    shuffled = network.pillar_net(make_pillars([points[torch.randperm(len(points))]], config))
+    torch.testing.assert_close(shuffled, image, atol=1e-5, rtol=1e-5)
+    assert image.max() > 0
+
+
+def test_points_keep_their_precision_where_the_rest_runs_in_16_bits():
+    config = tiny()
+    network = lively(config)
+    pillars = make_pillars([some_points(config)], config)
+    whole = network.pillar_net(pillars)
+    with torch.autocast("cpu", torch.bfloat16):
+        assert torch.equal(network.pillar_net(pillars), whole)
+        assert network.features(pillars).dtype == torch.bfloat16
+
+
+def test_moving_the_points_by_a_pillar_moves_the_image_by_a_cell():
+    config = tiny("v0", low=(0.0, -4.0, -3.0), high=(8.0, 4.0, 1.0), cell=0.25)
+    network = lively(config)
+    network.pillar_net.linear.weight[:, :2] = 0  # x and y themselves
+    points = (some_points(config) * 64).round() / 64  # so that moving is exact
+    points = points[(points[:, 0] < 7.5) & (points[:, 1] < 3.5)]
+    image = network.pillar_net(make_pillars([points], config))
+    for axis, (rows, columns) in ((0, (0, 1)), (1, (1, 0))):
+        moved = points.clone()
+        moved[:, axis] += 0.25
+        shifted = network.pillar_net(make_pillars([moved], config))
+        torch.testing.assert_close(shifted, image.roll((rows, columns), (2, 3)), atol=1e-5, rtol=0)
+
+
+def test_smaller_x_and_y_need_larger_weights():
+    config = tiny("v2", xy_scale=1.0)
+    plain, small = lively(config), lively(dataclasses.replace(config, xy_scale=0.125))
+    small.load_state_dict(plain.state_dict())
+    pillars = make_pillars([some_points(config)], config)
+    assert not torch.allclose(small.pillar_net(pillars), plain.pillar_net(pillars), atol=0.1)
+    small.pillar_net.linear.weight[:, :2] *= 8
+    torch.testing.assert_close(small.pillar_net(pillars), plain.pillar_net(pillars))
+
+
+@pytest.mark.parametrize("middle_z", [False, True])
+def test_limited_pillars_are_those_of_padded_code(middle_z):
+    config = tiny("v0", max_points=2, zero_row=True, middle_z=middle_z, xy_scale=1.0)
+    network, points = lively(config), some_points(config, 900)
+    net, low = network.pillar_net, torch.tensor(config.low)
+    image = net(make_pillars([points], config))[0]
+    expected = torch.zeros_like(image)
+    cells = ((points[:, :2] - low[:2]) / config.cell).floor().long()
+    for column, row in set(map(tuple, cells.tolist())):
+        members = points[(cells == torch.tensor([column, row])).all(1)][:2]
+        rows = torch.zeros(2, 9 + middle_z)  # filled up with zeros, which take part in the maximum
+        middle = [*(low[:2] + (torch.tensor([column, row]) + 0.5) * config.cell), -1.0]
+        rows[:len(members)] = torch.cat([members, members[:, :3] - members[:, :3].mean(0),
+                                         (members[:, :3] - torch.tensor(middle))[:, :2 + middle_z]],
+                                        dim=1)
+        expected[:, row, column] = torch.relu(net.norm(net.linear(rows))).max(0).values
+    torch.testing.assert_close(image, expected, atol=1e-5, rtol=1e-5)
+
+
+# the network
+
+
+@each_version
+@pytest.mark.parametrize("changes", [{}, dict(fusion="concat"), dict(block_strides=(1, 2, 2))])
+def test_every_version_gives_an_output_for_every_anchor(version, changes):
+    config = tiny(version, **changes)
+    count = len(make_anchors(config))
+    assert count == config.head_grid[0] * config.head_grid[1] * 6
+    out = make_network(config)(make_pillars([some_points(config), some_points(config, 9)], config),
+                               torch.cat([some_map(config)] * 2) if config.pseudo_map else None)
+    assert [tuple(t.shape) for t in out] == [(2, count, 3), (2, count, 7), (2, count, 2)]
+    assert torch.sigmoid(out.logits).mean().item() == pytest.approx(0.01, rel=0.2)  # untrained
+
+
+@each_version
+def test_a_batch_of_two_is_two_clouds(version):
+    config = tiny(version)
+    network = lively(config)
+    clouds = [some_points(config, 300, 1), some_points(config, 500, 2)]
+    maps = [some_map(config, 1), some_map(config, 2)]
+    both = network(make_pillars(clouds, config),
+                   torch.cat(maps) if config.pseudo_map else None)
+    for i in range(2):
+        alone = network(make_pillars(clouds[i:i + 1], config), maps[i])
+        for one, batch in zip(alone, both):
+            torch.testing.assert_close(one[0], batch[i], atol=2e-5, rtol=1e-4)
+    assert not torch.allclose(both.logits[0], both.logits[1], atol=1e-3)
+
+
+@each_version
+def test_folding_the_norms_changes_nothing(version):
+    config = tiny(version)
+    network = lively(config)
+    pillars, cluster_map = make_pillars([some_points(config)], config), some_map(config)
+    folded = fused(network)
+    for a, b in zip(network(pillars, cluster_map), folded(pillars, cluster_map)):
+        torch.testing.assert_close(a, b, atol=2e-5, rtol=1e-4)
+    assert not [m for m in folded.modules() if isinstance(m, torch.nn.BatchNorm2d)]
+
+
+def test_boxes_at_some_anchors_are_those_of_all():
+    config = tiny("v1")
+    network = lively(config)
+    features = network.features(make_pillars([some_points(config)], config))
+    out, some = network.head(features), torch.tensor([0, 5, 17, 100, 1535])
+    codes, directions = network.head.boxes_at(features, some)
+    torch.testing.assert_close(codes, out.codes[0, some], atol=1e-5, rtol=1e-4)
+    torch.testing.assert_close(directions, out.directions[0, some], atol=1e-5, rtol=1e-4)
+    assert torch.equal(network.head.logits(features), out.logits)
+
+
+def test_a_tiny_network_learns_two_objects():
+    config = tiny("v0", block_channels=(16, 24, 24), deconv_channels=16, pillar_channels=16)
+    torch.manual_seed(0)
+    network = make_network(config)
+    for module in network.modules():
+        if isinstance(module, torch.nn.BatchNorm1d | torch.nn.BatchNorm2d):
+            module.momentum = 0.1
+    anchors, kinds = make_anchors(config), anchor_classes(config)
+    targets = assign(anchors, config, BOXES, LABELS)
+    points = torch.from_numpy(two_objects())
+    optimizer = torch.optim.AdamW(network.parameters())
+    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 0.02, total_steps=400)
+    for _ in range(400):
+        losses = detection_loss(network(make_pillars([points], config)), targets, kinds)
+        optimizer.zero_grad()
+        losses.total.backward()
+        optimizer.step()
+        rate.step()
+    with torch.no_grad():
+        out = fused(network)(make_pillars([points], config))
+    scores = torch.sigmoid(out.logits[0])
+    for box, label in zip(BOXES, LABELS):
+        best = scores[:, label].argmax()
+        found = decode(out.codes[0, best][None], out.directions[0, best].argmax()[None],
+                       anchors[best][None], config.direction_offset)[0]
+        assert scores[best, label] > 0.9
+        torch.testing.assert_close(found[:6], box[:6], atol=0.2, rtol=0)
+        assert abs(wrap_angle((found[6] - box[6]).item())) < 0.2
+    assert (scores.amax(1) > 0.5).sum() <= 2 * (targets.labels >= 0).sum()

@@ -1,0 +1,246 @@
+"""Laws of what a network is taught and how it is read: anchors, boxes, targets, losses, NMS."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from detection_samples import BOXES, LABELS, tiny
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidar_perception.detectors.nms import suppressed
+from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
+from lidar_perception.detectors.pointpillars.box_coder import decode, encode
+from lidar_perception.detectors.pointpillars.config import ANCHORS
+from lidar_perception.detectors.pointpillars.losses import detection_loss
+from lidar_perception.detectors.pointpillars.network import Outputs
+from lidar_perception.detectors.pointpillars.targets import (
+    BACKGROUND,
+    IGNORED,
+    Targets,
+    anchors_near,
+    assign,
+    nearest_axis_iou,
+    stacked,
+)
+
+few = settings(max_examples=25, database=None)
+seeds = st.integers(0, 2**32 - 1)
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def some_boxes(seed, count=20, spread=6.0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(-spread, spread, (count, 3)),
+                            rng.uniform(0.4, 5, (count, 3)), rng.uniform(-7, 7, count)])
+
+
+# anchors and boxes
+
+
+def test_anchors_lie_in_rows_along_y_then_x_then_class_then_yaw():
+    config = tiny("v0")
+    anchors = make_anchors(config)
+    height, width = config.head_grid
+    grid = anchors.view(height, width, 3, 2, 7)
+    assert torch.equal(anchor_classes(config).view(height, width, 3, 2)[2, 3].T,
+                       torch.arange(3).expand(2, 3))
+    torch.testing.assert_close(grid[0, :, 0, 0, 0], (torch.arange(width) + 0.5) * 0.64)
+    torch.testing.assert_close(grid[:, 0, 0, 0, 1], -5.12 + (torch.arange(height) + 0.5) * 0.64)
+    for i, spec in enumerate(ANCHORS):
+        assert grid[1, 1, i, :, 3:6].tolist() == [pytest.approx(spec.size)] * 2
+        assert grid[1, 1, i, 0, 2] - spec.size[2] / 2 == pytest.approx(-1.73)  # on the ground
+    ends = make_anchors(tiny("v0", anchors_at="ends")).view(height, width, 3, 2, 7)
+    assert (ends[0, 0, 0, 0, :2].tolist(), ends[-1, -1, 0, 0, :2].tolist()) == (
+        [0.0, pytest.approx(-5.12)], [pytest.approx(10.24), pytest.approx(5.12)])
+
+
+@few
+@given(seeds, st.sampled_from([0.0, np.pi / 4, 0.78539, -np.pi / 2]))
+def test_decoding_undoes_encoding(seed, offset):
+    boxes = torch.from_numpy(some_boxes(seed))
+    anchors = torch.from_numpy(some_boxes(seed ^ 1))
+    codes, bins = encode(boxes, anchors, offset)
+    turned = codes.clone()
+    turned[:, 6] += np.pi  # the direction is in the bins alone
+    for given_codes in codes, turned:
+        back = decode(given_codes, bins, anchors, offset)
+        torch.testing.assert_close(back[:, :6], boxes[:, :6], atol=1e-9, rtol=1e-9)
+        away = torch.remainder(back[:, 6] - boxes[:, 6] + np.pi, 2 * np.pi) - np.pi
+        assert away.abs().max() < 1e-9 and back[:, 6].abs().max() <= np.pi
+    assert torch.equal(encode(anchors, anchors, offset)[0], torch.zeros(20, 7, dtype=torch.float64))
+
+
+# targets
+
+
+def test_the_overlap_of_boxes_along_the_axes_is_the_usual_one():
+    a = torch.tensor([[0, 0, 0, 4.0, 2, 1, 0.0]])
+    b = torch.tensor([[1, 0, 0, 2.0, 4, 1, np.pi / 2 + 0.1], [9, 0, 0, 1, 1, 1, 0]])
+    assert nearest_axis_iou(a, b)[0].tolist() == [pytest.approx(6 / 10), 0.0]
+
+
+def test_targets_are_those_of_a_plain_reading():
+    config = tiny("v0")
+    anchors, classes = make_anchors(config), anchor_classes(config)
+    rng = np.random.default_rng(3)
+    sizes = torch.tensor([a.size for a in config.anchors])
+    labels = torch.from_numpy(rng.integers(0, 3, 8))
+    boxes = torch.from_numpy(np.column_stack([
+        rng.uniform(1, 9, 8), rng.uniform(-4, 4, 8), np.full(8, -1.0), np.zeros((8, 3)),
+        rng.uniform(-4, 4, 8)])).float()
+    boxes[:, 3:6] = sizes[labels] * 1.05
+    found = assign(anchors, config, boxes, labels)
+    overlap = nearest_axis_iou(anchors, boxes).numpy()
+    for i in range(len(anchors)):
+        spec = config.anchors[classes[i]]
+        mine = [j for j in range(8) if labels[j] == classes[i]]
+        forced = [j for j in mine if overlap[i, j] > 0 and
+                  overlap[i, j] == overlap[(classes == labels[j]).numpy(), j].max()]
+        best = max(mine, key=lambda j: overlap[i, j], default=None)
+        if forced or (best is not None and overlap[i, best] >= spec.matched):
+            target = forced[0] if forced else best
+            assert found.labels[0, i] == classes[i]
+            codes, bins = encode(boxes[target][None], anchors[i][None], config.direction_offset)
+            torch.testing.assert_close(found.codes[0, i], codes[0])
+            assert found.bins[0, i] == bins[0]
+        elif best is not None and overlap[i, best] >= spec.unmatched:
+            assert found.labels[0, i] == IGNORED
+        else:
+            assert found.labels[0, i] == BACKGROUND and not found.codes[0, i].any()
+    assert {*found.labels.unique().tolist()} == {IGNORED, BACKGROUND, *labels.tolist()}
+
+
+@few
+@given(seeds)
+def test_anchors_that_are_not_near_overlap_nothing(seed):
+    config = tiny()
+    anchors = make_anchors(config)
+    boxes = torch.from_numpy(some_boxes(seed, 6, 12.0)).float()
+    kinds = anchor_classes(config)
+    for index in range(len(config.anchors)):
+        near = anchors_near(anchors, config, boxes, index)
+        mine = torch.nonzero(kinds == index)[:, 0]
+        assert torch.isin(near, mine).all() and (near.diff() > 0).all()
+        others = mine[~torch.isin(mine, near)]
+        assert not nearest_axis_iou(anchors[others], boxes).any()
+    assert len(anchors_near(anchors, config, boxes[:0], 0)) == 0
+
+
+def test_every_object_has_an_anchor_and_the_order_of_objects_makes_no_difference():
+    config = tiny("v0")
+    anchors = make_anchors(config)
+    there = assign(anchors, config, BOXES, LABELS)
+    back = assign(anchors, config, BOXES.flip(0), LABELS.flip(0))
+    for a, b in zip(there, back):
+        assert torch.equal(a, b)
+    positive = there.labels[0] >= 0
+    decoded = decode(there.codes[0, positive], there.bins[0, positive], anchors[positive],
+                     config.direction_offset)
+    for box, label in zip(BOXES, LABELS):
+        near = (decoded - box).abs().amax(1) < 1e-4
+        assert near.any() and (there.labels[0, positive][near] == label).all()
+
+
+def test_objects_without_size_and_no_objects_leave_background():
+    config = tiny("v0")
+    broken = BOXES.clone()
+    broken[0, 3], broken[1, 0] = 0, torch.nan
+    for boxes, labels in (broken, LABELS), (BOXES[:0], LABELS[:0]):
+        assert (assign(make_anchors(config), config, boxes, labels).labels == BACKGROUND).all()
+
+
+# losses
+
+
+def outputs_of(targets, classes=3, sure=12.0):
+    """Outputs that are just right."""
+    logits = torch.full((*targets.labels.shape, classes), -sure)
+    directions = torch.nn.functional.one_hot(targets.bins, 2).float() * 2 * sure
+    positive = targets.labels >= 0
+    logits[positive] += torch.nn.functional.one_hot(
+        targets.labels[positive], classes) * 2 * sure
+    return Outputs(logits, targets.codes.clone(), directions)
+
+
+def test_what_is_right_costs_nothing_and_what_is_wrong_costs():
+    config = tiny("v0")
+    kinds = anchor_classes(config)
+    targets = assign(make_anchors(config), config, BOXES, LABELS)
+    right = outputs_of(targets)
+    assert detection_loss(right, targets, kinds).total < 1e-4
+    turned = right._replace(codes=right.codes + torch.tensor([0, 0, 0, 0, 0, 0, np.pi]))
+    assert detection_loss(turned, targets, kinds).boxes < 1e-6  # the direction is another loss
+    wrong = right._replace(directions=-right.directions)
+    assert detection_loss(wrong, targets, kinds).directions > 1
+    assert detection_loss(right._replace(codes=right.codes + 0.3), targets, kinds).boxes > 0.1
+    assert detection_loss(right._replace(logits=-right.logits), targets, kinds).classes > 1
+
+
+def random_outputs(anchors, clouds=1):
+    torch.manual_seed(0)
+    return Outputs(*(torch.randn(clouds, len(anchors), n) for n in (3, 7, 2)))
+
+
+def test_losses_of_a_batch_twice_are_the_same_and_do_not_see_what_is_ignored():
+    config = tiny("v0")
+    anchors, kinds = make_anchors(config), anchor_classes(config)
+    targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors)
+    once = detection_loss(out, targets, kinds)
+    twice = detection_loss(Outputs(*(torch.cat([t, t]) for t in out)), stacked([targets, targets]),
+                           kinds)
+    for a, b in zip(once, twice):
+        torch.testing.assert_close(a, b)
+    changed = out.logits.clone()
+    changed[targets.labels == IGNORED] += 5
+    assert (targets.labels == IGNORED).any()
+    torch.testing.assert_close(detection_loss(out._replace(logits=changed), targets, kinds).total,
+                               once.total)
+
+
+def test_scores_of_every_class_weigh_alike_however_many_anchors_it_is_on():
+    config = tiny("v0")
+    anchors, kinds = make_anchors(config), anchor_classes(config)
+    targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors, 2)
+    targets = stacked([targets, assign(anchors, config, BOXES[:1], LABELS[:1])])
+    parts = []
+    for kind in range(3):
+        mine = kinds == kind
+        part = detection_loss(Outputs(*(t[:, mine] for t in out)),
+                              Targets(*(t[:, mine] for t in targets)), kinds[mine])
+        parts.append(part.classes)
+    numbers = [int(((targets.labels >= 0) & (kinds == kind)).sum()) for kind in range(3)]
+    assert max(numbers) > 2 * min(numbers)
+    torch.testing.assert_close(detection_loss(out, targets, kinds).classes, sum(parts))
+
+
+# non-maximum suppression
+
+
+def reference_iou(a, b):
+    (one, first), (two, second) = (
+        (((box[0], box[1]), (box[3], box[4]), np.degrees(box[6])), box[3] * box[4])
+        for box in (a, b))
+    kind, region = cv2.rotatedRectangleIntersection(one, two)
+    shared = cv2.contourArea(cv2.convexHull(region)) if kind else 0.0
+    return shared / (first + second - shared)
+
+
+@few
+@given(seeds, st.booleans())
+def test_suppression_is_that_of_a_slow_loop(seed, across):
+    rng = np.random.default_rng(seed)
+    boxes = some_boxes(seed, 30, spread=4)
+    scores, labels, limit = rng.permutation(30) / 30, rng.integers(0, 3, 30), 0.2
+    kept, sure = [], True
+    for i in np.argsort(-scores):
+        overlaps = [reference_iou(boxes[i], boxes[j]) for j in kept
+                    if across or labels[i] == labels[j]]
+        sure &= all(abs(o - limit) > 1e-3 for o in overlaps)  # the reference is in float32
+        if all(o <= limit for o in overlaps):
+            kept.append(i)
+    if sure:
+        assert suppressed(boxes, scores, labels, limit, across).tolist() == kept
+    assert suppressed(boxes[:0], scores[:0], labels[:0], limit).tolist() == []

@@ -1,0 +1,283 @@
+"""The detector from frame to boxes: experts, pose, thresholds, bad input, devices."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from detection_samples import eager, frame, lively, random_detector, same, tiny
+
+from lidar_perception.clustering.cluster import cluster
+from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
+from lidar_perception.detectors.pointpillars import detector as detector_module
+from lidar_perception.detectors.pointpillars.checkpoint import Header
+from lidar_perception.detectors.pointpillars.config import VERSIONS, network_config
+from lidar_perception.detectors.pointpillars.detector import (
+    CPU,
+    STEPS,
+    Detector,
+    TorchNetwork,
+    chosen_device,
+)
+from lidar_perception.detectors.pointpillars.expert import (
+    MAP_CLASSES,
+    draw_clusters,
+    network_input,
+    renumbered,
+)
+from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
+from lidar_perception.detectors.view import in_sensor_frame, visible
+from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.ground.segment import level, segment_ground
+from lidar_perception.param_fields import with_values
+from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+each_version = pytest.mark.parametrize("version", VERSIONS)
+
+
+# experts
+
+@each_version
+def test_columns_that_are_given_say_the_same_as_those_that_are_computed(version):
+    detector = random_detector(version)
+    scan = frame()
+    places, seen = visible(scan, detector.config)
+    flat = np.zeros(len(scan), bool)
+    flat[places] = segment_ground(seen, EXPERT_GROUND)
+    ids = np.zeros(len(scan), np.uint32)
+    obstacles = places[~flat[places]]
+    ids[obstacles] = cluster(scan.xyz[obstacles], EXPERT_CLUSTERING)
+    ids[ids > 0] *= 3  # whatever the numbers
+    assert flat.any() and ids.max() >= 6
+    computed = detector(scan)
+    assert len(computed) > 3
+    for columns in (flat, None), (None, ids), (flat.astype(np.uint8), ids):
+        assert same(detector(scan, *columns), computed)
+
+
+def test_versions_see_what_the_paper_says():
+    scan = frame()
+    inputs = {}
+    for version in VERSIONS:
+        config = tiny(version)
+        _, seen = visible(scan, config)
+        inputs[version] = network_input(seen, config)
+    flat = segment_ground(seen, EXPERT_GROUND)
+    assert [i.points.shape[1] for i in inputs.values()] == [4, 4, 5, 5, 4]
+    assert [i.cluster_map is not None for i in inputs.values()] == [False] * 4 + [True]
+    for version, kept in (("v0", np.ones(len(seen), bool)), ("v1", ~flat), ("v2", ~flat),
+                          ("v3", np.ones(len(seen), bool)), ("v4", ~flat)):
+        np.testing.assert_array_equal(inputs[version].points[:, :3], seen.xyz[kept])
+        np.testing.assert_array_equal(inputs[version].points[:, 3], seen.intensity[kept])
+    np.testing.assert_array_equal(inputs["v3"].points[~flat], inputs["v2"].points)
+    assert not inputs["v3"].points[flat, 4].any()
+    ids = inputs["v2"].points[:, 4]
+    assert {*np.unique(ids)} >= {1, 2} and ids.max() == len(np.unique(ids[ids > 0]))
+
+
+def test_numbers_of_clusters_keep_their_order():
+    assert renumbered(np.array([7, 0, 3, 7, -1, 9])).tolist() == [2, 0, 1, 2, 0, 3]
+    assert renumbered(np.zeros(0, np.uint32)).tolist() == []
+    large = np.array([2**31 - 1, 0, 7, 2**31 - 1, -5, 2**62])  # no table of that length is made
+    assert renumbered(large).tolist() == [2, 0, 1, 2, 0, 3]
+
+
+def test_the_map_is_that_of_a_plain_loop_over_cells():
+    config = tiny("v4", cell=0.16)
+    rng = np.random.default_rng(4)
+    spots = rng.uniform([0, -6, 0], [10.5, 6, 0], (25, 3))
+    spread = np.linspace(0.02, 3, 25)[:, None, None]
+    xyz = (spots[:, None] + rng.normal(size=(25, 40, 3)) * spread * 0.5).reshape(-1, 3)
+    xyz, ids = xyz.astype(np.float32), np.repeat(np.arange(25), 40).astype(np.int32)  # 0 is none
+    kinds = class_by_diagonal(oriented_boxes(xyz, ids, "min_area"))
+    assert {*kinds} == {-1, *(CLASSES.index(n) for n in MAP_CLASSES)}
+    expected = np.zeros((3, *config.grid), np.uint8)
+    y, x = np.meshgrid(*(low + (np.arange(n) + 0.5) * 0.16
+                         for low, n in zip((config.low[1], config.low[0]), config.grid)),
+                       indexing="ij")
+    for kind, (cx, cy, a, b, yaw) in zip(kinds, ellipses(xyz, ids).astype(float)):
+        if kind < 0:
+            continue
+        u = np.cos(yaw) * (x - cx) + np.sin(yaw) * (y - cy)
+        v = np.cos(yaw) * (y - cy) - np.sin(yaw) * (x - cx)
+        centre = np.maximum(abs(x - cx), abs(y - cy)) <= 0.08
+        expected[MAP_CLASSES.index(CLASSES[kind])] |= ((u / a)**2 + (v / b)**2 <= 1) | centre
+    drawn = draw_clusters(xyz, ids, config)
+    assert (drawn != expected).sum() <= 2  # cells whose middle is on the rim
+    assert drawn.shape == (3, 64, 64) and all(layer.any() for layer in drawn)
+
+
+def test_a_cluster_on_a_line_is_drawn_where_its_centre_is():
+    config = tiny("v4")
+    xyz = np.float32([[4.1, 1.1, -1], [4.5, 1.1, -0.5], [4.9, 1.1, 0]])
+    image = draw_clusters(xyz, np.ones(3, np.int32), config)
+    assert np.argwhere(image).tolist() == [[MAP_CLASSES.index("Pedestrian"), int(6.22 / 0.32),
+                                            int(4.5 / 0.32)]]
+
+
+# the detector
+
+def test_what_is_visible_does_not_depend_on_the_height_of_the_sensor():
+    config, rng = tiny(), np.random.default_rng(0)
+    scan = LidarFrame(rng.uniform([-2, -7, -6], [12, 7, 5], (500, 3)).astype(np.float32))
+    places, seen = visible(scan, config)
+    higher = replace(scan, xyz=scan.xyz - np.float32([0, 0, 0.5]))
+    again, seen_again = visible(higher, config, SensorPoseParams(height=2.23))
+    assert places.tolist() == again.tolist() and 50 < len(places) < 450
+    np.testing.assert_allclose(seen_again.xyz, seen.xyz, atol=1e-5)
+    low, high = np.array(config.low), np.array(config.high)
+    assert (seen.xyz >= low).all() and (seen.xyz < high).all()
+
+
+def test_detections_are_above_their_thresholds_in_order_and_apart():
+    detector = random_detector("v4")
+    found = detector(frame())
+    assert (np.diff(found.scores) <= 0).all() and (found.scores >= 0.25).all()
+    assert {*found.class_ids} <= {CLASSES.index(n) for n in detector.config.classes}
+    assert detector.problem is None and list(detector.ms) == list(STEPS)
+    assert detector.ms["network"] > 0
+    middle = float(np.median(found.scores[found.class_ids == found.class_ids[0]]))
+    name = CLASSES[found.class_ids[0]].lower()
+    detector.params = with_values(detector.params, {f"detection.scores.{name}": middle})
+    fewer = detector(frame())
+    assert fewer.scores[fewer.class_ids == found.class_ids[0]].min() >= middle
+    detector.params = with_values(detector.params, {"detection.nms.max_boxes": 2})
+    assert same(detector(frame()), fewer[:2])
+
+
+def test_another_height_of_the_sensor_moves_the_boxes_only():
+    detector = random_detector("v4")
+    scan, found = frame(), detector(frame())
+    higher = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
+    detector.params = with_values(detector.params, {"ground.sensor_pose.height": 2.23})
+    moved = detector(higher)
+    assert same(replace(moved, boxes=moved.boxes + np.float32([0, 0, 0.5, 0, 0, 0, 0])), found,
+                1e-3)
+
+
+@pytest.mark.parametrize("roll, pitch", [(3.1416, 0.0), (0.0, 0.2), (0.1, -0.1)])
+def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch):
+    pose = SensorPoseParams(roll=roll, pitch=pitch)
+    turn = level(np.eye(3, dtype=np.float32), pose)  # rows: the sensor's axes when level
+    found = Detections.of([[8, 2, -1, 4, 2, 1.5, 0.7]], scores=[0.5])
+    box = in_sensor_frame(found, pose).boxes[0]
+    np.testing.assert_allclose(box[:3] @ turn, [8, 2, -1], atol=1e-5)
+    forward = np.array([np.cos(box[6]), np.sin(box[6]), 0]) @ turn
+    assert forward[:2] @ [np.cos(0.7), np.sin(0.7)] > 0.97  # yaw is about the sensor's own z
+    assert same(in_sensor_frame(found, SensorPoseParams()), found)
+
+
+def test_intensity_is_scaled_and_may_be_left_out():
+    detector, scan = random_detector(), frame()
+    found = detector(scan)
+    half = replace(scan, intensity=scan.intensity / 2)
+    assert not same(detector(half), found)
+    detector.params = with_values(detector.params, {"detection.intensity_scale": 2.0})
+    assert same(detector(half), found)
+    without = detector(replace(scan, intensity=None))
+    assert "no intensity" in detector.problem
+    detector.params = with_values(detector.params, {"detection.intensity_scale": 0.0})
+    assert same(detector(scan), without) and detector.problem is None
+    assert same(detector(replace(scan, intensity=None)), without) and detector.problem is None
+
+
+@pytest.mark.parametrize("xyz, words", [
+    (np.zeros((0, 3)), "empty"), (np.full((5, 3), np.nan), "network's range"),
+    ([[-5, 0, 0], [500, 0, 0]], "network's range")])
+@pytest.mark.parametrize("version", ["v0", "v4"])
+def test_a_cloud_with_nothing_to_see_has_no_detections_and_a_reason(version, xyz, words):
+    detector = random_detector(version)
+    assert len(detector(LidarFrame(np.asarray(xyz, np.float32)))) == 0
+    assert words in detector.problem and detector.ms["network"] == 0
+    detector(frame())
+    assert detector.problem is None
+
+
+def test_ground_alone_has_no_detections_and_a_reason():
+    detector, scan = random_detector("v4"), frame()
+    assert len(detector(scan, np.ones(len(scan), bool))) == 0
+    assert "ground.sensor_pose" in detector.problem
+
+
+def test_where_nothing_passes_the_best_scores_are_said():
+    detector, scan = random_detector("v4", eager(score=0.0)), frame()
+    found = detector(scan)
+    assert detector.best == {}
+    highest = {name: float(found.scores[found.class_ids == CLASSES.index(name)].max())
+               for name in detector.config.classes if CLASSES.index(name) in found.class_ids}
+    detector.params = eager(score=1.0)
+    assert len(detector(scan)) == 0 and detector.problem is None
+    assert list(detector.best) == list(detector.config.classes)
+    assert max(detector.best.values()) == pytest.approx(max(highest.values()))
+    assert all(detector.best[name] >= score - 1e-6 for name, score in highest.items())
+    for parameter in detector.network.network.head.parameters():
+        parameter.fill_(np.nan)
+    detector(scan)
+    assert "NaN" in detector.problem
+
+
+def test_many_points_and_broken_ones_are_no_trouble():
+    detector, scan = random_detector("v2"), frame()
+    xyz = np.tile(scan.xyz, (250, 1))
+    xyz[:5] = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [1e9, 0, 0], [-np.inf, 0, np.nan]]
+    assert len(xyz) > 900_000
+    detector(LidarFrame(xyz, np.tile(scan.intensity, 250)), np.zeros(len(xyz), bool),
+             np.tile(np.arange(len(scan)), 250))
+    assert detector.problem is None
+
+
+def test_columns_of_another_length_are_refused():
+    with pytest.raises(InputError, match="ground has 3 values"):
+        random_detector()(frame(), np.zeros(3, bool))
+
+
+class OutOfMemory(TorchNetwork):
+    """A network for which another device than the CPU has no memory."""
+
+    def __init__(self, network):
+        super().__init__(network, CPU)
+        self.device = torch.device("meta")
+
+    def to(self, device):
+        self.device = device
+
+    def __call__(self, pillars, maps):
+        if self.device.type != "cpu":
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return super().__call__(pillars, maps)
+
+
+def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(monkeypatch):
+    config, scan = tiny(), frame()
+    real = detector_module.make_pillars
+    monkeypatch.setattr(detector_module, "make_pillars", lambda clouds, config: real(
+        [c if c.device.type == "cpu" else torch.zeros(1, 4) for c in clouds], config))
+    broken = Detector(OutOfMemory(lively(config)), Header(config), torch.device("meta"), eager())
+    assert same(broken(scan), random_detector()(scan))
+    assert "CPU" in broken.problem and broken.device == CPU
+    assert same(broken(scan), random_detector()(scan)) and "CPU" in broken.problem
+    never = with_values(eager(), {"detection.cpu_fallback": False})
+    with pytest.raises(InputError, match="no memory"):
+        Detector(OutOfMemory(lively(config)), Header(config), torch.device("meta"), never)(scan)
+
+
+@pytest.mark.parametrize("name, words", [("tpu", "no device 'tpu'"), ("mps", "no device 'mps'"),
+                                         ("cuda:99", "CUDA device")])
+def test_a_device_that_is_not_there_is_refused(name, words):
+    with pytest.raises(InputError, match=words):
+        chosen_device(name)
+    assert chosen_device("cpu") == CPU
+    assert chosen_device().type == ("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def test_real_scans_of_any_version_go_through(data):
+    from lidar_perception.data.kitti.folder import open_kitti
+    scan = open_kitti(data / "kitti_object")[0].load()
+    for version in VERSIONS:
+        config = network_config(version, "compact")
+        detector = Detector(TorchNetwork(lively(config)), Header(config), CPU)
+        detector(scan)
+        assert detector.problem is None and detector.ms["network"] > 0

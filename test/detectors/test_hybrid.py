@@ -1,0 +1,204 @@
+"""The hybrid detectors: either score alone at the ends of the weight, each box judged by itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from candidate_samples import boxes_at, scene
+from detection_samples import same
+from pointnet_samples import random_detector
+
+from lidar_perception.candidates.configurations import BEST
+from lidar_perception.candidates.pipeline import find_candidates
+from lidar_perception.candidates.seed_sources import automatic_seed
+from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.detectors.hybrid.candidates import RescoredCandidates
+from lidar_perception.detectors.hybrid.judging import combined, judged
+from lidar_perception.detectors.hybrid.params import ConfirmingParams, RescoringParams
+from lidar_perception.detectors.hybrid.proposals import ConfirmedProposals, points_of
+from lidar_perception.detectors.pointnet.clusters import clusters_of
+from lidar_perception.detectors.pointnet.predict import predict
+from lidar_perception.geometry import bev_iou, points_in_box
+from lidar_perception.param_fields import with_values
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+PIPELINE = with_values(BEST, {"view.enabled": False, "height.tolerance": 1.0})
+SEED = automatic_seed(load_seed(), PIPELINE)
+CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
+
+
+def cloud() -> LidarFrame:
+    xyz = scene()
+    return LidarFrame(xyz, np.random.default_rng(1).uniform(0, 1, len(xyz)).astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def judge():
+    return random_detector()
+
+
+@pytest.fixture(scope="module")
+def found(judge):
+    """What a low threshold leaves: the frame's segmentation and candidates."""
+    pipeline = RescoredCandidates(judge, RescoringParams(least_confidence=0.0), PIPELINE).pipeline
+    segmented, candidates = find_candidates(cloud(), SEED, None, pipeline)
+    assert len(candidates.final) >= 4
+    return segmented, candidates
+
+
+@pytest.fixture(scope="module")
+def clusters(found):
+    segmented, candidates = found
+    ids = np.where(np.isin(segmented.cluster_ids, candidates.clusters), segmented.cluster_ids, 0)
+    return clusters_of(cloud().take(segmented.places), ids, ground=segmented.ground)
+
+
+def rescored(judge, **changes) -> Detections:
+    params = RescoringParams(**{"least_confidence": 0.0, "threshold": 0.0, **changes})
+    return RescoredCandidates(judge, params, PIPELINE)(cloud(), SEED)
+
+
+def by_score(found: Detections) -> Detections:
+    return found[np.argsort(-found.scores, kind="stable")]
+
+
+def test_the_combined_score_is_a_mean_and_each_alone_at_its_ends():
+    rng = np.random.default_rng(0)
+    a, b = rng.uniform(0, 1, (2, 100)).astype(np.float32)
+    a[0] = b[1] = 0
+    np.testing.assert_array_equal(combined(a, b, 0.0), a)
+    np.testing.assert_array_equal(combined(a, b, 1.0), b)
+    for weight in (0.2, 0.5, 0.9):
+        mean = combined(a, b, weight)
+        assert (mean >= np.minimum(a, b) - 1e-6).all() and (mean <= np.maximum(a, b) + 1e-6).all()
+        np.testing.assert_allclose(mean, combined(b, a, 1 - weight), rtol=1e-5)
+        assert mean[0] == mean[1] == 0
+
+
+def test_candidates_know_their_clusters(found):
+    segmented, candidates = found
+    np.testing.assert_array_equal(segmented.boxes[candidates.clusters - 1],
+                                  candidates.final.boxes)
+    assert (np.diff(candidates.clusters) > 0).all()
+
+
+def test_with_weight_0_the_candidates_stand_as_they_are(judge, found):
+    assert same(rescored(judge, weight=0.0, box="cluster"), by_score(found[1].final))
+
+
+def test_with_weight_1_the_network_alone_scores(judge, found, clusters):
+    place = judge.config.classes.index("Pedestrian")
+    probability = predict(judge.network, clusters).probabilities[:, place]
+    alone = replace(found[1].final, scores=probability)
+    assert same(rescored(judge, weight=1.0, box="cluster"), by_score(alone), atol=1e-6)
+
+
+def test_a_candidate_is_judged_by_itself_whatever_the_order(judge, found, clusters):
+    whole, boxes = judged(judge, found[1].final, clusters, 0.5)
+    order = np.random.default_rng(2).permutation(len(whole))[:-1]
+    part, part_boxes = judged(judge, found[1].final[order], clusters.take(order), 0.5)
+    assert same(part, whole[order], atol=1e-5)
+    np.testing.assert_allclose(part_boxes, boxes[order], atol=1e-4)
+
+
+def test_boxes_of_the_network_are_of_pedestrians_and_do_not_overlap(judge, found, clusters):
+    result = rescored(judge, overlap=0.1)
+    _, boxes = judged(judge, found[1].final, clusters, 0.5)
+    assert all((np.abs(boxes - box).max(axis=1) < 1e-4).any() for box in result.boxes)
+    overlap = bev_iou(result.boxes, result.boxes) - np.eye(len(result))
+    assert overlap.max() <= 0.1 and (result.class_ids == PEDESTRIAN).all()
+    assert (np.diff(result.scores) <= 0).all()
+
+
+def test_the_threshold_leaves_what_scores_as_much(judge):
+    everything = rescored(judge, box="cluster")
+    limit = float(np.median(everything.scores))
+    assert same(rescored(judge, box="cluster", threshold=limit),
+                everything[everything.scores >= limit])
+
+
+def test_times_and_problems_are_told(judge):
+    detector = RescoredCandidates(judge, pipeline=PIPELINE)
+    detector(cloud(), SEED)
+    assert detector.problem is None and {"clustering", "stm", "network"} <= {*detector.ms}
+    empty = LidarFrame(np.zeros((0, 3), np.float32))
+    assert len(detector(empty, SEED)) == 0 and "empty" in detector.problem
+    with pytest.raises(InputError, match="no camera calibration"):
+        RescoredCandidates(judge)(cloud(), SEED)
+
+
+def test_a_network_that_knows_no_pedestrian_cannot_judge_candidates():
+    with pytest.raises(InputError, match="no Pedestrian, only Car"):
+        RescoredCandidates(random_detector(classes=("Car",), sizes=((4, 2, 1.5),)))
+
+
+@pytest.fixture(scope="module")
+def proposals():
+    """On two people and a thing, one nowhere, and one of a class that the network does not know."""
+    boxes = np.concatenate([boxes_at([(7, 2), (12, -5), (10.95, 9.5), (30, 30), (7, 2)])])
+    boxes[2, 3:6] = 2.5, 3.5, 1.6
+    return Detections.of(boxes, [PEDESTRIAN, CAR, CAR, PEDESTRIAN, VAN], [0.9, 0.8, 0.5, 0.4, 0.35])
+
+
+def confirmed(judge, proposals, frame=None, **changes) -> Detections:
+    stub = SimpleNamespace(problem="as the proposer says", ms={})
+    proposer = type("Stub", (), {**vars(stub), "__call__": lambda self, frame: proposals})()
+    detector = ConfirmedProposals(proposer, judge, ConfirmingParams(**{"threshold": 0.0,
+                                                                       **changes}))
+    result = detector(cloud() if frame is None else frame)
+    assert detector.problem == "as the proposer says"
+    assert {*detector.ms} == {"proposals", "ground", "clusters", "network"}
+    return result
+
+
+def test_with_weight_0_the_proposals_stand_as_they_are(judge, proposals):
+    assert same(confirmed(judge, proposals, weight=0.0), proposals)
+    assert len(confirmed(judge, proposals[:0])) == 0
+
+
+def test_with_weight_1_those_with_points_get_the_networks_probability(judge, proposals):
+    result = confirmed(judge, proposals, weight=1.0)
+    assert (np.diff(result.scores) <= 0).all() and len(result) == len(proposals)
+    score_of = {tuple(box) + (kind,): score for box, kind, score in zip(
+        result.boxes.tolist(), result.class_ids, result.scores)}
+    scores = [score_of[(*box, kind)] for box, kind in zip(proposals.boxes.tolist(),
+                                                          proposals.class_ids)]
+    np.testing.assert_array_equal(scores[3:], proposals.scores[3:])  # no points, no such class
+    assert (np.abs(np.array(scores[:3]) - proposals.scores[:3]) > 1e-3).all()
+    for i in range(3):
+        alone = confirmed(judge, proposals[i:i + 1], weight=1.0)
+        assert alone.scores[0] == pytest.approx(scores[i], abs=1e-6)
+
+
+def test_few_points_say_nothing(judge, proposals):
+    assert same(confirmed(judge, proposals, least_points=1_000_000), proposals)
+
+
+def test_a_higher_sensor_sees_the_same(judge, proposals):
+    frame, lift = cloud(), np.float32(0.5)
+    low = confirmed(judge, proposals, frame)
+    higher = random_detector(with_values(judge.params, {
+        "ground.sensor_pose.height": judge.params.ground.sensor_pose.height + float(lift)}))
+    down = np.array([0, 0, -lift], np.float32)
+    boxes = proposals.boxes + np.pad(down, (0, 4))
+    high = confirmed(higher, replace(proposals, boxes=boxes),
+                     replace(frame, xyz=frame.xyz + down))
+    np.testing.assert_allclose(high.scores, low.scores, atol=2e-3)
+
+
+def test_the_points_of_boxes_are_those_within(proposals):
+    frame = cloud()
+    seen = replace(frame, xyz=frame.xyz + np.float32(1))
+    made = points_of(proposals.boxes, frame, seen, 0.2)
+    assert len(made) == len(proposals) and made.sizes[3] < 5 < made.sizes[:3].min()
+    for i, box in enumerate(proposals.boxes):
+        part = made.points[made.first[i]:made.first[i + 1]]
+        inside = points_in_box(frame.xyz, box, 0.2)
+        np.testing.assert_array_equal(part[:, :3], seen.xyz[inside])
+        np.testing.assert_array_equal(part[:, 3], seen.intensity[inside])
+    assert len(points_of(proposals.boxes[:0], frame, seen, 0.2)) == 0

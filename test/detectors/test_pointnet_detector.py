@@ -1,0 +1,405 @@
+"""The PointNet detector from frame to boxes: clusters, pose, thresholds, bad input, weights."""
+
+from __future__ import annotations
+
+import json
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from cli_samples import evaluate_detection as evaluate
+from click.testing import CliRunner
+from detection_samples import frame, same
+from detection_samples import lively as lively_pointpillars
+from detection_samples import tiny as tiny_pointpillars
+from pointnet_samples import CPU, eager, lively, random_detector, small
+from samples import object_folder
+
+from lidar_perception.cli.main import cli
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.detectors.checkpoint import network_of
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointnet import weights_file as weights_module
+from lidar_perception.detectors.pointnet.checkpoint import Header, load_pointnet, read_header
+from lidar_perception.detectors.pointnet.detector import PointNetDetector, load_pointnet_detector
+from lidar_perception.detectors.pointnet.params import (
+    CLUSTERING,
+    GROUND,
+    STEPS,
+    PointNetDetectorParams,
+)
+from lidar_perception.detectors.pointnet.predict import CHUNK
+from lidar_perception.detectors.pointpillars.checkpoint import Header as PointPillarsHeader
+from lidar_perception.detectors.pointpillars.checkpoint import load_network, save_checkpoint
+from lidar_perception.detectors.pointpillars.detector import Detector
+from lidar_perception.detectors.view import in_sensor_frame
+from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.ground.segment import level, segment_ground
+from lidar_perception.param_fields import with_values
+from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def ids() -> np.ndarray:
+    """Cluster ids of the points of frame()."""
+    found = cluster_obstacles(frame().xyz, segment_ground(frame(), GROUND), CLUSTERING)
+    assert found.max() >= 5
+    return found
+
+
+def moved(found: Detections, turn: float = 0.0, shift=(0, 0, 0)) -> Detections:
+    """Turned about the sensor's z axis, then shifted."""
+    boxes = found.boxes.astype(np.float64)
+    cos, sin = np.cos(turn), np.sin(turn)
+    boxes[:, :2] = boxes[:, :2] @ np.array([[cos, sin], [-sin, cos]])
+    boxes[:, :3] += shift
+    boxes[:, 6] += turn
+    return replace(found, boxes=boxes)
+
+
+def alike(a: Detections, b: Detections, atol: float = 1e-4) -> bool:
+    """Whether both say the same; scores that hardly differ may have changed places."""
+    if len(a) != len(b):
+        return False
+    left = set(range(len(b)))
+    for box, kind, score in zip(a.boxes, a.class_ids, a.scores):
+        near = [i for i in left if np.allclose(b.boxes[i, :6], box[:6], atol=atol)
+                and np.cos(b.boxes[i, 6] - box[6]) > 1 - atol
+                and b.class_ids[i] == kind and abs(b.scores[i] - score) < atol]
+        if not near:
+            return False
+        left.remove(near[0])
+    return True
+
+
+# clusters
+
+def test_columns_that_are_given_say_the_same_as_those_that_are_computed(ids):
+    detector, scan = random_detector(), frame()
+    computed = detector(scan)
+    assert len(computed) > 3 and len(set(computed.class_ids)) > 1
+    flat = segment_ground(scan, GROUND)
+    for columns in (dict(cluster_ids=ids), dict(ground=flat), dict(ground=flat.astype("u1")),
+                    dict(cluster_ids=ids.astype(np.uint32), ground=flat)):
+        assert same(detector(scan, **columns), computed)
+
+
+def test_the_numbers_of_clusters_do_not_matter(ids):
+    detector, scan = random_detector(), frame()
+    found = detector(scan, ids)
+    assert same(detector(scan, np.where(ids > 0, ids + 100_000, 0)), found)
+    assert same(detector(scan, np.where(ids > 0, ids, -1)), found)
+    assert same(detector(scan, np.where(ids > 0, ids.astype(np.int64) * 2**40, -(2**50))), found)
+    turn = np.random.default_rng(0).permutation(ids.max()) + 1
+    permuted = np.concatenate([[0], turn])[ids]
+    assert not np.array_equal(permuted, ids) and alike(detector(scan, permuted), found)
+
+
+def test_clusters_do_not_know_of_each_other(ids):
+    detector, scan = random_detector(), frame()
+    everything = detector(scan, ids)
+    alone = [detector(scan, np.where(ids == i, ids, 0)) for i in range(1, ids.max() + 1)]
+    joined = Detections(*(np.concatenate([getattr(one, part) for one in alone])
+                          for part in ("boxes", "class_ids", "scores")))
+    assert alike(joined, everything)
+
+
+def test_a_frame_without_clusters_has_no_detections_and_a_reason(ids):
+    detector, scan = random_detector(), frame()
+    nothing = np.zeros(len(scan), np.int32)
+    far = LidarFrame(np.float32([[9, 0, -1], [20, 3, 0]]), np.zeros(2, np.float32))
+    for clouds, words in (
+            ((LidarFrame(np.zeros((0, 3), np.float32)),), "empty"),
+            ((LidarFrame(np.full((5, 3), np.nan, np.float32)),), "no finite point"),
+            ((scan, nothing), "no clusters"), ((scan, nothing - 1), "no clusters"),
+            ((far,), "no clusters"), ((scan, None, np.ones(len(scan), bool)), "no clusters"),
+            ((scan, np.arange(len(scan))), "fewer than 5 points")):
+        assert len(detector(*clouds)) == 0 and words in detector.problem, words
+        assert detector.best == {} and list(detector.ms) == list(STEPS)
+        detector(scan, ids)
+        assert detector.problem is None and detector.ms["network"] > 0
+
+
+def test_small_and_large_clusters_and_many_are_no_trouble(ids):
+    rng = np.random.default_rng(0)
+    detector = random_detector(with_values(eager(), {"pointnet.least_points": 1}))
+    batches = []
+    detector.network.register_forward_hook(lambda net, given, _: batches.append(len(given[0])))
+    one = LidarFrame(np.float32([[9, 0, -1]]), np.ones(1, np.float32))
+    assert len(detector(one, np.ones(1, int))) == 1
+    xyz = rng.uniform([5, -3, -1.7], [9, 3, 2], (50_000, 3)).astype(np.float32)
+    big = LidarFrame(xyz, rng.uniform(0, 1, len(xyz)).astype(np.float32))
+    assert len(detector(big, np.ones(len(xyz), int))) == 1
+    spots = rng.uniform(-80, 80, (5000, 1, 3)) * [1, 1, 0.01]
+    xyz = (spots + rng.normal(0, 0.2, (5000, 6, 3))).reshape(-1, 3).astype(np.float32)
+    batches.clear()
+    found = detector(LidarFrame(xyz, np.zeros(len(xyz), np.float32)), np.repeat(
+        np.arange(5000), 6) + 1)
+    assert sum(batches) == 5000 and max(batches) <= CHUNK
+    assert len(found) == detector.params.pointnet.nms.max_boxes and detector.problem is None
+
+
+# where the sensor is
+
+def test_the_scene_turned_about_the_sensor_has_its_boxes_turned(ids):
+    detector, scan = random_detector(), frame()
+    found = detector(scan, ids)
+    cos, sin = np.cos(2.0), np.sin(2.0)
+    turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
+    turned = replace(scan, xyz=(scan.xyz @ turn).astype(np.float32))
+    assert alike(detector(turned, ids), moved(found, 2.0), 2e-3)
+
+
+def test_another_height_of_the_sensor_moves_the_boxes_only(ids):
+    detector, scan = random_detector(), frame()
+    for columns in ((ids,), ()):
+        detector.params = eager()
+        found = detector(scan, *columns)
+        higher = replace(scan, xyz=scan.xyz - np.float32([0, 0, 0.5]))
+        # heights are measured from the ground that is there, so that nobody need say it
+        assert alike(detector(higher, *columns), moved(found, shift=(0, 0, -0.5)), 1e-3)
+        detector.params = with_values(eager(), {"ground.sensor_pose.height": 2.23})
+        assert alike(detector(higher, *columns), moved(found, shift=(0, 0, -0.5)), 1e-3)
+
+
+@pytest.mark.parametrize("roll, pitch", [(3.1416, 0.0), (0.0, 0.2)])
+def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch, ids):
+    pose = SensorPoseParams(roll=roll, pitch=pitch)
+    detector, scan = random_detector(), frame()
+    found = detector(scan, ids)
+    back = level(np.eye(3, dtype=np.float32), pose).T
+    detector.params = with_values(eager(), {"ground.sensor_pose.roll": roll,
+                                            "ground.sensor_pose.pitch": pitch,
+                                            "pointnet.nms.iou": 1.0})
+    seen = detector(replace(scan, xyz=scan.xyz @ back), ids)
+    detector.params = with_values(eager(), {"pointnet.nms.iou": 1.0})
+    assert alike(seen, in_sensor_frame(detector(scan, ids), pose), 2e-3) and len(found) > 3
+
+
+# scores, boxes, intensity
+
+def test_detections_are_above_their_thresholds_in_order_and_apart(ids):
+    detector, scan = random_detector(), frame()
+    found = detector(scan, ids)
+    assert (np.diff(found.scores) <= 0).all() and len(found) > 3
+    middle = float(np.median(found.scores[found.class_ids == found.class_ids[0]]))
+    name = CLASSES[found.class_ids[0]].lower()
+    detector.params = with_values(eager(), {f"pointnet.scores.{name}": middle})
+    fewer = detector(scan, ids)
+    assert fewer.scores[fewer.class_ids == found.class_ids[0]].min() >= np.float32(middle)
+    others = found[found.class_ids != found.class_ids[0]]
+    assert len(others) and same(fewer[fewer.class_ids != found.class_ids[0]], others)
+    detector.params = with_values(eager(), {"pointnet.nms.max_boxes": 2})
+    assert same(detector(scan, ids), found[:2])
+    halves = ids.copy()  # two clusters of one thing: one box of them stays
+    thing = np.flatnonzero(ids == 1)
+    halves[thing[::2]] = ids.max() + 1
+    detector.params = with_values(eager(), {"pointnet.nms.iou": 1.0})
+    both = detector(scan, halves)
+    detector.params = with_values(eager(), {"pointnet.nms.iou": 0.05,
+                                            "pointnet.nms.across_classes": True})
+    assert len(both) > len(detector(scan, halves))
+
+
+def test_where_nothing_passes_the_best_scores_are_said(ids):
+    detector, scan = random_detector(), frame()
+    found = detector(scan, ids)
+    assert detector.best == {} and len(found) == ids.max()
+    detector.params = eager(score=1.0)
+    assert len(detector(scan, ids)) == 0 and detector.problem is None
+    assert list(detector.best) == ["Car", "Pedestrian", "Cyclist"]
+    assert max(detector.best.values()) == pytest.approx(found.scores.max())
+
+
+@pytest.mark.parametrize("layer", ["classes", "box"])
+def test_what_is_not_a_number_is_left_out_and_said(layer, ids):
+    detector, scan = random_detector(), frame()
+    expected = detector(scan, np.where(ids == 2, 0, ids))
+    intensity = np.where(ids == 2, np.float32(np.nan), scan.intensity)
+    assert same(detector(replace(scan, intensity=intensity), ids), expected)
+    assert f"1 of {ids.max()} clusters" in detector.problem and "NaN" in detector.problem
+    getattr(detector.network, layer).bias.fill_(np.nan)
+    assert len(detector(scan, ids)) == 0 and "NaN" in detector.problem
+
+
+def test_intensity_is_scaled_and_may_be_left_out(ids):
+    detector, scan = random_detector(), frame()
+    found = detector(scan, ids)
+    half = replace(scan, intensity=scan.intensity / 2)
+    assert not same(detector(half, ids), found)
+    detector.params = with_values(eager(), {"pointnet.intensity_scale": 2.0})
+    assert same(detector(half, ids), found)
+    without = detector(replace(scan, intensity=None), ids)
+    assert "no intensity" in detector.problem
+    detector.params = with_values(eager(), {"pointnet.intensity_scale": 0.0})
+    assert same(detector(scan, ids), without) and detector.problem is None
+    assert same(detector(replace(scan, intensity=None), ids), without)
+    assert detector.problem is None
+
+
+def test_broken_points_are_left_out(ids):
+    detector, scan = random_detector(), frame()
+    found = detector(scan, ids)
+    bad = np.float32([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [1e9, 0, 0], [-np.inf, 0, 1]])
+    broken = LidarFrame(np.concatenate([scan.xyz, bad]),
+                        np.append(scan.intensity, np.ones(5, np.float32)))
+    assert same(detector(broken, np.append(ids, np.ones(5, int))), found)
+    assert alike(detector(broken), detector(scan)) and detector.problem is None
+    for name in "cluster_ids", "ground":
+        with pytest.raises(InputError, match=f"{name} has 3 values"):
+            detector(scan, **{name: np.zeros(3, int)})
+
+
+# devices
+
+def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(ids, monkeypatch):
+    """As if everything but the CPU had no memory."""
+    from lidar_perception.detectors.pointnet import detector as module
+    scan, expected, real = frame(), random_detector()(frame(), ids), module.predict
+    broken = random_detector()
+
+    def predict(network, clusters):
+        if broken.device != CPU:
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+        return real(network, clusters)
+    monkeypatch.setattr(module, "predict", predict)
+    broken.device = torch.device("meta")
+    assert same(broken(scan, ids), expected)
+    assert "CPU" in broken.problem and broken.device == CPU
+    assert same(broken(scan, ids), expected) and "CPU" in broken.problem
+    broken.device = torch.device("meta")
+    broken.params = with_values(eager(), {"pointnet.cpu_fallback": False})
+    with pytest.raises(InputError, match="no memory"):
+        broken(scan, ids)
+
+
+# weights
+
+@pytest.fixture
+def saved(tmp_path):
+    """Checkpoints of both networks."""
+    config, other = small(), tiny_pointpillars("v4")
+    header = Header(config, {"data": "simulated"}, {"accuracy": 0.9}, "abc123")
+    save_checkpoint(tmp_path / "n.safetensors", lively(config), header)
+    save_checkpoint(tmp_path / "p.safetensors", lively_pointpillars(other),
+                    PointPillarsHeader(other))
+    return tmp_path / "n.safetensors", tmp_path / "p.safetensors", header
+
+
+def with_header(path, out, **changes):
+    """A copy of a checkpoint with other things in its header; None removes them."""
+    content = path.read_bytes()
+    length = struct.unpack("<Q", content[:8])[0]
+    names = json.loads(content[8:8 + length])
+    header = {**json.loads(names["__metadata__"]["lidar_perception"]), **changes}
+    names["__metadata__"]["lidar_perception"] = json.dumps(
+        {k: v for k, v in header.items() if v is not None})
+    text = json.dumps(names).encode()
+    out.write_bytes(struct.pack("<Q", len(text)) + text + content[8 + length:])
+    return out
+
+
+def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
+    path, other, header = saved
+    assert read_header(path) == header and network_of(path) == "pointnet"
+    loaded_header, loaded = load_pointnet(path, header.config)
+    assert loaded_header == header
+    for name, value in lively(header.config).state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value), name
+    save_checkpoint(tmp_path / "half", loaded, header, half=True)
+    assert (tmp_path / "half").stat().st_size < path.stat().st_size
+    detector = load_pointnet_detector(path, "cpu", eager())
+    assert same(detector(frame()), random_detector()(frame()))
+    first = with_header(other, tmp_path / "first.safetensors", network=None)  # had no such key
+    assert network_of(other) == network_of(first) == "pointpillars"
+    assert load_network(first)[0] == load_network(other)[0]
+
+
+def test_weights_of_another_network_or_other_classes_are_refused(saved, tmp_path):
+    path, other, header = saved
+    with pytest.raises(InputError, match=r"holds a PointNet, .*pointnet_detector.*PointPillars"):
+        load_network(path)
+    with pytest.raises(InputError, match=r"holds a PointPillars, .*pointpillars_detector"):
+        load_pointnet(other)
+    unknown = with_header(path, tmp_path / "u.safetensors", network="transformer")
+    for read in read_header, network_of, load_network:
+        with pytest.raises(InputError, match="'transformer', this version knows"):
+            read(unknown)
+    two = small(classes=("Car", "Pedestrian"), sizes=header.config.sizes[:2])
+    with pytest.raises(InputError, match=r"classes is .*Cyclist.*asked for was"):
+        load_pointnet(path, two)
+    config = json.loads(header.text())["config"]
+    for change, words in ((dict(classes=two.classes, sizes=two.sizes), "do not fit its header"),
+                          (dict(classes=("Car", "Dog", "Cyclist")), "no class 'Dog'"),
+                          (dict(colour=1), "'colour'")):
+        changed = with_header(path, tmp_path / "c.safetensors", config={**config, **change})
+        with pytest.raises(InputError, match=words) as error:
+            load_pointnet(changed)
+        assert "\n" not in str(error.value)
+    result = CliRunner().invoke(cli, ["export", "onnx", str(path), "--out", str(tmp_path / "o")])
+    assert isinstance(result.exception, InputError) or "PointPillars" in result.output
+    assert result.exit_code and not (tmp_path / "o").exists()
+
+
+def test_fewer_classes_are_found_as_what_they_are(ids):
+    config = small(classes=("Pedestrian",), sizes=small().sizes[1:2])
+    found = PointNetDetector(lively(config), Header(config), CPU, eager())(frame(), ids)
+    assert len(found) > 3 and {*found.class_ids} == {CLASSES.index("Pedestrian")}
+
+
+def test_one_function_opens_both(saved, tmp_path):
+    path, other, _ = saved
+    pointnet, pointpillars = open_detector(path, "cpu"), open_detector(other, "cpu")
+    assert isinstance(pointnet, PointNetDetector) and isinstance(pointpillars, Detector)
+    assert pointnet.params.clustering == CLUSTERING and pointnet.params.ground == GROUND
+    ablated = small(dynamic_threshold=False)
+    save_checkpoint(tmp_path / "a.safetensors", lively(ablated), Header(ablated))
+    clustering = open_detector(tmp_path / "a.safetensors", "cpu").params.clustering
+    assert clustering == ablated.clustering != CLUSTERING
+    for detector in pointnet, pointpillars:
+        assert isinstance(detector(frame()), Detections)
+        assert detector.ms["network"] > 0 and detector.problem is None
+    for name, words in ("none.safetensors", "no checkpoint"), ("none.onnx", "onnx"):
+        with pytest.raises(InputError, match=words):
+            open_detector(tmp_path / name)
+    (tmp_path / "text").write_text("hello")
+    with pytest.raises(InputError, match="no checkpoint, or was cut"):
+        open_detector(tmp_path / "text")
+
+
+def test_evaluation_runs_either_network(saved, tmp_path):
+    kitti = object_folder(tmp_path / "kitti")
+    for path in saved[:2]:
+        content, _ = evaluate(tmp_path, "--kitti", kitti, "--weights", path, "--device", "cpu")
+        assert content["frames"] == 2 and content["ms"] > 0 and not content["skipped"]
+
+
+def test_weights_that_do_not_come_with_the_package_are_asked_for(saved, tmp_path, monkeypatch):
+    path, _, _ = saved
+    monkeypatch.setattr(weights_module, "WEIGHTS", tmp_path / "own.safetensors")
+    with pytest.raises(InputError, match="no PointNet weights come with the package"):
+        load_pointnet_detector()
+    named = with_values(eager(), {"pointnet.weights": str(path)})
+    expected = random_detector()(frame())
+    assert same(load_pointnet_detector("", "cpu", named)(frame()), expected)
+    path.rename(tmp_path / "own.safetensors")
+    assert same(load_pointnet_detector("", "cpu", eager())(frame()), expected)
+    with pytest.raises(InputError, match=r"no checkpoint .*pointnet\.weights"):
+        load_pointnet_detector("", "cpu", named)
+    with pytest.raises(InputError, match="no device 'tpu'"):
+        load_pointnet_detector("", "tpu")
+
+
+def test_real_scans_of_any_network_go_through(data):
+    from lidar_perception.data.kitti.folder import open_kitti
+    scan = open_kitti(data / "kitti_object")[0].load()
+    for name in "improved", "pointnet", "pointnet2":
+        config = small(name)
+        detector = PointNetDetector(lively(config), Header(config), CPU,
+                                    PointNetDetectorParams())
+        detector(scan)
+        assert detector.problem is None and detector.ms["network"] > 0

@@ -1,0 +1,52 @@
+"""The weights that come with the package: small, described, and of use in a street."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lidar_perception.detectors.checkpoint import network_of
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointnet.weights_file import WEIGHTS as POINTNET
+from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
+from lidar_perception.scoring.centres.matching import match_centres
+from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.sensor import HDL64E
+from lidar_perception.types import CLASSES
+
+pytestmark = pytest.mark.usefixtures("one_thread", "streets")
+FILES = [*sorted(WEIGHTS.glob("*.safetensors")), POINTNET]
+MOST = {"pointpillars": 30e6, "pointnet": 6e6}  # bytes of all files
+
+
+def test_they_are_small_enough_and_there():
+    assert (WEIGHTS / "pointpillars_v4_compact.safetensors") in FILES  # the default
+    for network, most in MOST.items():
+        assert 0 < sum(f.stat().st_size for f in FILES if network_of(f) == network) < most
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_each_says_what_it_was_trained_on_and_how_it_scores(file):
+    card = file.with_suffix(".md").read_text()
+    assert "Trained on: sim" in card and "Steps:" in card and "AP in percent" in card
+    header = open_detector(file, "cpu").header
+    assert header.training["data"] == ["sim"] and header.metrics["score"] > 0
+    assert str(header.training["steps"]) in card and header.commit in card
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_each_finds_most_cars_that_are_plain_to_see(file):
+    detector = open_detector(file, "cpu")
+    found = hits = 0
+    for street in (0, 12, 15):
+        scan = scan_at(street, 0, HDL64E)
+        cars = scan.truth.class_ids == CLASSES.index("Car")
+        plain = np.array([e["num_points"] > 100 and e["visible"] > 0.5 for e in scan.truth.extras])
+        ahead = (scan.truth.boxes[:, 0] > 5) & (scan.truth.boxes[:, 0] < 35) & (
+            np.abs(scan.truth.boxes[:, 1]) < 20)
+        boxes = scan.truth.boxes[cars & plain & ahead]
+        detections = detector(scan.frame)
+        mine = detections.boxes[detections.class_ids == CLASSES.index("Car")]
+        found += len(boxes)
+        hits += len(match_centres(mine[:, :3], boxes[:, :3], 1.0)[0])
+    assert found >= 4 and hits >= 0.7 * found

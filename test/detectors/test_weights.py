@@ -1,0 +1,290 @@
+"""Checkpoints, exported networks, and weights of other projects."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import struct
+
+import pytest
+import torch
+from click.testing import CliRunner
+from detection_samples import eager, frame, lively, random_detector, same, tiny
+
+from lidar_perception.cli.main import cli
+from lidar_perception.detectors.checkpoint import adopt
+from lidar_perception.detectors.pointpillars import weights_file as weights_module
+from lidar_perception.detectors.pointpillars.checkpoint import (
+    Header,
+    load_network,
+    read_header,
+    save_checkpoint,
+)
+from lidar_perception.detectors.pointpillars.config import VERSIONS, network_config
+from lidar_perception.detectors.pointpillars.detector import (
+    CPU,
+    Detector,
+    TorchNetwork,
+    load_detector,
+)
+from lidar_perception.detectors.pointpillars.import_weights import import_weights
+from lidar_perception.detectors.pointpillars.network import make_network
+from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.param_fields import with_values
+from lidar_perception.types import InputError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+needs_onnx = pytest.mark.skipif(
+    not all(importlib.util.find_spec(name) for name in ("onnx", "onnxruntime", "onnxscript")),
+    reason="needs the extra [onnx]")
+
+
+# checkpoints
+
+@pytest.fixture
+def saved(tmp_path):
+    config = tiny("v4")
+    header = Header(config, {"data": "simulated", "steps": 10}, {"map": 0.5}, "abc123")
+    network = lively(config)
+    save_checkpoint(tmp_path / "w.safetensors", network, header)
+    return tmp_path / "w.safetensors", header, network
+
+
+def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
+    path, header, network = saved
+    assert read_header(path) == header
+    loaded_header, loaded = load_network(path, header.config)
+    assert loaded_header == header
+    for name, value in network.state_dict().items():
+        assert torch.equal(loaded.state_dict()[name], value), name
+    save_checkpoint(tmp_path / "half", network, header, half=True)
+    assert (tmp_path / "half").stat().st_size < path.stat().st_size
+    for name, value in load_network(tmp_path / "half")[1].state_dict().items():
+        torch.testing.assert_close(value, network.state_dict()[name], atol=1e-7,
+                                   rtol=0 if value.ndim < 2 else 2**-10)
+    found = load_detector(path, "cpu", eager())(frame())
+    assert len(found) and same(found, Detector(TorchNetwork(network), header, CPU,
+                                               eager())(frame()))
+
+
+def test_a_checkpoint_of_another_network_is_refused_with_both_values(saved):
+    path, _, _ = saved
+    with pytest.raises(InputError, match=r"version is v4, asked for was v2"):
+        load_network(path, tiny("v2"))
+    wanted = with_values(DetectorParams(), {"detection.version": "v1"})
+    with pytest.raises(InputError, match=r"holds version v4, asked for was v1"):
+        load_detector(path, "cpu", wanted)
+    with pytest.raises(InputError, match=r"holds size compact, asked for was full"):
+        load_detector(path, "cpu", with_values(DetectorParams(), {"detection.size": "full"}))
+
+
+def test_a_network_begins_with_what_fits_of_another(saved):
+    path, header, network = saved
+    state = network.state_dict()
+    same = make_network(header.config)
+    taken, count = adopt(same, path, Header)
+    assert taken == count == len(state)
+    assert all(torch.equal(value, state[name]) for name, value in same.state_dict().items())
+    # without the branch of the map the first block has fewer inputs, of which it takes its own
+    other = make_network(tiny("v1"))
+    taken, count = adopt(other, path, Header)
+    assert taken == count
+    first, old = (s["blocks.0.0.0.weight"] for s in (other.state_dict(), state))
+    assert first.shape[1] < old.shape[1] and torch.equal(first, old[:, :first.shape[1]])
+    # a new input, such as the number of the cluster, comes last and begins at 0
+    numbered = make_network(tiny("v2"))
+    assert len(set(adopt(numbered, path, Header))) == 1
+    first, old = (s["pillar_net.linear.weight"] for s in (numbered.state_dict(), state))
+    assert torch.equal(first[:, :-1], old) and not first[:, -1].any()
+    # and another neck begins at random
+    third = make_network(tiny("v0"))
+    before = {name: value.clone() for name, value in third.state_dict().items()}
+    taken, count = adopt(third, path, Header)
+    assert 0 < taken < count
+    assert all(torch.equal(value, before[name]) for name, value in third.state_dict().items()
+               if name.startswith("neck"))
+    with pytest.raises(InputError, match="no layer"):
+        adopt(torch.nn.Linear(2, 3), path, Header)
+
+
+def test_files_that_are_no_checkpoints_are_refused(saved, tmp_path):
+    path, _, _ = saved
+    content = path.read_bytes()
+    length = struct.unpack("<Q", content[:8])[0]
+    names = json.loads(content[8:8 + length])
+    other = json.loads(names["__metadata__"]["lidar_perception"])
+    cases = {"missing": (None, "no checkpoint"), "cut": (content[:-9], "cut short"),
+             "text": (b"hello", "cut short"), "empty": (b"", "cut short")}
+    for name, change, words in (
+            ("foreign", None, "import-weights"), ("later", dict(format=9), "format 9"),
+            ("unknown", dict(config={**other["config"], "colour": 1}), "'colour'"),
+            ("unfit", dict(config={**other["config"], "fpn_channels": 9}), "do not fit"),
+            ("odd", dict(config={**other["config"], "cell": "wide"}), "describes no network")):
+        kept = {k: v for k, v in names.items() if k != "__metadata__"}
+        if change:
+            kept["__metadata__"] = {"lidar_perception": json.dumps({**other, **change})}
+        text = json.dumps(kept).encode()
+        cases[name] = (struct.pack("<Q", len(text)) + text + content[8 + length:], words)
+    for name, (raw, words) in cases.items():
+        if raw is not None:
+            (tmp_path / name).write_bytes(raw)
+        with pytest.raises(InputError, match=words) as error:
+            load_network(tmp_path / name)
+        assert "\n" not in str(error.value) and name in str(error.value)
+
+
+def test_a_full_disk_leaves_the_last_checkpoint(saved, monkeypatch):
+    path, header, network = saved
+    before = path.read_bytes()
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(InputError, match="No space left"):
+        save_checkpoint(path, network, header, half=True)
+    assert path.read_bytes() == before and [*path.parent.iterdir()] == [path]
+
+
+def test_weights_that_do_not_come_with_the_package_are_asked_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(weights_module, "WEIGHTS", tmp_path)
+    with pytest.raises(InputError, match="no weights for v4 compact"):
+        load_detector("", "cpu")
+    wanted = with_values(eager(), {"detection.version": "v1"})
+    config = tiny("v1")
+    save_checkpoint(tmp_path / "pointpillars_v1_compact.safetensors", lively(config),
+                    Header(config))
+    assert same(load_detector("", "cpu", wanted)(frame()), random_detector("v1")(frame()))
+    named = with_values(eager(), {"detection.weights": str(
+        tmp_path / "pointpillars_v1_compact.safetensors")})
+    assert same(load_detector("", "cpu", named)(frame()), random_detector("v1")(frame()))
+    with pytest.raises(InputError, match="no checkpoint /nowhere"):
+        load_detector("", "cpu", with_values(eager(), {"detection.weights": "/nowhere"}))
+
+
+# export
+
+@needs_onnx
+@pytest.mark.parametrize("version, changes", [
+    *((version, {}) for version in VERSIONS),
+    ("v0", dict(max_points=3, zero_row=True, middle_z=True))])
+def test_an_exported_network_finds_the_same(version, changes, tmp_path):
+    from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork, export_onnx
+    config = tiny(version, anchors=tiny().anchors[:1 + int(version[1])][-2:], **changes)
+    network, header = lively(config), Header(config, {"steps": 3})
+    export_onnx(network, header, tmp_path / "n.onnx")
+    exported = load_detector(tmp_path / "n.onnx", "auto", eager(score=0.1))
+    assert exported.header == header and isinstance(exported.network, OnnxNetwork)
+    expected = Detector(TorchNetwork(network), header, CPU, eager(score=0.1))(frame())
+    assert len(expected) and same(exported(frame()), expected, 1e-4)
+
+
+@needs_onnx
+def test_export_writes_from_a_checkpoint_and_bad_files_are_refused(saved, tmp_path, monkeypatch):
+    path, _, _ = saved
+    out = tmp_path / "o/w.onnx"
+    done = CliRunner().invoke(cli, ["export", "onnx", str(path), "--out", str(out)])
+    assert done.exit_code == 0 and "v4 compact" in " ".join(done.output.split())
+    assert same(load_detector(out, "cpu", eager())(frame()),
+                load_detector(path, "cpu", eager())(frame()), 1e-4)
+    with pytest.raises(InputError, match="not on 'cuda'"):
+        load_detector(out, "cuda")
+    (tmp_path / "bad.onnx").write_bytes(out.read_bytes()[:-50])
+    for name, words in ("bad.onnx", "cannot read"), ("none.onnx", "no exported network"):
+        with pytest.raises(InputError, match=words):
+            load_detector(tmp_path / name, "cpu")
+
+
+# weights of other projects
+
+def theirs(state, project):
+    """Our state dict under the names, and with the points' inputs, of another project."""
+    names = {"OpenPCDet": ("vfe", "backbone_2d.blocks", "backbone_2d.deblocks", "dense_head",
+                           ("conv_cls", "conv_box", "conv_dir_cls"), 1),
+             "mmdetection3d": ("voxel_encoder", "backbone.blocks", "neck.deblocks", "bbox_head",
+                               ("conv_cls", "conv_reg", "conv_dir_cls"), 0)}
+    points, blocks, ups, head, convs, first = names[project]
+    out = {}
+    for name, value in state.items():
+        part = name.split(".")
+        if part[0] == "pillar_net":
+            key = f"{points}.pfn_layers.0.{'.'.join(part[1:])}"
+        elif part[0] == "blocks":
+            key = f"{blocks}.{part[1]}.{first + 3 * int(part[2]) + int(part[3])}.{part[4]}"
+        elif part[0] == "neck":
+            key = f"{ups}.{part[2]}.{part[3]}.{part[4]}"
+        else:
+            conv = convs[["scores", "codes", "directions"].index(part[1])]
+            key = f"{head}.{conv}.{part[2]}"
+        out[key] = value
+    return out
+
+
+@pytest.fixture(scope="module")
+def big():
+    """A v0 full network as those projects have it, with ten inputs for each point."""
+    return lively(network_config("v0", "full", middle_z=True)).state_dict()
+
+
+@pytest.mark.parametrize("project, wrapped", [
+    ("OpenPCDet", lambda s: {"epoch": 80, "model_state": {**s, "global_step": torch.tensor([5])}}),
+    ("mmdetection3d", lambda s: {"meta": {"epoch": 160}, "state_dict": {
+        f"module.{k}": v for k, v in s.items()}})])
+def test_weights_of_other_projects_become_ours(project, wrapped, big, tmp_path):
+    path = tmp_path / "theirs.pth"
+    torch.save(wrapped(theirs(big, project)), path)
+    config, network, name = import_weights(path)
+    assert name == project and (config.version, config.size) == ("v0", "full")
+    state = network.state_dict()
+    linear = "pillar_net.linear.weight"
+    assert all(torch.equal(state[k], v) for k, v in big.items() if k != linear)
+    xyz, rest = torch.randn(50, 3), torch.randn(50, 4)
+    middle = xyz - torch.tensor([3.0, 2.0, -1.0])  # any pillar; z above the middle of the range
+    first = middle if project == "mmdetection3d" else xyz  # it overwrites x y z
+    torch.testing.assert_close(torch.cat([first, rest, middle], dim=1) @ big[linear].T,
+                               torch.cat([xyz, rest, middle], dim=1) @ state[linear].T)
+    car = config.anchors[config.classes.index("Car")]
+    assert car.z == pytest.approx(-1.78 + 1.56 / 2) and config.zero_row
+    assert config.classes == (("Car", "Pedestrian", "Cyclist") if project == "OpenPCDet"
+                              else ("Pedestrian", "Cyclist", "Car"))
+
+
+def test_weights_are_imported_from_the_command_line(big, tmp_path):
+    torch.save(theirs(big, "OpenPCDet"), tmp_path / "a.pth")
+    done = CliRunner().invoke(cli, [
+        "import-weights", str(tmp_path / "a.pth"), "--out", str(tmp_path / "a.safetensors"),
+        "--classes", "Cyclist,Pedestrian,Car", "--half"])
+    assert done.exit_code == 0, done.output
+    header = read_header(tmp_path / "a.safetensors")
+    assert header.config.classes == ("Cyclist", "Pedestrian", "Car")
+    assert header.training == {"imported from": "OpenPCDet", "file": "a.pth"}
+
+
+class Code:
+    """What weights_only must not run."""
+
+    def __reduce__(self):
+        return print, ("run",)
+
+
+def test_files_that_hold_no_such_weights_are_refused(big, tmp_path, capsys):
+    good = theirs(big, "OpenPCDet")
+    points = "vfe.pfn_layers.0.linear.weight"
+    cases = [({**good, "evil": Code()}, (), "weights only"), ({}, (), "no state_dict"),
+             ([1], (), "no state_dict"), ({"a": torch.zeros(2)}, (), points),
+             ({**good, points: good[points][:, :9]}, (), "9 inputs"),
+             ({**good, "roi_head.weight": torch.zeros(3)}, (), "roi_head.weight"),
+             (good, ("Car", "Pedestrian"), "3 classes"), (good, ("Car", "Dog", "Cat"), "Dog"),
+             ({k: v for k, v in good.items() if "blocks.2.7" not in k}, (), "blocks.2.7"),
+             ({**good, "backbone_2d.blocks.0.1.weight": torch.zeros(64, 32, 3, 3)}, (),
+              "blocks.0.0.0.weight")]
+    for content, classes, words in cases:
+        torch.save(content, tmp_path / "x.pth")
+        with pytest.raises(InputError, match=words) as error:
+            import_weights(tmp_path / "x.pth", classes)
+        assert "\n" not in str(error.value)
+    (tmp_path / "x.pth").write_bytes(b"no pickle")
+    for name, words in ("x.pth", "weights only"), ("none.pth", "no file"):
+        with pytest.raises(InputError, match=words):
+            import_weights(tmp_path / name)
+    assert capsys.readouterr().out == ""

@@ -1,0 +1,275 @@
+"""Laws of the sheet under obstacles, and of the ground by cloth simulation."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samples import DATA, needs_data
+
+from lidar_perception.data.semantickitti import open_semantic_kitti
+from lidar_perception.ground.climbing import REACH, STEP, UNOBSERVED, climbed_cells
+from lidar_perception.ground.cloth import lay_cloth, segment_by_cloth
+from lidar_perception.ground.obstacle import at_rest
+from lidar_perception.ground.params import ClothParams
+from lidar_perception.scoring.points.segmentation import (
+    PROTOCOLS,
+    ground_counts,
+    ground_row,
+    true_ground,
+)
+
+few = settings(max_examples=25, database=None)
+
+
+def obstacles(seed, rows=24, columns=40, seen=0.6):
+    """Bumpy obstacles with unseen cells between them."""
+    rng = np.random.default_rng(seed)
+    heights = rng.normal(0, 0.3, (rows, columns)).astype(np.float32)
+    heights[rng.random((rows, columns)) > seen] = np.inf
+    heights[rng.random((rows, columns)) < 0.05] += np.float32(3)
+    heights[0, 0] = 0
+    return heights
+
+
+def free_height(sheet, obstacle, lift):
+    """Where each cell would lie without its obstacle."""
+    wide = np.pad(sheet.astype(np.float64), 1, mode="edge")
+    mean = (wide[:-2, 1:-1] + wide[2:, 1:-1] + wide[1:-1, :-2] + wide[1:-1, 2:]) / 4
+    return mean + np.where(np.isfinite(obstacle), lift, 0)
+
+
+def slow_at_rest(obstacle, lift, steps=20_000):
+    """Projected Jacobi in float64, from below."""
+    sheet = np.full(obstacle.shape, obstacle.min(), np.float64)
+    for _ in range(steps):
+        sheet = np.minimum(free_height(sheet, obstacle, lift), obstacle)
+    return sheet
+
+
+@few
+@given(st.integers(0, 2**31), st.floats(0.0001, 0.05), st.integers(1, 4))
+def test_every_cell_touches_its_obstacle_or_hangs_free(seed, lift, levels):
+    obstacle = obstacles(seed)
+    sheet = at_rest(obstacle, lift, 1e-5, levels)
+    free = free_height(sheet, obstacle, lift)
+    touches = sheet >= obstacle - 1e-6
+    assert (sheet <= obstacle).all()
+    np.testing.assert_allclose(sheet[~touches], free[~touches], atol=2e-4)
+    assert (free[touches] >= sheet[touches] - 2e-4).all()
+
+
+@pytest.mark.parametrize("seed, lift", [(0, 0.002), (1, 0.006), (2, 0.03)])
+def test_multigrid_finds_what_slow_relaxation_finds(seed, lift):
+    obstacle = obstacles(seed, 16, 24)
+    expected = slow_at_rest(obstacle, lift)
+    for levels in (1, 2, 3, 4):
+        np.testing.assert_allclose(at_rest(obstacle, lift, 1e-6, levels), expected, atol=1e-3)
+
+
+def climbing_road(seed=0):
+    """A road that climbs by 0.9 m from 18 to 40 m ahead and is level again, seen in rings, with
+    three cars on it that hide what is behind them."""
+    rng = np.random.default_rng(seed)
+    radius = 1.73 / np.tan(np.radians(np.arange(2, 24, 0.42)))
+    angles = np.radians(np.arange(-60, 60, 0.17))
+    reach, angle = (x.ravel() for x in np.meshgrid(radius, angles))
+    x, y = reach * np.cos(angle), reach * np.sin(angle)
+    cars = np.array([[15.0, 3], [26, -3], [34, 4]])
+    away = np.abs(np.stack([x, y], axis=1)[:, None] - cars) > [2.1, 0.9]
+    seen = away.any(axis=2).all(axis=1)
+
+    def rise(x):
+        return 0.45 * (1 - np.cos(np.clip((x - 18) / 22, 0, 1) * np.pi))
+
+    road = np.column_stack([x, y, rise(x) - 1.73 + rng.normal(0, 0.01, len(x))])[seen]
+    things = [rng.uniform(-1, 1, (300, 3)) * [2, 0.85, 0.55] + [*car, rise(car[0]) - 0.9]
+              for car in cars]
+    xyz = np.concatenate([road, *things])
+    return xyz.astype(np.float32), np.arange(len(xyz)) < len(road)
+
+
+def test_a_road_that_climbs_stays_ground_and_the_cars_on_it_do_not_become_it():
+    xyz, road = climbing_road()
+    found = segment_by_cloth(xyz)
+    assert found[road].mean() > 0.97 and found[~road].mean() < 0.1
+    # also where reflections far below pull the cloth down
+    rng = np.random.default_rng(1)
+    below = rng.choice(xyz[road & (xyz[:, 0] > 12)], 12) - np.float32([0, 0, 1])
+    below[:, 2] -= rng.uniform(0, 9, 12)
+    deep = np.concatenate([xyz, below, below + np.float32([0.6, 0, 0.2])])
+    found = segment_by_cloth(deep)
+    assert found[:len(xyz)][road].mean() > 0.97 and not found[len(xyz):].any()
+    assert segment_by_cloth(deep, ClothParams(slope=0.0))[:len(xyz)][road].mean() > 0.9
+
+
+@few
+@given(st.integers(0, 2**31), st.floats(0.01, 0.2))
+def test_cells_are_climbed_as_a_slow_reading_climbs_them(seed, slope):
+    rng = np.random.default_rng(seed)
+    lowest = rng.uniform(0, 0.8, (14, 18)).astype(np.float32)
+    lowest[rng.random(lowest.shape) < 0.4] = UNOBSERVED
+    height = np.zeros_like(lowest)
+    seen = np.argwhere(lowest != UNOBSERVED)
+    touched = {(r, c) for r, c in seen if lowest[r, c] <= 0.1}
+    while True:
+        new = set()
+        for r, c in map(tuple, seen):
+            near = sorted(((r - i) ** 2 + (c - j) ** 2, lowest[i, j]) for i, j in touched)
+            if (r, c) not in touched and near and near[0][0] <= REACH**2 and (
+                    lowest[r, c] - near[0][1] <= STEP + slope * np.sqrt(near[0][0])):
+                new.add((r, c))
+        if not new:
+            break
+        touched |= new
+    found = climbed_cells(lowest, height, np.float32(0.1), slope)
+    assert {tuple(cell) for cell in np.argwhere(found)} == {
+        (r, c) for r, c in touched if lowest[r, c] > np.float32(0.1)}
+
+
+@few
+@given(st.integers(0, 2**31))
+def test_a_higher_obstacle_never_lowers_the_sheet(seed):
+    obstacle = obstacles(seed)
+    higher = obstacle.copy()
+    higher[5:9, 5:9] += np.float32(1)
+    low, high = (at_rest(o, 0.01, 1e-5, 4) for o in (obstacle, higher))
+    assert (high >= low - 2e-4).all()
+
+
+def street(seed=0, slope=(0.0, 0.0), count=30_000, reach=40.0):
+    """Points of a sloped road, five cars and a wall on it; and which of them are the road's."""
+    rng = np.random.default_rng(seed)
+    road = np.column_stack([rng.uniform(-reach, reach, (count, 2)), rng.normal(0, 0.02, count)])
+    cars = [rng.uniform(-1, 1, (600, 3)) * [2.1, 0.9, 0.6] + [*rng.uniform(-25, 25, 2), 0.9]
+            for _ in range(5)]
+    wall = np.column_stack([rng.uniform(-30, 30, 3000), np.full(3000, 33.25),
+                            rng.uniform(0.4, 5, 3000)])
+    # Nothing is seen of the road behind the wall or under the cars.
+    hidden = road[:, 1] > 33
+    for car in cars:
+        centre = car.mean(axis=0)
+        hidden |= (np.abs(road[:, :2] - centre[:2]) < [2.1, 0.9]).all(axis=1)
+    road = road[~hidden]
+    xyz = np.concatenate([road, *cars, wall])
+    xyz[:, 2] += xyz[:, :2] @ np.asarray(slope) - 1.73
+    return xyz.astype(np.float32), np.arange(len(xyz)) < len(road)
+
+
+def f1(found, truth):
+    return 2 * (found & truth).sum() / (found.sum() + truth.sum())
+
+
+@pytest.mark.parametrize("slope", [(0, 0), (0.1, -0.05), (-0.2, 0.15)])
+def test_a_road_is_ground_and_what_stands_on_it_is_not(slope):
+    xyz, road = street(slope=slope)
+    assert f1(segment_by_cloth(xyz), road) > 0.985
+
+
+def test_a_hill_too_curved_for_a_plane_is_ground():
+    rng = np.random.default_rng(1)
+    xy = rng.uniform(-40, 40, (40_000, 2))
+    hill = np.column_stack([xy, 2.5 * np.cos(xy[:, 0] / 12) * np.cos(xy[:, 1] / 15)])
+    post = rng.uniform(-0.2, 0.2, (200, 3)) * [1, 1, 5] + [10, 10, 3]
+    found = segment_by_cloth(np.concatenate([hill, post]).astype(np.float32))
+    assert found[:len(hill)].mean() > 0.99 and found[len(hill):].mean() < 0.2
+
+
+@few
+@given(st.integers(0, 2**31))
+def test_permuting_points_permutes_the_ground(seed):
+    xyz, _ = street(seed, count=4000)
+    order = np.random.default_rng(seed).permutation(len(xyz))
+    np.testing.assert_array_equal(segment_by_cloth(xyz[order]), segment_by_cloth(xyz)[order])
+
+
+@pytest.mark.parametrize("degrees, same", [(90, 0.999), (180, 0.999), (23, 0.99), (-71, 0.99)])
+def test_rotating_about_z_rotates_the_ground(degrees, same):
+    xyz, _ = street(3, slope=(0.05, 0.02))
+    angle = np.radians(degrees)
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0],
+                     [0, 0, 1]])
+    turned = (xyz @ turn.T).astype(np.float32)
+    assert (segment_by_cloth(turned) == segment_by_cloth(xyz)).mean() > same
+
+
+@pytest.mark.parametrize("far", [[1e5, 0, 0], [0, -9e4, 50], [0, 101, -1.7], [95, 80, 30],
+                                 [-99, 3, -8]])
+def test_a_far_outlier_changes_nothing_near(far):
+    xyz, _ = street(4)
+    found = segment_by_cloth(np.concatenate([xyz, np.float32([far])]))[:-1]
+    assert (found != segment_by_cloth(xyz)).mean() < 1e-3
+
+
+def test_reflections_below_the_ground_pull_nothing_down():
+    xyz, _ = street(5)
+    below = np.column_stack([np.random.default_rng(0).uniform(-30, 30, (40, 2)),
+                             np.full(40, -4.0)]).astype(np.float32)
+    found = segment_by_cloth(np.concatenate([xyz, below]))
+    assert not found[-40:].any()
+    assert (found[:-40] != segment_by_cloth(xyz)).mean() < 0.002
+
+
+def test_points_beyond_max_range_are_not_ground_and_do_not_make_the_cloth_larger():
+    xyz, road = street(6)
+    params = ClothParams(max_range=15)
+    inside = (np.abs(xyz[:, :2]) <= 15).all(axis=1)
+    found = segment_by_cloth(xyz, params)
+    assert not found[~inside].any() and f1(found, road & inside) > 0.99
+    cells = 2 ** 5
+    assert lay_cloth(xyz, params).height.size <= (2 * 15 / 0.5 + 2 * cells) ** 2
+
+
+@pytest.mark.parametrize("xyz, expected", [
+    (np.zeros((0, 3)), []), ([[5, 5, -1]], [True]), ([[500, 0, 0]], [False]),
+    (np.full((9, 3), 3.3), [True] * 9),
+    ([[1, 1, -2], [1, 1, -1.9], [1, 1, 4]], [True, True, False]),
+], ids=["empty", "one point", "far", "all equal", "column"])
+def test_small_clouds(xyz, expected):
+    found = segment_by_cloth(np.asarray(xyz, np.float32).reshape(-1, 3))
+    assert found.dtype == bool and found.tolist() == expected
+
+
+def test_a_finer_cloth_sees_the_same_street():
+    xyz, road = street(7, count=120_000)
+    for resolution in (0.3, 0.5, 1.0):
+        assert f1(segment_by_cloth(xyz, ClothParams(resolution=resolution)), road) > 0.985
+
+
+@contextlib.contextmanager
+def silent():
+    """The wheel prints to file descriptor 1."""
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
+
+
+@needs_data
+def test_on_the_real_scan_it_is_as_good_as_the_falling_cloth_of_the_wheel():
+    CSF = pytest.importorskip("CSF")
+    frame, semantic, _ = open_semantic_kitti(DATA / "semantickitti")[0].load()
+    params = ClothParams()
+    with silent():
+        wheel = CSF.CSF()
+        wheel.params.bSloopSmooth = False
+        wheel.params.cloth_resolution = params.resolution
+        wheel.params.class_threshold = params.class_threshold
+        wheel.setPointCloud(frame.xyz.astype(np.float64))
+        inside, outside = CSF.VecInt(), CSF.VecInt()
+        wheel.do_filtering(inside, outside, False)
+    theirs = np.zeros(len(frame), bool)
+    theirs[np.array(inside)] = True
+    ours = segment_by_cloth(frame.xyz, params)
+    for protocol in PROTOCOLS:
+        truth = true_ground(semantic, frame.xyz[:, 2], protocol)
+        mine, his = (ground_row(ground_counts(g, *truth))["f1"] for g in (ours, theirs))
+        assert mine > his - 0.01 and mine > 0.95, protocol

@@ -1,0 +1,218 @@
+"""Boxes <-> markers and detections, and what one array does to the next."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from samples import STAMP, each_make, header
+
+from lidar_perception.types import CLASSES, GroundTruth
+from lidar_perception.wire import codec
+from lidar_perception.wire.messages import to_detections, to_truth, truth_markers
+from msg_utils.detections import from_detection_array, to_detection_array
+from msg_utils.markers import (
+    ADD,
+    CUBE,
+    DELETE,
+    box_pose,
+    from_marker_array,
+    marker_keys,
+    pose_yaw,
+    to_marker_array,
+)
+
+# Jazzy's vision_msgs, which rosbags does not come with
+VISION_MSGS = {
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "ObjectHypothesis": "string class_id\nfloat64 score",
+    "ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\n"
+                                "geometry_msgs/PoseWithCovariance pose",
+    "Detection3D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+                   "vision_msgs/BoundingBox3D bbox\nstring id",
+    "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+}
+
+metres = st.floats(-200, 200)
+yaws = st.floats(-math.pi, math.pi, exclude_min=True) | st.sampled_from([math.pi, 0.0])
+boxes = st.tuples(metres, metres, metres, *[st.floats(0.01, 30)] * 3, yaws)
+words = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=8)
+json_values = st.recursive(st.none() | st.booleans() | st.integers(-10**6, 10**6) | words
+                           | st.floats(allow_nan=False), lambda inner: st.lists(inner, max_size=3))
+contents = st.dictionaries(words.filter(lambda key: key != "score"), json_values, max_size=3)
+objects = st.lists(st.tuples(boxes, st.sampled_from(CLASSES) | words, st.floats(0, 1), contents),
+                   max_size=5)
+notes = st.lists(st.tuples(words, contents), max_size=2)
+
+
+def array(make, rows, **more):
+    return to_marker_array(np.array([box for box, *_ in rows]), [r[1] for r in rows],
+                           header=header(make), make=make, **more)
+
+
+def keys(rows):
+    return [(label, i) for i, (_, label, *_) in enumerate(rows)]
+
+
+def same_boxes(a, b) -> bool:
+    """Numbers equal; yaw went through a quaternion, and pi is -pi."""
+    a, b = (np.reshape(x, (-1, 7)) for x in (a, b))
+    turned = np.abs((a[:, 6] - b[:, 6] + np.pi) % (2 * np.pi) - np.pi)
+    return np.array_equal(a[:, :6], b[:, :6]) and bool((turned < 1e-12).all())
+
+
+@each_make
+@given(rows=objects, remarks=notes)
+def test_from_marker_array_inverts_to_marker_array(make, rows, remarks):
+    got = from_marker_array(array(make, rows, scores=[r[2] for r in rows],
+                                  extras=[r[3] for r in rows], notes=remarks,
+                                  ids=range(7, 7 + len(rows))))
+    assert same_boxes(got.boxes, [r[0] for r in rows])
+    assert got.labels == [r[1] for r in rows]
+    assert got.scores.tolist() == [r[2] for r in rows]
+    assert got.extras == [{**r[3], "score": r[2]} for r in rows]
+    assert got.notes == remarks
+    assert got.ids.tolist() == list(range(7, 7 + len(rows)))
+    assert (got.stamp_ns, got.frame_id) == (STAMP, "velodyne")
+
+
+@given(rows=objects, remarks=notes)
+def test_markers_survive_the_wire(rows, remarks):
+    sent = array(codec.bag_message, rows, scores=[r[2] for r in rows], extras=[r[3] for r in rows],
+                 notes=remarks)
+    raw = codec.encode(sent)
+    read = codec.decode(raw, "visualization_msgs/msg/MarkerArray")
+    assert codec.encode(read) == raw
+    before, after = from_marker_array(sent), from_marker_array(read)
+    assert np.array_equal(before.boxes, after.boxes)
+    assert (before.labels, before.extras, before.notes) == (after.labels, after.extras,
+                                                            after.notes)
+
+
+@each_make
+@given(yaw=yaws)
+def test_the_quaternion_is_a_unit_and_turns_about_z_only(make, yaw):
+    pose = box_pose(np.array([1.0, 2, 3, 4, 5, 6, yaw]), make)
+    q = pose.orientation
+    assert q.x == q.y == 0 and math.hypot(q.z, q.w) == pytest.approx(1, abs=1e-15)
+    forward = (1 - 2 * q.z * q.z, 2 * q.z * q.w)  # where the quaternion takes the x axis
+    assert forward == pytest.approx((math.cos(yaw), math.sin(yaw)), abs=1e-12)
+    q.z, q.w = -q.z, -q.w  # the same rotation
+    assert math.remainder(pose_yaw(pose) - yaw, math.tau) == pytest.approx(0, abs=1e-12)
+
+
+@each_make
+@given(before=objects, after=objects)
+def test_what_is_gone_is_deleted_and_nothing_else(make, before, after):
+    first = array(make, before)
+    second = array(make, after, previous=marker_keys(first))
+    assert marker_keys(first) == {*keys(before)}
+    deleted = [(m.ns, m.id) for m in second.markers if m.action == DELETE]
+    gone = {*keys(before)} - {*keys(after)}
+    assert sorted(deleted) == sorted(gone or ({("", 0)} if not after else ()))
+    assert marker_keys(second) == {*keys(after)}
+    assert len(from_marker_array(second)) == len(after) and not from_marker_array(second).notes
+
+
+@each_make
+def test_an_empty_array_says_which_frame_was_empty(make):
+    msg = array(make, [])
+    got = from_marker_array(msg)
+    assert len(got) == 0 and got.boxes.shape == (0, 7) and got.notes == []
+    assert (got.stamp_ns, got.frame_id) == (STAMP, "velodyne")
+    assert marker_keys(msg) == frozenset()
+
+
+@each_make
+def test_a_message_without_markers_is_empty(make):
+    got = from_marker_array(make("visualization_msgs/msg/MarkerArray", markers=[]))
+    assert (len(got), got.stamp_ns, got.frame_id) == (0, 0, "")
+
+
+@each_make
+@pytest.mark.parametrize("text, score, extra", [
+    ("", 1.0, {}),
+    ("car 7", 1.0, {"text": "car 7"}),
+    ("{broken", 1.0, {"text": "{broken"}),
+    ("12", 1.0, {"text": "12"}),
+    ("[1, 2]", 1.0, {"text": "[1, 2]"}),
+    ('{"score": 0.25, "id": 3}', 0.25, {"score": 0.25, "id": 3}),
+    ('{"score": 1}', 1.0, {"score": 1}),
+    ('{"score": "high"}', 1.0, {"score": "high"}),
+    ('{"score": null}', 1.0, {"score": None}),
+])
+def test_cubes_of_other_nodes_are_read(make, text, score, extra):
+    cube = make("visualization_msgs/msg/Marker", header=header(make, 5, "map"), ns="car", id=4,
+                type=CUBE, action=ADD, text=text,
+                pose=box_pose(np.array([1.0, 2, 3, 4, 5, 6, -2.0]), make),
+                scale=make("geometry_msgs/msg/Vector3", x=4.0, y=5.0, z=6.0))
+    sphere = make("visualization_msgs/msg/Marker", header=header(make), type=2, action=ADD)
+    got = from_marker_array(make("visualization_msgs/msg/MarkerArray", markers=[cube, sphere]))
+    assert same_boxes(got.boxes, [[1, 2, 3, 4, 5, 6, -2.0]])
+    assert (got.labels, got.ids.tolist(), got.frame_id, got.stamp_ns) == (["car"], [4], "map", 5)
+    assert got.scores.tolist() == [score] and got.extras == [extra]
+    assert CLASSES[to_truth(got).class_ids[0]] == "Misc"
+    assert to_detections(got).scores.tolist() == [score]
+
+
+@each_make
+def test_lengths_that_differ_are_refused(make):
+    with pytest.raises(ValueError):
+        to_marker_array(np.zeros((2, 7)), ["Car"], header=header(make), make=make)
+
+
+@each_make
+def test_lifetime_and_color_reach_every_cube(make):
+    rows = [((0, 0, 0, 1, 1, 1, 0), label, 1.0, {}) for label in ("Car", "unheard of")]
+    msg = array(make, rows, color=(0.25, 0.5, 1.0), lifetime_ns=1_500_000_000)
+    for m in msg.markers:
+        assert (m.lifetime.sec, m.lifetime.nanosec) == (1, 500_000_000)
+        assert (m.color.r, m.color.g, m.color.b) == (0.25, 0.5, 1.0) and 0 < m.color.a < 1
+
+
+@each_make
+@pytest.mark.parametrize("tracks, ids", [
+    ([4, 9], [4, 9]), ([4, None], [0, 1]), ([4, 4], [0, 1]), ([], [])])
+def test_labels_keep_their_track_where_it_tells_them_apart(make, tracks, ids):
+    extras = [{} if t is None else {"track_id": t} for t in tracks]
+    truth = GroundTruth.of(np.ones((len(tracks), 7)), [0] * len(tracks), extras,
+                           [("DontCare", {"track_id": -1})])
+    got = from_marker_array(truth_markers(truth, header(make), make))
+    assert got.ids.tolist() == ids
+    assert to_truth(got).extras == truth.extras and to_truth(got).notes == truth.notes
+
+
+@pytest.fixture(scope="module")
+def vision_make():
+    """bag_message, with vision_msgs."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in VISION_MSGS.items():
+        store.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(codec, "typestore", lambda: store)
+        yield codec.bag_message
+
+
+@given(rows=objects)
+def test_from_detection_array_inverts_to_detection_array(vision_make, rows):
+    msg = to_detection_array(np.array([r[0] for r in rows]), [r[1] for r in rows],
+                             [r[2] for r in rows], header=header(vision_make), make=vision_make)
+    for read in (msg, codec.decode(codec.encode(msg), "vision_msgs/msg/Detection3DArray")):
+        got = from_detection_array(read)
+        assert same_boxes(got.boxes, [r[0] for r in rows])
+        assert got.labels == [r[1] for r in rows]
+        assert got.scores.tolist() == [r[2] for r in rows]
+        assert (got.stamp_ns, got.frame_id) == (STAMP, "velodyne")
+
+
+def test_a_detection_is_of_its_most_likely_class(vision_make):
+    msg = to_detection_array(np.ones((2, 7)), ["Car", "Van"], [0.3, 0.5],
+                             header=header(vision_make), make=vision_make)
+    msg.detections[0].results.extend(msg.detections[1].results)
+    msg.detections[1].results.clear()
+    got = from_detection_array(msg)
+    assert (got.labels, got.scores.tolist()) == (["Van", ""], [0.5, 1.0])

@@ -1,0 +1,290 @@
+"""Laws of a run: however it is spread or stopped, the records are the same, and bad input costs the
+frames that it hits and no others."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from reproduction_samples import (
+    COUNT,
+    SMALL,
+    command,
+    count_points,
+    lines_of,
+    points_table,
+    small,
+    untimed,
+)
+from samples import object_folder, write
+
+from lidar_perception.reproduction import journal, runner
+from lidar_perception.reproduction.report import write_report
+from lidar_perception.reproduction.stm_cpa import STM_CPA
+from lidar_perception.types import InputError
+
+ROOT = Path(__file__).resolve().parents[2]
+TIMED = {"table_9", "table_9_median"}
+
+
+def break_down(frames, number):
+    if number == 2:
+        raise ZeroDivisionError("a mistake")
+    return {"frame": frames[number].name}
+
+
+def not_json(frames, number):
+    return {"frame": frames[number].name, "value": float("nan")}
+
+
+def end_the_process(frames, number):
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def content(folder):
+    """Name to content of the files that hold no times."""
+    return {path.name: path.read_bytes() for path in sorted(folder.rglob("*"))
+            if path.suffix in (".csv", ".png") and path.stem not in TIMED}
+
+
+# However it is spread and stopped
+
+
+def test_two_processes_measure_what_one_does(crowds, whole, tmp_path):
+    runner.run(STM_CPA, crowds, tmp_path / "out", jobs=2)
+    assert untimed(tmp_path / "out") == untimed(whole)
+
+
+def test_a_cluster_of_two_workers_measures_what_one_process_does(crowds, whole, tmp_path):
+    distributed = pytest.importorskip("distributed", reason="needs the extra [distributed]")
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
+                                  dashboard_address=None) as cluster:
+        address = cluster.scheduler_address
+        runner.run(STM_CPA, crowds, tmp_path / "out", dask=address)
+        with pytest.raises(ZeroDivisionError):
+            runner.run(small(break_down), crowds, tmp_path / "broken", dask=address)
+    assert untimed(tmp_path / "out") == untimed(whole)
+
+
+def test_a_cluster_that_is_not_there_is_named(few, tmp_path, monkeypatch):
+    pytest.importorskip("distributed", reason="needs the extra [distributed]")
+    monkeypatch.setattr(runner, "CONNECT_S", 0.2)
+    with pytest.raises(InputError, match="cannot reach a Dask scheduler"):
+        runner.run(SMALL, few, tmp_path / "out", dask="tcp://127.0.0.1:9")
+
+
+def test_without_distributed_the_extra_is_named(few, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"lidar_perception\[distributed\]"):
+        runner.run(SMALL, few, tmp_path / "out", dask="tcp://127.0.0.1:9")
+
+
+def test_a_killed_run_leaves_no_process_and_goes_on_where_it_was(crowds, whole, tmp_path):
+    out = tmp_path / "out"
+    process = subprocess.Popen(
+        [sys.executable, "-m", "lidar_perception.cli.main", "reproduce", "--kitti", str(crowds),
+         "--out", str(out), "--jobs", "2"], cwd=ROOT, start_new_session=True, text=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE)
+    while len(lines_of(out)) < 4:
+        assert process.poll() is None, process.stderr.read()
+        time.sleep(0.005)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:  # its children end by themselves
+        try:
+            os.killpg(process.pid, 0)
+        except ProcessLookupError:
+            break
+        time.sleep(0.02)
+    else:
+        pytest.fail("a process is still there")
+    assert "Traceback" not in process.communicate()[1]
+    kept = lines_of(out)
+    assert 4 <= len(kept) < COUNT and not (out / "report.html").exists()
+    command("--kitti", crowds, "--out", out, "--jobs", 1)
+    assert untimed(out) == untimed(whole)
+    assert content(out) == content(whole)
+    assert set(kept[:4]) <= set(lines_of(out))  # with their times: they were not measured again
+
+
+@pytest.mark.parametrize("cut", [1, 2, 40])
+def test_a_cut_last_line_is_dropped_and_its_frame_measured_again(few, tmp_path, cut):
+    expected = runner.run(SMALL, few, tmp_path / "out")
+    path = tmp_path / "out" / journal.NAME
+    bytes_before = path.read_bytes()
+    path.write_bytes(bytes_before[:-cut])
+    assert runner.run(SMALL, few, tmp_path / "out") == expected
+    assert path.read_bytes() == bytes_before
+
+
+def test_what_is_there_is_not_measured_again(few, tmp_path, monkeypatch):
+    expected = runner.run(SMALL, few, tmp_path / "out", limit=2)
+    assert [r["frame"] for r in expected] == ["000000", "000001"]
+    asked = []
+
+    def noted(frames, number):
+        asked.append(number)
+        return count_points(frames, number)
+
+    assert runner.run(small(noted), few, tmp_path / "out")[:2] == expected
+    assert asked == [2, 3, 4]
+    assert len(runner.run(small(noted), few, tmp_path / "out", limit=1)) == 1
+    assert asked == [2, 3, 4]
+    assert len(lines_of(tmp_path / "out")) == 1 + 4  # the plan, and what was not skipped
+
+
+def test_a_frame_that_was_skipped_is_tried_again(few, tmp_path):
+    scan = few / "training/velodyne/000001.bin"
+    whole = scan.read_bytes()
+    scan.write_bytes(whole[:100])
+    first = runner.run(SMALL, few, tmp_path / "out")
+    assert "000001.bin" in first[1]["skipped"] and "000001.bin" in first[2]["skipped"]
+    scan.write_bytes(whole)
+    assert runner.run(SMALL, few, tmp_path / "out") == runner.run(SMALL, few, tmp_path / "again")
+
+
+# What is in the way
+
+
+def test_another_plan_is_an_error_that_names_what_differs(few, tmp_path):
+    out = tmp_path / "out"
+    runner.run(small(limits=(1, 2), deep={"a": 1, "b": 2}), few, out)
+    before = (out / journal.NAME).read_bytes()
+    with pytest.raises(InputError, match=r"settings.deep.b 2, not 3; .*--force") as error:
+        runner.run(small(limits=(1, 2), deep={"a": 1, "b": 3}), few, out)
+    assert "deep.a" not in str(error.value) and "limits" not in str(error.value)
+    other = object_folder(tmp_path / "other", count=4)
+    with pytest.raises(InputError, match=r"kitti '.*few', not '.*other'; frames 5, not 4"):
+        runner.run(small(limits=(1, 2), deep={"a": 1, "b": 2}), other, out)
+    assert (out / journal.NAME).read_bytes() == before
+    runner.run(SMALL, other, out, force=True)
+    assert len(runner.run(SMALL, other, out)) == 4
+
+
+def test_a_folder_of_something_else_is_left_alone(few, tmp_path):
+    out = tmp_path / "mine"
+    write(out / "letter.txt", "dear")
+    write(out / "figures/photo.png", "me")
+    with pytest.raises(InputError, match=f"{out} exists already.*--force"):
+        runner.run(SMALL, few, out)
+    assert sorted(p.name for p in out.rglob("*.*")) == ["letter.txt", "photo.png"]
+    runner.run(SMALL, few, out, force=True)
+    assert (out / "letter.txt").read_text() == "dear" and (out / "figures/photo.png").exists()
+    with pytest.raises(InputError, match="is a file"):
+        runner.run(SMALL, few, out / "letter.txt")
+    with pytest.raises(InputError, match="cannot make the folder"):
+        runner.run(SMALL, few, out / "letter.txt/deeper")
+
+
+def test_force_begins_anew_and_leaves_no_old_table(whole, few, tmp_path):
+    shutil.copytree(whole, tmp_path / "out")
+    records = runner.run(SMALL, few, tmp_path / "out", force=True)
+    assert [p.name for p in (tmp_path / "out").rglob("*.*")] == [journal.NAME]
+    write_report(tmp_path / "out", SMALL, records, points_table(records), {})
+    assert [p.stem for p in (tmp_path / "out").rglob("*.csv")] == ["points"]
+
+
+@pytest.mark.parametrize("first", ["", "{", "[]", '{"frame": "000000"}'])
+def test_a_journal_without_a_plan_is_not_gone_on_with(few, tmp_path, first):
+    write(tmp_path / "out" / journal.NAME, first + "\n")
+    with pytest.raises(InputError, match=r"cannot read .*--force"):
+        runner.run(SMALL, few, tmp_path / "out")
+    assert len(runner.run(SMALL, few, tmp_path / "out", force=True)) == 5
+
+
+def test_two_runs_do_not_write_one_folder(few, tmp_path):
+    with (journal.journal(tmp_path / "out", {}) as _,
+          pytest.raises(InputError, match="another process")):
+        runner.run(SMALL, few, tmp_path / "out", force=True)
+
+
+def test_a_full_disk_is_one_line_and_the_rest_goes_on_later(few, tmp_path, monkeypatch):
+    def full(self):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(journal, "SYNC_S", -1.0)
+        patch.setattr(journal.Journal, "sync", full)
+        with pytest.raises(InputError, match=r"No space left.*the same command goes on"):
+            runner.run(SMALL, few, tmp_path / "out")
+    assert len(runner.run(SMALL, few, tmp_path / "out")) == 5
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_mistake_in_an_experiment_is_not_a_skipped_frame(few, tmp_path, jobs, capfd):
+    with pytest.raises((ZeroDivisionError, InputError)) as error:
+        runner.run(small(break_down), few, tmp_path / "out", jobs=jobs)
+    said = capfd.readouterr().err + "".join(getattr(error.value, "__notes__", []))
+    assert "while frame 000002 was measured" in said
+    assert '"000002"' not in "".join(lines_of(tmp_path / "out"))
+
+
+def test_a_record_that_is_no_json_is_a_mistake(few, tmp_path):
+    with pytest.raises(ValueError, match="JSON"):
+        runner.run(small(not_json), few, tmp_path / "out")
+
+
+def test_a_process_that_is_killed_ends_the_run_with_a_reason(few, tmp_path):
+    with pytest.raises(InputError, match=r"measured frames.*want of memory: try fewer --jobs"):
+        runner.run(small(end_the_process), few, tmp_path / "out", jobs=2)
+
+
+# Broken frames
+
+
+BROKEN = {
+    "velodyne/000000.bin": lambda b: b[:1003],        # cut
+    "velodyne/000001.bin": lambda b: b"",             # empty
+    "label_2/000002.txt": lambda b: b[:-30],          # cut in a line
+    "label_2/000003.txt": lambda b: b.replace(b"1.", b"nan ", 1),
+    "label_2/000004.txt": None,                       # not there
+    "calib/000005.txt": None,
+    "calib/000006.txt": lambda b: b[:200],
+    "calib/000007.txt": lambda b: re.sub(rb"(Tr_velo_to_cam:).*", rb"\1" + b" 0" * 12, b),
+    "velodyne/000008.bin": None,
+    "calib/000009.txt": lambda b: re.sub(rb"(R0_rect:) \S+", rb"\1 -1", b),  # mirrored
+}
+
+
+def test_broken_frames_are_skipped_by_name_and_the_others_are_as_before(crowds, whole, tmp_path):
+    root = tmp_path / "kitti"
+    shutil.copytree(crowds, root)
+    for name, change in BROKEN.items():
+        path = root / "training" / name
+        if change is None:
+            path.unlink()
+        else:
+            path.write_bytes(change(path.read_bytes()))
+    records = {r["frame"]: r for r in runner.run(STM_CPA, root, tmp_path / "out")}
+    assert len(records) == COUNT
+    for name in BROKEN:
+        frame = Path(name).stem
+        reason = records[frame]["skipped"]
+        assert frame in reason and len(reason.splitlines()) == 1, reason
+        named = "velodyne/000004.bin" if name == "label_2/000004.txt" else name
+        assert (named if named != "velodyne/000008.bin" else "label_2/000008.txt") in reason
+    expected = {r["frame"]: r for r in untimed(whole)}
+    for name, record in records.items():
+        if "skipped" not in record:
+            assert {k: v for k, v in record.items() if k != "ms"} == expected[name]
+    assert sum("skipped" not in r for r in records.values()) == COUNT - len(BROKEN) - 1
+
+
+def test_a_folder_without_scans_or_pedestrians_is_an_error(tmp_path):
+    for argument, words in ((tmp_path / "none", "is not a folder"), (tmp_path, "no KITTI scans")):
+        with pytest.raises(InputError, match=words):
+            command("--kitti", argument, "--out", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+    nobody = object_folder(tmp_path / "nobody", "")
+    with pytest.raises(InputError, match=r"no frame could be measured.*no Pedestrian"):
+        command("--kitti", nobody, "--out", tmp_path / "out", "--jobs", 1)
+    assert json.loads((tmp_path / "out/report.json").read_text())["skipped"] == 2

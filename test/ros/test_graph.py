@@ -1,0 +1,112 @@
+"""The nodes as real processes over DDS, against the offline path on the same bag."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.data.bag import Bag
+from lidar_perception.data.recording import open_recording
+from lidar_perception.nodes.graph import cloud_topic, result_topics
+from lidar_perception.nodes.replay import replay
+from lidar_perception.param_fields import with_values
+from lidar_perception.scoring.centres.report import CandidateReport, evaluate
+from lidar_perception.wire.messages import column, to_detections, to_frame
+from lidar_perception.wire.topics import POINTS
+from msg_utils.markers import from_marker_array
+from msg_utils.point_cloud2 import to_array
+
+PAPER = with_values(PipelineParams(), {"view.enabled": True, "seed.source": "ground_truth"})
+
+
+RUNS = {  # one process?, parameters beside the protocol
+    "three nodes": (False, {}),
+    "one node": (True, {}),
+    "three nodes of paper C": (False, {"ground.method": "cloth", "clustering.method": "euclidean",
+                                       "boxes.shape": "l_shape"}),
+    "one node, patchwork": (True, {"ground.method": "patchwork", "boxes.shape": "min_area",
+                                   "clustering.dbscan.join_bands": True}),
+}
+
+
+@pytest.fixture(scope="module", params=RUNS.values(), ids=RUNS)
+def setting(request):
+    single, values = request.param
+    return single, with_values(PAPER, values)
+
+
+@pytest.fixture(scope="module")
+def run(setting, drive_bag, tmp_path_factory):
+    """One replay: whether in one process, its scores, and the folder with the result bag."""
+    single, params = setting
+    out = tmp_path_factory.mktemp("run")
+    with Bag(drive_bag) as bag:
+        clouds = bag.counts[POINTS]
+    return single, replay(drive_bag, clouds, out, params, single=single), out
+
+
+@pytest.fixture(scope="module")
+def offline(setting, drive_bag):
+    """Stamp -> what the offline pipeline finds; and its report."""
+    report = CandidateReport()
+    results = [r for r in evaluate(open_recording(bag=drive_bag), setting[1], report) if r]
+    return {r.frame.stamp_ns: (segmented, found) for r, segmented, found in results}, report
+
+
+def test_no_frame_is_lost_between_the_processes(run):
+    _, content, _ = run
+    assert content["results"] == content["clouds"] == content["frames"]
+    assert content["lost_frames"] == 0
+
+
+def test_candidates_over_dds_are_those_of_the_offline_path(run, offline):
+    single, _, out = run
+    for stage, topic in result_topics(single).items():
+        with Bag(out / "result") as bag:
+            messages = [from_marker_array(m) for _, _, m in bag.messages({topic})]
+        received = {m.stamp_ns: to_detections(m) for m in messages}
+        assert received.keys() == offline[0].keys()
+        assert any(len(d) for d in received.values())
+        for stamp, detections in received.items():
+            expected = getattr(offline[0][stamp][1], stage)
+            np.testing.assert_array_equal(detections.boxes, expected.boxes)
+            np.testing.assert_array_equal(detections.scores, expected.scores)
+            np.testing.assert_array_equal(detections.class_ids, expected.class_ids)
+
+
+def test_the_published_cloud_holds_all_fields_and_the_offline_columns(run, offline, drive_bag):
+    single, _, out = run
+    with Bag(drive_bag) as bag:
+        sent = {to_frame(m)[0].stamp_ns: m for _, _, m in bag.messages({POINTS})}
+    with Bag(out / "result") as bag:
+        clouds = [m for _, _, m in bag.messages({cloud_topic(single)})]
+    assert len(clouds) == len(sent)
+    for msg in clouds:
+        frame, places = to_frame(msg)
+        original = to_array(sent[frame.stamp_ns])
+        for name in original.dtype.names:
+            np.testing.assert_array_equal(to_array(msg)[name], original[name])
+        segmented, _ = offline[0][frame.stamp_ns]
+        np.testing.assert_array_equal(places, segmented.places)
+        np.testing.assert_array_equal(column(msg, "ground", places) > 0, segmented.ground)
+        np.testing.assert_array_equal(column(msg, "cluster_id", places), segmented.cluster_ids)
+        assert msg.header.frame_id == "velodyne"
+
+
+def test_the_evaluator_scores_as_the_offline_evaluation(run, offline):
+    _, content, out = run
+    expected = json.loads(json.dumps(offline[1].content()))
+    for key in ("frames", "ground_truth", "ground_truth_by_range", "stage1", "stage2", "final"):
+        assert _rounded(content[key]) == _rounded(expected[key])
+    assert json.loads((out / "logs" / "scores.json").read_text())["frames"] == expected["frames"]
+
+
+def _rounded(value):
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    return round(value, 6) if isinstance(value, float) else value

@@ -1,0 +1,174 @@
+"""bag_player and bag_recorder: what is in the bag is what arrives, when it should."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import SetParameters
+from std_srvs.srv import Trigger
+
+from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
+from lidar_perception.nodes.runtime import LATCHED
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
+from msg_utils.stamps import to_ns
+
+CLOUD, TEXT, INFO = ("sensor_msgs/msg/PointCloud2", "std_msgs/msg/String",
+                     "sensor_msgs/msg/CameraInfo")
+START, STEP = 10**18, 10**8
+
+
+@pytest.fixture
+def text_bag(tmp_path):
+    """20 messages 'n' on /text every 0.1 s, 'latched' on /note at the start."""
+    with BagWriter(tmp_path / "texts") as bag:
+        bag.add_topic("/text", TEXT, SENSOR_QOS)
+        bag.add_topic("/note", TEXT, LATCHED_QOS)
+        bag.write("/note", START, bag_message(TEXT, data="latched"))
+        for i in range(20):
+            bag.write("/text", START + i * STEP, bag_message(TEXT, data=str(i)))
+    return tmp_path / "texts"
+
+
+def texts(messages):
+    return [m.data for m in messages]
+
+
+def start(processes, bag, **params):
+    processes.start("bag_player", {}, {"bag": str(bag), "wait_for": ["/text"], **params})
+
+
+def test_bytes_arrive_as_they_are_in_the_bag(processes, peer, drive_bag):
+    with Bag(drive_bag) as bag:
+        expected = {t: [d for topic, _, d in bag.raw({t})] for t in (POINTS, TRUTH)}
+    received = {POINTS: peer.listen_raw(POINTS, CLOUD),
+                TRUTH: peer.listen_raw(TRUTH, "visualization_msgs/msg/MarkerArray")}
+    info = peer.listen(CAMERA_INFO, INFO, LATCHED)
+    processes.start("bag_player", {}, {"bag": str(drive_bag), "wait_for": [POINTS, TRUTH]})
+    peer.wait(lambda: processes.ended("bag_player"), "the end of the bag")
+    peer.wait(lambda: all(len(received[t]) == len(expected[t]) for t in expected), "all messages")
+    processes.check("bag_player")
+    for topic, messages in expected.items():
+        # What pads the end of CDR may differ; the message may not.
+        assert all(a[:len(b)] == b[:len(a)] and abs(len(a) - len(b)) < 4
+                   for a, b in zip(received[topic], messages))
+    assert len(info) == 1 and info[0].width == 1242
+
+
+def test_offset_duration_topics_and_remapping(processes, peer, text_bag):
+    heard, note = peer.listen("/renamed", TEXT), peer.listen("/note", TEXT, LATCHED)
+    start(processes, text_bag, start_offset=0.5, duration=1.0, remap=["/text:=/renamed"],
+          wait_for=["/renamed"], rate=10.0)
+    peer.wait(lambda: processes.ended("bag_player") and len(heard) >= 10 and note, "ten messages")
+    assert texts(heard) == [str(i) for i in range(5, 15)]
+    assert texts(note) == ["latched"]  # although the offset skips it
+    processes.check("bag_player")
+
+
+def test_a_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
+    heard = peer.listen("/text", TEXT)
+    start(processes, text_bag, start_paused=True)
+    peer.wait(lambda: "playing" in peer.message_of("bag_player"), "the start")
+    peer.call("/bag_player/resume", Trigger, Trigger.Request())
+    peer.wait(lambda: heard, "a message")
+    peer.call("/bag_player/pause", Trigger, Trigger.Request())
+    note = peer.listen("/note", TEXT, LATCHED)
+    peer.wait(lambda: note, "the latched message")
+
+
+def test_pause_step_resume_and_rate(processes, peer, text_bag):
+    heard = peer.listen("/text", TEXT)
+    start(processes, text_bag, start_paused=True, rate=0.02)  # 85 s for what is left to the end
+    request = Trigger.Request()
+    for expected in (["0"], ["0", "1"], ["0", "1", "2"]):
+        assert peer.call("/bag_player/step", Trigger, request).success
+        peer.wait(lambda n=len(expected): len(heard) >= n, "the stepped message")
+        assert texts(heard) == expected
+    assert peer.call("/bag_player/resume", Trigger, request).success
+    assert not peer.call("/bag_player/step", Trigger, request).success  # only while paused
+    rate = Parameter(name="rate", value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE,
+                                                       double_value=5.0))
+    set_rate = SetParameters.Request(parameters=[rate])
+    assert peer.call("/bag_player/set_parameters", SetParameters, set_rate).results[0].successful
+    peer.wait(lambda: len(heard) == 20, "the rest")
+    assert texts(heard) == [str(i) for i in range(20)]
+
+
+def test_bag_time_runs_at_the_rate_and_stands_still_while_paused(monkeypatch):
+    from lidar_perception.nodes import bag_player
+    from lidar_perception.params import PlayerParams
+    player = bag_player.BagPlayer.__new__(bag_player.BagPlayer)
+    player.now_ns, player.anchor, player.paused, player.clock = START, 50.0, False, None
+    player.params = PlayerParams(rate=2.5)
+    monkeypatch.setattr(bag_player, "monotonic", lambda: 54.0)
+    player._advance()
+    assert player.now_ns == START + 10 * 10**9
+    player.paused = True
+    monkeypatch.setattr(bag_player, "monotonic", lambda: 99.0)
+    player._advance()
+    player.paused, player.params = False, PlayerParams(rate=0.5)
+    monkeypatch.setattr(bag_player, "monotonic", lambda: 101.0)
+    player._advance()
+    assert player.now_ns == START + 11 * 10**9
+
+
+def test_looping_starts_again_and_the_clock_follows_the_bag(processes, peer, text_bag):
+    heard, clock = peer.listen("/text", TEXT), peer.listen("/clock", "rosgraph_msgs/msg/Clock")
+    start(processes, text_bag, loop=True, rate=20.0, clock_hz=200.0)
+    peer.wait(lambda: len(heard) > 45, "two and a half rounds")
+    assert texts(heard)[18:22] == ["18", "19", "0", "1"]
+    times = np.array([to_ns(c.clock) for c in clock])
+    assert (times >= START).all() and (times <= START + 25 * STEP).all()
+    back = np.diff(times) < 0
+    assert 1 <= back.sum() <= 3  # back to the start, once a round
+
+
+def test_it_waits_for_its_subscribers(processes, peer, text_bag):
+    start(processes, text_bag, wait_for=["/text:=2"], rate=20.0)
+    first = peer.listen("/text", TEXT)
+    peer.wait(lambda: peer.value_of("bag_player", "subscribers of /text") == "1", "one subscriber")
+    assert first == []
+    second = peer.listen("/text", TEXT)
+    peer.wait(lambda: len(first) == 20 and len(second) == 20, "all messages at both")
+
+
+@pytest.mark.parametrize("bad, words", [
+    ({"bag": ""}, "'bag' is empty"),
+    ({"bag": "/nowhere"}, "no bag /nowhere"),
+    ({"topics": ["/other"]}, "no topic /other"),
+    ({"remap": ["/text"]}, "OLD:=NEW"),
+    ({"rate": -1.0}, "rate"),
+])
+def test_what_cannot_be_played_is_one_line_and_exit_code_2(processes, peer, text_bag, bad, words):
+    processes.start("bag_player", {}, {"bag": str(text_bag), **bad})
+    peer.wait(lambda: processes.ended("bag_player"), "the end")
+    assert processes.running["bag_player"].returncode == 2
+    log = (processes.logs / "bag_player.log").read_text()
+    assert words in log.splitlines()[-1] and "Traceback" not in log
+
+
+def test_a_truncated_bag_names_the_file(processes, peer, text_bag):
+    storage = next(text_bag.glob("*.mcap"))
+    storage.write_bytes(storage.read_bytes()[:-300])
+    processes.start("bag_player", {}, {"bag": str(text_bag)})
+    peer.wait(lambda: processes.ended("bag_player"), "the end")
+    log = (processes.logs / "bag_player.log").read_text()
+    assert processes.running["bag_player"].returncode == 2
+    assert "truncated" in log and str(text_bag) in log and "Traceback" not in log
+
+
+def test_the_recorder_writes_what_the_player_plays(processes, peer, text_bag, tmp_path):
+    processes.start("bag_recorder", {}, {"bag": str(tmp_path / "copy"),
+                                         "topics": ["/text", "/note"]})
+    start(processes, text_bag, rate=10.0)
+    peer.wait(lambda: processes.ended("bag_player")
+              and peer.value_of("bag_recorder", "frames") == "21", "21 recorded messages")
+    assert processes.stop()["bag_recorder"] == 0
+    with Bag(tmp_path / "copy") as bag:
+        assert [m.data for _, _, m in bag.messages({"/text"})] == [str(i) for i in range(20)]
+        assert [m.data for _, _, m in bag.messages({"/note"})] == ["latched"]
+        assert bag.qos("/note")[0].durability.name == "TRANSIENT_LOCAL"

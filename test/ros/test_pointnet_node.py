@@ -1,0 +1,174 @@
+"""pointnet_detector as a real process, against the offline detector with the same weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from detection_samples import frame
+from detection_samples import lively as lively_pointpillars
+from detection_samples import tiny as tiny_pointpillars
+from pointnet_samples import eager, lively, small
+from std_msgs.msg import Float64
+from test_bad_input import BAD, CLOUD, MARKERS, RELIABLE_IN, cloud
+from test_pointpillars_node import assert_equal, message, received
+
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import segment
+from lidar_perception.cli.options import read_config
+from lidar_perception.detectors.pointnet.checkpoint import Header, save_checkpoint
+from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
+from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams
+from lidar_perception.detectors.pointpillars.checkpoint import Header as PointPillarsHeader
+from lidar_perception.nodes.graph import POINTNET
+from lidar_perception.nodes.main import run
+from lidar_perception.param_fields import flatten, with_values
+from lidar_perception.wire.messages import column, to_frame
+from lidar_perception.wire.topics import POINTS
+
+NODE = "pointnet_detector"
+SHARED = Path(__file__).resolve().parents[2] / "config" / "pointnet.param.yaml"
+REMAP = {"~/input/points": "/in", "~/output/detections": "/found"}
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> Path:
+    """Those of a small network at random, which finds something."""
+    path = tmp_path_factory.mktemp("weights") / "pointnet.safetensors"
+    save_checkpoint(path, lively(small()), Header(small()))
+    return path
+
+
+def values(weights):
+    """Parameters of the node, as flat as a launch file has them; unchanged ones are left out."""
+    params = with_values(eager(), {"pointnet.weights": str(weights), "pointnet.threads": 1})
+    defaults = flatten(PointNetDetectorParams())
+    return {k: v for k, v in flatten(params).items() if v != defaults[k]}
+
+
+def offline(weights, msg, *columns):
+    params = with_values(eager(), {"pointnet.threads": 1})
+    detector = load_pointnet_detector(weights, "cpu", params)
+    return detector(to_frame(msg, params.input.intensity_max)[0], *columns)
+
+
+def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, weights):
+    """The graph of three nodes with the detector's numbers, and a plain cloud straight to the
+    detector, which then finds ground and clusters itself."""
+    shared = read_config(SHARED, PipelineParams())
+    for node, remap in POINTNET.items():
+        extra = {"~/output/detections": "/found"} if node == NODE else {}
+        processes.start(node, {**remap, **extra}, {**shared, **(
+            values(weights) if node == NODE else {})})
+    found, between = peer.listen("/found", MARKERS), POINTNET[NODE]["~/input/points"]
+    points = peer.listen(between, CLOUD)
+    times = {step: [] for step in STEPS}
+    for step, heard in times.items():
+        peer.node.create_subscription(Float64, f"/{NODE}/debug/{step}_ms", heard.append, 10)
+    peer.wait(lambda: peer.message_of(NODE) == "waiting for input", "the network")
+    peer.send(peer.talker(POINTS, CLOUD), message(1), lambda: points and received(found, 1),
+              "detections")
+    scan = to_frame(message(1), 0.0)[0]
+    segmented = segment(scan, None, with_values(PipelineParams(), shared))
+    assert segmented.ground.any() and segmented.cluster_ids.max() >= 5
+    np.testing.assert_array_equal(column(points[-1], "cluster_id", np.arange(len(scan))),
+                                  segmented.cluster_ids)
+    expected = offline(weights, message(1), segmented.cluster_ids)
+    assert_equal(received(found, 1), expected)
+    assert received(found, 1).frame_id == "lidar"
+
+    talker = peer.talker(between, CLOUD)
+    peer.send(talker, message(2), lambda: received(found, 2), "detections of a plain cloud")
+    assert_equal(received(found, 2), expected)
+    # Columns that say something else are believed.
+    halves = segmented.cluster_ids * 2 + np.arange(len(scan)) % 2
+    halves[segmented.cluster_ids == 0] = 0
+    peer.send(talker, message(3, cluster_id=halves.astype(np.uint32)),
+              lambda: received(found, 3), "detections of a cloud with clusters")
+    other = offline(weights, message(3), halves)
+    assert_equal(received(found, 3), other)
+    assert not np.array_equal(other.boxes, expected.boxes)
+
+    peer.wait(lambda: all(times.values()), "the times of the steps")
+    assert times["network"][-1].data > 0
+    peer.wait(lambda: peer.value_of(NODE, "detections"), "counts")
+    assert peer.value_of(NODE, "network").startswith("improved, Car")
+    processes.check()
+
+
+def test_no_cloud_ends_the_detector_and_each_has_its_reason(processes, peer, weights):
+    processes.start(NODE, REMAP, {**RELIABLE_IN, **values(weights)})
+    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
+    count = np.zeros(len(frame()))
+    strange = {
+        **{name: bad for name, bad in BAD.items() if name != "one point"},
+        "one point": (cloud([[5, 0, -1]]), "no clusters"),
+        "all is ground": (message(1, ground=count.astype("u1") + 1), "no clusters"),
+        "no clusters": (message(1, cluster_id=count.astype("u4")), "no clusters"),
+        "clusters of one point": (message(1, cluster_id=np.arange(len(count), dtype="u4")),
+                                  "fewer than 5 points"),
+        "numbers of another program": (message(1, cluster_id=(count + 2**32 - 1).astype("u4")),
+                                       "no clusters"),
+        "one large cluster": (message(1, cluster_id=(count + 2**31 - 1).astype("u4")),
+                              "detecting"),
+        "a column of floats": (message(1, cluster_id=count * np.nan), "no clusters"),
+        "no intensity": (cloud(frame().xyz), "no intensity"),
+        "two numbers a point": (message(1, cluster_id=np.zeros((len(count), 2), "u4")),
+                                "'cluster_id' has count > 1"),
+    }
+    for name, (msg, words) in strange.items():
+        peer.diagnostics.clear()
+        peer.send(talker, msg, lambda w=words: w in peer.message_of(NODE), f"'{words}': {name}")
+        processes.check()
+    peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
+    assert_equal(received(found, 7), offline(weights, message(7)))
+
+    for name in ("car", "pedestrian", "cyclist"):
+        peer.set_parameter(f"/{NODE}", f"pointnet.scores.{name}", 1.0)
+    peer.send(talker, message(8), lambda: received(found, 8) is not None, "no detections")
+    assert len(received(found, 8)) == 0
+    peer.wait(lambda: "threshold in pointnet.scores" in peer.message_of(NODE), "the reason")
+    peer.wait(lambda: "Car 0." in (peer.value_of(NODE, "best scores") or ""), "the best scores")
+    log = (processes.logs / f"{NODE}.log").read_text()
+    assert "Traceback" not in log and "Warning" not in log
+
+
+def missing_weights(folder):
+    return "/nowhere.safetensors"
+
+
+def pointpillars_weights(folder):
+    config = tiny_pointpillars()
+    save_checkpoint(folder / "p.safetensors", lively_pointpillars(config),
+                    PointPillarsHeader(config))
+    return folder / "p.safetensors"
+
+
+UNUSABLE = {  # weights made in a folder; words of the diagnostic
+    "nowhere": (missing_weights, "there is no checkpoint /nowhere.safetensors"),
+    "PointPillars": (pointpillars_weights, "holds a PointPillars, which is for"),
+}
+
+
+@pytest.mark.parametrize("make, words", UNUSABLE.values(), ids=UNUSABLE)
+def test_weights_that_cannot_be_used_are_a_diagnostic(make, words, processes, peer, tmp_path):
+    processes.start(NODE, REMAP, {**RELIABLE_IN, "pointnet.weights": str(make(tmp_path))})
+    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
+    peer.send(talker, message(1), lambda: words in peer.message_of(NODE), words)
+    assert ord(peer.diagnostics[NODE].level) == 2 and not found
+    maps = Path(f"/proc/{processes.running[NODE].pid}/maps")
+    if make is missing_weights and maps.is_file():
+        assert "libtorch" not in maps.read_text()  # which takes seconds and 200 MB
+    processes.check()
+    assert "Traceback" not in (processes.logs / f"{NODE}.log").read_text()
+
+
+def test_help_knows_the_node(capsys):
+    assert run(NODE, [NODE, "--help"]) == 0
+    assert "pointnet.least_points (default 5)" in capsys.readouterr().out

@@ -1,0 +1,278 @@
+"""pointpillars_detector as a real process, against the offline detector with the same weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from detection_samples import eager, frame, lively, tiny
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+from rcl_interfaces.srv import DescribeParameters, SetParameters
+from std_msgs.msg import Float64
+from test_bad_input import BAD, CLOUD, MARKERS, RELIABLE_IN, cloud
+
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import segment
+from lidar_perception.cli.options import read_config
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.detectors.pointpillars.checkpoint import Header, save_checkpoint
+from lidar_perception.detectors.pointpillars.detector import STEPS, load_detector
+from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.nodes.graph import POINTPILLARS
+from lidar_perception.nodes.main import run
+from lidar_perception.param_fields import flatten, with_values
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.messages import column, to_detections, to_frame
+from lidar_perception.wire.topics import POINTS
+from msg_utils.markers import box_pose, from_marker_array, pose_yaw
+from msg_utils.point_cloud2 import from_array
+from msg_utils.stamps import header_message
+
+NODE = "pointpillars_detector"
+EXPERTS = Path(__file__).resolve().parents[2] / "config" / "pointpillars.param.yaml"
+FIELDS = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
+REMAP = {"~/input/points": "/in", "~/output/detections": "/found"}
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> Path:
+    """A small v4 with random weights, which finds something."""
+    path = tmp_path_factory.mktemp("weights") / "v4.safetensors"
+    save_checkpoint(path, lively(tiny("v4")), Header(tiny("v4")))
+    return path
+
+
+def values(weights, **changes):
+    """Parameters of the node, as flat as a launch file has them; unchanged ones are left out."""
+    params = with_values(eager(), {"detection.weights": str(weights), "detection.threads": 1,
+                                   **changes})
+    defaults = flatten(DetectorParams())
+    return {k: v for k, v in flatten(params).items() if v != defaults[k]}
+
+
+def message(stamp, **columns):
+    """The scan of detection_samples, with columns of its own."""
+    scan = frame()
+    kinds = [(name, values.dtype.str, values.shape[1:]) for name, values in columns.items()]
+    points = np.zeros(len(scan), np.dtype([*FIELDS.descr, *kinds]))
+    for i, name in enumerate("xyz"):
+        points[name] = scan.xyz[:, i]
+    points["intensity"] = scan.intensity
+    for name, column_values in columns.items():
+        points[name] = column_values
+    return from_array(points, header_message(stamp, "lidar", bag_message), bag_message)
+
+
+def received(messages, stamp):
+    """What came for the cloud of a stamp."""
+    return next((m for m in map(from_marker_array, messages) if m.stamp_ns == stamp), None)
+
+
+def offline(weights, msg, params=None, *columns):
+    params = params or with_values(eager(), {"detection.threads": 1})
+    detector = load_detector(weights, "cpu", params)
+    return detector(to_frame(msg, params.input.intensity_max)[0], *columns)
+
+
+def assert_equal(objects, expected):
+    found = to_detections(objects)
+    assert len(expected) > 3
+    np.testing.assert_array_equal(found.boxes[:, :6], expected.boxes[:, :6])
+    yaws = [pose_yaw(box_pose(box, bag_message)) for box in expected.boxes]  # -pi .. pi
+    np.testing.assert_array_equal(found.boxes[:, 6], np.float32(yaws))
+    np.testing.assert_array_equal(found.scores, expected.scores)
+    np.testing.assert_array_equal(found.class_ids, expected.class_ids)
+
+
+def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, weights):
+    """The graph of three nodes with the experts' numbers, and a plain cloud straight to the
+    detector, which then computes ground and clusters itself."""
+    shared = read_config(EXPERTS, PipelineParams())
+    for node, remap in POINTPILLARS.items():
+        extra = {"~/output/detections": "/found"} if node == NODE else {}
+        processes.start(node, {**remap, **extra}, {**shared, **(
+            values(weights) if node == NODE else {})})
+    found, between = peer.listen("/found", MARKERS), POINTPILLARS[NODE]["~/input/points"]
+    points = peer.listen(between, CLOUD)
+    times = {step: [] for step in STEPS}
+    for step, heard in times.items():
+        peer.node.create_subscription(Float64, f"/{NODE}/debug/{step}_ms", heard.append, 10)
+    peer.wait(lambda: peer.message_of(NODE) == "waiting for input", "the network")
+    peer.send(peer.talker(POINTS, CLOUD), message(1), lambda: points and received(found, 1),
+              "detections")
+
+    params = with_values(PipelineParams(), shared)
+    scan = to_frame(message(1), 0.0)[0]
+    segmented = segment(scan, None, params)
+    columns = segmented.ground, segmented.cluster_ids
+    assert segmented.ground.any() and segmented.cluster_ids.max() >= 2
+    marked, places = points[-1], np.arange(len(scan))
+    np.testing.assert_array_equal(column(marked, "ground", places) > 0, segmented.ground)
+    np.testing.assert_array_equal(column(marked, "cluster_id", places), segmented.cluster_ids)
+    assert_equal(received(found, 1), offline(weights, message(1), None, *columns))
+    assert received(found, 1).frame_id == "lidar"
+
+    talker = peer.talker(between, CLOUD)
+    peer.send(talker, message(2), lambda: received(found, 2), "detections of a plain cloud")
+    assert_equal(received(found, 2), offline(weights, message(2)))
+    # Columns that say something else are believed: no ground, and clusters of that.
+    nowhere = np.zeros(len(scan), np.uint8)
+    ids = cluster_obstacles(scan.xyz, nowhere > 0, DetectorParams().clustering)
+    peer.send(talker, message(3, ground=nowhere, cluster_id=ids.astype(np.uint32)),
+              lambda: received(found, 3), "detections of a cloud with columns")
+    other = offline(weights, message(3), None, nowhere, ids)
+    assert_equal(received(found, 3), other)
+    assert not np.array_equal(other.boxes, offline(weights, message(2)).boxes)
+
+    peer.wait(lambda: all(times.values()), "the times of the steps")
+    assert times["network"][-1].data > 0
+    peer.wait(lambda: peer.value_of(NODE, "detections"), "counts")
+    assert peer.value_of(NODE, "network").startswith("v4 compact")
+    processes.check()
+
+
+def test_no_cloud_ends_the_detector_and_each_has_its_reason(processes, peer, weights):
+    processes.start(NODE, REMAP, {**RELIABLE_IN, **values(weights)})
+    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
+    xyz, rng = frame().xyz, np.random.default_rng(0)
+    count = np.zeros(len(xyz))
+    strange = {
+        **{name: bad for name, bad in BAD.items() if name != "one point"},
+        "one point": (cloud([[5, 0, -1]]), "no intensity"),
+        "out of range": (cloud(xyz + [500, 0, 0]), "network's range"),
+        "behind": (cloud(np.abs(xyz) * [-1, 1, -1] - [1, 0, 0]), "network's range"),
+        "no intensity": (cloud(xyz), "no intensity"),
+        "a million": (cloud(rng.uniform(-50, 50, (1_000_000, 3)) * [1, 1, 0.05]), "no intensity"),
+        "NaN among them": (cloud(np.where(np.arange(len(xyz))[:, None] % 3, xyz, np.nan)),
+                           "no intensity"),
+        "all is ground": (message(1, ground=count.astype("u1") + 1), "is ground"),
+        "no clusters": (message(1, ground=count.astype("u1"), cluster_id=count.astype("u4")),
+                        "detecting"),
+        "numbers of another program": (message(1, cluster_id=(count + 2**32 - 1).astype("u4"),
+                                               ground=count.astype("u1")), "detecting"),
+        "large numbers": (message(1, cluster_id=(count + 2**31 - 1).astype("u4")), "detecting"),
+        "columns of floats": (message(1, cluster_id=count * np.nan, ground=count * np.nan),
+                              "detecting"),
+        "two numbers a point": (message(1, ground=np.zeros((len(xyz), 2), "u1")),
+                                "'ground' has count > 1"),
+    }
+    for name, (msg, words) in strange.items():
+        peer.diagnostics.clear()
+        peer.send(talker, msg, lambda w=words: w in peer.message_of(NODE), f"'{words}': {name}")
+        processes.check()
+    peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
+    assert_equal(received(found, 7), offline(weights, message(7)))
+    log = (processes.logs / f"{NODE}.log").read_text()
+    assert "Traceback" not in log and "Warning" not in log
+
+
+def test_thresholds_change_at_run_time_and_what_cannot_is_refused(processes, peer, weights):
+    processes.start(NODE, REMAP, {**RELIABLE_IN, **values(weights)})
+    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
+    peer.send(talker, message(1), lambda: received(found, 1), "detections")
+
+    def change(name, **value):
+        request = SetParameters.Request(parameters=[
+            Parameter(name=name, value=ParameterValue(**value))])
+        return peer.call(f"/{NODE}/set_parameters", SetParameters, request).results[0]
+
+    text, double = ParameterType.PARAMETER_STRING, ParameterType.PARAMETER_DOUBLE
+    for name, value in ("weights", "other.safetensors"), ("device", "cuda"), ("version", "v0"):
+        refused = change(f"detection.{name}", type=text, string_value=value)
+        assert not refused.successful and "read-only" in refused.reason
+    refused = change("detection.scores.car", type=double, double_value=1.5)
+    assert not refused.successful and refused.reason
+    refused = change("ground.method", type=text, string_value="dream")
+    assert not refused.successful and "patchwork" in refused.reason
+    described, = peer.call(f"/{NODE}/describe_parameters", DescribeParameters,
+                           DescribeParameters.Request(names=["detection.scores.car"])).descriptors
+    assert described.floating_point_range[0].to_value == 1.0 and "Car" in described.description
+
+    for name in ("car", "pedestrian", "cyclist"):
+        peer.set_parameter(f"/{NODE}", f"detection.scores.{name}", 1.0)
+    peer.send(talker, message(2), lambda: received(found, 2) is not None, "no detections")
+    assert len(received(found, 2)) == 0
+    peer.wait(lambda: "below its threshold" in peer.message_of(NODE), "the reason")
+    peer.wait(lambda: "Car 0." in (peer.value_of(NODE, "best scores") or ""), "the best scores")
+    peer.set_parameter(f"/{NODE}", "ground.sensor_pose.height", 1.2)
+    peer.send(talker, message(3), lambda: "ground.sensor_pose.height is 1.2"
+              in peer.message_of(NODE), "the wrong height")
+
+
+def checkpoint_of_another_size(folder):
+    path = folder / "v0.safetensors"
+    save_checkpoint(path, lively(tiny("v0")), Header(tiny("v0")))
+    return {"detection.weights": str(path), "detection.version": "v4"}
+
+
+def cut_checkpoint(folder):
+    checkpoint_of_another_size(folder)
+    whole = (folder / "v0.safetensors").read_bytes()
+    (folder / "cut.safetensors").write_bytes(whole[:len(whole) // 2])
+    return {"detection.weights": str(folder / "cut.safetensors")}
+
+
+def broken_weights(folder):
+    network = lively(tiny("v0"))
+    network.head.scores.bias.fill_(np.nan)
+    save_checkpoint(folder / "nan.safetensors", network, Header(tiny("v0")))
+    return {"detection.weights": str(folder / "nan.safetensors")}
+
+
+UNUSABLE = {  # parameters made in a folder; level, words of the diagnostic
+    "nowhere": (lambda folder: {"detection.weights": "/nowhere.safetensors"}, 2,
+                "there is no checkpoint /nowhere.safetensors"),
+    "another version": (checkpoint_of_another_size, 2, "holds version v0, asked for was v4"),
+    "cut": (cut_checkpoint, 2, "is no checkpoint, or was cut short"),
+    "no CUDA": (lambda folder: {**checkpoint_of_another_size(folder), "detection.version": "auto",
+                                "detection.device": "cuda:99", "detection.cpu_fallback": False}, 2,
+                "'cuda:99' is asked for"),
+    "no CUDA, the CPU instead": (lambda folder: {
+        **checkpoint_of_another_size(folder), "detection.version": "auto",
+        "detection.device": "cuda:99"}, 1, "the CPU is used"),
+    "NaN": (broken_weights, 1, "not numbers (NaN)"),
+}
+
+
+@pytest.mark.parametrize("make, level, words", UNUSABLE.values(), ids=UNUSABLE)
+def test_weights_that_cannot_be_used_are_a_diagnostic(make, level, words, processes, peer,
+                                                      tmp_path):
+    processes.start(NODE, REMAP, {**RELIABLE_IN, **make(tmp_path)})
+    talker = peer.talker("/in", CLOUD)
+    peer.send(talker, message(1), lambda: words in peer.message_of(NODE), words)
+    assert ord(peer.diagnostics[NODE].level) == level
+    peer.diagnostics.clear()
+    peer.wait(lambda: words in peer.message_of(NODE), "the diagnostic again")
+    processes.check()
+    assert "Traceback" not in (processes.logs / f"{NODE}.log").read_text()
+
+
+def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, peer, weights):
+    from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
+    missing = next((f"{v} {s}" for v in ("v4", "v3", "v2", "v1", "v0") for s in ("compact", "full")
+                    if not (WEIGHTS / f"pointpillars_{v}_{s}.safetensors").is_file()), None)
+    if missing is None:
+        pytest.skip("weights of all versions and sizes come with the package")
+    version, size = missing.split()
+    processes.start(NODE, REMAP, {**RELIABLE_IN, "detection.version": version,
+                                  "detection.size": size})
+    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
+    peer.send(talker, message(1), lambda: f"no weights for {missing}" in peer.message_of(NODE),
+              "the diagnostic")
+    peer.until(lambda: False, 1.0)
+    assert not found and f"no weights for {missing}" in peer.message_of(NODE)
+    maps = Path(f"/proc/{processes.running[NODE].pid}/maps")
+    if maps.is_file():
+        assert "libtorch" not in maps.read_text()  # which takes seconds and 200 MB
+    processes.check()
+
+
+def test_help_and_run_know_the_node(capsys):
+    assert run(NODE, [NODE, "--help"]) == 0
+    assert "detection.scores.pedestrian (default 0.3)" in capsys.readouterr().out

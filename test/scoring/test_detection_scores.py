@@ -1,0 +1,388 @@
+"""KITTI's protocol: cases worked out by hand, laws, and a second reading of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import kitti_reference as reference
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samples import CALIBRATION
+
+from lidar_perception.data.kitti.labels import parse, to_ground_truth
+from lidar_perception.data.kitti.write import image_boxes
+from lidar_perception.scoring.average_precision import at_recall, averages, recall_thresholds
+from lidar_perception.scoring.centres.matching import match_centres
+from lidar_perception.scoring.centres.scores import CentreScores
+from lidar_perception.scoring.kitti.camera_objects import camera_objects
+from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED, Comparison, precision
+from lidar_perception.scoring.kitti.report import ROWS, DetectionReport, mean_3d
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
+
+few = settings(max_examples=15, database=None)
+seeds = st.integers(0, 2**32 - 1)
+
+
+def labels(text):
+    return to_ground_truth([parse(line) for line in text.splitlines()],
+                           CALIBRATION.lidar_to_camera)
+
+
+def report(frames, calibration=CALIBRATION):
+    """frames: (label text, result text)."""
+    total = DetectionReport()
+    for truth, found in frames:
+        total.add("frame", labels(truth), labels(found), calibration)
+    return total
+
+
+def ap(frames):
+    return report(frames).content()["ap"]
+
+
+def numbers(content):
+    """All numbers of a report's ap, in order; nothing for what has no objects."""
+    if isinstance(content, dict):
+        return [n for value in content.values() for n in numbers(value)]
+    return [] if content is None else [content]
+
+
+# One line: a car 20 m ahead, 60 pixels high, seen in full; a result is the same with a score.
+def car(kind="Car", left=500, top=150, bottom=210, z=20.0, x=0.0, occluded=0, truncated=0.0,
+        alpha=0.0, score=None, y=1.6):
+    line = (f"{kind} {truncated} {occluded} {alpha} {left} {top} {left + 100} {bottom} "
+            f"1.5 1.6 3.9 {x} {y} {z} 0.3")
+    return line if score is None else f"{line} {score}"
+
+
+REGION = "DontCare -1 -1 -10 {} 100 {} 250 -1 -1 -1 -1000 -1000 -1000 -10"
+WRONG = dict(left=900, z=40.0, x=10.0)  # another place, in the image and in space
+
+
+def together(*lines):
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("seed, count, noise", [(0, 60, 0.12), (1, 150, 0.05), (2, 12, 0.1),
+                                                (3, 40, 0.3), (4, 2, 0.1)])
+def test_a_second_reading_of_the_protocol_gives_the_same(seed, count, noise):
+    rng = np.random.default_rng(seed)
+    frames = [reference.random_frame(rng, noise=noise) for _ in range(count)]
+    compared = Comparison.of(report(frames).frames)
+    few_objects = many_objects = 0
+    for metric, overlaps in ROWS.values():
+        prepared = reference.prepare(frames, metric)
+        for name in SCORED:
+            for level in DIFFICULTIES:
+                found = precision(compared, name, metric, overlaps[name], level)
+                expected = reference.evaluate(prepared, name, level, overlaps[name], metric)
+                if expected is None:
+                    assert found is None
+                    continue
+                assert dataclasses.astuple(found) == pytest.approx(expected, abs=1e-9)
+                few_objects += found.objects <= 40 and found.r40 > 0
+                many_objects += found.objects > 40 and found.r40 > 0
+    assert few_objects and (many_objects or count < 150)
+
+
+def test_average_precision_of_four_objects_worked_out_by_hand():
+    # Scores: 0.9 right, 0.8 wrong, 0.7 right, 0.6 wrong, 0.5 right; the fourth car is missed.
+    # Recall 1/4, 2/4, 3/4 at precision 1, 2/3, 3/5.
+    truth = together(*(car(left=120 * i, x=6.0 * i) for i in range(4)))
+    found = together(car(score=0.9, left=0), car(score=0.8, **WRONG),
+                     car(score=0.7, left=120, x=6.0, alpha=np.pi / 2),
+                     car(score=0.6, left=900, z=50.0, x=20.0), car(score=0.5, left=240, x=12.0))
+    row = ap([(truth, found)])["Car"]["3d"]["easy"]
+    assert row["objects"] == 4
+    # 40 points: 10 up to 1/4, 10 up to 2/4, 10 up to 3/4, 10 beyond.
+    assert row["r40"] == pytest.approx(100 * (10 * 1 + 10 * 2 / 3 + 10 * 3 / 5) / 40)
+    # 11 points: 0 .1 .2; .3 .4 .5; .6 .7; .8 .9 1.
+    assert row["r11"] == pytest.approx(100 * (3 * 1 + 3 * 2 / 3 + 2 * 3 / 5) / 11)
+    # KITTI's program puts the three precisions on the first three of 41 points.
+    assert row["official_r40"] == pytest.approx(100 * (2 / 3 + 3 / 5) / 40)
+    assert row["official_r11"] == pytest.approx(100 * 1 / 11)
+    # The second hit points a quarter turn away: similarities 1, 1 + 1/2, 2 + 1/2 of 1, 3, 5.
+    aos = ap([(truth, found)])["Car"]["aos"]["easy"]
+    assert aos["r40"] == pytest.approx(100 * (10 * 1 + 10 * 1.5 / 3 + 10 * 2.5 / 5) / 40)
+
+
+def test_average_precision_of_a_hundred_objects_worked_out_by_hand():
+    # 50 cars found, then 50 false ones, then the other 50 cars: precision 1 up to recall 1/2, and
+    # at recall 1 it is 100 / 150, which is the best there is beyond 1/2.
+    frames = [(car(), together(car(score=0.9 - i * 1e-3), car(score=0.5 + i * 1e-4, **WRONG)))
+              for i in range(50)]
+    frames += [(car(), car(score=0.4 - i * 1e-3)) for i in range(50)]
+    for key in ("", "official_"):
+        row = ap(frames)["Car"]["bev"]["moderate"]
+        assert row[f"{key}r40"] == pytest.approx(100 * (20 * 1 + 20 * 2 / 3) / 40)
+        assert row[f"{key}r11"] == pytest.approx(100 * (6 * 1 + 5 * 2 / 3) / 11)
+
+
+# A car found at 0.9 and something found at 0.95: AP is 100 if that does not count, else 50, as
+# the only precision is 1 / 2. By metric, in the difficulty that is named.
+@pytest.mark.parametrize("case, other_truth, other_found, level, image, space", [
+    ("nothing there", None, car(**WRONG, score=0.95), "easy", 50, 50),
+    ("a van", car("Van", **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
+    ("a truck", car("Truck", **WRONG), car(**WRONG, score=0.95), "easy", 50, 50),
+    ("someone sitting", car("Person_sitting", **WRONG), car(**WRONG, score=0.95), "easy", 50, 50),
+    ("a region", REGION.format(880, 1010), car(**WRONG, score=0.95), "easy", 100, 50),
+    ("half a region", REGION.format(880, 950), car(**WRONG, score=0.95), "easy", 50, 50),
+    ("hidden, easy", car(occluded=1, **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
+    ("hidden, not told", car(occluded=3, **WRONG), car(**WRONG, score=0.95), "hard", 100, 100),
+    ("cut off", car(truncated=0.16, **WRONG), car(**WRONG, score=0.95), "easy", 100, 100),
+    ("cut off more", car(truncated=0.51, **WRONG), car(**WRONG, score=0.95), "hard", 100, 100),
+    ("39 pixels, easy", None, car(**WRONG, bottom=189, score=0.95), "easy", 100, 100),
+    ("39 pixels, moderate", None, car(**WRONG, bottom=189, score=0.95), "moderate", 50, 50),
+    ("24 pixels", None, car(**WRONG, bottom=174, score=0.95), "hard", 100, 100),
+    ("25 pixels", None, car(**WRONG, bottom=175, score=0.95), "hard", 50, 50),
+    ("another class", None, car("Pedestrian", **WRONG, score=0.95), "easy", 100, 100),
+    # What is lower than 25 pixels is ignored, but it takes the car from what is found there.
+    ("24 pixels, another class", None, car("Pedestrian", bottom=174, score=0.95), "hard", 100, 0),
+    # The better score is the only threshold, and above it nothing is wrong.
+    ("found twice", None, car(score=0.95), "easy", 100, 100),
+])
+def test_what_counts_as_wrong(case, other_truth, other_found, level, image, space):
+    truth = together(car(), *([other_truth] if other_truth else []))
+    rows = ap([(truth, together(car(score=0.9), other_found))])["Car"]
+    assert rows["3d"][level]["objects"] == 1
+    found = [rows[metric][level]["r40"] for metric in ("image", "bev", "3d")]
+    assert found == [image, space, space]
+
+
+@pytest.mark.parametrize("change, counted", [
+    ({}, (1, 1, 1)), (dict(occluded=1), (0, 1, 1)), (dict(occluded=2), (0, 0, 1)),
+    (dict(occluded=3), (0, 0, 0)), (dict(truncated=0.15), (1, 1, 1)),
+    (dict(truncated=0.16), (0, 1, 1)), (dict(truncated=0.3), (0, 1, 1)),
+    (dict(truncated=0.31), (0, 0, 1)), (dict(truncated=0.5), (0, 0, 1)),
+    (dict(truncated=0.51), (0, 0, 0)), (dict(bottom=190), (1, 1, 1)),
+    (dict(bottom=189.9), (0, 1, 1)), (dict(bottom=175), (0, 1, 1)), (dict(bottom=174.9), (0, 0, 0)),
+    (dict(kind="Van"), (0, 0, 0)), (dict(kind="Truck"), (0, 0, 0))])
+def test_what_must_be_found(change, counted):
+    rows = ap([(car(**change), "")])["Car"]["3d"]
+    assert tuple(rows[level]["objects"] if rows[level] else 0 for level in DIFFICULTIES) == counted
+
+
+def test_truncation_of_tracks_is_computed_and_their_level_is_no_share():
+    inside = np.array([20.0, 0, -0.9, 3.9, 1.6, 1.5, 0.2])
+    across = np.array([7.0, 6.3, -0.9, 3.9, 1.6, 1.5, 0.2])
+    share = image_boxes(across[None], CALIBRATION)[1][0]
+    assert 0.3 < share < 0.95
+    extras = [{"track_id": 1, "truncated": 0.0}, {"track_id": 2, "truncated": 1.0},
+              {"track_id": 3, "truncated": 0.0}, {"track_id": 4, "truncated": 2.0},
+              {"truncated": 0.21}, {}]
+    boxes = [inside, inside, across, inside, across, across]
+    truth = GroundTruth.of(boxes, [0] * 6, extras)
+    objects = camera_objects(truth, CALIBRATION)
+    assert objects.truncated == pytest.approx([0, 0, share, 1, 0.21, share])
+
+
+def test_what_a_label_does_not_say_is_computed_from_its_box():
+    text = "\n".join(car(left=100 * i, x=i - 3.0, z=15.0 + i, alpha=-10) for i in range(6))
+    said, bare = labels(text), labels(text)
+    bare = GroundTruth.of(bare.boxes, bare.class_ids)
+    said, bare = camera_objects(said, CALIBRATION), camera_objects(bare, CALIBRATION)
+    np.testing.assert_allclose(bare.boxes[:, :6], said.boxes[:, :6], atol=1e-6)
+    np.testing.assert_allclose(np.cos(bare.boxes[:, 6] - said.boxes[:, 6]), 1, atol=1e-6)
+    x, z = np.arange(6) - 3.0, 15.0 + np.arange(6)
+    np.testing.assert_allclose(said.alpha, 0.3 - np.arctan2(x, z), atol=1e-9)
+    np.testing.assert_allclose(bare.alpha, said.alpha, atol=1e-3)  # the camera is tilted
+    np.testing.assert_allclose(bare.image_boxes,
+                               image_boxes(labels(text).boxes, CALIBRATION)[0], atol=1e-9)
+
+
+@few
+@given(seeds)
+def test_the_truth_scores_100_in_everything(seed):
+    rng = np.random.default_rng(seed)
+    # Objects far apart: where labels overlap one another one may be found by another's box.
+    truths = [labels(together(*(reference.line(reference.with_pixels(
+        {**reference.some_object(rng), "x": 8.0 * k - 8, "z": 20.0})) for k in range(3))))
+        for _ in range(rng.integers(1, 40))]
+    total = DetectionReport()
+    for truth in truths:
+        scores = rng.uniform(0, 1, len(truth))
+        found = GroundTruth.of(truth.boxes, truth.class_ids,
+                               [{**e, "score": s} for e, s in zip(truth.extras, scores)])
+        total.add("frame", truth, found, CALIBRATION)
+    content = total.content()
+    for name in SCORED:
+        for row in ("image", "aos", "bev", "3d", "bev_relaxed", "3d_relaxed"):
+            for level in DIFFICULTIES:
+                if cell := content["ap"][name][row][level]:
+                    assert (cell["r11"], cell["r40"]) == pytest.approx((100, 100))
+    assert content["diagnosis"] == []
+
+
+@few
+@given(seeds)
+def test_the_order_of_detections_changes_nothing(seed):
+    rng = np.random.default_rng(seed)
+    frames, shuffled = [], []
+    for _ in range(20):
+        truth, found = reference.random_frame(rng)
+        lines = [f"{line.rsplit(' ', 1)[0]} {rng.integers(1, 4) / 4}"  # many equal scores
+                 for line in found.splitlines()]
+        frames.append((truth, together(*lines)))
+        shuffled.append((truth, together(*rng.permutation(lines))))
+    assert report(frames).content() == report(shuffled).content()
+
+
+def test_the_order_of_equal_scores_changes_nothing():
+    # The first of two people is found by either detection, the second by one of them only.
+    truth = together(*(car("Pedestrian", left=300 * i, x=1.6 * i) for i in range(2)))
+    found = [car("Pedestrian", x=x, score=0.5) for x in (0.8, -0.8)]
+    there, back = (ap([(truth, together(*order))])["Pedestrian"] for order in (found, found[::-1]))
+    assert there == back and there["bev_relaxed"]["easy"]["r40"] > 0
+
+
+@few
+@given(seeds)
+def test_a_wrong_detection_of_lower_score_never_raises_ap(seed):
+    rng = np.random.default_rng(seed)
+    frames = [reference.random_frame(rng) for _ in range(20)]
+    worse = [(truth, together(*found.splitlines(), *(
+        car(name, left=2000 + 200 * i, x=300.0, score=-rng.uniform())
+        for i, name in enumerate(SCORED)))) for truth, found in frames]
+    before, after = numbers(ap(frames)), numbers(ap(worse))
+    assert len(before) == len(after)
+    assert all(a <= b for a, b in zip(after, before))
+
+
+def test_frames_one_by_one_are_the_frames_together_and_empty_ones_change_nothing():
+    rng = np.random.default_rng(5)
+    frames = [reference.random_frame(rng) for _ in range(30)]
+    there, back = (numbers(ap(f)) for f in (frames, [*frames[10:], ("", ""), *frames[:10]]))
+    assert there == pytest.approx(back, abs=1e-9)
+
+
+def test_without_objects_or_frames_there_is_no_figure():
+    content = report([]).content()
+    assert content["frames"] == 0 and content["ap"] == {} and content["map_3d"] is None
+    content = report([("", car(score=0.5))]).content()
+    assert mean_3d(content["ap"]) is None and content["ap"]["Car"]["3d"]["easy"] is None
+    json.dumps(content, allow_nan=False)
+
+
+def test_a_detection_without_an_angle_has_no_orientation_score():
+    flat = "Car -1 -1 -10 500 150 600 210 -1 -1 -1 -1000 -1000 -1000 -10 0.9"  # a 2D detector
+    rows = ap([(car(), flat)])["Car"]
+    assert rows["image"]["easy"]["r40"] == 100 and rows["aos"]["easy"] is None
+    assert rows["3d"]["easy"]["r40"] == 0
+    json.dumps(rows, allow_nan=False)
+
+
+def test_detections_are_projected_and_outside_the_image_they_do_not_count():
+    truth = labels(car())
+    ahead, behind, beside = np.repeat(truth.boxes, 3, axis=0)
+    behind[0], beside[1] = -20, 300
+    found = Detections.of([ahead, behind, beside], CLASSES.index("Car"), [0.5, 0.9, 0.8])
+    for boxes, expected in ((found, 100), (found[1:], 0)):
+        total = DetectionReport()
+        total.add("frame", truth, boxes, CALIBRATION)
+        assert total.content()["ap"]["Car"]["bev"]["hard"]["r40"] == expected
+    total = DetectionReport()
+    total.add("frame", truth, found)  # no camera: everything around counts
+    rows = total.content()["ap"]["Car"]
+    assert rows["bev"]["hard"]["r40"] == pytest.approx(100 / 3) and "image" not in rows
+
+
+@pytest.mark.parametrize("broken", [dict(boxes=[[np.nan] * 7]), dict(scores=np.inf)])
+def test_a_number_that_is_not_finite_is_an_error_that_names_the_frame(broken):
+    found = Detections.of(**{"boxes": labels(car()).boxes, "class_ids": 0, "scores": 1, **broken})
+    with pytest.raises(InputError, match=r"^000123: .*box 1 of 1 .*not finite"):
+        DetectionReport().add("000123", labels(car()), found, CALIBRATION)
+
+
+@pytest.mark.parametrize("shift, taller, words", [
+    (0.62, 0, "0.62 m too high; check the height of the sensor"),
+    (-0.62, 0, "0.62 m too low; check the height"),
+    (-0.75, 0, "0.75 m too low; that is half their height"),
+    (0, 0, ""), (0.1, 0, ""), (0, 4.0, "0.00 m too high or too low, and 4.00 m too tall"),
+])
+def test_boxes_that_are_right_from_above_but_not_in_space_are_noticed(shift, taller, words):
+    total = DetectionReport()
+    truth = labels(together(*(car(left=100 * i, x=5.0 * i - 10) for i in range(5))))
+    found = Detections.of(truth.boxes + [0, 0, shift, 0, 0, taller, 0], 0, np.arange(5) / 5)
+    for _ in range(10):
+        total.add("frame", truth, found, CALIBRATION)
+    content = total.content()
+    assert content["matched"]["Car"]["pairs"] == 50
+    assert content["matched"]["Car"]["z_error_m"] == pytest.approx(shift, abs=0.01)
+    assert content["ap"]["Car"]["bev"]["moderate"]["r40"] > 99
+    if words:
+        line, = content["diagnosis"]
+        assert line.startswith("Car: AP is 100.0 from above but 0.0 in space") and words in line
+    else:
+        assert content["diagnosis"] == []
+
+
+def brute_best(scores):
+    """The greatest F1 over every score that occurs."""
+    return max(scores.table(s)["all"]["f1"] for _, _, found in scores.frames for s in found)
+
+
+@settings(few, max_examples=60)
+@given(seeds)
+def test_the_best_score_is_the_best_of_all_scores(seed):
+    rng = np.random.default_rng(seed)
+    scores = CentreScores()
+    for _ in range(6):
+        truth, found = (np.column_stack([rng.uniform(-2, 2, (n, 3)), np.ones((n, 4))])
+                        for n in rng.integers(1, 6, 2))
+        scores.add(truth, found, rng.integers(0, 3, len(found)) / 2)
+    assert scores.table(scores.best_score())["all"]["f1"] == pytest.approx(brute_best(scores))
+    row = scores.content()["of_all"]["all"]
+    assert row["tp"] == sum(len(match_centres(found, truth)[0])
+                            for truth, found, _ in scores.frames)
+
+
+def test_detections_of_equal_score_are_kept_together():
+    # From 0.9 on: 2 * 1 / (1 + 2). From 0.5 on: 2 * 2 / (5 + 2). The hit alone is no choice.
+    scores, person, wrong = CentreScores(), np.array([[10.0, 0, 0, 1, 1, 1, 0]]), np.ones((3, 7))
+    scores.add(person, person, np.array([0.9]))
+    scores.add(person, np.concatenate([person, wrong]), np.full(4, 0.5))
+    assert scores.best_score() == 0.9
+
+
+def test_pedestrians_by_centre_distance_worked_out_by_hand():
+    total = DetectionReport()
+    person = np.array([10.0, 0, -0.8, 0.8, 0.6, 1.7, 0])
+    truth = GroundTruth.of([person, person + [0, 4, 0, 0, 0, 0, 0]],
+                           [PEDESTRIAN] * 2)
+    near, far, behind = (person + [dx, 0, 0, 0, 0, 0, 0] for dx in (0.9, 1.1, -30))
+    found = Detections.of([near, far, behind], PEDESTRIAN, [0.8, 0.3, 0.9])
+    total.add("a", truth, found, CALIBRATION)
+    total.add("no pedestrian", GroundTruth.of([], []), found, CALIBRATION)
+    content = total.content()["pedestrian_centres"]
+    assert (content["frames"], content["ground_truth"]) == (1, 2)
+    # near hits; far does not; what is behind the camera does not count: 2 * 1 / (2 + 2)
+    assert content["of_all"]["all"]["f1"] == 0.5
+    assert content["best_score"] == pytest.approx(0.8)  # 2 * 1 / (1 + 2)
+    assert content["at_best_score"]["all"]["f1"] == pytest.approx(2 / 3)
+
+
+@few
+@given(seeds, st.integers(41, 400))
+def test_thresholds_are_scores_of_hits_at_evenly_spaced_recall(seed, objects):
+    rng = np.random.default_rng(seed)
+    hits = rng.uniform(0, 1, rng.integers(1, objects + 1))
+    chosen = recall_thresholds(hits, objects)
+    assert len(chosen) <= 41 and (np.diff(chosen) < 0).all() and np.isin(chosen, hits).all()
+    recall = np.array([(hits >= t).sum() for t in chosen]) / objects
+    # each within half a step of its point; the last hit stands for what is left
+    np.testing.assert_allclose(recall[:-1], np.arange(len(chosen) - 1) / 40,
+                               atol=1 / objects + 1e-9)
+    assert chosen[-1] == hits.min()
+
+
+@pytest.mark.parametrize("objects", [1, 2, 7, 40, 41, 1000])
+def test_a_curve_without_an_error_averages_to_100_where_the_program_cannot(objects):
+    thresholds = recall_thresholds(np.linspace(1, 0, objects), objects)
+    right = np.ones(len(thresholds))
+    assert averages(at_recall(right, objects)) == pytest.approx((100, 100))
+    official = averages(at_recall(right, objects, official=True))
+    assert official[1] == pytest.approx(100 * (min(objects, 41) - 1) / 40)
+    assert averages(at_recall(np.zeros(0), objects)) == (0, 0)

@@ -1,0 +1,307 @@
+"""evaluate detection: result files, checkpoints, splits, and what is wrong with them."""
+
+from __future__ import annotations
+
+import sys
+import types
+
+import numpy as np
+import pytest
+from cli_samples import evaluate_detection as evaluate
+from cli_samples import exit_of
+from samples import CALIBRATION, LABELS, object_folder, write
+
+from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.kitti.results import read_results, write_results
+from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
+from lidar_perception.scoring.thinning import thinned
+from lidar_perception.types import CLASSES, Detections, InputError
+
+PERSON, CAR, REGION = LABELS.splitlines()
+WHOLE = CAR.replace("0.35 2", "0.00 0")
+ROWS = ("image", "aos", "bev", "3d", "bev_relaxed", "3d_relaxed")
+
+
+def error_of(monkeypatch, capsys, *arguments):
+    assert exit_of(monkeypatch, "evaluate", "detection", *arguments) == 2
+    line, = capsys.readouterr().err.strip().splitlines()
+    return line
+
+
+def cells(content):
+    return {(name, row, level): cell for name in SCORED for row in ROWS for level in DIFFICULTIES
+            if (cell := content["ap"][name][row][level])}
+
+
+def result_files(folder, text, count=2):
+    for i in range(count):
+        write(folder / f"{i:06}.txt", text)
+    return folder
+
+
+@pytest.fixture
+def kitti(tmp_path):
+    """Two frames with a pedestrian and a car in full view."""
+    return object_folder(tmp_path / "kitti", f"{PERSON}\n{WHOLE}\n{REGION}\n")
+
+
+@pytest.fixture
+def found(tmp_path):
+    """What is there, as result files."""
+    return result_files(tmp_path / "found", f"{PERSON} 0.9\n{WHOLE} 0.8\n")
+
+
+@pytest.fixture
+def detector(monkeypatch):
+    """A stand-in for the detector of a checkpoint: finds what made.boxes says, and says what it
+    was asked."""
+    made = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
+
+    def open_detector(path, device="auto", least_score=None):
+        made.asked.append((str(path), device))
+
+        def detect(frame):
+            made.scans.append(frame)
+            return made.find(frame)
+        return detect
+
+    module = types.ModuleType("lidar_perception.detectors.open")
+    module.open_detector = open_detector
+    monkeypatch.setitem(sys.modules, "lidar_perception.detectors.open", module)
+    return made
+
+
+def truth_of(kitti):
+    truth = open_kitti(kitti)[0].truth()
+    return Detections.of(truth.boxes, truth.class_ids, [0.9, 0.8])
+
+
+def test_the_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    content, text = evaluate(tmp_path, "--kitti", kitti, "--results", found)
+    assert content["frames"] == 2 and content["source"] == str(found)
+    assert len(cells(content)) == 2 * len(ROWS) * len(DIFFICULTIES)
+    assert {(c["objects"], c["r11"], c["r40"]) for c in cells(content).values()} == {(2, 100, 100)}
+    assert content["map_3d"] == {"r11": 100, "r40": 100} and content["ap"]["Cyclist"]["3d"][
+        "easy"] is None
+    assert content["pedestrian_centres"]["of_all"]["all"]["f1"] == 1
+    for words in ("Table 5", "67.09", "here, R40", "Pedestrians within 1.0 m", "from above"):
+        assert words in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_scans_are_not_needed_for_result_files(kitti, found, tmp_path):
+    before, _ = evaluate(tmp_path, "--kitti", kitti, "--results", found)
+    for path in (kitti / "training/velodyne").iterdir():
+        path.unlink()
+    (kitti / "training/velodyne").rmdir()
+    after, _ = evaluate(tmp_path, "--kitti", kitti / "training", "--results", found)
+    assert after == before
+    with pytest.raises(InputError, match="no KITTI scans"):
+        open_kitti(kitti)
+
+
+def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
+    detector.find = lambda frame: truth_of(kitti)
+    content, text = evaluate(tmp_path, "--kitti", kitti, "--weights", "v4.safetensors",
+                             "--device", "cpu")
+    assert detector.asked == [("v4.safetensors", "cpu")] and len(detector.scans) == 2
+    assert len(detector.scans[0]) == len(open_kitti(kitti)[0].load())
+    assert content["ms"] >= 0 and "ms a frame" in text
+    for (_, row, _), cell in cells(content).items():
+        if row not in ("image", "aos"):  # the made-up 2D boxes of the labels are no projections
+            assert cell["r40"] == 100
+
+
+def test_a_share_of_the_points_is_kept_and_always_the_same(kitti, detector, tmp_path):
+    kept = {}
+    for share in (1, 0.1, 0.1):
+        detector.scans.clear()
+        content, _ = evaluate(tmp_path, "--kitti", kitti, "--weights", "w", "--keep", share)
+        assert content["keep"] == share
+        points = [np.column_stack([scan.xyz, scan.intensity]) for scan in detector.scans]
+        for now, before in zip(points, kept.get(share, points), strict=True):
+            np.testing.assert_array_equal(now, before)
+        kept[share] = points
+    for frame, whole, tenth in zip(open_kitti(kitti), kept[1], kept[0.1], strict=True):
+        np.testing.assert_array_equal(whole[:, :3], frame.load().xyz)
+        assert abs(len(tenth) / len(whole) - 0.1) < 0.03
+        assert set(map(tuple, tenth)) < set(map(tuple, whole))
+    assert len(kept[0.1][0]) != len(kept[0.1][1])  # each frame draws its own
+
+
+def test_a_smaller_share_is_part_of_a_larger_one(kitti):
+    frame = open_kitti(kitti)[0].load()
+    before = frame
+    for share in (1.0, 0.5, 0.2, 0.1, 0.0):
+        now = thinned(frame, share, "000000")
+        assert set(map(bytes, now.xyz)) <= set(map(bytes, before.xyz))
+        assert abs(len(now) - share * len(frame)) <= 3 * np.sqrt(len(frame))
+        before = now
+    assert thinned(frame, 1.0, "a") is frame and len(before) == 0
+
+
+def test_written_results_score_as_what_was_found(kitti, detector, tmp_path):
+    noise = np.random.default_rng(0)
+    detector.find = lambda frame: Detections.of(
+        truth_of(kitti).boxes + noise.normal(0, 0.02, 7), truth_of(kitti).class_ids,
+        [0.123456, 3])
+    out = tmp_path / "out/data"
+    direct, text = evaluate(tmp_path, "--kitti", kitti, "--weights", "w", "--write-results", out)
+    assert "result files" in text and sorted(p.name for p in out.iterdir()) == [
+        "000000.txt", "000001.txt"]
+    read, _ = evaluate(tmp_path, "--kitti", kitti, "--results", out)
+    for key, cell in cells(direct).items():
+        assert cells(read)[key] == pytest.approx(cell, abs=1e-3)
+
+
+def test_result_files_hold_what_was_found(tmp_path):
+    rng = np.random.default_rng(3)
+    boxes = np.column_stack([rng.uniform(8, 40, 20), rng.uniform(-9, 9, 20),
+                             rng.uniform(-2, 0, 20), rng.uniform(0.5, 4, (20, 3)),
+                             rng.uniform(-3, 3, 20)])
+    boxes[0, 0] = -30  # behind the camera: no 2D box
+    made = Detections.of(boxes, rng.integers(0, 6, 20), rng.uniform(-2, 1, 20))
+    path = tmp_path / "000000.txt"
+    write_results(path, made, CALIBRATION)
+    back = read_results(path, CALIBRATION.lidar_to_camera)
+    np.testing.assert_array_equal(back.class_ids, made.class_ids)
+    # LiDAR and camera are tilted to each other by a degree, and a file has upright boxes only.
+    np.testing.assert_allclose(back.boxes[:, :6], made.boxes[:, :6], atol=2e-4)
+    np.testing.assert_allclose(np.cos(back.boxes[:, 6] - made.boxes[:, 6]), 1, atol=1e-4)
+    np.testing.assert_allclose([e["score"] for e in back.extras], made.scores, atol=1e-4)
+    assert back.extras[0]["bbox"] == [0] * 4 and max(back.extras[1]["bbox"]) > 0
+    assert {(e["truncated"], e["occluded"]) for e in back.extras} == {(-1, -1)}
+    write_results(path, Detections.none(), CALIBRATION)
+    assert len(read_results(path, CALIBRATION.lidar_to_camera)) == 0
+
+
+def test_frames_without_labels_are_written_and_not_scored(kitti, detector, tmp_path, monkeypatch,
+                                                          capsys):
+    (kitti / "training/label_2/000001.txt").unlink()
+    out = tmp_path / "out"
+    content, _ = evaluate(tmp_path, "--kitti", kitti, "--weights", "w", "--write-results", out)
+    assert content["frames"] == 1 and (out / "000001.txt").exists()
+    (kitti / "training/label_2/000000.txt").unlink()
+    content, _ = evaluate(tmp_path, "--kitti", kitti, "--weights", "w", "--write-results", out)
+    assert content["frames"] == 0
+    line = error_of(monkeypatch, capsys, "--kitti", kitti, "--weights", "w")
+    assert line == f"Error: {kitti}: no frame with labels"
+
+
+def test_a_scan_that_was_cut_is_skipped_and_one_that_is_refused_is_missed(kitti, detector,
+                                                                         tmp_path):
+    write(kitti / "training/velodyne/000001.bin", b"123")
+    content, text = evaluate(tmp_path, "--kitti", kitti, "--weights", "w")
+    line, = content["skipped"]
+    assert "000001.bin" in line and "was cut" in line and "skipped" in text
+    assert content["frames"] == 1
+
+    def refuse(frame):
+        raise InputError("the cloud has no intensity")
+    detector.find = refuse
+    content, _ = evaluate(tmp_path, "--kitti", kitti, "--weights", "w")
+    assert content["skipped"][0] == "000000: the cloud has no intensity"
+    assert content["frames"] == 1 and content["ap"]["Car"]["3d"]["hard"]["r40"] == 0
+
+
+def test_a_split_says_which_frames_are_scored(kitti, found, tmp_path):
+    (found / "000000.txt").unlink()
+    split = write(tmp_path / "val.txt", "000001\n000001\n")
+    content, _ = evaluate(tmp_path, "--kitti", kitti, "--results", found, "--split", split)
+    assert content["frames"] == 1
+
+
+BAD = {
+    "columns": (f"{PERSON} 0.9\n\n{WHOLE} 0.8 7\n", "000000.txt:3 is no KITTI label"),
+    "words": (PERSON.replace("1.80", "tall") + " 0.9", "000000.txt:1 is no KITTI label"),
+    "score": (f"{PERSON} 0.9\n{WHOLE}", "000000.txt:2 is no result"),
+    "nan": (f"{PERSON} nan", "000000.txt:1 is no KITTI label"),
+    "class": (f"{PERSON.lower()} 0.9", "000000.txt:1 has the unknown class 'pedestrian'"),
+    "bytes": (b"\xff\xfe\x00", "cannot read the labels"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_result_file_is_named_with_its_line(case, kitti, found, monkeypatch, capsys):
+    content, words = BAD[case]
+    write(found / "000000.txt", content)
+    line = error_of(monkeypatch, capsys, "--kitti", kitti, "--results", found)
+    assert line.startswith("Error: ") and words in line and str(found) in line
+
+
+def test_what_is_missing_is_named(kitti, found, tmp_path, monkeypatch, capsys):
+    def error(*arguments):
+        return error_of(monkeypatch, capsys, "--kitti", kitti, *arguments)
+
+    assert "none is not a folder" in error("--results", tmp_path / "none")
+    assert "cannot read the frames" in error("--results", found, "--split", tmp_path / "none")
+    split = write(tmp_path / "split.txt", "000001 000007 000008")
+    line = error("--results", found, "--split", split)
+    assert "names the frame 000007 (2 such)" in line
+    assert "names no frame" in error("--results", found, "--split", write(split, "\n"))
+    (found / "000001.txt").unlink()
+    assert f"no result file {found / '000001.txt'}" in error("--results", found)
+    write(kitti / "training/label_2/000000.txt", "Car 1 2 3")
+    write(kitti / "training/label_2/000001.txt", "Car 1 2 3")
+    assert "no frame with labels" in (line := error("--results", found)) and "000000.txt:1" in line
+
+
+@pytest.mark.parametrize("arguments, words", [
+    (["--kitti", "a"], "give either --results DIR or --weights FILE"),
+    (["--kitti", "a", "--results", "b", "--weights", "c"], "give either"),
+    (["--kitti", "a", "--results", "b", "--keep", "0.1"], "--keep thins the scans"),
+    (["--kitti", "a", "--weights", "b", "--keep", "1.1"], "1.1 is not in the range"),
+    (["--results", "b"], "--kitti"),
+    (["--kitti", "a", "--results", "b", "--write-results", "c"], "has its files already"),
+])
+def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):
+    assert exit_of(monkeypatch, "evaluate", "detection", *arguments) == 2
+    assert words in capsys.readouterr().err
+
+
+def with_scores(labels):
+    lines = [line for line in labels.read_text().splitlines() if not line.startswith("DontCare")]
+    return "".join(f"{line} {1 - i / 100}\n" for i, line in enumerate(lines))
+
+
+def test_real_labels_as_their_own_results_score_100(data, tmp_path):
+    root = data / "kitti_object"
+    for path in root.glob("training/label_2/*.txt"):
+        write(tmp_path / "found" / path.name, with_scores(path))
+    content, _ = evaluate(tmp_path, "--kitti", root, "--results", tmp_path / "found")
+    found = cells(content)
+    assert content["frames"] == 57 and len(found) == len(SCORED) * len(ROWS) * len(DIFFICULTIES)
+    assert {(c["r11"], c["r40"]) for c in found.values()} == {(100, 100)}
+    assert found["Car", "3d", "hard"]["objects"] > found["Car", "3d", "easy"]["objects"] > 40
+    assert content["pedestrian_centres"]["of_all"]["all"]["f1"] == 1
+    assert content["diagnosis"] == [] and content["skipped"] == []
+
+
+def test_real_boxes_without_2d_boxes_are_projected_onto_the_labels(data, detector, tmp_path):
+    """Boxes, and nothing else, score 100 from above and in space. In the image a person's limbs
+    and what hides him make his label differ from the projection of his box."""
+    truths = iter([f.truth() for f in open_kitti(data / "kitti_object")])
+
+    def find(frame):
+        truth = next(truths)
+        return Detections.of(truth.boxes, truth.class_ids, np.linspace(1, 0.5, len(truth)))
+    detector.find = find
+    content, _ = evaluate(tmp_path, "--kitti", data / "kitti_object", "--weights", "w")
+    for (name, row, _), cell in cells(content).items():
+        assert cell["r40"] > (80 if name == "Pedestrian" and row in ("image", "aos") else 99.99)
+
+
+def test_real_tracks_are_scored_by_what_is_outside_the_image(data, tmp_path):
+    root = data / "kitti_tracking"
+    frames = open_kitti(root)
+    for frame in frames:
+        truth = frame.truth()
+        write_results(tmp_path / f"found/{frame.name}.txt",
+                      Detections.of(truth.boxes, truth.class_ids), frame.calibration())
+    content, _ = evaluate(tmp_path, "--kitti", root, "--results", tmp_path / "found")
+    assert content["frames"] == len(frames) == 30
+    assert content["ap"]["Cyclist"]["3d"]["easy"]["r40"] == pytest.approx(100)
+    levels = [content["ap"]["Car"]["3d"][level]["objects"] for level in DIFFICULTIES]
+    tall = sum(c == CLASSES.index("Car") for frame in frames for c in frame.truth().class_ids)
+    assert 0 < levels[0] < levels[1] < levels[2] < tall

@@ -1,0 +1,211 @@
+"""evaluate nuscenes: result files, checkpoints, scenes, and what is wrong with them."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import types
+
+import numpy as np
+import nuscenes_folder as folder
+import pytest
+from cli_samples import exit_of
+from click.testing import CliRunner
+
+from lidar_perception.cli import nuscenes as command
+from lidar_perception.cli.main import cli
+from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
+from lidar_perception.data.nuscenes.folder import open_nuscenes
+from lidar_perception.data.nuscenes.results import (
+    DETECTED,
+    MOST_BOXES,
+    read_results,
+    to_results,
+    write_results,
+)
+from lidar_perception.scoring.nuscenes.report import OURS
+from lidar_perception.types import CLASSES, Detections, InputError
+
+TABLES = folder.made_tables(seed=2, frames=4, objects=60)
+
+
+@pytest.fixture
+def root(tmp_path):
+    return folder.save(tmp_path / "nuscenes", TABLES)
+
+
+def detections(frame, seed=0):
+    """What is there of the classes that detectors know, a little off, and a Van."""
+    truth, rng = frame.truth(), np.random.default_rng(seed)
+    kept = np.isin(truth.class_ids, [CLASSES.index(name) for name in DETECTED])
+    kept &= np.array([extras["points"] > 0 for extras in truth.extras])
+    near = truth.boxes[kept] + rng.normal(0, 0.05, 7)
+    ids = truth.class_ids[kept]
+    return Detections.of(np.vstack([near, near[:1]]), [*ids, CLASSES.index("Van")],
+                         rng.uniform(0.1, 1, len(near) + 1))
+
+
+@pytest.fixture
+def detector(monkeypatch):
+    """A stand-in for the detector of a checkpoint."""
+    made = types.SimpleNamespace(asked=[], find=lambda scan: Detections.none())
+
+    def detector_at(*arguments):
+        made.asked.append(arguments)
+        return lambda scan: made.find(scan)
+    monkeypatch.setattr(command, "detector_at", detector_at)
+    return made
+
+
+def evaluate(tmp_path, *arguments):
+    path = tmp_path / "made/scores.json"
+    result = CliRunner().invoke(cli, ["evaluate", "nuscenes", "--json", str(path),
+                                      *map(str, arguments)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return json.loads(path.read_text()), result.stdout
+
+
+def error_of(monkeypatch, capsys, *arguments):
+    assert exit_of(monkeypatch, "evaluate", "nuscenes", *arguments) == 2
+    line, = capsys.readouterr().err.strip().splitlines()
+    return line
+
+
+def by_stamp(root):
+    return {frame.stamp_ns: frame for frame in open_nuscenes(root)}
+
+
+def test_a_checkpoint_is_run_and_its_results_score_the_same(root, detector, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    frames, out = by_stamp(root), tmp_path / "out/results.json"
+    detector.find = lambda scan: detections(frames[scan.stamp_ns])
+    direct, text = evaluate(tmp_path, "--root", root, "--weights", "w.safetensors", "--device",
+                            "cpu", "--write-results", out)
+    (path, device, height), = detector.asked
+    assert (str(path), device, height) == ("w.safetensors", "cpu", folder.SENSOR[2])
+    assert direct["frames"] == 8 and direct["ms"] >= 0 and direct["version"] == "v1.0-mini"
+    car, person = (direct["classes"][n] for n in ("car", "pedestrian"))
+    assert car["mean_ap"] > 99 and car["ate"] < 0.3 and person["mean_ap"] > 99
+    assert all(direct["classes"][n]["mean_ap"] == 0 and direct["classes"][n]["ate"] == 1
+               for n in NAMES if n not in OURS)
+    assert direct["ours"]["ave"] == direct["ours"]["aae"] == 1
+    assert direct["all"]["map"] == pytest.approx(0.3 * direct["ours"]["map"])
+    read, _ = evaluate(tmp_path, "--root", root, "--results", out)
+    assert {**read, "source": None, "ms": None} == {**direct, "source": None, "ms": None}
+    for words in ("92.68", "83.45", "our three ", "all ten", "result file", "ms a frame"):
+        assert words in text
+    assert max(map(len, text.splitlines())) <= 80
+
+
+def test_scenes_are_chosen_by_a_file(root, tmp_path):
+    scenes, path = tmp_path / "val.txt", tmp_path / "r.json"
+    scenes.write_text("scene-0916\nscene-0916\n")
+    write_results(path, {f.token: GlobalBoxes.none() for f in open_nuscenes(root)})
+    content, _ = evaluate(tmp_path, "--root", root, "--results", path, "--scenes", scenes)
+    assert content["frames"] == 4 and content["all"]["map"] == content["all"]["nds"] == 0
+
+
+def test_boxes_go_to_the_file_and_back(root, tmp_path):
+    frames, rng = open_nuscenes(root), np.random.default_rng(0)
+    written = {}
+    for frame in frames:
+        found = detections(frame)
+        boxes = to_results(found, frame)
+        assert len(boxes) == len(found) - 1 and (np.diff(boxes.scores) <= 0).all()
+        boxes.velocities[::2] = rng.normal(0, 1, (len(boxes[::2]), 2))
+        boxes.attributes[::3] = 4
+        written[frame.token] = boxes
+    write_results(tmp_path / "r.json", written)
+    for frame, read in zip(frames, read_results(tmp_path / "r.json", frames)):
+        for name, column in vars(written[frame.token]).items():
+            np.testing.assert_array_equal(getattr(read, name), column, err_msg=name)
+
+
+def test_only_the_best_boxes_of_a_frame_are_written(root):
+    frame, rng = open_nuscenes(root)[0], np.random.default_rng(0)
+    scores = rng.uniform(0, 1, MOST_BOXES + 50)
+    made = to_results(Detections.of(np.ones((len(scores), 7)), 0, scores), frame)
+    assert len(made) == MOST_BOXES and made.scores.min() > np.sort(scores)[49]
+    broken = Detections.of(np.full((1, 7), np.nan), 0)
+    with pytest.raises(InputError, match=r"scene-0103/00: a box or score .* not finite"):
+        to_results(broken, frame)
+
+
+def test_what_cannot_be_read_or_is_refused_is_told(root, detector, tmp_path):
+    frames = open_nuscenes(root)
+    frames[0].points.unlink()
+    frames[1].points.write_bytes(bytes(30))
+
+    def find(scan):
+        if scan.stamp_ns == frames[2].stamp_ns:
+            raise InputError("too dark")
+        return detections(by_stamp(root)[scan.stamp_ns])
+    detector.find = find
+    out = tmp_path / "r.json"
+    content, text = evaluate(tmp_path, "--root", root, "--weights", "w", "--write-results", out)
+    assert content["frames"] == 6 and len(content["skipped"]) == 3
+    assert "cannot read the sweep" in content["skipped"][0] and "30 bytes" in content["skipped"][1]
+    assert content["skipped"][2] == "scene-0103/02: too dark" and "skipped" in text
+    results = json.loads(out.read_text())["results"]
+    assert results[frames[2].token] == [] and frames[0].token not in results
+
+
+def test_a_version_without_labels_is_written_and_not_scored(tmp_path, detector, monkeypatch,
+                                                            capsys):
+    tables = {name: rows for name, rows in TABLES.items() if name != "sample_annotation"}
+    root = tmp_path / "test"
+    folder.save(root, TABLES)
+    folder.save(root, tables, "v1.0-test", sweeps=False)
+    detector.find = lambda scan: Detections.of(np.ones((1, 7)), 0, 0.5)
+    out = tmp_path / "r.json"
+    content, _ = evaluate(tmp_path, "--root", root, "--version", "v1.0-test", "--weights", "w",
+                          "--write-results", out)
+    assert content["frames"] == 0 and content["all"] is None
+    assert [len(rows) for rows in json.loads(out.read_text())["results"].values()] == [1] * 8
+    assert "no frame of v1.0-test with labels" in error_of(
+        monkeypatch, capsys, "--root", root, "--version", "v1.0-test", "--results", out)
+
+
+@pytest.mark.parametrize("text, words", [
+    (None, "cannot read the results"), ("{", "is no JSON file"), ("[]", "has no 'results'"),
+    ('{"results": []}', "has no 'results'")])
+def test_files_that_are_no_results_are_named(root, tmp_path, monkeypatch, capsys, text, words):
+    path = tmp_path / "r.json"
+    if text is not None:
+        path.write_text(text)
+    assert words in error_of(monkeypatch, capsys, "--root", root, "--results", path)
+
+
+@pytest.mark.parametrize("arguments, words", [
+    (["--root", "a"], "give either --results JSON or --weights FILE"),
+    (["--root", "a", "--results", "b", "--weights", "c"], "give either"),
+    (["--results", "b"], "--root"),
+    (["--root", "a", "--results", "b", "--write-results", "c"], "such a file already"),
+])
+def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):
+    assert exit_of(monkeypatch, "evaluate", "nuscenes", *arguments) == 2
+    assert words in capsys.readouterr().err
+
+
+def test_scene_files_that_are_wrong_are_named(root, tmp_path, monkeypatch, capsys):
+    def error(path):
+        return error_of(monkeypatch, capsys, "--root", root, "--weights", "w", "--scenes", path)
+    scenes = tmp_path / "scenes.txt"
+    assert "cannot read the scenes" in error(scenes)
+    scenes.write_text("\n")
+    assert "names no scene" in error(scenes)
+    scenes.write_text("scene-0103\nscene-9999\n")
+    assert "no scene scene-9999" in error(scenes)
+
+
+@pytest.mark.parametrize("samples, save", [
+    ("detection_samples", "lidar_perception.detectors.pointpillars.checkpoint"),
+    ("pointnet_samples", "lidar_perception.detectors.pointnet.checkpoint")])
+def test_the_detector_of_either_network_is_told_how_high_the_sensor_is(samples, save, tmp_path,
+                                                                      one_thread):
+    made, module = importlib.import_module(samples), importlib.import_module(save)
+    config = (made.tiny if samples.startswith("detection") else made.small)()
+    module.save_checkpoint(tmp_path / "w", made.lively(config), module.Header(config))
+    detector = command.detector_at(tmp_path / "w", "cpu", 1.84)
+    assert detector.config == config
+    assert detector.params.ground.sensor_pose.height == 1.84

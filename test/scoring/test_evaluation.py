@@ -1,0 +1,233 @@
+"""Laws of matching and scores: optimal, one to one, and the counts add up."""
+
+from __future__ import annotations
+
+import json
+from itertools import permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidar_perception.candidates.params import PipelineParams, SeedParams
+from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, match_centres, range_bins
+from lidar_perception.scoring.centres.report import CandidateReport, evaluate, pedestrians
+from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, InputError, LidarFrame
+
+few = settings(max_examples=60, database=None)
+seeds = st.integers(0, 2**32 - 1)
+small = st.integers(0, 5)
+
+
+def boxes(*centres):
+    out = np.zeros((len(centres), 7))
+    out[:, :3] = np.reshape(centres, (-1, 3))
+    out[:, 3:6] = 1
+    return out
+
+
+def some(rng, count, reach=1.2):
+    return boxes(*rng.uniform(-reach, reach, (count, 3)))
+
+
+def brute_force(found, truth, limit):
+    """Most pairs, then least distance, over every way to pair the smaller set with the larger."""
+    if len(found) > len(truth):
+        return brute_force(truth, found, limit)
+    best = (0, 0.0)
+    for chosen in permutations(range(len(truth)), len(found)):
+        d = [np.linalg.norm(found[i, :3] - truth[j, :3]) for i, j in enumerate(chosen)]
+        d = [x for x in d if x <= limit]
+        best = min(best, (-len(d), sum(d)))
+    return -best[0], best[1]
+
+
+def distances(found, truth, pairs):
+    return np.linalg.norm(found[pairs[0], :3] - truth[pairs[1], :3], axis=1)
+
+
+@few
+@given(seeds, small, small, st.sampled_from([0.3, 1.0, 5.0]))
+def test_matching_is_the_best_of_all_pairings(seed, found_count, truth_count, limit):
+    rng = np.random.default_rng(seed)
+    found, truth = some(rng, found_count), some(rng, truth_count)
+    pairs = match_centres(found, truth, limit)
+    count, total = brute_force(found, truth, limit)
+    assert len(pairs[0]) == len(pairs[1]) == count
+    assert distances(found, truth, pairs).sum() == pytest.approx(total, abs=1e-9)
+
+
+@few
+@given(seeds, st.integers(0, 30), st.integers(0, 30))
+def test_matching_is_one_to_one_and_within_the_distance(seed, found_count, truth_count):
+    rng = np.random.default_rng(seed)
+    found, truth = some(rng, found_count, 2.0), some(rng, truth_count, 2.0)
+    i, j = match_centres(found, truth)
+    assert len(set(i.tolist())) == len(i) and len(set(j.tolist())) == len(j)
+    assert (distances(found, truth, (i, j)) <= 1.0).all()
+    back = match_centres(truth, found)
+    assert set(zip(*(x.tolist() for x in back))) == set(zip(j.tolist(), i.tolist()))
+
+
+def test_two_pairs_are_better_than_one_perfect_pair():
+    found, truth = boxes([0, 0, 0], [0.9, 0, 0]), boxes([0, 0, 0], [-0.9, 0, 0])
+    pairs = match_centres(found, truth)
+    assert set(zip(*(x.tolist() for x in pairs))) == {(0, 1), (1, 0)}
+
+
+def test_exactly_the_maximal_distance_is_a_hit_in_three_dimensions():
+    truth = boxes([10, 5, -1])
+    for step in ([1, 0, 0], [0, -1, 0], [0, 0, 1]):
+        assert len(match_centres(truth + [*step, 0, 0, 0, 0], truth)[0]) == 1
+        assert len(match_centres(truth + [*np.multiply(step, 1.001), 0, 0, 0, 0], truth)[0]) == 0
+
+
+def test_detections_with_nan_or_infinite_centres_match_nothing_and_count_as_false():
+    # Another node may send anything; one broken box must not stop the evaluation.
+    truth = boxes([10, 0, 0], [20, 0, 0])
+    found = boxes([np.nan, 0, 0], [20.1, 0, 0], [np.inf, 0, 0])
+    i, j = match_centres(found, truth)
+    assert (i.tolist(), j.tolist()) == ([1], [1])
+    score = Score()
+    score.add(found, truth)
+    everything = score.table()["all"]
+    assert (everything["tp"], everything["fp"], everything["fn"]) == (1, 2, 1)
+
+
+@few
+@given(seeds, st.lists(st.tuples(st.integers(0, 12), st.integers(0, 12)), max_size=4))
+def test_hits_and_misses_add_up_to_the_truth_and_to_what_was_found(seed, frames):
+    rng = np.random.default_rng(seed)
+    score, truths, found_count = Score(), [np.zeros((0, 7))], 0
+    for found_in_frame, truth_in_frame in frames:
+        truth = some(rng, truth_in_frame, 70.0)
+        truth[:, 2] = 0
+        near = truth[rng.random(len(truth)) < 0.5]
+        near = near + rng.normal(0, 0.5, near.shape)
+        found = np.concatenate([some(rng, found_in_frame, 70.0), near]).astype(np.float32)
+        score.add(found, truth)
+        truths.append(truth)
+        found_count += len(found)
+    table = score.table()
+    by_range = np.bincount(range_bins(np.concatenate(truths)), minlength=len(RANGE_NAMES))
+    for name, count in zip(RANGE_NAMES, by_range):
+        assert table[name]["tp"] + table[name]["fn"] == count
+    everything = table["all"]
+    assert everything["tp"] + everything["fn"] == by_range.sum()
+    assert everything["tp"] + everything["fp"] == found_count
+    for count in ("tp", "fp", "fn"):
+        assert everything[count] == sum(table[name][count] for name in RANGE_NAMES)
+    for row in table.values():
+        p, r = row["precision"], row["recall"]
+        assert row["f1"] == pytest.approx(2 * p * r / (p + r) if p + r else 0.0)
+
+
+def test_a_case_by_hand():
+    score = Score()
+    score.add(boxes([10.3, 0, 0], [20, 0, 0.5], [14.5, 14.5, 0], [61, 0, 0]),
+              boxes([10, 0, 0], [20, 0, 0], [40, 0, 0]))
+    score.add(np.zeros((0, 7), np.float32), boxes([5, 0, 0]))
+    score.add(boxes([0, -50, 0]).astype(np.float32), np.zeros((0, 7)))
+    table = score.table()
+    counts = {name: tuple(row[k] for k in ("tp", "fp", "fn")) for name, row in table.items()}
+    assert counts == {"0-15": (1, 0, 1), "15-30": (1, 1, 0), "30-45": (0, 0, 1),
+                      "45-60": (0, 1, 0), "60+": (0, 1, 0), "all": (2, 3, 2)}
+    everything = table["all"]
+    assert everything["precision"] == pytest.approx(2 / 5)
+    assert everything["recall"] == pytest.approx(2 / 4)
+    assert everything["f1"] == pytest.approx(4 / 9)
+    assert everything["centre_error_m"] == pytest.approx(0.4)
+    assert table["0-15"]["centre_error_m"] == pytest.approx(0.3)
+    assert table["30-45"]["centre_error_m"] is None
+
+
+def test_a_hit_belongs_to_the_range_of_the_true_object():
+    score = Score()
+    score.add(boxes([15.2, 0, 0]), boxes([14.8, 0, 0]))
+    assert score.table()["0-15"]["tp"] == 1 and score.table()["15-30"]["fp"] == 0
+
+
+def test_a_range_begins_at_its_lower_limit():
+    at = boxes([0, 0, 9], [14.999, 0, 0], [0, 15, 0], [18, -24, 0], [45, 0, 0], [60, 0, 0],
+               [1e4, 0, 0])
+    assert [RANGE_NAMES[i] for i in range_bins(at)] == [
+        "0-15", "0-15", "15-30", "30-45", "45-60", "60+", "60+"]
+
+
+def test_nothing_found_and_nothing_to_find_have_ratios_of_0():
+    empty = Score().table()["all"]
+    assert empty == dict(tp=0, fp=0, fn=0, precision=0.0, recall=0.0, f1=0.0, centre_error_m=None)
+
+
+# --- reports -------------------------------------------------------------------------------
+
+
+def scene_points():
+    """A floor at -1.7 m and an upright figure at (7, 0)."""
+    rng = np.random.default_rng(0)
+    flat = np.column_stack([rng.uniform(-20, 20, (3000, 2)), rng.normal(-1.7, 0.01, 3000)])
+    figure = [7, -0.3, -1.64] + rng.random((400, 3)) * [0.1, 0.6, 1.65]
+    return np.concatenate([flat, figure]).astype(np.float32)
+
+
+class Item:
+    """What an evaluation reads of a recorded frame."""
+
+    def __init__(self, name, truth):
+        self.name, self.truth, self.camera = name, truth, None
+        self.frame = LidarFrame(scene_points())
+
+
+def truth_of(*centres, label="Pedestrian"):
+    made = boxes(*centres)
+    made[:, 3:6] = [0.6, 0.8, 1.75]
+    return GroundTruth.of(made, [CLASSES.index(label)] * len(made))
+
+
+def run(items, source="ground_truth"):
+    report = CandidateReport()
+    params = PipelineParams(seed=SeedParams(source=source))
+    results = list(evaluate(items, params, report))
+    assert len(results) == len(items)
+    return report.content(), results
+
+
+HERE = (7.05, 0, -0.82)
+
+
+def test_the_report_of_a_recording_is_json_and_counts_every_labelled_pedestrian():
+    items = [Item("both", truth_of(HERE, (25, 9, -0.8))), Item("car", truth_of(HERE, label="Car")),
+             Item("none", None), InputError("frame 3 is cut"), Item("again", truth_of(HERE))]
+    content, results = run(items)
+    assert [r is not None for r in results] == [True, False, False, False, True]
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+    assert content["frames"] == 2 and content["ground_truth"] == 3
+    assert content["ground_truth_by_range"] == {"0-15": 2, "15-30": 1, "30-45": 0, "45-60": 0,
+                                                "60+": 0}
+    assert content["skipped"] == ["frame 3 is cut"]
+    for stage in ("stage1", "stage2", "final"):
+        row = content[stage]["all"]
+        assert (row["tp"], row["fp"], row["fn"]) == (2, 0, 1)
+        assert row["centre_error_m"] < 0.1
+    assert content["ms"]["total"] > 0
+
+
+def test_a_frame_without_a_seed_counts_its_pedestrians_as_missed():
+    content, results = run([Item("far", truth_of((30, 10, -0.8)))])
+    assert results == [None]
+    assert content["frames"] == 1 and content["final"]["all"]["fn"] == 1
+    assert content["skipped"][0].startswith("far: ")
+
+
+def test_an_empty_recording_has_an_empty_report():
+    content, _ = run([])
+    assert content["frames"] == content["ground_truth"] == 0
+    assert json.loads(json.dumps(content, allow_nan=False)) == content
+
+
+def test_only_pedestrians_count():
+    mixed = GroundTruth.of(boxes([1, 0, 0], [2, 0, 0], [3, 0, 0]),
+                           [PEDESTRIAN, CLASSES.index("Person_sitting"), CLASSES.index("Cyclist")])
+    np.testing.assert_array_equal(pedestrians(Item("", mixed)), boxes([1, 0, 0]))
+    assert pedestrians(Item("", None)).shape == (0, 7)

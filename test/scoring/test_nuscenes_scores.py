@@ -1,0 +1,274 @@
+"""nuScenes' detection task: hand-made cases, a second reading, and nuscenes-devkit."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import json
+import math
+
+import numpy as np
+import nuscenes_folder as folder
+import nuscenes_reference as reference
+import pytest
+
+from lidar_perception.data.nuscenes.boxes import CATEGORIES, NAMES, GlobalBoxes
+from lidar_perception.data.nuscenes.folder import open_nuscenes
+from lidar_perception.data.nuscenes.results import META, read_results
+from lidar_perception.scoring.nuscenes.protocol import (
+    RANGES,
+    class_scores,
+    counted,
+    hit_errors,
+    summary,
+)
+from lidar_perception.scoring.nuscenes.report import OURS, NuscenesReport
+from lidar_perception.types import InputError
+
+TABLES = folder.made_tables(seed=2, frames=4, objects=60)
+ERRORS = dict(zip(("ate", "ase", "aoe", "ave", "aae"), reference.ERRORS))
+
+
+def boxes(*centres, kind="car", scores=0.0, yaw=0.0, **columns):
+    """Boxes of 4 x 2 x 1.5 m at (x, y)."""
+    count = len(centres)
+    return GlobalBoxes.of([[*c, 0.0] for c in centres], [[4, 2, 1.5]] * count,
+                          [[math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)]] * count,
+                          NAMES.index(kind), scores=scores, **columns)
+
+
+def scored(truth, found, kind="car", true_frames=None, found_frames=None):
+    def numbers(given, of):
+        return np.zeros(len(of), int) if given is None else np.array(given)
+    return class_scores(kind, truth, numbers(true_frames, truth), found,
+                        numbers(found_frames, found))
+
+
+ROW = [(10.0 * i, 0.0) for i in range(20)]
+
+
+def test_everything_found_scores_one():
+    s = scored(boxes(*ROW, velocities=1.0, attributes=6),
+               boxes(*ROW, scores=np.linspace(1, 0.1, 20), velocities=1.0, attributes=6))
+    assert s.objects == s.detections == 20 and s.mean_ap == pytest.approx(1)
+    assert s.errors == dict.fromkeys(ERRORS, 0.0)
+    assert summary({"car": s})["nds"] == pytest.approx(1)
+
+
+def test_the_best_without_velocities_and_attributes_is_0_8():
+    s = scored(boxes(*ROW, velocities=1.0, attributes=6), boxes(*ROW, scores=0.5))
+    assert (s.errors["ave"], s.errors["aae"]) == (1, 1)
+    assert summary({"car": s})["nds"] == pytest.approx(0.8)
+
+
+def test_one_of_four_is_recall_0_25():
+    """Of the 90 recalls above 0.1 the first 15 are reached, with precision 1."""
+    s = scored(boxes(*ROW[:4]), boxes((10.3, 0.4), scores=0.7))
+    assert s.ap == pytest.approx({0.5: 0, 1.0: 15 / 90, 2.0: 15 / 90, 4.0: 15 / 90})
+    assert s.errors["ate"] == pytest.approx(0.5)
+
+
+def test_recall_up_to_0_1_counts_nothing():
+    s = scored(boxes(*ROW), boxes(ROW[0], ROW[1], scores=[0.9, 0.8]))
+    assert s.mean_ap == 0 and set(s.errors.values()) == {1.0}
+
+
+def test_a_better_scored_false_one_takes_precision():
+    """Precision is read off between (recall 0, 0) and (1, 0.5): r / 2, of which the part above 0.1
+    is (16.2 / 90) in the mean over the recalls, out of 0.9."""
+    s = scored(boxes((0, 0)), boxes((30, 0), (0, 0), scores=[0.9, 0.8]))
+    assert s.mean_ap == pytest.approx(0.2)
+
+
+def test_a_hit_is_nearer_than_the_distance():
+    s = scored(boxes(*ROW), boxes(*[(x, 1.0) for x, _ in ROW], scores=0.5))
+    assert s.ap == pytest.approx({0.5: 0, 1.0: 0, 2.0: 1, 4.0: 1})
+
+
+def test_an_object_is_found_once_and_by_the_better_score():
+    """The other one is false: at recall 1 itself precision is that of both, 0.5."""
+    truth = boxes((0, 0))
+    for first, other in ((0.2, 0.0), (0.0, 0.2)):
+        s = scored(truth, boxes((first, 0), (other, 0), scores=[0.9, 0.8]))
+        assert s.mean_ap == pytest.approx((89 + 0.4 / 0.9) / 90)
+        assert s.errors["ate"] == pytest.approx(first)
+
+
+def test_a_detection_takes_what_is_left():
+    """The first takes the nearer object; the other, between them, the farther one, or is false."""
+    s = scored(boxes((0, 0), (3, 0)), boxes((0.1, 0), (0.5, 0), scores=[0.9, 0.8]))
+    assert s.ap == pytest.approx({**dict.fromkeys((0.5, 1.0, 2.0), (39 + 0.4 / 0.9) / 90), 4.0: 1})
+
+
+def test_objects_of_other_frames_are_not_found():
+    truth, found = boxes((0, 0), (0, 0)), boxes((0, 0), (0, 0), scores=[0.9, 0.8])
+    assert scored(truth, found, true_frames=[0, 1], found_frames=[1, 0]).mean_ap == pytest.approx(1)
+    assert scored(truth, found, true_frames=[0, 3], found_frames=[1, 2]).mean_ap == 0
+
+
+def test_nothing_found_or_nothing_there_is_zero_and_errors_of_one():
+    for truth, found in ((boxes((0, 0)), boxes()), (boxes(), boxes((0, 0), scores=1.0)),
+                         (boxes(), boxes())):
+        s = scored(truth, found)
+        assert s.mean_ap == 0 and set(s.errors.values()) == {1.0}
+    cone = scored(boxes(), boxes(), "traffic_cone")
+    assert [k for k, v in cone.errors.items() if math.isnan(v)] == ["aoe", "ave", "aae"]
+
+
+def test_errors_of_a_pair():
+    truth = boxes((0, 0), velocities=[3.0, 0.0], attributes=5)
+    found = boxes((0.3, 0.4), yaw=math.pi - 0.1, velocities=[0.0, 4.0], attributes=6)
+    larger = GlobalBoxes.of(found.centres, 2 * found.sizes, found.rotations, found.kinds)
+    e = hit_errors(truth, found, False)
+    assert {k: v[0] for k, v in e.items()} == pytest.approx(
+        dict(ate=0.5, ase=0, aoe=math.pi - 0.1, ave=5, aae=1))
+    assert hit_errors(truth, found, True)["aoe"] == pytest.approx(0.1)
+    assert hit_errors(truth, larger, False)["ase"] == pytest.approx(7 / 8)
+    for true, other in ((boxes((0, 0)), found), (truth, boxes((0, 0)))):
+        assert np.isnan(hit_errors(true, other, False)["ave"])
+    assert np.isnan(hit_errors(boxes((0, 0)), found, False)["aae"])
+
+
+def test_the_error_is_a_mean_of_means_over_recall():
+    """Two objects, errors 0 and 1 by falling score. Recalls 0.11 .. 0.5 have the first error,
+    0.51 .. 1 one that rises from 0 to the mean of both, 0.5, in 50 steps."""
+    s = scored(boxes((0, 0), (20, 0)), boxes((0, 0), (21, 0), scores=[0.9, 0.8]))
+    assert s.errors["ate"] == pytest.approx(sum(0.01 * k for k in range(1, 51)) / 90)
+
+
+@pytest.mark.parametrize("kind", NAMES)
+def test_a_class_counts_within_its_range_of_the_vehicle(kind):
+    there = np.array([100.0, 50.0])
+    away = RANGES[kind]
+    kept = counted(boxes(*(there + [away * s, 0] for s in (0.999, 1, -0.999, 1.2)), kind=kind),
+                   np.array([100, 50, 7]), boxes())
+    assert kept.tolist() == [True, False, True, False]
+    assert (RANGES["car"], RANGES["pedestrian"], RANGES["barrier"]) == (50, 40, 30)
+
+
+def test_labels_without_points_and_cycles_in_racks_do_not_count():
+    rack = boxes((0, 0), yaw=math.pi / 2)  # 2 m along x, 4 m along y
+    for kind, inside in ("bicycle", False), ("motorcycle", False), ("pedestrian", True):
+        kept = counted(boxes((0.9, 1.9), (1.9, 0.9), kind=kind), np.zeros(3), rack)
+        assert kept.tolist() == [inside, True]
+    assert counted(boxes((0, 0), (1, 0), (2, 0), points=[0, 3, -1]), np.zeros(3),
+                   boxes()).tolist() == [False, True, True]
+    none = GlobalBoxes.of(np.zeros((1, 3)), np.ones((1, 3)), [[1, 0, 0, 0]], -1)
+    assert not counted(none, np.zeros(3), boxes()).any()
+
+
+def reported(root, results):
+    path = root / "results.json"
+    path.write_text(json.dumps({"meta": META, "results": results}))
+    frames, report = open_nuscenes(root), NuscenesReport()
+    for frame, found in zip(frames, read_results(path, frames)):
+        report.add(frame, found)
+    return report.content()
+
+
+def close_to_reference(content, by_class, over):
+    for name, (objects, ap, errors) in by_class.items():
+        row = content["classes"][name]
+        assert row["objects"] == objects
+        assert row["ap"] == pytest.approx({f"{d:g}": 100 * v for d, v in ap.items()}, abs=1e-9)
+        for key, kind in ERRORS.items():
+            assert (row[key] is None) == (kind not in errors)
+            assert row[key] is None or row[key] == pytest.approx(errors[kind], abs=1e-5)
+    for key, (mean_ap, errors, nds) in over.items():
+        row = content[key]
+        assert row["map"] == pytest.approx(100 * mean_ap, abs=1e-9)
+        assert row["nds"] == pytest.approx(100 * nds, abs=1e-3)
+        assert [row[e] for e in ERRORS] == pytest.approx([errors[k] for k in ERRORS.values()],
+                                                         abs=1e-5)
+
+
+@pytest.mark.parametrize("seed, frames, objects, noise", [
+    (0, 2, 20, 0.1), (1, 3, 60, 0.4), (2, 5, 150, 0.4), (3, 4, 90, 1.0)])
+def test_the_same_as_a_second_reading(tmp_path, seed, frames, objects, noise):
+    tables = folder.made_tables(seed, frames, objects)
+    results = folder.made_results(tables, CATEGORIES, seed + 10, noise)
+    by_class, over = reference.evaluate(tables, results, CATEGORIES)
+    content = reported(folder.save(tmp_path, tables, sweeps=False), results)
+    assert content["frames"] == 2 * frames and 0 < content["all"]["map"] < 100
+    close_to_reference(content, by_class, {"all": over, "ours": reference.over(by_class, OURS)})
+
+
+@pytest.mark.parametrize("seed, ties", [(4, False), (5, False), (4, True)])
+def test_the_same_as_nuscenes_devkit(tmp_path, seed, ties):
+    module = pytest.importorskip("nuscenes.eval.detection.evaluate", reason="needs nuscenes-devkit")
+    from nuscenes import NuScenes
+    from nuscenes.eval.common.config import config_factory
+    tables = folder.made_tables(seed, 8, 100)
+    results = folder.made_results(tables, CATEGORIES, seed)
+    for box in itertools.chain(*results.values()) if ties else ():
+        box["detection_score"] = round(box["detection_score"], 1)
+    content = reported(folder.save(tmp_path, tables, sweeps=False), results)
+    devkit = module.DetectionEval(
+        NuScenes(folder.VERSION, str(tmp_path), verbose=False),
+        config_factory("detection_cvpr_2019"), str(tmp_path / "results.json"), "mini_val",
+        str(tmp_path / "out"), verbose=False)
+    figures = devkit.evaluate()[0].serialize()
+    names = dict(zip(ERRORS, ("trans_err", "scale_err", "orient_err", "vel_err", "attr_err")))
+    assert content["all"] == pytest.approx({
+        "map": 100 * figures["mean_ap"], "nds": 100 * figures["nd_score"],
+        **{key: figures["tp_errors"][name] for key, name in names.items()}}, abs=1e-9)
+    for kind, row in content["classes"].items():
+        assert row["ap"] == pytest.approx(
+            {f"{d:g}": 100 * ap for d, ap in figures["label_aps"][kind].items()}, abs=1e-9)
+        assert [math.nan if row[key] is None else row[key] for key in names] == pytest.approx(
+            [figures["label_tp_errors"][kind][name] for name in names.values()], abs=1e-9,
+            nan_ok=True)
+
+
+def test_turning_and_moving_the_world_changes_nothing(tmp_path):
+    results = folder.made_results(TABLES, CATEGORIES)
+    before = reported(folder.save(tmp_path / "a", TABLES, sweeps=False), results)
+    tables, turn = copy.deepcopy(TABLES), folder.Rotation.from_euler("z", 1.1)
+    moved = copy.deepcopy(results)
+    for row in [*tables["ego_pose"], *tables["sample_annotation"], *itertools.chain(
+            *moved.values())]:
+        row["rotation"] = folder.wxyz(turn * folder.turn(row))
+        row["translation"] = (turn.apply(row["translation"]) + [30, -200, 0]).tolist()
+        if "velocity" in row:
+            row["velocity"] = turn.apply([*row["velocity"], 0])[:2].tolist()
+    after = reported(folder.save(tmp_path / "b", tables, sweeps=False), moved)
+    for key in "all", "ours":
+        assert after[key] == pytest.approx(before[key], abs=1e-6)
+
+
+def test_ap_depends_on_the_order_of_scores_only(tmp_path):
+    root, results = folder.save(tmp_path, TABLES, sweeps=False), folder.made_results(
+        TABLES, CATEGORIES)
+    before = reported(root, results)
+    for rows in results.values():
+        rows.reverse()
+        for row in rows:
+            row["detection_score"] **= 3
+    after = reported(root, results)
+    assert {n: r["ap"] for n, r in after["classes"].items()} == {
+        n: pytest.approx(r["ap"]) for n, r in before["classes"].items()}
+
+
+def spoil(**values):
+    def change(results):
+        next(rows for rows in results.values() if rows)[0].update(values)
+    return change
+
+
+@pytest.mark.parametrize("change, words", [
+    (lambda r: r.pop("s0k1"), "no boxes of scene-0103/01, sample s0k1 (1 of 8 such)"),
+    (lambda r: r.update(s0k0=r["s0k0"] * 100), "at most 500 boxes"),
+    (lambda r: r.update(s0k0={}), "needs a list"),
+    (lambda r: r["s0k0"][0].pop("size"), "a box has no 'size'"),
+    (spoil(detection_name="van"), "cannot be read"), (spoil(attribute_name="red"), "cannot be"),
+    (spoil(size=[1, 2, 0]), "sizes above 0"), (spoil(rotation=[0, 0, 0, 0]), "a quaternion"),
+    (spoil(translation=[1, 2, math.nan]), "must be finite"), (spoil(size=[1]), "cannot be read"),
+    (spoil(velocity=[math.inf, 0]), "velocity finite or NaN"), (spoil(velocity=[0]), "cannot be"),
+    (spoil(detection_score="high"), "cannot be read"),
+])
+def test_results_that_are_wrong_are_named(tmp_path, change, words):
+    results = folder.made_results(TABLES, CATEGORIES)
+    change(results)
+    with pytest.raises(InputError) as caught:
+        reported(folder.save(tmp_path, TABLES, sweeps=False), results)
+    assert words in str(caught.value) and "\n" not in str(caught.value)

@@ -1,0 +1,351 @@
+"""Scores of ground and clusters: laws, cases by hand, and SemanticKITTI folders."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samples import DATA, needs_data, object_folder, walker_label, write
+
+from lidar_perception.cli.segmentation import segmentation
+from lidar_perception.clustering.params import CLUSTERING_METHODS
+from lidar_perception.data.semantickitti import GROUND, MOVING, THINGS, open_semantic_kitti
+from lidar_perception.ground.params import GROUND_METHODS
+from lidar_perception.scoring.points.segmentation import (
+    PROTOCOLS,
+    RANGE_NAMES,
+    ClusterReport,
+    GroundReport,
+    Objects,
+    ground_counts,
+    objects_in_boxes,
+    objects_of_instances,
+    score_clusters,
+    true_ground,
+)
+from lidar_perception.scoring.points.tables import PUBLISHED
+from lidar_perception.types import CLASSES, GroundTruth, InputError
+
+few = settings(max_examples=60, database=None)
+seeds = st.integers(0, 2**32 - 1)
+CAR, VAN, TRUCK = (CLASSES.index(name) for name in ("Car", "Van", "Truck"))
+
+
+def objects(owner, region=None, near=None, counted=None, ranges=None):
+    """Objects called a, b, c, ... with the given owner of each point."""
+    owner = np.asarray(owner, np.int32)
+    region = owner if region is None else np.asarray(region, np.int32)
+    count = int(owner.max(initial=0))
+    return Objects(owner, region, region > 0 if near is None else np.asarray(near, bool),
+                   np.ones(len(owner), bool) if counted is None else np.asarray(counted, bool),
+                   tuple("abcdefghij"[:count]), np.full(count, 10.0) if ranges is None else ranges)
+
+
+def report_of(cluster_ids, truth) -> dict:
+    report = ClusterReport()
+    report.add(np.asarray(cluster_ids, np.int32), truth, 2.0)
+    return report.content()
+
+
+def some(seed):
+    """Labels and objects of a random frame; objects overlap clusters in every way."""
+    rng = np.random.default_rng(seed)
+    owner = rng.integers(0, rng.integers(1, 6), 300).astype(np.int32)
+    owner = np.unique(owner, return_inverse=True)[1].reshape(-1)
+    region = np.where(owner == 0, rng.integers(0, owner.max() + 1, 300) * (rng.random(300) < 0.1),
+                      owner)
+    found = np.where(rng.random(300) < 0.7, owner, rng.integers(0, 9, 300)).astype(np.int32)
+    return found, objects(owner, region, counted=rng.random(300) < 0.9)
+
+
+def test_perfect_clusters_are_perfect_everywhere():
+    owner = np.repeat([0, 1, 2, 3], [40, 10, 20, 30])
+    content = report_of(owner, objects(owner, ranges=np.array([10.0, 20.0, 50.0])))
+    assert [content[k] for k in ("precision", "f1")] == [1, 1]
+    ranges = [content["by_range"][RANGE_NAMES[i]] for i in (0, 1, 3)]
+    for row in [content, *content["by_class"].values(), *ranges]:
+        assert (row["recall"], row["mean_iou"], row["mean_pieces"]) == (1, 1, 1)
+        assert (row["over_segmentation"], row["under_segmentation"]) == (0, 0)
+
+
+def test_two_objects_in_one_cluster_are_both_under_segmented():
+    owner = np.repeat([1, 2, 3, 0], [30, 60, 50, 5])
+    content = report_of(np.repeat([4, 4, 7, 0], [30, 60, 50, 5]), objects(owner))
+    assert (content["under_segmented"], content["over_segmented"]) == (2, 0)
+    # 30 of 90 points, 60 of 90, and the third perfectly.
+    assert content["mean_iou"] == pytest.approx((1 / 3 + 2 / 3 + 1) / 3)
+    assert (content["objects"], content["hits"], content["judged_clusters"]) == (3, 2, 2)
+    assert content["under_segmentation"] == pytest.approx(2 / 3)
+
+
+def test_halves_of_an_object_and_two_objects_as_one_have_half_the_iou_and_are_no_hit():
+    halves = report_of(np.repeat([1, 2], 20), objects(np.ones(40)))
+    assert (halves["over_segmented"], halves["mean_pieces"], halves["under_segmented"]) == (1, 2, 0)
+    both = report_of(np.ones(40), objects(np.repeat([1, 2], 20)))
+    assert (both["over_segmented"], both["mean_pieces"], both["under_segmented"]) == (0, 1, 2)
+    for content in (halves, both):
+        assert (content["mean_iou"], content["hits"], content["f1"]) == (0.5, 0, 0)
+
+
+def test_a_piece_has_a_tenth_of_the_object():
+    for small, pieces in ((9, 1), (10, 2)):
+        score = score_clusters(np.repeat([3, 1], [100 - small, small]), objects(np.ones(100)))
+        assert score.pieces.tolist() == [pieces]
+
+
+def test_a_case_by_hand():
+    # Of object a 8 of 10 points are in cluster 1, beside 2 others; of b none is found. Cluster 2
+    # is half near an object, so not judged; cluster 3 is far from all; 4 is judged, and no hit.
+    owner = np.repeat([1, 1, 2, 0, 0, 0, 0], [8, 2, 10, 2, 4, 6, 3])
+    found = np.repeat([1, 0, 0, 1, 2, 3, 4], [8, 2, 10, 2, 4, 6, 3])
+    near = np.repeat([1, 1, 1, 0, 0, 0, 1], [8, 2, 10, 2, 4, 6, 3])
+    near[22:24] = 1
+    content = report_of(found, objects(owner, near=near, ranges=np.array([14.9, 45.0])))
+    assert (content["clusters"], content["judged_clusters"]) == (4, 2)
+    assert (content["objects"], content["hits"]) == (2, 1)
+    assert content["mean_iou"] == pytest.approx(8 / 12 / 2)
+    assert (content["precision"], content["recall"], content["f1"]) == (0.5, 0.5, 0.5)
+    assert content["mean_pieces"] == 1  # of a; b has none
+    assert content["by_class"]["b"]["mean_pieces"] is None
+    assert content["by_class"]["a"]["mean_iou"] == pytest.approx(2 / 3)
+    assert [row["objects"] for row in content["by_range"].values()] == [1, 0, 0, 1]
+    assert (content["frames"], content["ms"], content["clusters_per_frame"]) == (1, 2.0, 4.0)
+
+
+def test_neutral_points_speak_neither_for_nor_against_their_own_object_only():
+    owner, region = np.repeat([1, 0, 2], [10, 10, 10]), np.repeat([1, 1, 2], [10, 10, 10])
+    clean = score_clusters(np.repeat([1, 0, 2], [10, 10, 10]), objects(owner, region))
+    with_road = score_clusters(np.repeat([1, 1, 2], [10, 10, 10]), objects(owner, region))
+    assert clean.iou.tolist() == with_road.iou.tolist() == [1, 1]
+    other = score_clusters(np.repeat([1, 2, 2], [10, 10, 10]), objects(owner, region))
+    assert other.iou.tolist() == [1, 0.5]
+
+
+@few
+@given(seeds)
+def test_order_of_points_and_numbers_of_clusters_do_not_matter(seed):
+    found, truth = some(seed)
+    rng = np.random.default_rng(seed)
+    order = rng.permutation(len(found))
+    renamed = np.concatenate([[0], rng.permutation(50)[:10] + 1])[found]
+    shuffled = replace(truth, **{name: getattr(truth, name)[order]
+                                 for name in ("owner", "region", "near", "counted")})
+    assert report_of(renamed[order], shuffled) == report_of(found, truth)
+
+
+@few
+@given(seeds)
+def test_scores_are_those_of_a_plain_loop_over_sets(seed):
+    found, truth = some(seed)
+    score = score_clusters(found, truth)
+    keep = truth.counted
+    sets = {c: set(np.flatnonzero(keep & (found == c))) for c in set(found.tolist()) - {0}}
+    own = [set(np.flatnonzero(keep & (truth.owner == k + 1))) for k in range(len(truth.classes))]
+    pieces = [{c for c, s in sets.items() if s & o and 10 * len(s & o) >= len(o)} for o in own]
+    for k, o in enumerate(own):
+        neutral = set(np.flatnonzero(keep & (truth.region == k + 1))) - o
+        ious = {c: len(s & o) / len(o | (s - neutral)) for c, s in sets.items()}
+        best = {c for c, v in ious.items() if v == max(ious.values())}
+        assert score.iou[k] == max(ious.values(), default=0)
+        assert score.pieces[k] == len(pieces[k])
+        assert score.shared[k] == any(c in pieces[k] and any(
+            c in p for j, p in enumerate(pieces) if j != k) for c in best)
+    near = set(np.flatnonzero(truth.near))
+    assert score.judged == sum(2 * len(s & near) > len(s) for s in sets.values())
+    assert score.judged >= np.sum(score.iou > 0.5)  # so that no ratio is above 1
+
+
+def test_nothing_found_and_nothing_to_find():
+    nothing = report_of(np.zeros(20), objects(np.ones(20)))
+    assert (nothing["recall"], nothing["precision"], nothing["mean_iou"]) == (0, 0, 0)
+    for found in (np.zeros(20), np.ones(20), np.zeros(0)):
+        empty = report_of(found, objects(np.zeros(len(found))))
+        assert (empty["objects"], empty["judged_clusters"], empty["by_class"]) == (0, 0, {})
+
+
+def column(x, y, z, count):
+    """count points at x y, in heights z[0] .. z[1]."""
+    return np.column_stack([np.full(count, x), np.full(count, y), np.linspace(*z, count)])
+
+
+def test_points_low_in_a_box_are_neutral_and_small_objects_are_left_out():
+    xyz = np.concatenate([column(10, 0, (-1.65, -1.55), 5), column(10, 0, (-1.45, 0), 12),
+                          column(20, 0, (-1.4, 0), 9), column(10, 1.1, (-1, 0), 3),
+                          column(30, 0, (-1, 0), 4)]).astype(np.float32)
+    truth = GroundTruth.of([[20, 0, -0.7, 2, 2, 2, 0], [10, 0, -0.7, 2, 2, 2, 0.0]], [CAR, VAN])
+    found = objects_in_boxes(xyz, truth)
+    assert found.owner.tolist() == [0] * 5 + [1] * 12 + [0] * 16
+    assert found.region.tolist() == [1] * 17 + [0] * 16
+    assert found.near.tolist() == [True] * 17 + [False] * 9 + [True] * 3 + [False] * 4
+    assert found.counted.all() and found.classes == ("Van",) and found.ranges.tolist() == [10]
+
+
+def test_a_point_in_two_boxes_belongs_to_the_smaller():
+    xyz = np.concatenate([column(10, 0, (-1, 0), 20), column(12, 0, (-1, 0), 30)])
+    boxes = [[10, 0, 0, 1, 1, 4, 0], [11, 0, 0, 5, 3, 4, 0]]
+    for order in ([0, 1], [1, 0]):
+        truth = GroundTruth.of(np.array(boxes)[order], np.array([CAR, TRUCK])[order])
+        found = objects_in_boxes(xyz.astype(np.float32), truth)
+        classes = np.array(["", *found.classes])[found.owner]
+        assert classes.tolist() == ["Car"] * 20 + ["Truck"] * 30
+
+
+def test_dont_care_and_no_boxes_are_no_objects():
+    xyz = column(10, 0, (-1, 0), 20).astype(np.float32)
+    for truth in (GroundTruth.of([[10, 0, 0, 2, 2, 4, 0]], [CLASSES.index("DontCare")]),
+                  GroundTruth.of([], [])):
+        found = objects_in_boxes(xyz, truth)
+        assert found.classes == () and not found.owner.any() and not found.near.any()
+
+
+def test_instances_are_the_things_of_one_class_and_number_moving_or_not():
+    kinds = [(10, 5, 12), (252, 6, 10), (30, 5, 11), (10, 0, 20), (11, 1, 9), (50, 5, 30),
+             (0, 5, 4), (1, 0, 4), (40, 0, 10)]
+    counts = [count for _, _, count in kinds]
+    semantic, instance = (np.repeat([kind[i] for kind in kinds], counts).astype(np.uint16)
+                          for i in (0, 1))
+    xyz = np.zeros((len(semantic), 3), np.float32)
+    xyz[:12] = [30, 40, 1]
+    found = objects_of_instances(xyz, semantic, instance)
+    assert found.classes == ("car", "car", "person")
+    assert found.owner.tolist() == np.repeat([1, 2, 3, 0, 0, 0, 0, 0, 0], counts).tolist()
+    # Not counted: a car without an instance, a bicycle of 9 points, unlabelled, outliers.
+    assert found.counted.tolist() == np.repeat([1, 1, 1, 0, 0, 1, 0, 0, 1], counts).tolist()
+    assert found.ranges.tolist() == [50, 0, 0]
+    assert set(MOVING) == set(range(252, 260)) and set(MOVING.values()) <= set(THINGS)
+
+
+def test_each_protocol_by_hand():
+    semantic = np.array([40, 44, 48, 49, 60, 72, 70, 70, 70, 0, 1, 10, 50], np.uint16)
+    z = np.full(len(semantic), -1.7)
+    z[7:9] = [-1.3, -1.2]  # at the limit is not low
+    expected = ([1] * 6 + [None] * 5 + [0, 0], [1] * 7 + [0, 0, None, None, 0, 0],
+                [1] * 6 + [0, 0, 0, None, None, 0, 0])
+    for name, row in zip(PROTOCOLS, expected, strict=True):
+        ground, counted = true_ground(semantic, z, name)
+        assert [int(g) if c else None for g, c in zip(ground, counted)] == row, name
+    assert set(PUBLISHED) <= set(PROTOCOLS)
+
+
+def test_counts_and_ratios_of_ground_by_hand():
+    found = np.array([1, 1, 1, 0, 0, 0, 0, 1, 0], bool)
+    ground = np.array([1, 1, 0, 1, 0, 0, 0, 1, 0], bool)
+    counted = np.array([1, 1, 1, 1, 1, 1, 1, 0, 0], bool)
+    assert ground_counts(found, ground, counted).tolist() == [2, 1, 1, 3]
+    report = GroundReport()
+    for _ in range(2):
+        report.add(found[:7], np.where(ground[:7], 40, 50), np.zeros(7), 3.0)
+    row = report.content()["protocols"]["without vegetation"]
+    assert [row[k] for k in ("tp", "fp", "fn", "tn")] == [4, 2, 2, 6]
+    assert [row[k] for k in ("precision", "recall", "f1", "accuracy")] == pytest.approx(
+        [2 / 3, 2 / 3, 2 / 3, 5 / 7])
+    assert report.content()["scans"] == 2 and report.content()["ms"] == 3.0
+
+
+def semantic_folder(root, scans=("00/000000", "00/000001", "05/000000")):
+    """A road 1.73 m below, two cars of 200 points, some unusable returns."""
+    rng = np.random.default_rng(0)
+    road = rng.uniform(-20, 20, (4000, 3)) * [1, 1, 0.001] - [0, 0, 1.73]
+    car = rng.uniform(-1, 1, (200, 3)) * [0.15, 0.15, 0.3] - [0, 0, 0.9]
+    xyz = np.concatenate([road, car + [8, 3, 0], car + [9, -4, 0], [[0, 0, 0], [np.nan, 1, 1]]])
+    cloud = np.column_stack([xyz, np.full(len(xyz), 0.4)]).astype(np.float32)
+    labels = np.repeat(np.array([40, 10 | 7 << 16, 252 | 300 << 16, 0], np.uint32),
+                       [4000, 200, 200, 2])
+    for name in scans:
+        sequence, scan = name.split("/")
+        write(root / f"sequences/{sequence}/velodyne/{scan}.bin", cloud.tobytes())
+        write(root / f"sequences/{sequence}/labels/{scan}.label", labels.tobytes())
+    return root
+
+
+def test_a_folder_is_read_in_order_without_unusable_returns(tmp_path):
+    semantic_folder(tmp_path / "dataset")
+    write(tmp_path / "dataset/sequences/11/velodyne/000000.bin", b"")  # a test sequence
+    frames = open_semantic_kitti(tmp_path)
+    assert [f.name for f in frames] == ["00/000000", "00/000001", "05/000000"]
+    assert [f.name for f in open_semantic_kitti(tmp_path / "dataset")] == [f.name for f in frames]
+    frame, semantic, instance = frames[0].load()
+    assert len(frame) == len(semantic) == len(instance) == 4400
+    assert semantic.dtype == instance.dtype == np.uint16
+    assert semantic[[0, 4000, 4200]].tolist() == [40, 10, 252]
+    assert instance[[0, 4000, 4200]].tolist() == [0, 7, 300]
+
+
+@pytest.mark.parametrize("root, file, content, text", [
+    ("nowhere", None, None, "is not a folder"), (".", None, None, "has no SemanticKITTI scans"),
+    ("unlabelled", "velodyne/000000.bin", b"", "scans but no labels"),
+    ("kitti", "velodyne/000001.bin", b"", "cannot read the labels"),
+    ("kitti", "labels/000000.label", bytes(40), "has 10 labels for the 4402 points"),
+    ("kitti", "labels/000000.label", bytes(41), "not a multiple of 4"),
+    ("kitti", "velodyne/000000.bin", bytes(41), "not a multiple of 16")])
+def test_a_broken_folder_gives_one_line_with_a_remedy(tmp_path, root, file, content, text):
+    semantic_folder(tmp_path / "kitti", ["00/000000"])
+    if file:
+        write(tmp_path / root / "sequences/00" / file, content)
+    with pytest.raises(InputError, match=text) as error:
+        for frame in open_semantic_kitti(tmp_path / root):
+            frame.load()
+    assert "\n" not in str(error.value) and re.search("give|expected|again", str(error.value))
+
+
+@needs_data
+def test_the_real_scan_has_a_label_for_every_point():
+    frame, semantic, instance = open_semantic_kitti(DATA / "semantickitti")[0].load()
+    assert len(frame) == len(semantic) == len(instance) > 100_000
+    assert np.isin(semantic, GROUND).mean() > 0.4
+    cars = np.bincount(instance[semantic == 10])
+    assert objects_of_instances(frame.xyz, semantic, instance).classes.count("car") == np.sum(
+        cars[1:] >= 10)
+
+
+def run(*arguments):
+    return CliRunner().invoke(segmentation, [str(a) for a in arguments])
+
+
+def test_the_command_scores_every_method_and_goes_on_after_a_broken_scan(tmp_path):
+    root = semantic_folder(tmp_path / "semantic")
+    write(root / "sequences/00/labels/000001.label", b"")
+    kitti = object_folder(tmp_path / "kitti", walker_label() + "\n")
+    path = tmp_path / "made/here/scores.json"
+    result = run("--semantic-kitti", root, "--kitti", kitti, "--json", path)
+    assert result.exit_code == 0, result.output
+    content = json.loads(path.read_text())
+    assert len(content["skipped"]) == 1 and "skipped" in result.stdout
+    assert list(content["ground"]) == list(GROUND_METHODS)
+    assert {report["scans"] for report in content["ground"].values()} == {2}
+    assert set(content["clusters"]) == {"semantic_kitti", "kitti"}
+    for reports in content["clusters"].values():
+        assert list(reports) == list(CLUSTERING_METHODS)
+    cars, walkers = (content["clusters"][s]["dbscan"] for s in ("semantic_kitti", "kitti"))
+    assert (cars["objects"], cars["hits"], cars["precision"]) == (4, 4, 1)
+    assert (walkers["objects"], walkers["frames"]) == (2, 2)
+
+
+def test_methods_and_frames_can_be_chosen(tmp_path):
+    root, path, png = semantic_folder(tmp_path), tmp_path / "a.json", tmp_path / "made/a.png"
+    assert run("--semantic-kitti", root, "--methods", "threshold", "--limit", 1, "--json", path,
+               "--png", png).exit_code == 0
+    content = json.loads(path.read_text())
+    assert list(content["ground"]) == ["threshold"] and content["clusters"] == {}
+    ground = content["ground"]["threshold"]
+    assert ground["scans"] == 1 and ground["protocols"]["without vegetation"]["f1"] > 0.99
+    assert png.read_bytes().startswith(b"\x89PNG")
+
+
+def test_calls_that_cannot_be_answered_say_why(tmp_path):
+    root = semantic_folder(tmp_path / "semantic", ["00/000000"])
+    for arguments, text in (([], "at least one of"),
+                            (["--semantic-kitti", root, "--methods", "magic"], "is no method"),
+                            (["--kitti", root, "--png", "a.png"], "--png draws"),
+                            (["--kitti", root, "--methods", "threshold"], "SemanticKITTI only")):
+        result = run(*arguments)
+        assert result.exit_code == 2 and text in result.output
+    write(root / "sequences/00/labels/000000.label", b"")
+    with pytest.raises(InputError, match="no frame with labels"):
+        raise run("--semantic-kitti", root).exception

@@ -1,0 +1,370 @@
+"""Laws of the ray caster and the ground."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from lidar_perception.simulation import foliage
+from lidar_perception.simulation.hashing import uniform
+from lidar_perception.simulation.pairs import View
+from lidar_perception.simulation.raycast import cast, cast_batch
+from lidar_perception.simulation.realism.roughness import roughness
+from lidar_perception.simulation.returns import measure
+from lidar_perception.simulation.sensor import HDL64E, STILL, Motion, generic, rays
+from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID, Solids
+from lidar_perception.simulation.terrain import Ground, cast_ground, surface_height, tufts
+
+SENSOR = generic(24, -24.0, 12.0, 1.0, 10.0, height=1.7, max_range=60.0, divergence=0.0,
+                 lifts=tuple(np.linspace(0.2, 0.0, 24)))
+WIDE = replace(SENSOR, divergence=8e-3)
+NO_GROUND = np.array([0.0, 0.0, 1e4])
+OVER_ROAD = np.array([0.0, 0.0, SENSOR.height])
+DRIVE = Motion((12.0, -1.0, 0.2), 0.8, stamp=0.3)
+FULL = Ground(0.01, -0.02, 0.05, 20.0, 0.02, 6.0, -4.0, 0.13, 2.0, ((8.0, 15.0), (-30.0, -22.0)),
+              1.5)
+
+
+def solids(kind, centre, half, owner=1, axes=None, density=np.inf, transmission=0.0,
+           velocity=(0.0, 0.0, 0.0)):
+    """Solids of P kinds, centres and half sizes; the rest as given for each or for all."""
+    kind, centre = np.atleast_1d(np.array(kind, np.int8)), np.atleast_2d(np.array(centre, float))
+    n = len(kind)
+    axes = np.eye(3) if axes is None else axes
+    return Solids(kind, centre, np.broadcast_to(np.array(half, float), (n, 3)),
+                  np.broadcast_to(axes, (n, 3, 3)), np.full(n, 0.5), np.full(n, 10, np.uint16),
+                  np.broadcast_to(float(density), n), np.broadcast_to(float(transmission), n),
+                  np.broadcast_to(owner, n).astype(np.int32),
+                  np.broadcast_to(np.array(velocity, float), (n, 3)))
+
+
+def crowd(seed, count=60, moving=True):
+    """Solids of all kinds, turned anyhow, around the sensor and some far away."""
+    rng = np.random.default_rng(seed)
+    axes = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
+    bearing, far = rng.uniform(-np.pi, np.pi, count), rng.uniform(4, 70, count)
+    centre = np.stack([far * np.cos(bearing), far * np.sin(bearing), rng.uniform(-3, 2, count)], 1)
+    made = solids(rng.integers(0, 3, count), centre, rng.uniform(0.05, 2.0, (count, 3)),
+                  np.sort(rng.integers(0, 20, count)), axes,
+                  velocity=rng.normal(0, 8, (count, 3)) * moving)
+    return replace(made, reflectance=rng.uniform(0.1, 0.9, count))
+
+
+def reference(made, sensor, motion=STILL):
+    """Range, solid (columns, rings) and reached, one solid after the other against every ray."""
+    turn = rays(sensor, motion)
+    nearest = np.full(turn.direction.shape[:2], np.inf)
+    solid, reached = np.full(nearest.shape, -1), {}
+    for i in range(len(made)):
+        centre = made.centre[i] + made.velocity[i] * turn.since[:, None, None]
+        o = (turn.origin - centre) @ made.axes[i] / made.half[i]
+        d = turn.direction @ made.axes[i] / made.half[i]
+        o = np.broadcast_to(o, d.shape)
+        with np.errstate(all="ignore"):
+            slab = np.sort(np.stack([(-1 - o) / d, (1 - o) / d]), axis=0)
+            flat = slice(0, 2) if made.kind[i] == CYLINDER else slice(0, 3)
+            a, b = (d[..., flat] ** 2).sum(-1), (o * d)[..., flat].sum(-1)
+            root = np.sqrt(b * b - a * ((o[..., flat] ** 2).sum(-1) - 1))
+            quadric = (-b - root) / a, (-b + root) / a
+            if made.kind[i] == BOX:
+                enter, leave = slab[0].max(-1), slab[1].min(-1)
+            elif made.kind[i] == ELLIPSOID:
+                enter, leave = quadric
+            else:
+                enter = np.maximum(quadric[0], slab[0][..., 2])
+                leave = np.minimum(quadric[1], slab[1][..., 2])
+        t = np.where((enter <= leave) & (enter > 0) & (enter <= sensor.max_range), enter, np.inf)
+        own = int(made.owner[i])
+        reached[own] = reached.get(own, False) | (t < np.inf)
+        solid = np.where(t < nearest, i, solid)
+        nearest = np.minimum(nearest, t)
+    return nearest, solid, {k: v.sum() for k, v in reached.items() if k}
+
+
+def same(one, other):
+    return all(np.array_equal(a, b) for a, b in zip(one, other))
+
+
+@pytest.mark.parametrize("motion", [STILL, DRIVE])
+@pytest.mark.parametrize("seed", range(4))
+def test_all_kinds_are_met_as_by_a_slow_reference(seed, motion):
+    made = crowd(seed)
+    for sensor in (SENSOR, replace(SENSOR, lifts=(), elevations=tuple(np.linspace(1.4, -1.4, 9)))):
+        hits = cast(made, Ground(), NO_GROUND, sensor, motion)
+        nearest, solid, reached = reference(made, sensor, motion)
+        assert (nearest < np.inf).sum() > 50
+        assert np.allclose(hits.range, nearest, rtol=1e-9)
+        assert np.array_equal(hits.solid, solid)
+        assert np.array_equal(hits.owner, np.where(solid < 0, 0, made.owner[solid]))
+        assert {k: n for k, n in enumerate(hits.reached) if n} == {
+            k: n for k, n in reached.items() if n}
+
+
+def leafy(seed):
+    made, rng = crowd(seed), np.random.default_rng(seed)
+    return replace(made, density=np.where(rng.random(60) < 0.4, 1.0, np.inf),
+                   transmission=np.where(rng.random(60) < 0.3, 0.5, 0.0))
+
+
+def test_neither_chunk_nor_batch_changes_a_byte():
+    views = [View(leafy(seed), FULL._replace(rough=0.05), OVER_ROAD, motion, seed)
+             for seed, motion in ((0, STILL), (1, DRIVE), (2, DRIVE))]
+    views.append(View(leafy(0).take(np.arange(0)), FULL, OVER_ROAD))
+    single = [cast(*view[:3], WIDE, *view[3:]) for view in views]
+    for chunk in (1, 777, None):
+        assert all(same(a, b) for a, b in zip(cast_batch(views, WIDE, chunk=chunk), single))
+    assert cast_batch([], WIDE) == []
+    for seed in (9, -1, (1 << 90) + 5):
+        assert not np.array_equal(cast(*views[0][:3], WIDE, seed=seed).range, single[0].range)
+
+
+def test_order_of_solids_does_not_matter():
+    made = crowd(7)
+    order = np.random.default_rng(0).permutation(len(made))
+    one, other = (cast(s, Ground(), NO_GROUND, SENSOR, DRIVE) for s in (made, made.take(order)))
+    assert np.array_equal(one.range, other.range) and np.array_equal(one.reached, other.reached)
+
+
+def test_turned_things_give_turned_hits():
+    made, shift = crowd(3, moving=False), 77
+    angle = 2 * np.pi * shift / SENSOR.columns
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0],
+                     [0, 0, 1]])
+    turned = replace(made, centre=made.centre @ turn.T, axes=turn @ made.axes)
+    one, other = (cast(s, Ground(), NO_GROUND, SENSOR) for s in (made, turned))
+    assert np.array_equal(np.roll(one.owner, shift, axis=0), other.owner)
+    assert np.allclose(np.roll(one.range, shift, axis=0), other.range, rtol=1e-9)
+
+
+def test_a_moving_solid_is_seen_where_it_is_when_the_ray_leaves():
+    velocity = np.array([10.0, -15.0, 0.0])
+    made = solids(BOX, (-9, 3, 0), (1, 2, 1), velocity=velocity)
+    hits, since = cast(made, Ground(), NO_GROUND, SENSOR), rays(SENSOR).since
+    seen = np.flatnonzero((hits.owner == 1).any(axis=1))
+    assert len(seen) > 10
+    for column in seen:
+        there = replace(made, centre=made.centre + velocity * since[column],
+                        velocity=np.zeros((1, 3)))
+        assert np.allclose(hits.range[column],
+                           cast(there, Ground(), NO_GROUND, SENSOR).range[column])
+
+
+def test_a_wall_is_flat_only_after_compensation():
+    wall = solids(BOX, (10, 0, 0), (1, 40, 8))
+    exact = replace(SENSOR, range_noise=0.0, dropout=0.0)
+    hits = cast(wall, Ground(), NO_GROUND, exact, DRIVE)
+    flat, raw = (measure(hits, exact, DRIVE, np.random.default_rng(0), compensated)
+                 for compensated in (True, False))
+    assert len(flat.xyz) > 1000 and np.abs(flat.xyz[:, 0] - 9).max() < 1e-5
+    assert np.ptp(raw.xyz[:, 0]) > 0.1
+    still = cast(wall, Ground(), NO_GROUND, exact)
+    assert np.ptp(measure(still, exact, STILL, np.random.default_rng(0), False).xyz[:, 0]) < 1e-5
+
+
+@pytest.fixture
+def even_leaves(monkeypatch):
+    """Leaves everywhere, not in clumps."""
+    monkeypatch.setattr(foliage, "FILLED", 1.0)
+
+
+def test_leaves_hang_in_clumps_that_do_not_change_along_a_drive():
+    """Two casts with other random numbers meet leaves in the same cells only; a share of FILLED."""
+    fine = generic(64, -8.0, 8.0, 0.1, 10.0, divergence=0.0)
+    plant = solids(BOX, (12, 0, 0), (3, 3, 3), density=2.0)
+    filled = []
+    for seed in (1, 2):
+        hits = cast(plant, Ground(), NO_GROUND, fine, seed=seed)
+        met = np.isfinite(hits.range)
+        xyz = fine.directions()[met] * hits.range[met][:, None] - [12, 0, 0]
+        filled.append({tuple(c) for c in np.floor(xyz / foliage.CLUMP).astype(int)})
+        assert len(xyz) > 2000
+    both = filled[0] & filled[1]
+    assert len(both) > 0.6 * min(map(len, filled))
+    front = {c for c in filled[0] | filled[1] if c[0] == -6}  # the first layer, 12 by 5 cells seen
+    seen = {(-6, y, z) for y in range(-5, 5) for z in range(-2, 2)}
+    assert 0.08 < len(front & seen) / len(seen) < 0.5
+
+
+@pytest.mark.parametrize("kind", [BOX, ELLIPSOID, CYLINDER])
+def test_foliage_stops_rays_after_its_mean_free_path(kind, even_leaves):
+    fine = generic(32, -8.0, 8.0, 0.2, 10.0, divergence=0.0)
+    thin, thick = (cast(solids(kind, (12, 0, 0), (3, 3, 3), density=density), Ground(), NO_GROUND,
+                        fine, seed=5) for density in (np.inf, 0.7))
+    shell = np.isfinite(thin.range)
+    path = thick.range[shell] - thin.range[shell]
+    assert shell.sum() > 1000 and (path > 0).all()
+    # Where the way through is long, paths are exponential up to 2 m.
+    middle = shell & (np.abs(fine.directions()[..., 1]) < 0.1)
+    path = (thick.range - np.where(shell, thin.range, 0))[middle]
+    for depth in (0.5, 1.0, 2.0):
+        assert abs((path > depth).mean() - np.exp(-0.7 * depth)) < 4 * 0.5 / np.sqrt(len(path))
+    assert thick.reached[1] == np.isfinite(thick.range).sum() < thin.reached[1]
+
+
+def test_from_within_foliage_stops_rays_and_what_is_opaque_does_not(even_leaves):
+    inside = [cast(solids(ELLIPSOID, (0.5, 0, 0), (4, 4, 4), density=density), Ground(), NO_GROUND,
+                   SENSOR).range for density in (np.inf, 1.0)]
+    assert not np.isfinite(inside[0]).any()
+    assert abs((inside[1] < 1).mean() - (1 - np.exp(-1))) < 0.03 and inside[1].min() > 0
+
+
+def test_glass_lets_its_share_pass_to_what_is_behind():
+    panes = solids([BOX, BOX], [(8, 0, 0), (12, 0, 0)], (0.01, 3, 2), [1, 2],
+                   transmission=0.7)
+    panes = replace(panes, transmission=np.array([0.7, 0.0]))
+    fine = generic(32, -5.0, 5.0, 0.1, 10.0, divergence=0.0)
+    hits = cast(panes, Ground(), NO_GROUND, fine)
+    front = np.abs(fine.directions()[..., 1]) < 0.2
+    front &= fine.directions()[..., 0] > 0
+    share = (hits.owner[front] == 2).mean()
+    assert abs(share - 0.7) < 4 * 0.46 / np.sqrt(front.sum())
+    assert set(np.unique(hits.owner[front])) == {1, 2}
+
+
+def test_nearest_wins_and_occlusion_is_seen():
+    both = solids([BOX, BOX], [(9, 0, 0), (5, 0, 0)], (0.5, 0.5, 1.0), [2, 1])
+    hits = cast(both, Ground(), OVER_ROAD, SENSOR)
+    seen = np.bincount(hits.owner.ravel(), minlength=3)
+    assert (hits.range[0][hits.owner[0] == 1] < 5.0).all()
+    assert seen[1] == hits.reached[1] and seen[2] < 0.4 * hits.reached[2]
+
+
+def test_beams_at_edges_return_from_between_or_from_one_side():
+    near, far = (BOX, (5, 0, 0), (0.2, 1, 1)), (BOX, (5.7, 0, 0), (0.2, 9, 4))
+    made = solids(*zip(near, far), [1, 2])
+    fine = generic(64, -10.0, 10.0, 0.2, 10.0, divergence=3e-3)
+    exact = cast(made, Ground(), NO_GROUND, replace(fine, divergence=0.0))
+    beams = cast(made, Ground(), NO_GROUND, fine)
+    mixed = beams.owner == 0
+    mixed &= np.isfinite(beams.range)
+    low, high = exact.range[exact.owner > 0].min(), exact.range[exact.owner > 0].max()
+    assert mixed.sum() > 10 and ((beams.range > low) & (beams.range < high))[mixed].all()
+    unchanged = beams.range == exact.range
+    assert 0.9 < unchanged[exact.owner > 0].mean() < 1
+    x = (fine.directions() * np.where(np.isfinite(beams.range), beams.range, 0)[..., None])[..., 0]
+    assert (np.abs(x[beams.owner == 1] - 4.8) < 0.01).all()  # an owner's points are on it
+    apart = cast(replace(made, centre=made.centre + [[0, 0, 0], [3, 0, 0]]), Ground(), NO_GROUND,
+                 fine)
+    assert (apart.owner[np.isfinite(apart.range)] > 0).all()  # too far apart to mix
+    assert np.array_equal(beams.reached, exact.reached)
+
+
+def test_a_beam_within_one_surface_is_a_ray():
+    made = solids(BOX, (8, 0, 0), (1, 200, 200))
+    one, other = (cast(made, Ground(), NO_GROUND, s) for s in (SENSOR, WIDE))
+    inner = np.isfinite(np.roll(one.range, 1, 0)) & np.isfinite(np.roll(one.range, -1, 0))
+    assert np.array_equal(one.range[inner], other.range[inner])
+
+
+def test_random_numbers_are_uniform_and_keep_their_place():
+    place = torch.arange(40_000) + (7 << 32)
+    u = uniform(3, place).numpy()
+    assert 0 < u.min() and u.max() < 1 and len(np.unique(u)) == len(u)
+    assert np.abs(np.histogram(u, 20, (0, 1))[0] - 2000).max() < 5 * np.sqrt(2000)
+    assert abs(np.corrcoef(u[1:], u[:-1])[0, 1]) < 0.02
+    assert abs(np.corrcoef(u, uniform(4, place))[0, 1]) < 0.02
+    assert np.array_equal(uniform(3, place[123:125]), u[123:125])
+
+
+def test_flat_ground_is_at_height_over_sine():
+    plain = replace(SENSOR, lifts=())
+    hits = cast(crowd(0, 0), Ground(), OVER_ROAD, plain)
+    sine = -np.sin(np.array(plain.elevations))
+    expected = np.where(sine > 0, plain.height / np.where(sine > 0, sine, 1), np.inf)
+    expected[expected > plain.max_range] = np.inf
+    assert np.allclose(hits.range, expected[None], rtol=1e-9)
+    assert (hits.owner == 0).all() and (hits.solid == -1).all()
+
+
+def on_ground(ground, position=(3.0, 0.4), sensor=None):
+    sensor = sensor or replace(SENSOR, azimuth_step=np.radians(0.5))
+    position = np.array([*position, surface_height(ground, *position) + sensor.height])
+    hits = cast(crowd(0, 0), ground, position, sensor)
+    met = np.isfinite(hits.range)
+    turn = rays(sensor)
+    at = position + turn.origin + turn.direction * np.where(met, hits.range, 0.0)[..., None]
+    return at[met], hits.semantic[met], met, hits
+
+
+@pytest.mark.parametrize("ground", [
+    FULL, FULL._replace(crossings=()), FULL._replace(wave=0.0, camber=0.05),
+    Ground(0.02, -0.03, 0.1)])
+def test_the_ground_is_met_where_it_is(ground):
+    at, semantic, met, _ = on_ground(ground)
+    x, y, z = at.T
+    off = z - surface_height(ground, x, y)
+    edges = [np.abs(y - ground.curb_left), np.abs(y - ground.curb_right)]
+    edges += [np.abs(x - end) for pair in ground.crossings for end in pair]
+    curb = (np.min(edges, axis=0) < 1e-6) & (semantic == 48)
+    assert np.abs(off[~curb]).max() < 2e-3
+    assert np.abs(off[curb]).max(initial=0) <= ground.curb_height + 1e-6
+    assert met[:, -12:].mean() > 0.99
+    if ground.curb_height:
+        assert curb.sum() > 50 and (y > ground.curb_left).any() and (y < ground.curb_right).any()
+
+
+def test_no_ray_passes_through_the_ground():
+    _, _, met, hits = on_ground(FULL)
+    sensor = replace(SENSOR, azimuth_step=np.radians(0.5))
+    turn, start = rays(sensor), np.array([3.0, 0.4, surface_height(FULL, 3.0, 0.4) + 1.7])
+    for share in np.linspace(0.02, 0.995, 40):
+        way = turn.direction * (np.where(met, hits.range, 0.0) * share)[..., None]
+        x, y, z = ((start + turn.origin + way)[met]).T
+        assert (z - surface_height(FULL, x, y)).min() > -2e-3
+
+
+def test_classes_of_the_ground_are_where_they_belong():
+    at, semantic, _, _ = on_ground(FULL, sensor=replace(SENSOR, azimuth_step=np.radians(0.25)))
+    x, y, _ = at.T
+    crossing = ((x > 8) & (x < 15)) | ((x > -30) & (x < -22))
+    out = np.maximum(y - 6, -4 - y)
+    sure = (np.abs(out) > 1e-3) & (np.abs(out + 1.5) > 1e-3) & (np.abs(out - 2) > 1e-3)
+    for edge in (8, 15, -30, -22):
+        sure &= np.abs(x - edge) > 1e-3
+    expected = np.select([crossing, out < -1.5, out < 0, out < 2], [40, 40, 44, 48], 72)
+    assert np.array_equal(semantic[sure], expected[sure])
+    assert set(np.unique(semantic)) == {40, 44, 48, 72}
+
+
+def test_rough_ground_lies_within_its_roughness_and_stays_where_it_is():
+    rough = FULL._replace(rough=0.08, litter=0.04)
+    (at, semantic, _, _), (again, *_) = on_ground(rough), on_ground(rough)
+    assert np.array_equal(at, again)
+    off = at[:, 2] - surface_height(rough, at[:, 0], at[:, 1])
+    for chosen, most in ((semantic == 72, 0.08), (semantic == 40, 0.008), (semantic == 44, 0.04)):
+        near = chosen & (np.linalg.norm(at[:, :2], axis=1) < 20)
+        assert off[near].min() > -0.01 and np.quantile(off[near], 0.99) < 1.3 * most
+        assert off[near].std() > 0.1 * most
+    # The same bumps from elsewhere.
+    assert np.isfinite(on_ground(rough, (4.0, 0.4))[0]).all()
+
+
+def test_grass_is_rough_at_every_range_and_hides_what_is_behind_it():
+    meadow = Ground(curb_left=2.0, curb_right=-2.0, walk=0.0, rough=0.6)
+    at, _, met, hits = on_ground(meadow, sensor=HDL64E)
+    above = at[:, 2] - surface_height(meadow, at[:, 0], at[:, 1])
+    assert -0.01 < above.min() and above.max() < 0.6
+    wild = np.abs(at[:, 1]) > 8  # no tuft of the road's side reaches there
+    near, middle, far = roughness(at[wild], np.array([8.0, 12.0, 18.0, 30.0]))
+    assert 0.02 < min(near, middle, far) and max(near, middle, far) < 0.1
+    _, _, _, smooth = on_ground(meadow._replace(rough=0.0), sensor=HDL64E)
+    assert (hits.range[met] <= smooth.range[met] + 1e-9).all()
+
+
+def test_tufts_are_met_where_a_slow_march_meets_them():
+    rng = np.random.default_rng(1)
+    meadow = Ground(curb_left=2.0, curb_right=-2.0, walk=0.0, rough=0.5)
+    yaw = torch.as_tensor(rng.uniform(0.3, 2.8, 400))
+    down = torch.as_tensor(rng.uniform(0.06, 0.3, 400))
+    way = torch.stack([yaw.cos() * down.cos(), yaw.sin() * down.cos(), -down.sin()])
+    start = torch.tensor([0.0, 0.0, 1.7], dtype=torch.float64)[:, None].expand(3, 400)
+    found = cast_ground(meadow, start, way, 60.0).range
+    # The first place, 5 mm by 5 mm, at which the ray is below the tufts.
+    t = torch.arange(0.0, 30.0, 0.005, dtype=torch.float64)
+    places = start[:, :, None] + way[:, :, None] * t
+    top = tufts(meadow, places[0].ravel(), places[1].ravel()).reshape(400, -1)
+    first = t[(places[2] < top).to(torch.int8).argmax(1)]
+    off = found - first
+    # Steps are longer than tufts are thick: some are missed, and few met too early.
+    assert off.abs().quantile(0.5) < 0.1 and off.abs().quantile(0.9) < 0.5

@@ -1,0 +1,312 @@
+"""Laws of the comparison of simulated with real scans."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import cache
+from io import StringIO
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from rich.console import Console
+from samples import CALIBRATION, calibration_text, object_folder, scene, walker_label, write
+
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.cli.main import cli
+from lidar_perception.data.recording import Recorded, open_recording
+from lidar_perception.simulation.realism.compare import (
+    LEAST_SAMPLES,
+    MOST_SCANS,
+    compare,
+    factor_off,
+    labelled,
+    measure,
+    median_interval,
+    ratio,
+)
+from lidar_perception.simulation.realism.report import draw_realism, print_realism
+from lidar_perception.simulation.realism.scan_statistics import (
+    CLASSES,
+    CURVES,
+    is_whole,
+    object_rows,
+    scan_rows,
+    square_degrees,
+)
+from lidar_perception.types import CLASSES as KITTI_CLASSES
+from lidar_perception.types import GroundTruth, InputError, LidarFrame
+
+SCANS = 6
+FEET = -1.7
+SIZES = {"Car": (3.9, 1.6, 1.5), "Pedestrian": (0.8, 0.6, 1.75), "Cyclist": (1.8, 0.6, 1.7)}
+PLACES = {"Car": ((15.0, 6.0), (25.0, 9.0), (38.0, 2.0)),
+          "Pedestrian": ((13.0, -3.0), (24.0, -6.0)), "Cyclist": ((17.0, -7.0), (27.0, 1.0))}
+COUNTS = ("scan points", "points", "elevation", *(
+    f"{name} {what}" for name in CLASSES for what in ("points", "points of all", "density")))
+EXTENTS = [f"{name} {what}" for name in CLASSES for what in ("height", "length", "width")]
+LIGHT = [name for name in CURVES if "intensity" in name]
+
+
+def recorded(seed: int, points: int = 500) -> Recorded:
+    """A street all around, and objects full of points."""
+    rng = np.random.default_rng(seed)
+    reach, turn = rng.uniform(3, 70, 12000), rng.uniform(-np.pi, np.pi, 12000)
+    reach[:3000] = rng.uniform(3, 9, 3000)  # so dense that cells of the ground have enough
+    parts = [np.column_stack([reach * np.cos(turn), reach * np.sin(turn),
+                              rng.normal(FEET, 0.01, 12000)])]
+    boxes, ids = [], []
+    for name, places in PLACES.items():
+        for x, y in places:
+            size = np.array(SIZES[name])
+            centre = np.array([x, y, FEET + size[2] / 2]) + rng.uniform(-0.5, 0.5, 3) * [1, 1, 0]
+            parts.append(centre + rng.uniform(-0.5, 0.5, (points, 3)) * size)
+            boxes.append([*centre, *size, 0.0])
+            ids.append(KITTI_CLASSES.index(name))
+    xyz = np.concatenate(parts).astype(np.float32)
+    intensity = rng.beta(2, 4, len(xyz)).round(2).astype(np.float32)
+    extras = [{"occluded": 0, "truncated": 0.0} for _ in boxes]
+    return Recorded(str(seed), LidarFrame(xyz, intensity), GroundTruth.of(boxes, ids, extras),
+                    CALIBRATION.camera())
+
+
+def changed(change, count: int = SCANS) -> list[Recorded]:
+    """The street's scans with every frame changed."""
+    return [replace(r, frame=change(r.frame, np.random.default_rng(100 + i)))
+            for i, r in enumerate(map(recorded, range(count)))]
+
+
+@cache
+def street():
+    return measure(map(recorded, range(SCANS)), PAPER)
+
+
+def judged(content: dict, names=CURVES) -> list[dict]:
+    return [b for name in names for b in content["curves"][name]["bins"]
+            if b["within"] is not None]
+
+
+def test_a_recording_is_as_real_as_itself():
+    content = compare(street(), street())
+    assert content["within"] == content["judged"] == len(judged(content)) > 100
+    assert all(b["ratio"] == 1.0 and factor_off(b) == 1.0 for b in judged(content))
+    assert all(content["curves"][name]["judged"] for name in CURVES if "histogram" not in name)
+
+
+def test_half_the_points_are_found_by_the_points_and_not_by_the_heights():
+    def half(frame, rng):
+        return frame.take(np.flatnonzero(rng.random(len(frame)) < 0.5))
+    content = compare(street(), measure(changed(half), PAPER))
+    for name in COUNTS:
+        bins = [b for b in judged(content, [name]) if b["real"]["median"] >= 100]
+        assert all(b["ratio"] == pytest.approx(0.5, abs=0.1) for b in bins), name
+        assert content["curves"][name]["share"] < 0.5, name
+    assert all(b["within"] for b in judged(content, EXTENTS))
+    assert all(b["within"] for b in judged(content, LIGHT))
+
+
+def test_a_weaker_light_is_found_by_the_intensities_alone():
+    content = compare(street(), measure(
+        changed(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PAPER))
+    for name, curve in content["curves"].items():
+        if name not in LIGHT:
+            assert all(b["ratio"] in (1.0, None) for b in curve["bins"]), name
+        elif curve["judged"]:
+            assert all(b["ratio"] == pytest.approx(0.5, abs=0.03) for b in curve["bins"]), name
+
+
+def test_the_order_of_the_points_does_not_matter():
+    content = compare(street(), measure(
+        changed(lambda frame, rng: frame.take(rng.permutation(len(frame)))), PAPER))
+    for name, curve in content["curves"].items():
+        for b in curve["bins"]:
+            assert b["real"] == b["simulated"], name
+
+
+def test_counts_add_up():
+    one = recorded(0)
+    rows = {name: row[0] for name, row in scan_rows(one.frame).items()}
+    assert rows["points"].sum() == rows["scan points"][0] == len(one.frame)
+    assert ((rows["ground share"] >= 0) & (rows["ground share"] <= 1)
+            | np.isnan(rows["ground share"])).all()
+    assert (rows["person clusters"] <= rows["clusters"]).all()
+    for name in LIGHT:
+        row = {**rows, **{k: v[0] for k, v in object_rows(one).items()}}[name]
+        assert row.sum() == pytest.approx(1.0) if "histogram" in name else (np.diff(row) >= 0).all()
+
+
+def test_bins_with_few_real_samples_are_not_judged():
+    content = compare(measure(map(recorded, range(LEAST_SAMPLES - 1)), PAPER), street())
+    assert all(content["curves"][name]["judged"] == 0 for name in (*COUNTS, *EXTENTS))
+    for name, curve in content["curves"].items():
+        for b in curve["bins"]:
+            few = b["real"]["n"] < LEAST_SAMPLES or CURVES[name].histogram
+            assert (b["within"] is None) == few, (name, b)
+
+
+def test_what_is_missing_on_the_simulated_side_is_wrong():
+    content = compare(street(), measure([], PAPER))
+    assert content["within"] == 0 and content["judged"] == compare(street(), street())["judged"]
+
+
+def test_nothing_is_compared_with_nothing():
+    empty = Recorded("0", LidarFrame(np.zeros((0, 3), np.float32)), GroundTruth.of([], []),
+                     CALIBRATION.camera())
+    for scans in ([], [empty], [replace(empty, truth=None)]):
+        measured = measure(scans, PAPER)
+        content = compare(measured, measured)
+        assert (content["judged"], content["share"]) == (0, None)
+        print_realism(content, Console(file=StringIO()))
+
+
+def test_scans_without_intensity_or_camera_have_the_other_curves():
+    bare = [replace(r, camera=None, frame=replace(r.frame, intensity=None))
+            for r in map(recorded, range(2))]
+    measured = measure(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
+    assert all((len(rows) == 0) == (name in LIGHT) for name, rows in measured.rows.items()
+               if not name.startswith(("stage", "final")))
+
+
+def test_a_scan_cropped_to_the_view_counts_for_its_objects_only():
+    whole = recorded(0)
+    seen = np.flatnonzero(whole.camera.in_view(whole.frame.xyz))
+    cropped = replace(whole, frame=whole.frame.take(seen))
+    assert is_whole(whole.frame) and not is_whole(cropped.frame)
+    measured = measure([cropped], PAPER)
+    assert (measured.scans, measured.whole_scans) == (1, 0)
+    assert all(not measured.rows[name] for name in ("points", "clusters", "ground intensity"))
+    expected = object_rows(whole)
+    assert all(np.array_equal(rows, expected[name], equal_nan=True)
+               for name, rows in object_rows(cropped).items())
+
+
+def test_objects_at_the_border_of_the_image_do_not_count():
+    one = recorded(0)
+    border = one.truth.boxes[:1].copy()
+    while one.camera.in_view(border[:, :3]).all():
+        border[0, 1] += 0.1
+    border[0, 1] -= 0.2  # the centre is seen, a half is not
+    assert object_rows(replace(one, truth=GroundTruth.of(border, [0]))) == {}
+
+
+@pytest.mark.parametrize("level", [1, 2, 3])
+def test_occluded_objects_count_for_all_points_only(level):
+    one = recorded(0)
+    truth = replace(one.truth, extras=tuple({"occluded": level} for _ in one.truth.extras))
+    found = set(object_rows(replace(one, truth=truth)))
+    assert found == {name for name in object_rows(one)
+                     if name.endswith("points of all") or "intensity" in name}
+
+
+def test_square_degrees():
+    upright = np.array([20.0, 0, 0, 0.5, 0.5, 1.7, 0])
+    assert square_degrees(upright) == pytest.approx(np.degrees(0.5 / 20) * np.degrees(1.7 / 20),
+                                                    rel=0.01)
+    turned = np.array([0, 20.0, 0, 0.5, 0.5, 1.7, np.pi / 2])
+    assert square_degrees(turned) == pytest.approx(square_degrees(upright))
+    side, behind = (np.array([20.0, 0, 0, 4, 2, 1.5, yaw]) for yaw in (np.pi / 2, 0))
+    assert square_degrees(side) == pytest.approx(2 * square_degrees(behind), rel=0.01)
+
+
+def test_ratio():
+    assert ratio(3.0, 2.0) == 1.5 and ratio(0.0, 0.0) == 1.0
+    assert ratio(1.0, 0.0) is None and ratio(None, 1.0) is None and ratio(1.0, None) is None
+
+
+def test_the_interval_holds_the_median():
+    rng = np.random.default_rng(0)
+    for count, least in ((5, 0.93), (27, 0.95), (200, 0.95)):
+        limits = [median_interval(rng.normal(size=count)) for _ in range(2000)]
+        assert np.mean([low <= 0 <= high for low, high in limits]) > least - 0.02
+    assert median_interval(np.array([3.0])) == [3.0, 3.0]
+
+
+def test_what_lies_among_uncertain_real_samples_is_plausible():
+    def thinned(shares):
+        return measure([replace(r, frame=r.frame.take(np.flatnonzero(
+            np.random.default_rng(100).random(len(r.frame)) < share)))
+            for r, share in zip(map(recorded, range(SCANS)), shares)], PAPER)
+    content = compare(thinned(np.linspace(0.3, 1, SCANS)), thinned([0.9] * SCANS))
+    points = judged(content, ["scan points", "Car points"])
+    assert not any(b["within"] for b in points) and all(b["plausible"] for b in points)
+    assert content["within"] < content["plausible"] <= content["judged"]
+    assert all(b["plausible"] for b in judged(content) if b["within"])
+
+
+def test_content_survives_json_and_is_shown(tmp_path):
+    import matplotlib.pyplot as plt
+    content = compare(street(), measure(map(recorded, range(3)), PAPER))
+    again = json.loads(json.dumps(content, allow_nan=False))
+    assert again == content
+    shown = StringIO()
+    print_realism(again, Console(file=shown, width=100))
+    assert f"{content['within']} of {content['judged']} bins" in shown.getvalue()
+    draw_realism(tmp_path / "new/realism.png", compare(street(), measure([], PAPER)))
+    picture = plt.imread(tmp_path / "new/realism.png")
+    assert min(picture.shape[:2]) > 1000 and picture[..., :3].std() > 0.05
+    with pytest.raises(InputError, match="cannot write"):
+        draw_realism(tmp_path / "new/realism.png/no.png", again)
+
+
+def tracking_folder(root):
+    write(root / "training/velodyne/0000/000003.bin", scene().tobytes())
+    write(root / "training/calib/0000.txt", calibration_text())
+    write(root / "training/label_02/0000.txt", f"3 7 {walker_label()}\n")
+    return root
+
+
+@pytest.mark.parametrize("make", [lambda root: object_folder(root, walker_label(), 1),
+                                  tracking_folder])
+def test_object_and_tracking_folders_are_read(tmp_path, make):
+    measured = measure(labelled(open_recording(kitti=make(tmp_path))), PAPER)
+    assert measured.objects == {"Car": 0, "Pedestrian": 1, "Cyclist": 0}
+    assert (measured.scans, measured.whole_scans, measured.skipped) == (1, 1, [])
+
+
+def test_folders_without_labels_are_refused(tmp_path):
+    object_folder(tmp_path)
+    for label in tmp_path.rglob("label_2/*.txt"):
+        label.unlink()
+    with pytest.raises(InputError, match="no labels"):
+        labelled(open_recording(kitti=tmp_path))
+
+
+def test_broken_scans_are_skipped_and_counted(tmp_path):
+    scans = sorted(object_folder(tmp_path, walker_label(), 3).rglob("velodyne/*.bin"))
+    write(scans[1], b"cut")
+    measured = measure(labelled(open_recording(kitti=tmp_path)), PAPER)
+    assert measured.scans == 2 and len(measured.skipped) == 1
+    assert compare(measured, measured)["real"]["skipped"] == measured.skipped
+    for scan in scans:
+        write(scan, b"cut")
+    with pytest.raises(InputError, match=r"none of 3 scans can be read: .*000000.bin"):
+        measure(labelled(open_recording(kitti=tmp_path)), PAPER)
+
+
+def test_of_a_large_folder_an_even_choice_is_compared(tmp_path):
+    recording = open_recording(kitti=object_folder(tmp_path, walker_label(), 1))
+    many = [replace(recording.frames[0], name=str(i)) for i in range(3 * MOST_SCANS)]
+    chosen = labelled(replace(recording, frames=many, count=len(many)))
+    numbers = [int(f.name) for f in chosen.frames]
+    assert chosen.count == len(numbers) == MOST_SCANS
+    assert (numbers[0], numbers[-1]) == (0, len(many) - 1) and set(np.diff(numbers)) <= {3, 4}
+
+
+def test_the_command_compares(tmp_path):
+    root, made = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "made"
+    result = CliRunner().invoke(cli, [
+        "simulate", "--compare", str(root), "--frames", "1", "--json", str(made / "realism.json"),
+        "--png", str(made / "realism.png")], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    content = json.loads((made / "realism.json").read_text())
+    assert set(content["curves"]) == set(CURVES) and (made / "realism.png").stat().st_size > 1e5
+    assert content["real"]["scans"] == content["simulated"]["scans"] == 1
+
+
+def test_real_scans_are_as_real_as_themselves(data):
+    scans = [r for r in open_recording(kitti=data / "kitti_object") if is_whole(r.frame)][:2]
+    first, second = (measure(scans, PAPER) for _ in range(2))
+    content = compare(first, second)
+    assert all(b["ratio"] in (1.0, None) for c in content["curves"].values() for b in c["bins"])
+    assert first.whole_scans == 2

@@ -1,0 +1,60 @@
+"""Laws of the roughness of the ground."""
+
+import numpy as np
+import pytest
+
+from lidar_perception.simulation.realism.roughness import LEAST_CELLS, roughness, scatter_of_cells
+
+LIMITS = np.array([0.0, 5.0, 15.0, np.inf])
+
+
+def plane(seed, count=8000, slopes=(0.0, 0.0), noise=0.0):
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(-12, 12, (count, 2))
+    return np.column_stack([xy, xy @ slopes - 1.7 + rng.normal(0, noise, count)])
+
+
+@pytest.mark.parametrize("slopes", [(0.0, 0.0), (0.1, -0.05)])
+def test_a_plane_is_smooth_however_it_leans(slopes):
+    middle, scatter = scatter_of_cells(plane(0, slopes=slopes))
+    assert len(middle) > 400 and scatter.max() < 1e-4
+
+
+def test_scatter_is_the_noise_less_what_the_planes_take():
+    _, scatter = scatter_of_cells(plane(1, 40_000, (0.05, 0.0), 0.03))
+    assert np.sqrt((scatter ** 2).mean()) == pytest.approx(0.03, rel=0.04)
+
+
+def test_a_beam_s_line_of_points_has_a_plane():
+    y = np.linspace(-10, 10, 1000)
+    line = np.column_stack([np.full(1000, 8.3), y, 0.02 * y])
+    assert scatter_of_cells(line)[1].max() < 1e-3
+
+
+def test_a_cell_with_something_on_it_is_no_ground_and_a_few_points_above_do_not_count():
+    ground = plane(2)
+    post = np.column_stack([np.full(200, 4.5), np.full(200, 4.5), np.linspace(-1.7, 0.3, 200)])
+    few = np.column_stack([np.full(2, -4.5), np.full(2, 4.5), [0.5, 1.0]])
+    alone, _ = scatter_of_cells(ground)
+    middle, scatter = scatter_of_cells(np.concatenate([ground, post, few]))
+    assert len(middle) == len(alone) - 1 and scatter.max() < 1e-4
+
+
+def test_order_and_place_of_the_origin_of_heights_make_no_difference():
+    xyz = plane(3, noise=0.02)
+    expected = roughness(xyz, LIMITS)
+    shuffled = np.random.default_rng(0).permutation(xyz) + [0.0, 0.0, 5.0]
+    np.testing.assert_allclose(roughness(shuffled, LIMITS), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("count", [0, 1, 7])
+def test_too_few_points_have_no_roughness(count):
+    assert np.isnan(roughness(np.zeros((count, 3), np.float32), LIMITS)).all()
+    assert len(scatter_of_cells(np.zeros((count, 3)))[0]) == 0
+
+
+def test_a_range_needs_some_cells():
+    few = plane(4)
+    few = few[np.hypot(few[:, 0], few[:, 1]) < 5]
+    row = roughness(few, np.array([0.0, 5.0, 15.0]))
+    assert LEAST_CELLS < 60 and row[0] < 1e-4 and np.isnan(row[1])

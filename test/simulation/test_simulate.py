@@ -1,0 +1,218 @@
+"""Laws of the command that makes data sets: neither a stop nor the number of processes changes a
+byte, and what is there is not touched."""
+
+import contextlib
+import errno
+import itertools
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from simulate_samples import arguments, content, run
+
+from lidar_perception.cli.simulate import simulate
+from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.simulation import dataset
+from lidar_perception.simulation.dataset import LAYOUTS
+from lidar_perception.simulation.drive import scan_at
+from lidar_perception.types import InputError
+
+pytestmark = pytest.mark.usefixtures("streets", "tiny_sensor")
+ROOT = Path(__file__).resolve().parents[2]
+SCRIPT = """
+from lidar_perception.simulation.sensor import SENSORS, generic
+SENSORS["tiny"] = generic(16, -14.0, 3.0, 2.0, 10.0)
+from lidar_perception.cli.main import main
+main()
+"""
+
+
+@pytest.mark.parametrize("layout, streets_of", [("kitti", 5), ("semantickitti", 2)])
+def test_the_number_of_processes_changes_no_byte(tmp_path, layout, streets_of):
+    for name, jobs in (("one", 1), ("two", 2)):
+        result = run(tmp_path / name, layout, 5, jobs, "--streets-of", streets_of)
+        assert result.exit_code == 0, result.output
+    expected = content(tmp_path / "one")
+    assert content(tmp_path / "two") == expected
+    record = json.loads(expected["dataset.json"])
+    assert record.items() >= {"format": layout, "sensor": "tiny", "seed": 3, "frames": 5,
+                              "streets_of": streets_of}.items()
+    assert "simulate" in record["command"] and record["version"]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_data_set_that_failed_in_the_middle_is_marked_and_resumed(made, tmp_path, monkeypatch,
+                                                                     layout):
+    out, calls = tmp_path / "set", itertools.count()
+
+    def fails(*args):
+        if next(calls) == 3:
+            raise ZeroDivisionError
+        return scan_at(*args)
+
+    with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
+        patch.setattr(dataset, "scan_at", fails)
+        run(out, layout, 5, 1, "--streets-of", 2)
+    assert json.loads((out / "INCOMPLETE").read_text())["frames"] == 5
+    assert not (out / "dataset.json").exists()
+    result = run(out, layout, 5, 1, "--streets-of", 2, "--resume")
+    assert result.exit_code == 0 and "3 of them from before" in result.output
+    assert content(out) == content(made / layout)
+    again = run(out, layout, 5, 1, "--streets-of", 2, "--resume")
+    assert again.exit_code == 0 and "nothing to do" in again.output
+    assert content(out) == content(made / layout)
+
+
+@pytest.fixture
+def start():
+    """start(out, frames, ...): the command in a process group of its own, once it has finished a
+    few frames. Whatever happens, none of the group outlives the test."""
+    groups = []
+
+    def begun(out, frames, *more):
+        process = subprocess.Popen(
+            [sys.executable, "-c", SCRIPT, "simulate",
+             *arguments(out, "kitti-tracking", frames, 2, *more)],
+            cwd=ROOT, env={**os.environ, "PYTHONPATH": str(ROOT)}, start_new_session=True,
+            text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+            # A shell lets what it starts in the background ignore SIGINT.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL))
+        groups.append(process.pid)
+        while len(list(out.glob(".parts/*.json"))) < 3:
+            assert process.poll() is None, process.stderr.read()
+            time.sleep(0.01)
+        return process
+
+    yield begun
+    for group in groups:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(group, signal.SIGKILL)
+
+
+def wait_for_the_end(group):
+    """Until no process of the group is left."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.02)
+    pytest.fail("a process is still there")
+
+
+def test_after_a_kill_nothing_runs_on_and_it_goes_on_where_it_was(start, tmp_path):
+    out, frames = tmp_path / "set", 40
+    process = start(out, frames, "--streets-of", 30)
+    os.kill(process.pid, signal.SIGKILL)  # its children end by themselves
+    process.wait()
+    wait_for_the_end(process.pid)
+    assert "Traceback" not in process.communicate()[1]
+    assert (out / "INCOMPLETE").exists()
+    (out / "training/velodyne/0000/.000299.bin.1.tmp").write_bytes(b"half")  # as a kill leaves it
+    assert 3 <= len(list(out.glob(".parts/*.json"))) < frames
+    again = run(out, "kitti-tracking", frames, 1, "--streets-of", 30, "--resume")
+    assert again.exit_code == 0
+    assert run(tmp_path / "whole", "kitti-tracking", frames, 1, "--streets-of", 30).exit_code == 0
+    assert content(out) == content(tmp_path / "whole")
+    assert len(open_kitti(out)) == frames
+    assert len(list(out.glob("training/label_02/*.txt"))) == 2
+
+
+def test_two_writers_do_not_meet_and_ctrl_c_ends_all_processes(start, tmp_path):
+    process = start(tmp_path / "set", 100_000)
+    for more in (["--resume"], ["--force"], []):
+        with pytest.raises(InputError, match="another process"):
+            run(tmp_path / "set", "kitti-tracking", 100_000, 2, *more)
+    os.killpg(process.pid, signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    wait_for_the_end(process.pid)
+    assert process.returncode not in (0, None) and "Traceback" not in errors
+    assert (tmp_path / "set/INCOMPLETE").exists()
+    assert not list((tmp_path / "set").rglob("dataset.json"))
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+def test_a_full_disk_is_one_line_and_exit_code_1(made, tmp_path, monkeypatch, call):
+    out, calls, real = tmp_path / "set", itertools.count(), getattr(os, call)
+
+    def full(*args, **others):
+        if next(calls) >= 6:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return real(*args, **others)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, call, full)
+        result = run(out, "kitti", 5, 1, "--streets-of", 2)
+    assert result.exit_code == 1
+    assert "No space left on device" in result.output and "--resume" in result.output
+    assert len(result.output.strip().splitlines()) == 1
+    assert (out / "INCOMPLETE").exists() and not list(out.rglob(".*.tmp"))
+    assert run(out, "kitti", 5, 1, "--streets-of", 2, "--resume").exit_code == 0
+    assert content(out) == content(made / "kitti")
+
+
+def test_a_process_that_cannot_write_ends_the_others_too(tmp_path):
+    blocked = tmp_path / "set/training/velodyne/000003.bin"
+    run(tmp_path / "set", "kitti", 5, 1, "--streets-of", 5)
+    (tmp_path / "set/dataset.json").rename(tmp_path / "set/INCOMPLETE")  # .parts is gone already
+    blocked.unlink()
+    blocked.mkdir()
+    result = run(tmp_path / "set", "kitti", 5, 2, "--streets-of", 5, "--resume")
+    assert result.exit_code == 1 and "cannot write" in result.output
+    assert "000003.bin" in result.output and (tmp_path / "set/INCOMPLETE").exists()
+
+
+def test_what_is_there_is_not_touched_without_a_word(made, tmp_path):
+    out = tmp_path / "set"
+    assert run(out, "kitti", 2).exit_code == 0
+    before = content(out)
+    with pytest.raises(InputError, match="exists already"):
+        run(out, "kitti", 3)
+    with pytest.raises(InputError, match="was begun with frames 2, not 3"):
+        run(out, "kitti", 3, 1, "--resume")
+    assert content(out) == before
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine/letter.txt").write_text("dear")
+    for flag in ("--resume", "--force"):
+        with pytest.raises(InputError, match="no simulated data set"):
+            run(tmp_path / "mine", "kitti", 2, 1, flag)
+    assert content(tmp_path / "mine") == {"letter.txt": b"dear"}
+    with pytest.raises(InputError, match="is a file"):
+        run(tmp_path / "mine/letter.txt", "kitti", 2, 1, "--force")
+    assert run(out, "semantickitti", 5, 1, "--streets-of", 2, "--force").exit_code == 0
+    assert content(out) == content(made / "semantickitti")
+
+
+def test_resume_names_every_difference(tmp_path, monkeypatch):
+    out = tmp_path / "set"
+    with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
+        patch.setattr(dataset, "scan_at", lambda *_: 1 / 0)
+        run(out)
+    with pytest.raises(InputError, match=r"format 'kitti', not 'semantickitti'; streets_of 1") as e:
+        run(out, "semantickitti", 5, 1, "--resume")
+    assert "\n" not in str(e.value)
+    (out / "INCOMPLETE").write_text("{")
+    with pytest.raises(InputError, match="cannot read"):
+        run(out, "kitti", 5, 1, "--resume")
+    assert run(out, "kitti", 2, 1, "--force").exit_code == 0
+
+
+@pytest.mark.parametrize("options, said", [
+    (["--sensor", "hdl65"], "unknown sensor 'hdl65': must be one of hdl64e"),
+    (["--format", "pcap"], "pcap"), (["--frames", "0"], "0 is not in the range"),
+    (["--seed", "-1"], "-1 is not in the range"), (["--streets-of", "201"], "1 .. 200"),
+    (["--resume", "--force"], "one of them"), (["--format", "mcap", "--resume"], "convert kitti")])
+def test_bad_arguments_are_named(tmp_path, options, said):
+    arguments = ["--out", str(tmp_path / "set"), "--format", "kitti", *options]
+    result = CliRunner().invoke(simulate, arguments)
+    text = result.output + str(result.exception)
+    assert result.exit_code != 0 and said in text
+    assert isinstance(result.exception, SystemExit | InputError)
+    assert not (tmp_path / "set").exists()

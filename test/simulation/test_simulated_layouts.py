@@ -1,0 +1,227 @@
+"""Laws of simulated data sets: scans have what they promise, and are read back from every
+layout."""
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from simulate_samples import TINY, run
+
+from lidar_perception.data.kitti import write as write_kitti
+from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.kitti.labels import read_object_labels, read_tracking_labels
+from lidar_perception.data.recording import open_recording
+from lidar_perception.data.semantickitti import MOVING, THINGS, open_semantic_kitti
+from lidar_perception.geometry import box_corners, points_in_box, wrap_angle
+from lidar_perception.simulation.batch import training_scans
+from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
+from lidar_perception.simulation.drive import drive, scan_at, scans, scans_at
+from lidar_perception.simulation.scene import CROWDED
+from lidar_perception.simulation.sensor import SENSORS
+
+pytestmark = pytest.mark.usefixtures("streets", "tiny_sensor")
+
+
+def test_scans_and_drive_are_the_same_and_any_scan_can_be_had_alone():
+    several = list(scans(3, 3, TINY))
+    for i, (scan, (frame, truth)) in enumerate(zip(several, drive(3, 3, TINY))):
+        alone = scan_at(3, i, TINY)
+        assert scan.frame.xyz.tobytes() == frame.xyz.tobytes() == alone.frame.xyz.tobytes()
+        assert np.array_equal(scan.semantic, alone.semantic)
+        assert truth.extras == scan.truth.extras == alone.truth.extras
+    assert np.array_equal(several[0].pose, np.eye(4)) and several[2].pose[0, 3] > 0
+
+
+def test_columns_of_a_scan_fit_its_points():
+    scan = scan_at(3, 7, TINY)
+    xyz, n = scan.frame.xyz.astype(float), len(scan.frame)
+    assert {scan.semantic.dtype, scan.instance.dtype, scan.ring.dtype} == {np.dtype(np.uint16)}
+    assert all(len(c) == n for c in (scan.semantic, scan.instance, scan.ring, scan.time))
+    elevation = np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1]))
+    off = np.abs(elevation - np.array(TINY.elevations)[scan.ring])
+    assert np.median(off) < 0.01  # beams start a little above each other, and the sensor moves
+    assert scan.time.dtype == np.float32 and np.ptp(scan.time) < 1 / TINY.rate
+    ahead = (np.abs(xyz[:, 1]) < 0.1) & (xyz[:, 0] > 0)
+    assert np.abs(scan.time[ahead]).max() < 0.01  # the stamp is when the sensor looks ahead
+    assert scan.instance[np.isin(scan.semantic, (40, 48, 50, 70, 72, 80))].max() == 0
+    things = scan.instance > 0
+    assert np.isin(scan.semantic[things], [*THINGS, *MOVING, 99]).all()  # 99: what one carries
+    assert np.isin(scan.semantic, list(MOVING)).any() and (scan.semantic == 10).any()
+    for box, extra in zip(scan.truth.boxes, scan.truth.extras):
+        own = scan.instance == extra["track_id"]
+        assert own.sum() == extra["num_points"]
+        assert points_in_box(xyz[own], box, margin=1.0).all()  # what moves, mirrors, umbrellas
+
+
+def test_object_layout_reads_back(made):
+    recording = open_recording(kitti=made / "kitti")
+    assert recording.count == 5
+    for number, recorded in enumerate(recording):
+        scan = scan_at(3 + number // 2, number % 2, TINY)
+        order = np.argsort(scan.ring, kind="stable")
+        assert recorded.name == f"{number:06}"
+        assert np.array_equal(recorded.frame.xyz, scan.frame.xyz[order])
+        assert np.array_equal(recorded.frame.intensity, scan.frame.intensity[order])
+        assert np.allclose(recorded.camera.projection, FORWARD_CAMERA.camera().projection)
+        assert (recorded.camera.width, recorded.camera.height) == (1242, 375)
+        same_objects(recorded.truth, kitti_labels(scan.truth), 0.0051)
+
+
+def test_what_is_hidden_or_nearly_so_is_not_labelled_but_marked():
+    scan = scan_at(33, 0, SENSORS["hdl64e"], CROWDED)
+    seen, labels = write_kitti.seen_by_camera(scan.truth, FORWARD_CAMERA), kitti_labels(scan.truth)
+    assert 0 < len(labels) < len(seen) == len(labels) + len(labels.notes)
+    assert all(e["num_points"] >= 5 and e["visible"] >= 0.15 for e in labels.extras)
+    kept = {e["track_id"] for e in labels.extras}
+    left_out = [e for e in seen.extras if e["track_id"] not in kept]
+    assert all(e["num_points"] < 5 or e["visible"] < 0.15 for e in left_out)
+    assert [e["bbox"] for e in left_out] == [note["bbox"] for _, note in labels.notes]
+
+
+def test_tracking_layout_reads_back(made):
+    frames = open_kitti(made / "kitti-tracking")
+    assert [f.name for f in frames] == ["0000/000000", "0000/000001", "0001/000000", "0001/000001",
+                                        "0002/000000"]
+    for number, recorded in enumerate(open_recording(kitti=made / "kitti-tracking")):
+        scan = scan_at(3 + number // 2, number % 2, TINY)
+        expected = kitti_labels(scan.truth)
+        same_objects(recorded.truth, expected, 6e-7, truncation=0.26)
+        assert ([e["track_id"] for e in recorded.truth.extras]
+                == [e["track_id"] for e in expected.extras])
+
+
+def same_objects(found, expected, accuracy, truncation=None):
+    """Equal up to the digits of the text."""
+    assert found.labels == expected.labels
+    assert [name for name, _ in found.notes] == [name for name, _ in expected.notes]
+    for (_, a), (_, b) in zip(found.notes, expected.notes):
+        assert a["bbox"] == pytest.approx(b["bbox"], abs=accuracy)
+    assert np.abs(found.boxes - expected.boxes)[:, :6].max(initial=0) <= 1.6 * accuracy
+    turned = wrap_angle(found.boxes[:, 6] - expected.boxes[:, 6])
+    assert np.abs(turned).max(initial=0) <= accuracy
+    for a, b in zip(found.extras, expected.extras):
+        scale = 2 if truncation else 1  # a level in the tracking layout
+        assert abs(a["truncated"] / scale - b["truncated"]) <= (truncation or accuracy)
+        assert a["occluded"] == b["occluded"]
+        assert np.allclose(a["bbox"], b["bbox"], atol=accuracy)
+
+
+def test_semantickitti_layout_reads_back(made):
+    root = made / "semantickitti"
+    frames = open_semantic_kitti(root)
+    assert [f.name for f in frames] == ["00/000000", "00/000001", "01/000000", "01/000001",
+                                        "02/000000"]
+    for number, frame in enumerate(frames):
+        scan = scan_at(3 + number // 2, number % 2, TINY)
+        order = np.argsort(scan.ring, kind="stable")
+        read, semantic, instance = frame.load()
+        assert np.array_equal(read.xyz, scan.frame.xyz[order])
+        assert np.array_equal(semantic, scan.semantic[order])
+        assert np.array_equal(instance, scan.instance[order])
+    for sequence in range(2):
+        folder = root / f"sequences/{sequence:02}"
+        calibration = dict(line.split(": ") for line in
+                           (folder / "calib.txt").read_text().splitlines())
+        to_camera = np.vstack([np.fromstring(calibration["Tr"], sep=" ").reshape(3, 4),
+                               [0, 0, 0, 1]])
+        poses = np.loadtxt(folder / "poses.txt").reshape(-1, 3, 4)
+        assert np.loadtxt(folder / "times.txt").tolist() == [0.0, 0.1]
+        for moment, pose in enumerate(poses):  # as SemanticKITTI's own tools do
+            pose = np.linalg.inv(to_camera) @ np.vstack([pose, [0, 0, 0, 1]]) @ to_camera
+            assert np.allclose(pose, scan_at(3 + sequence, moment, TINY).pose, atol=1e-9)
+
+
+def test_a_bag_goes_on_with_the_next_street(tmp_path):
+    result = run(tmp_path / "bag", "mcap", 4, 1, "--streets-of", 2)
+    assert result.exit_code == 0, result.output
+    recording = list(open_recording(bag=tmp_path / "bag"))
+    for number, recorded in enumerate(recording):
+        scan = scan_at(3 + number // 2, number % 2, TINY)
+        assert np.array_equal(recorded.frame.xyz, scan.frame.xyz)
+    stamps = [r.frame.stamp_ns for r in recording]
+    assert np.diff(stamps).tolist() == [10**8, 101 * 10**8, 10**8]
+
+
+def test_2d_boxes_are_those_of_the_corners_in_the_image():
+    rng = np.random.default_rng(0)
+    boxes = np.column_stack([rng.uniform(-10, 60, 300), rng.uniform(-20, 20, 300),
+                             rng.uniform(-2, 1, 300), rng.uniform(0.3, 6, (300, 3)),
+                             rng.uniform(-4, 4, 300)])
+    found, outside = write_kitti.image_boxes(boxes, FORWARD_CAMERA)
+    seen = np.isfinite(found[:, 0])
+    assert 30 < seen.sum() < 250 and ((outside >= 0) & (outside <= 1)).all()
+    assert (found[seen] >= 0).all() and (found[seen] <= [1241, 374, 1241, 374]).all()
+    projection = FORWARD_CAMERA.camera().projection
+    corners = box_corners(boxes) @ projection[:, :3].T + projection[:, 3]
+    whole = (corners[..., 2] > write_kitti.NEAR).all(axis=1)
+    pixels = corners[..., :2] / corners[..., 2:]
+    inside = whole & ((pixels >= 0) & (pixels <= [1241, 374])).all(axis=(1, 2)) & seen
+    assert inside.sum() > 10 and np.abs(outside[inside]).max() < 1e-9
+    assert np.allclose(found[inside], np.concatenate([pixels[inside].min(axis=1),
+                                                      pixels[inside].max(axis=1)], axis=1))
+    # Many points of a box that reaches behind the camera: none in the image is outside its 2D box.
+    for box, limits in zip(boxes[~whole & seen], found[~whole & seen]):
+        inner = (rng.uniform(-0.5, 0.5, (4000, 3)) * box[3:6])
+        cos, sin = np.cos(box[6]), np.sin(box[6])
+        points = inner @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) + box[:3]
+        p = points @ projection[:, :3].T + projection[:, 3]
+        p = p[p[:, 2] > write_kitti.NEAR]
+        uv = np.clip(p[:, :2] / p[:, 2:], 0, [1241, 374])
+        assert (uv >= limits[:2] - 1e-6).all() and (uv <= limits[2:] + 1e-6).all()
+
+
+def test_2d_boxes_are_those_of_real_labels(data):
+    worst, shares = [], []
+    for frame in open_kitti(data / "kitti_object"):
+        truth = frame.truth()
+        boxes, outside = write_kitti.image_boxes(truth.boxes, frame.calibration())
+        for box, share, extra in zip(boxes, outside, truth.extras):
+            worst.append(np.abs(box - extra["bbox"]).max())
+            shares.append(abs(share - extra["truncated"]))
+    assert np.median(worst) < 0.5 and np.max(shares) < 0.07
+
+
+def test_labels_without_objects_read_back(tmp_path):
+    nothing = scan_at(3, 0, TINY).truth
+    nothing = type(nothing).of([], [])
+    write_kitti.write_object(tmp_path, 0, np.zeros((0, 4)), nothing, FORWARD_CAMERA)
+    assert len(read_object_labels(tmp_path / "training/label_2/000000.txt", np.eye(4))) == 0
+    text = write_kitti.tracking_label_text(0, nothing, FORWARD_CAMERA)
+    (tmp_path / "0000.txt").write_text(text)
+    assert read_tracking_labels(tmp_path / "0000.txt", np.eye(4)) == {}
+
+
+def test_scans_that_are_cast_together_are_those_cast_alone():
+    places = [(3, 0), (5, 0), (3, 2)]
+    for scan, place in zip(scans_at(places, TINY), places):
+        alone = scan_at(*place, TINY)
+        assert np.array_equal(scan.frame.xyz, alone.frame.xyz)
+        assert np.array_equal(scan.instance, alone.instance)
+        assert np.array_equal(scan.truth.boxes, alone.truth.boxes)
+        assert scan.truth.extras == alone.truth.extras
+
+
+def test_training_scans_are_the_streets_in_order():
+    for street, batch in zip((3, 4, 5), training_scans(3, TINY)):
+        scan = scan_at(street, 0, TINY)
+        assert batch["points"].dtype == batch["boxes"].dtype == torch.float32
+        assert np.array_equal(batch["points"][:, :3], scan.frame.xyz)
+        assert np.array_equal(batch["points"][:, 3], scan.frame.intensity)
+        assert np.allclose(batch["boxes"], scan.truth.boxes)
+        assert batch["class_ids"].tolist() == scan.truth.class_ids.tolist()
+        assert batch["num_points"].tolist() == [e["num_points"] for e in scan.truth.extras]
+
+
+class Streets(torch.utils.data.IterableDataset):
+    """What a user writes for a DataLoader."""
+
+    def __iter__(self):
+        return itertools.islice(training_scans(3, TINY), 2)
+
+
+def test_workers_of_a_loader_share_the_streets():
+    expected = sorted(batch["points"].numpy().tobytes()
+                      for batch in itertools.islice(training_scans(3, TINY), 4))
+    loader = torch.utils.data.DataLoader(Streets(), batch_size=None, num_workers=2)
+    assert sorted(batch["points"].numpy().tobytes() for batch in loader) == expected

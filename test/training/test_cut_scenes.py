@@ -1,0 +1,272 @@
+"""Clusters cut from labelled scenes, changed, learned from and counted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from pointnet_samples import SMALL, blobs
+from samples import CALIBRATION
+
+from lidar_perception.detectors.pointnet.clusters import Clusters
+from lidar_perception.detectors.pointnet.config import pointnet_config
+from lidar_perception.detectors.pointnet.network import make_pointnet
+from lidar_perception.detectors.pointnet.predict import Predictions
+from lidar_perception.geometry import points_in_box, wrap_angle
+from lidar_perception.scoring.points.clusters import (
+    UNKNOWN,
+    ClusterScores,
+    labelled,
+    point_labels,
+    uncared,
+    unknown_where,
+)
+from lidar_perception.training.augment import Scene
+from lidar_perception.training.data import JudgedScenes
+from lidar_perception.training.params import ClusterAugmentParams
+from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes, cut
+from lidar_perception.training.pointnet.task import (
+    FEWEST,
+    ClusterPreparation,
+    changed,
+    judged_clusters,
+    make_loss,
+    validated,
+)
+from lidar_perception.types import CLASSES, GroundTruth, InputError, LidarFrame
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+CONFIG = pointnet_config(**SMALL)
+STILL = ClusterAugmentParams(box_shift=0, farther=0, dropout=0, beam_noise=0, range_noise=0,
+                             scale=0, flip=0, intensity=0, height=0, shine=0)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(8)
+
+
+def ids(*names):
+    return np.array([CLASSES.index(name) for name in names])
+
+
+def in_boxes(rng, boxes, count=60):
+    """Clusters of points that fill boxes."""
+    parts = []
+    for box in boxes:
+        unit = rng.uniform(-0.49, 0.49, (count, 3)) * box[3:6]
+        cos, sin = np.cos(box[6]), np.sin(box[6])
+        turned = np.column_stack([cos * unit[:, 0] - sin * unit[:, 1],
+                                  sin * unit[:, 0] + cos * unit[:, 1], unit[:, 2]])
+        parts.append(np.column_stack([turned + box[:3], rng.random(count)]))
+    points = np.concatenate(parts).astype(np.float32)
+    return Clusters(points, np.arange(len(boxes) + 1) * count, np.arange(1, len(boxes) + 1))
+
+
+BOXES = np.array([[10, 2, -0.9, 4, 1.7, 1.5, 0.4], [8, -6, -0.85, 0.7, 0.7, 1.75, 0],
+                  [15, 5, -0.85, 1.8, 0.7, 1.75, 2.0], [20, -9, -0.4, 5, 2, 2.5, -1]])
+
+
+def test_a_cluster_is_what_most_of_its_points_lie_in(rng):
+    names = ids("Car", "Pedestrian", "Cyclist", "Van")
+    clusters = in_boxes(rng, np.concatenate([BOXES, BOXES[:1] + [40, 0, 0, 0, 0, 0, 0]]))
+    labels, owners = labelled(clusters, BOXES, names, CONFIG.classes)
+    assert labels.tolist() == [0, 1, 2, UNKNOWN, 3] and owners.tolist() == [0, 1, 2, -1, -1]
+    # a third in the box is neither object nor background, a tenth is background
+    for share, wanted in ((0.9, 0), (0.3, UNKNOWN), (0.1, 3)):
+        points = clusters.points[:60].copy()
+        points[int(60 * share):, 2] += 5
+        one = Clusters(points, np.array([0, 60]), np.array([1]))
+        assert labelled(one, BOXES, names, CONFIG.classes)[0].tolist() == [wanted]
+    none = labelled(clusters, np.zeros((0, 7)), ids(), CONFIG.classes)
+    assert none[0].tolist() == [3] * 5 and none[1].tolist() == [-1] * 5
+    points = point_labels(clusters.points[:, :3], BOXES, names, CONFIG.classes)
+    assert points.reshape(5, 60).tolist() == [[k] * 60 for k in (0, 1, 2, UNKNOWN, 3)]
+
+
+def test_where_nothing_is_labelled_background_is_unknown(rng):
+    camera = CALIBRATION.camera()
+    xyz = np.column_stack([rng.uniform(-20, 40, 500), rng.uniform(-20, 20, (500, 2))])
+    xyz = xyz.astype(np.float32)
+    whole = np.array([0, 0, camera.width, camera.height])
+    assert np.array_equal(camera.in_regions(xyz, whole[None]), camera.in_view(xyz))
+    halves = np.array([[0, 0, 600, camera.height], [600, 0, camera.width, camera.height]])
+    assert np.array_equal(camera.in_regions(xyz, halves), camera.in_view(xyz))
+    assert not camera.in_regions(xyz, np.zeros((0, 4))).any()
+    clusters = in_boxes(rng, BOXES[:3], 10)
+    truth = GroundTruth.of(np.zeros((0, 7)), [], notes=(("DontCare", {"bbox": whole}),))
+    blind = uncared(truth, camera, clusters.points[:, :3])
+    assert blind.all() and not uncared(replace(truth, notes=()), camera,
+                                       clusters.points[:, :3]).any()
+    blind[:14] = False  # the first cluster, and four tenths of the second
+    assert unknown_where(np.array([3, 3, 3]), clusters, blind, 3).tolist() == [3, UNKNOWN, UNKNOWN]
+    assert unknown_where(np.array([0, 1, 2]), clusters, blind, 3).tolist() == [0, 1, 2]
+
+
+def test_scores_of_clusters_and_points_are_counted_by_hand(rng):
+    scores = ClusterScores(CONFIG.classes)
+    clusters = blobs(rng, [20, 20, 12, 12, 9])
+    found = np.eye(4, dtype=np.float32)[[0, 3, 1, 2, 0]]
+    labels = np.array([0, 0, 1, 3, 0])  # right, missed, right, wrong; too small to count
+    numbers = np.array([1, 1, 2, 3, 0, 0])
+    truth = np.array([0, 3, 0, 1, 1, UNKNOWN])
+    scores.add(clusters, labels, Predictions(found, found.argmax(1), np.zeros((5, 7))), truth,
+               numbers)
+    content = scores.content()
+    assert content["clusters"]["accuracy"] == 50.0
+    assert content["clusters"]["object_accuracy"] == pytest.approx(200 / 3)
+    car = content["clusters"]["by_class"]["Car"]
+    assert (car["objects"], car["precision"], car["recall"]) == (2, 100.0, 50.0)
+    assert content["clusters"]["by_class"]["Cyclist"]["recall"] is None
+    car = content["points"]["by_class"]["Car"]  # of two one is found, and one is wrong
+    assert (car["precision"], car["recall"], car["f1"], car["iou"]) == (
+        50.0, 50.0, 50.0, pytest.approx(100 / 3))
+    assert content["points"]["mean"]["recall"] == 50.0
+    empty = ClusterScores(CONFIG.classes).content()
+    assert empty["clusters"]["accuracy"] is None and empty["points"]["mean"]["iou"] is None
+
+
+def test_changes_keep_points_in_their_boxes_and_take_far_ones_as_a_sensor_would(rng):
+    clusters = in_boxes(rng, BOXES, 400)
+    no = np.zeros(4, bool)
+    same, boxes = changed(clusters, BOXES, no, STILL, rng)
+    assert np.allclose(same.points, clusters.points, atol=1e-6) and np.allclose(boxes, BOXES)
+    for seed in range(5):
+        params = ClusterAugmentParams(beam_noise=0, range_noise=0, intensity=0)
+        made, boxes = changed(clusters, BOXES, no, params, np.random.default_rng(seed))
+        for k in range(4):
+            own = made.points[made.first[k]:made.first[k + 1], :3]
+            assert len(own) >= FEWEST and points_in_box(own, boxes[k], 1e-3).all()
+        # what is moved away stays in its direction, and has fewer points
+        ratio = np.hypot(*boxes[:, :2].T) / np.hypot(*BOXES[:, :2].T)
+        assert np.allclose(np.abs(np.arctan2(boxes[:, 1], boxes[:, 0])),
+                           np.abs(np.arctan2(BOXES[:, 1], BOXES[:, 0])), atol=0.03)
+        far = ratio > 1.3
+        assert (made.sizes[far] < 400 / ratio[far] ** 2 + 60).all()
+    flip = ClusterAugmentParams(**{**vars(STILL), "flip": 1.0})
+    twice = changed(*changed(clusters, BOXES, no, flip, rng), no, flip, rng)
+    assert np.allclose(twice[0].points, clusters.points, atol=1e-6)
+    assert np.allclose(wrap_angle(twice[1] - BOXES), 0, atol=1e-6)
+
+
+def test_loose_clusters_are_cut_near_their_boxes_and_none_is_left_empty(rng):
+    clusters = in_boxes(rng, BOXES * [1, 1, 1, 1.4, 1.4, 1.4, 1], 300)
+    made, boxes = changed(clusters, BOXES, np.ones(4, bool), STILL, rng)
+    assert np.allclose(boxes, BOXES) and (made.sizes < 300).all() and (made.sizes > 80).all()
+    tiny = in_boxes(rng, BOXES, 3)
+    hard = ClusterAugmentParams(dropout=0.99, box_shift=2.0)
+    assert (changed(tiny, BOXES, np.ones(4, bool), hard, rng)[0].sizes == 3).all()
+
+
+def test_a_scene_is_cut_by_our_own_clustering_and_around_its_objects(rng, tmp_path):
+    flat = np.column_stack([rng.uniform(-20, 30, (12_000, 2)), rng.normal(-1.73, 0.01, 12_000),
+                            rng.random(12_000)])
+    objects = in_boxes(rng, BOXES[:3], 500).points
+    points = np.concatenate([flat, objects]).astype(np.float32)
+    scene = Scene(points, BOXES[:3], ids("Car", "Pedestrian", "Cyclist"),
+                  np.array([True, True, False]))
+    made = cut(scene, CONFIG, 5)
+    assert set(made.labels[~made.loose]) >= {0, 1, 2}
+    assert made.labels[made.loose].tolist() == [0, 1]
+    assert np.array_equal(made.boxes[made.loose], BOXES[:2])
+    background = made.labels == 3
+    assert not made.boxes[background].any() and made.boxes[made.labels == 2].any()
+
+    class One:
+        def __len__(self):
+            return 1
+
+        def __repr__(self):
+            return "one"
+
+        def scene(self, i):
+            return scene
+
+    source = CutScenes(One(), CONFIG, 5, tmp_path)
+    first, again = source.scene(0), source.scene(0)  # the second from the cache
+    assert len(list(tmp_path.iterdir())) == 1
+    for name in ("labels", "boxes", "loose"):
+        assert np.array_equal(getattr(first, name), getattr(again, name))
+    assert np.array_equal(first.clusters.points, again.clusters.points)
+    next(tmp_path.iterdir()).write_bytes(b"broken")
+    assert np.array_equal(source.scene(0).labels, first.labels)
+    other = CutScenes(One(), pointnet_config("base"), 5, tmp_path)
+    other.scene(0)
+    assert len(list(tmp_path.iterdir())) == 2  # made in another way
+
+
+def sample_scene(rng, count=40):
+    clusters = in_boxes(rng, np.tile(BOXES[:3], (count, 1)) + np.repeat(
+        rng.uniform(-1, 1, (count, 7)) * [3, 3, 0, 0, 0, 0, 0], 3, axis=0), 20)
+    labels = np.tile([0, 1, 3], count)
+    boxes = np.tile(BOXES[:3], (count, 1)) * (labels < 3)[:, None]
+    return CutScene(clusters, labels, boxes, np.zeros(len(labels), bool))
+
+
+def test_a_sample_has_so_many_of_each_class_and_nothing_unknown(rng):
+    scene = sample_scene(rng)
+    scene.labels[:3] = UNKNOWN
+    params = ClusterAugmentParams(objects=7, background=5)
+    sample = ClusterPreparation(CONFIG, params)(scene, rng)
+    assert np.bincount(sample.labels, minlength=4).tolist() == [7, 7, 0, 5]
+    assert np.array_equal(sample.has_box, sample.labels < 3)
+    nothing = CutScene(scene.clusters, np.full(len(scene.labels), UNKNOWN), scene.boxes,
+                       scene.loose)
+    with pytest.raises(InputError, match="no cluster"):
+        ClusterPreparation(CONFIG, params)(nothing, rng)
+
+
+def test_background_shines_and_objects_do_not(rng):
+    scene = sample_scene(rng)
+    scene.clusters.points[:, 3] = 0.3
+    before = scene.clusters.points.copy()
+    for shine in (0.0, 1.0):
+        sample = ClusterPreparation(CONFIG, replace(STILL, shine=shine))(scene, rng)
+        bright = (sample.inputs.points[..., 3] > 0.9).any(axis=1)
+        assert not bright[sample.has_box].any()
+        assert bright[~sample.has_box].mean() >= 0.7 * shine  # no point may lie between the heights
+        assert shine or not bright.any()
+    assert np.array_equal(scene.clusters.points, before)
+
+
+def test_a_network_learns_to_tell_clusters_apart(rng):
+    torch.manual_seed(0)
+    network, loss = make_pointnet(CONFIG), make_loss(CONFIG, torch.device("cpu"))
+    optimizer = torch.optim.Adam(network.parameters(), 0.01)
+    prepare = ClusterPreparation(CONFIG, STILL)
+    first = None
+    for _ in range(60):
+        total, parts = loss(network, [prepare(sample_scene(rng, 8), rng)])
+        optimizer.zero_grad()
+        total.backward()
+        optimizer.step()
+        first = first or parts["classes"].item()
+    assert parts["classes"].item() < 0.5 * first
+
+
+def test_validation_reads_every_scene_and_calibrates(rng):
+    scene = sample_scene(rng, 4)
+    truth = GroundTruth.of(BOXES[:3], ids("Car", "Pedestrian", "Cyclist"),
+                           [{"truncated": 0.0, "occluded": 0}] * 3)
+
+    class Source:
+        def __len__(self):
+            return 2
+
+        def scene(self, i):
+            if i == 1:
+                raise InputError("broken.bin")
+            return scene
+
+        def judged(self, i):
+            return "a", LidarFrame(np.zeros((0, 3), np.float32)), truth, CALIBRATION
+
+    items = [JudgedScenes((Source(),), judged_clusters)[n] for n in range(2)]
+    assert items[1].sample is None and items[1].skipped == ("broken.bin",)
+    torch.manual_seed(0)
+    network = make_pointnet(CONFIG).eval()
+    metrics = validated(network, [items[0].sample])
+    assert {"score", "accuracy", "object_accuracy", "calibration_error"} <= set(metrics)
+    assert 0 <= metrics["accuracy"] <= 100 and network.temperature.item() != 1.0

@@ -1,0 +1,76 @@
+"""train pointnet from the command line."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from lidar_perception.cli import train as train_module
+from lidar_perception.cli.main import cli
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointnet.checkpoint import load_pointnet, read_header
+from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS
+from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.training.params import PointNetTraining
+from lidar_perception.types import InputError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+SENSOR = "generic:32,-24,5,0.8,10"
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """Simulated scans and their clusters are made once for all tests."""
+    return tmp_path_factory.mktemp("cache")
+
+
+def train(cache, out, *more, **changes):
+    given = {"--data": "sim", "--data-sensor": SENSOR, "--data-scans": 2, "--data-val-scans": 1,
+             "--data-people": 1, "--steps": 3, "--validate-steps": 3, "--log-steps": 1,
+             "--batch": 1, "--jobs": 0, "--data-cache": cache, "--out": out, **changes}
+    words = [str(word) for pair in given.items() for word in pair]
+    return CliRunner().invoke(cli, ["train", "pointnet", *words, *more])
+
+
+def test_a_network_is_trained_on_clusters_and_finds_its_way_into_the_detector(cache, tmp_path):
+    out = tmp_path / "run"
+    result = train(cache, out)
+    assert result.exit_code == 0, result.output
+    assert len((out / "log.csv").read_text().splitlines()) == 4
+    assert len(list((cache / "clusters").iterdir())) == 3
+    header, network = load_pointnet(out / "last.safetensors")
+    assert header.config.name == "improved" and header.training["steps"] == 3
+    assert {"score", "accuracy", "calibration_error"} <= set(header.metrics)
+    json.loads(header.text())
+    assert network.offsets.abs().sum() > 0  # calibrated
+    open_detector(out / "last.safetensors", "cpu")(scan_at(3, 0, sensor_named(SENSOR)).frame)
+    # the same seed, the same weights, from the cache too; an interrupted run goes on
+    again = train(cache, tmp_path / "again")
+    assert again.exit_code == 0
+    assert _weights(tmp_path / "again") == _weights(out)
+    twice = train(cache, out)
+    assert isinstance(twice.exception, InputError) and "--resume" in str(twice.exception)
+    assert train(cache, out, "--resume").exit_code == 0
+
+
+def _weights(out):
+    network = load_pointnet(out / "last.safetensors")[1]
+    return {name: value.tolist() for name, value in network.state_dict().items()}
+
+
+def test_every_row_of_the_ablation_is_trained_and_shown(cache, tmp_path, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    result = train(cache, tmp_path / "all", "--ablation", **{"--steps": 1, "--validate-steps": 1})
+    assert result.exit_code == 0, result.output
+    for name in ABLATIONS:
+        assert read_header(tmp_path / "all" / name / "best.safetensors").config.name == name
+        assert name in result.output
+    assert "88.96" in result.output and len(train_module.PAPER_ABLATION) == len(ABLATIONS)
+
+
+def test_every_network_can_be_asked_for():
+    said = PointNetTraining.__dataclass_fields__["network"].metadata
+    assert set(NETWORKS) == set(said["choices"])

@@ -1,0 +1,148 @@
+"""train pointpillars from the command line."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+from click.testing import CliRunner
+from samples import object_folder, walker_label, write
+
+from lidar_perception.cli.main import cli
+from lidar_perception.detectors.pointpillars import config as config_module
+from lidar_perception.detectors.pointpillars.checkpoint import read_header
+from lidar_perception.detectors.pointpillars.detector import load_detector
+from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.training.params import PAPER_SHARE, DataParams, PointPillarsTraining
+from lidar_perception.training.sources import training_scenes
+from lidar_perception.types import InputError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+SENSOR = "generic:16,-20,5,2,10"
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """The compact size with a few channels and a coarse grid."""
+    monkeypatch.setitem(config_module.SIZES, "compact", dict(
+        low=(0.0, -20.48, -3.0), high=(40.96, 20.48, 1.0), cell=0.64, pillar_channels=8,
+        map_channels=(4, 8), block_channels=(8, 12, 16), block_layers=(1, 1, 1), deconv_channels=8,
+        fpn_channels=8))
+
+
+def train(*arguments):
+    return CliRunner().invoke(cli, ["train", "pointpillars", *map(str, arguments)])
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    """Simulated scans are made once for all tests."""
+    return tmp_path_factory.mktemp("cache")
+
+
+def sim(cache, out, **changes):
+    given = {"--data": "sim", "--data-sensor": SENSOR, "--data-scans": 1, "--data-val-scans": 1,
+             "--data-people": 1, "--steps": 4, "--validate-steps": 2, "--log-steps": 1,
+             "--batch": 2, "--jobs": 0, "--data-cache": cache, "--out": out, **changes}
+    return [word for pair in given.items() for word in pair]
+
+
+def test_a_network_is_trained_on_simulated_scans_and_finds_its_way_into_the_detector(
+        tmp_path, cache, small):
+    out = tmp_path / "run"
+    result = train(*sim(cache, out), "--version", "v4", "--seed", 5)
+    assert result.exit_code == 0, result.output
+    assert len((out / "log.csv").read_text().splitlines()) == 5
+    assert len((out / "validation.csv").read_text().splitlines()) == 3
+    assert len(list(cache.iterdir())) == 2
+    header = read_header(out / "last.safetensors")
+    assert (header.config.version, header.config.size) == ("v4", "compact")
+    said = header.training
+    assert (said["steps"], said["seed"], said["batch"], said["scenes"]) == (4, 5, 2, 1)
+    assert said["data"] == ["sim"] and said["params"]["data.sensor"] == SENSOR
+    assert "score" in header.metrics and header.commit
+    json.loads(header.text())
+    detector = load_detector(out / "best.safetensors", "cpu")
+    detector(scan_at(3, 0, sensor_named(SENSOR)).frame)
+    # a finished run is left as it is, whatever is said twice
+    before = (out / "last.safetensors").read_bytes()
+    again = train(*sim(cache, out), "--version", "v4", "--seed", 5)
+    assert again.exit_code == 1 and "--resume" in str(again.exception)
+    assert train(*sim(cache, out), "--version", "v4", "--seed", 5, "--resume").exit_code == 0
+    assert (out / "last.safetensors").read_bytes() == before
+    # and its weights can be where another begins
+    init = train(*sim(cache, tmp_path / "next", **{"--steps": 1}), "--version", "v4", "--init",
+                 out / "last.safetensors")
+    assert init.exit_code == 0, init.output
+    other = train(*sim(cache, tmp_path / "other", **{"--steps": 1}), "--version", "v0", "--init",
+                  out / "last.safetensors", "--ahead", 20, "--amp", "bf16")
+    assert other.exit_code == 0, other.output
+    assert "the others begin at random" in other.output
+    assert read_header(tmp_path / "other/last.safetensors").config.high == header.config.high
+
+
+def test_kitti_and_simulated_scenes_mix_and_broken_ones_are_counted(tmp_path, cache, small):
+    root = object_folder(tmp_path / "kitti", walker_label() + "\n", 6)
+    write(root / "training/label_2/000002.txt", "Pedestrian 0 0 x\n")
+    result = train(*sim(cache, tmp_path / "run"), "--data", root, "--version", "v0",
+                   "--data-val-share", 0.2, "--augment-cyclists", 0)
+    assert result.exit_code == 0, result.output
+    assert "1 scenes could not be used" in result.output and "000002.txt" in result.output
+    header = read_header(tmp_path / "run/best.safetensors")
+    assert header.training["scenes"] == 5 + 1 and header.training["scenes_skipped"] == 1
+    assert header.metrics["Pedestrian_3d"] is not None
+
+
+def counts(*arguments) -> tuple[list, list]:
+    train_on, judge_on = training_scenes(*arguments)
+    return [len(x) for x in train_on], [len(x) for x in judge_on]
+
+
+def test_what_is_held_out_is_not_trained_on(tmp_path):
+    root = object_folder(tmp_path, count=5)
+    params = DataParams(scans=7, val_scans=2, val_share=0.4)
+    folder = str(root)
+    (train_on, *_), (held, *_) = training_scenes((folder,), (), None, None, params, 0)
+    assert (len(train_on), len(held)) == (3, 2) and not {*train_on.names} & {*held.names}
+    assert counts((folder, "sim"), (), None, None, params, 0) == ([3, 7], [2, 2])
+    assert counts((folder,), ("sim",), None, None, params, 0) == ([5], [2])
+    assert counts(("sim",), (folder,), None, None, params, 0) == ([7], [5])
+    streets, = training_scenes(("sim",), (), None, None, params, 0)[0]
+    others, = training_scenes(("sim",), (), None, None, params, 0)[1]
+    assert streets.first + streets.count <= others.first
+    ours, theirs = write(tmp_path / "a", "000000\n000001\n"), write(tmp_path / "b", "000001\n")
+    (train_on,), (held,) = training_scenes((folder,), (folder,), ours, theirs, params, 0)
+    assert (train_on.names, held.names) == (("000000",), ("000001",))
+    (train_on,), (held,) = training_scenes((folder,), (), None, theirs, params, 0)
+    assert len(train_on) == 4 and held.names == ("000001",)
+    with pytest.raises(InputError, match="--split"):
+        training_scenes(("sim",), (), ours, None, params, 0)
+    with pytest.raises(InputError, match="--val-split"):
+        training_scenes(("sim",), (), None, theirs, params, 0)
+    with pytest.raises(InputError, match="no frame is left"):
+        training_scenes((folder,), (folder,), theirs, theirs, params, 0)
+
+
+@pytest.mark.parametrize("arguments, reason", [
+    (["--data", "nowhere"], "nowhere is not a folder"),
+    (["--data", "sim", "--data-sensor", "lidar9000"], "lidar9000"),
+    (["--data", "sim", "--device", "tpu"], "tpu"),
+    (["--data", "sim", "--lr", "0"], "lr = 0"),
+    (["--data", "sim", "--init", "missing.safetensors"], "missing.safetensors"),
+])
+def test_what_cannot_be_is_said_at_once(tmp_path, small, arguments, reason):
+    result = train(*arguments, "--out", tmp_path / "run", "--jobs", 0, "--data-scans", 1,
+                   "--augment-cars", 0, "--augment-pedestrians", 0, "--augment-cyclists", 0,
+                   "--augment-things", 0)
+    assert isinstance(result.exception, InputError) and reason in str(result.exception)
+    assert not (tmp_path / "run" / "last.pt").exists()
+
+
+def test_the_papers_share_is_held_out_and_every_number_has_a_flag():
+    assert round(PAPER_SHARE * 7518) == 751
+    said = train("--help").output
+    for group in PointPillarsTraining, DataParams:
+        for f in dataclasses.fields(group):
+            assert "--" in said and f.name.replace("_", "-") in said

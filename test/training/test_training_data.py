@@ -1,0 +1,302 @@
+"""Laws of what is learned from: sources, the stream, samples and their validation."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from detection_samples import BOXES, tiny, two_objects
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samples import WALKER, object_folder, walker_label, write
+
+from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
+from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED
+from lidar_perception.geometry import points_in_box
+from lidar_perception.simulation import drive
+from lidar_perception.training import scenes as scenes_module
+from lidar_perception.training.augment import Scene
+from lidar_perception.training.cut_objects import cut_objects
+from lidar_perception.training.data import Batches, Item, JudgedScenes, RawScenes, Stream
+from lidar_perception.training.params import AugmentParams
+from lidar_perception.training.pointpillars.task import (
+    Preparation,
+    Sample,
+    judged_scan,
+    make_loss,
+    score_detector,
+    targets_of,
+)
+from lidar_perception.training.record import metrics_of
+from lidar_perception.training.scenes import KittiScenes, SimulatedScenes, kitti_names, random_split
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError
+
+few = settings(max_examples=25, database=None)
+seeds = st.integers(0, 2**32 - 1)
+CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
+STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
+                      flip=0, turn=0, scale=0, beam_noise=0, range_noise=0, dropout=0, intensity=0,
+                      height=0, tilt=0)
+SENSOR = "generic:8,-20,4,2,10"
+
+
+# sources
+
+def broken_folder(root):
+    """Five frames, of which 1 has a broken label and 3 a scan that was cut."""
+    object_folder(root, walker_label() + "\n", 5)
+    write(root / "training/label_2/000001.txt", "Pedestrian 0 0 x\n")
+    scan = root / "training/velodyne/000003.bin"
+    scan.write_bytes(scan.read_bytes()[:-5])
+    return root
+
+
+def keep_all(scene, rng):
+    """Stands for a network's preparation: what it is given, and a number of the rng."""
+    return scene.points.sum(), scene.boxes, rng.random()
+
+
+def test_what_is_broken_is_named_skipped_and_counted(tmp_path, capsys):
+    root = broken_folder(tmp_path)
+    stream = Stream((KittiScenes(root, kitti_names(root)),), keep_all)
+    batches = Batches(stream, 5)
+    steps = batches(0)
+    for _ in range(2):
+        assert len(next(steps)) == 5
+    assert len(batches.skipped) == 2
+    reasons = sorted(batches.skipped)
+    assert "000001.txt:1" in reasons[0] and "000003.bin" in reasons[1]
+    assert capsys.readouterr().err.replace("\n", "").count("skipped:") == 2  # each said once
+    assert len(list(RawScenes(stream).some(10, 0))) == 3
+    broken = Stream((KittiScenes(root, ("000001", "000003")),), keep_all)
+    with pytest.raises(InputError, match="none of the 2 scenes"):
+        broken[0]
+
+
+def test_frames_without_labels_cannot_be_learned_from(tmp_path):
+    root = object_folder(tmp_path, count=2)
+    (root / "training/label_2/000001.txt").unlink()
+    with pytest.raises(InputError, match=r"000001\.bin has no labels"):
+        KittiScenes(root, ("000001",)).scene(0)
+
+
+def test_kitti_scenes_end_with_the_image_unless_asked(tmp_path):
+    root = object_folder(tmp_path, walker_label() + "\n", 1)
+    ahead, all_of_it = (KittiScenes(root, ("000000",), view).scene(0) for view in (True, False))
+    assert 0 < len(ahead.points) < len(all_of_it.points)
+    assert (ahead.points[:, 0] > 0).all() and (all_of_it.points[:, 0] < 0).any()
+    np.testing.assert_allclose(ahead.boxes[0], WALKER, atol=0.02)
+    assert points_in_box(ahead.points[:, :3], ahead.boxes[0]).sum() > 300
+
+
+def test_splits_name_their_frames(tmp_path):
+    root = object_folder(tmp_path, count=4)
+    split = write(tmp_path / "train.txt", "000003\n000001\n")
+    assert kitti_names(root, split) == ("000003", "000001")
+    assert len(kitti_names(root)) == 4
+    for text, reason in (("000009", "000009"), ("", "names no frame")):
+        with pytest.raises(InputError, match=reason):
+            kitti_names(root, write(split, text))
+    with pytest.raises(InputError, match="cannot read the split"):
+        kitti_names(root, tmp_path / "missing.txt")
+
+
+@few
+@given(st.integers(2, 200), st.floats(0, 1), seeds)
+def test_a_random_split_is_a_partition_drawn_by_its_seed(count, share, seed):
+    names = tuple(f"{i:06}" for i in range(count))
+    train, held = random_split(names, share, seed)
+    assert sorted(train + held) == list(names) and train and held
+    assert (train, held) == random_split(names, share, seed)
+    assert abs(len(held) - share * count) <= 1
+
+
+def test_one_frame_cannot_be_split():
+    with pytest.raises(InputError, match="--val"):
+        random_split(("000000",), 0.5, 0)
+
+
+def test_simulated_scans_are_the_same_from_the_cache(tmp_path, monkeypatch):
+    plain = SimulatedScenes(7, 2, SENSOR)
+    cached = SimulatedScenes(7, 2, SENSOR, cache=tmp_path / "cache")
+    frame, truth = plain.scan(1)
+    for _ in range(2):
+        again = cached.scan(1)
+        assert np.array_equal(frame.xyz, again[0].xyz)
+        assert np.array_equal(frame.intensity, again[0].intensity)
+        assert np.array_equal(truth.boxes, again[1].boxes) and truth.extras == again[1].extras
+        monkeypatch.setattr(scenes_module, "scan_at", None)  # the second comes from the cache
+    monkeypatch.undo()
+    file, = (tmp_path / "cache").iterdir()
+    file.write_bytes(file.read_bytes()[:100])  # a broken one is made again
+    assert np.array_equal(cached.scan(1)[0].xyz, frame.xyz)
+    full = SimulatedScenes(7, 2, SENSOR, cache=tmp_path / "cache", cache_gb=1e-9)
+    full.scan(0)
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
+def test_simulated_scenes_are_labelled_as_people_would():
+    source = SimulatedScenes(7, 1, SENSOR)
+    _, truth = source.scan(0)
+    scene = source.scene(0)
+    seen = [e["visible"] >= 0.15 and e["num_points"] >= 5 for e in truth.extras]
+    assert scene.around and scene.wanted.tolist() == seen and 0 < sum(seen) < len(seen)
+    assert drive.scan_at(7, 0, source._sensor).frame.xyz.shape == scene.points[:, :3].shape
+    assert source._sensor.height == 1.73
+
+
+# the stream
+
+class Numbers:
+    """A source of scenes that are told apart by their only point."""
+
+    def __init__(self, first: int, count: int):
+        self.first, self.count = first, count
+
+    def __len__(self):
+        return self.count
+
+    def scene(self, i):
+        point = np.full((1, 4), self.first + i, np.float32)
+        return Scene(point, np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool))
+
+
+def taken(batches: Batches, first: int, steps: int) -> list:
+    stream = batches(first)
+    result = [[(float(a), c) for a, _, c in next(stream)] for _ in range(steps)]
+    stream.close()
+    return result
+
+
+def test_the_stream_depends_on_the_seed_alone():
+    stream = Stream((Numbers(0, 7), Numbers(100, 4)), keep_all, 5)
+    whole = taken(Batches(stream, 3), 0, 12)
+    assert taken(Batches(stream, 3), 5, 7) == whole[5:]  # as after a stop
+    assert taken(Batches(stream, 3, jobs=2), 0, 6) == whole[:6]
+    pair = [taken(Batches(stream, 3, rank=rank, world=2), 0, 6) for rank in (0, 1)]
+    assert [batch for both in zip(*pair) for batch in both] == whole
+    assert taken(Batches(Stream(stream.sources, keep_all, 6), 3), 0, 12) != whole
+    flat = [point / 4 for batch in whole for point, _ in batch]
+    assert sorted(flat[:11]) == sorted(flat[11:22]) == [*range(7), *range(100, 104)]
+    assert flat[:11] != flat[11:22]
+    assert Batches(stream, 3).epoch == 4
+
+
+# PointPillars' samples
+
+def scene_of_two(**changes) -> Scene:
+    boxes = BOXES.numpy().astype(np.float64)
+    return Scene(**{**dict(points=two_objects(), boxes=boxes, wanted=np.ones(2, bool),
+                           class_ids=np.array([CAR, PEDESTRIAN])), **changes})
+
+
+@pytest.mark.parametrize("version", ["v0", "v2", "v4"])
+def test_samples_hold_what_the_version_sees(version):
+    config = tiny(version)
+    sample = Preparation(config, STILL)(scene_of_two(), np.random.default_rng(0))
+    assert sample.points.shape[1] == config.point_columns
+    assert (sample.cluster_map is not None) == config.pseudo_map
+    assert sample.labels.tolist() == [0, 1] and sample.counted.all()
+    np.testing.assert_allclose(sample.boxes, BOXES, atol=1e-5)
+    loss = make_loss(config, torch.device("cpu"))
+    from lidar_perception.detectors.pointpillars.network import make_network
+    total, parts = loss(make_network(config), [sample, sample])
+    assert torch.isfinite(total) and set(parts) == {"classes", "boxes", "directions"}
+
+
+def test_a_share_of_the_scenes_gets_objects_of_others(tmp_path):
+    cut_objects([scene_of_two()], tiny().classes, 1).save(tmp_path / "objects.npz")
+    rng, alone = np.random.default_rng(0), scene_of_two()
+    alone = replace(alone, boxes=alone.boxes[:1], class_ids=alone.class_ids[:1],
+                    wanted=alone.wanted[:1])
+
+    def numbers(crowded: float) -> list[int]:
+        prepare = Preparation(tiny(), replace(STILL, pedestrians=1, crowded=crowded),
+                              database=tmp_path / "objects.npz")
+        return [len(prepare(alone, rng).labels) for _ in range(24)]
+
+    assert set(numbers(0.0)) == {1} and set(numbers(0.5)) == {1, 2}
+    assert sum(numbers(1.0)) > sum(numbers(0.0))
+
+
+def test_what_nobody_needs_to_find_is_neither_object_nor_background():
+    config = tiny()
+    anchors, kinds = make_anchors(config), anchor_classes(config)
+    rng = np.random.default_rng(0)
+    whole = Preparation(config, STILL)(scene_of_two(), rng)
+    found = targets_of(whole, anchors, config).labels[0]
+    for scene, prepare in (
+            (scene_of_two(wanted=np.array([False, True])), Preparation(config, STILL)),
+            (scene_of_two(class_ids=np.array([VAN, PEDESTRIAN])), Preparation(config, STILL))):
+        sample = prepare(scene, rng)
+        assert sample.counted.tolist() == [False, True]
+        labels = targets_of(sample, anchors, config).labels[0]
+        assert (labels != 0).all() and torch.equal(labels[kinds == 1], found[kinds == 1])
+        near = (labels == IGNORED) & (kinds == 0)
+        assert near.any() and (near | (labels == BACKGROUND) | (kinds != 0)).all()
+        assert (found[near] != BACKGROUND).all()
+    few_points = Preparation(config, STILL, least_points=10**4)(scene_of_two(), rng)
+    assert not few_points.counted.any()
+
+
+def test_a_scene_that_the_network_cannot_see_is_skipped():
+    behind = scene_of_two(points=two_objects() * np.array([-1, 1, 1, 1], np.float32))
+    with pytest.raises(InputError, match="no point"):
+        Preparation(tiny(), STILL)(behind, np.random.default_rng(0))
+    far = Preparation(tiny(), STILL)(scene_of_two(boxes=BOXES.numpy() + [90, 0, 0, 0, 0, 0, 0]),
+                                     np.random.default_rng(0))
+    assert len(far.boxes) == 0 and len(far.labels) == 0
+    assert (targets_of(far, make_anchors(tiny()), tiny()).labels == BACKGROUND).all()
+
+
+def test_a_perfect_detector_scores_and_a_blind_one_does_not(tmp_path):
+    root = broken_folder(tmp_path)
+    scenes = JudgedScenes((KittiScenes(root, kitti_names(root)),), judged_scan)
+    right = score_detector(lambda frame: Detections.of([WALKER]), scenes)
+    blind = score_detector(lambda frame: Detections.none(), scenes)
+    assert right.content()["frames"] == 3 and len(right.skipped) == 2
+    names = ("Car", "Pedestrian", "Cyclist")
+    for score in "bev", "map":
+        metrics = metrics_of(right.content(), score, names)
+        assert metrics["score"] == metrics["Pedestrian_3d"] == 100.0
+        assert np.isnan(metrics["Car_bev_relaxed"])
+        assert metrics_of(blind.content(), score, names)["score"] == 0.0
+
+
+def test_samples_are_plain_arrays_that_other_processes_can_send():
+    sample = Preparation(tiny("v4"), STILL)(scene_of_two(), np.random.default_rng(0))
+    assert all(isinstance(value, np.ndarray) for value in vars(sample).values())
+    assert isinstance(Item(sample).sample, Sample)
+
+
+class Workers:
+    """items[n]: the process that makes them."""
+
+    def __getitem__(self, n: int) -> int:
+        return os.getpid()
+
+
+def test_workers_end_with_a_process_that_is_killed():
+    script = ("from test_training_data import Workers\n"
+              "from lidar_perception.training.data import loaded\n"
+              "for pids in loaded(Workers(), ([n] for n in range(10**6)), 1):\n"
+              "    print(pids[0], flush=True)\n"
+              "    input()\n")
+    with subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parent, text=True,
+                          env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+                          stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                          stderr=subprocess.DEVNULL) as run:
+        worker = Path(f"/proc/{int(run.stdout.readline())}/stat")
+        assert worker.exists()
+        run.kill()
+    end = time.monotonic() + 30
+    while worker.exists() and worker.read_text().split()[2] != "Z":
+        assert time.monotonic() < end, "the worker lives on"
+        time.sleep(0.05)

@@ -1,0 +1,105 @@
+"""Messages: cameras in both kinds of message classes, and bytes that we and ROS read alike."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from samples import CALIBRATION, each_make, header
+
+from lidar_perception.camera import Calibration, Camera
+from lidar_perception.types import Detections, InputError
+from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.messages import camera_info, camera_of, detection_markers, extrinsics
+from msg_utils.messages import message_class, ros_message
+from msg_utils.point_cloud2 import from_array
+
+
+@each_make
+def test_the_camera_is_the_same_from_either_direction_of_the_transform(make):
+    info = camera_info(CALIBRATION, header(make, frame_id="camera"), make)
+    forth = extrinsics(CALIBRATION, header(make), make)
+    back = extrinsics(CALIBRATION, header(make, frame_id="camera"), make)
+    back.child_frame_id = "velodyne"
+    inverse = np.linalg.inv(CALIBRATION.lidar_to_camera)
+    turned = Calibration(CALIBRATION.intrinsics, inverse, 1, 1).pose
+    q, t = back.transform.rotation, back.transform.translation
+    (q.x, q.y, q.z, q.w), (t.x, t.y, t.z) = (map(float, v) for v in turned)
+    expected = CALIBRATION.intrinsics @ CALIBRATION.lidar_to_camera
+    for transform in (forth, back):
+        camera = camera_of(info, transform)
+        np.testing.assert_allclose(camera.projection, expected, atol=1e-9)
+        assert (camera.width, camera.height) == (1242, 375)
+
+
+@each_make
+@pytest.mark.parametrize("change, words", [
+    (lambda info, tf: setattr(info.header, "frame_id", "rear"),
+     "'rear' but the transform links 'velodyne' and 'camera'"),
+    (lambda info, tf: setattr(info, "width", 0), "no image size"),
+    (lambda info, tf: setattr(info, "p", np.zeros(12)), "no projection matrix"),
+    (lambda info, tf: setattr(tf.transform.rotation, "w", 5.0), "no unit quaternion"),
+    (lambda info, tf: setattr(tf.transform.rotation, "w", float("nan")), "no unit quaternion"),
+])
+def test_a_camera_that_cannot_be_used_is_an_input_error(make, change, words):
+    info = camera_info(CALIBRATION, header(make, frame_id="camera"), make)
+    transform = extrinsics(CALIBRATION, header(make), make)
+    change(info, transform)
+    with pytest.raises(InputError, match=words):
+        camera_of(info, transform)
+
+
+def test_a_point_is_in_view_where_its_pixel_is_in_the_image():
+    camera = Camera(np.array([[10.0, 0, 50, 0], [0, 10, 20, 0], [0, 0, 1, 0]]), 100, 40)
+    points = np.array([[0, 0, 1], [0, 0, -1], [-5.01, 0, 1], [4.99, 0, 1], [5.01, 0, 1],
+                       [0, 1.99, 1], [0, 2.01, 1], [0, -2.01, 1]], np.float32)
+    assert camera.in_view(points).tolist() == [True, False, False, True, False, True, False, False]
+
+
+MESSAGES = {
+    "cloud": lambda make: from_array(
+        np.arange(24, dtype="<f4").view([("x", "<f4"), ("", "V4"), ("y", "<f4"), ("z", "<f4")])[
+            ["x", "y", "z"]], header(make), make, height=2),
+    "no points": lambda make: from_array(np.zeros(0, [("x", "<f4")]), header(make), make),
+    "markers": lambda make: detection_markers(
+        Detections.of([[1, 2, 3, 4, 5, 6, 0.5]] * 2, [3, 0], [0.25, 1]), header(make), make,
+        {("Car", 9)}),
+    "camera": lambda make: camera_info(CALIBRATION, header(make), make),
+    "transform": lambda make: extrinsics(CALIBRATION, header(make), make),
+}
+
+
+@pytest.mark.parametrize("build", MESSAGES.values(), ids=MESSAGES)
+def test_ros_and_rosbags_read_each_others_bytes(build):
+    serialization = pytest.importorskip("rclpy.serialization", reason="needs rclpy")
+    ours, theirs = build(bag_message), build(ros_message)
+    name = ours.__msgtype__
+    raw = serialization.serialize_message(theirs)
+    as_ros = message_class(name)
+    assert serialization.deserialize_message(
+        encode(ours), as_ros) == serialization.deserialize_message(raw, as_ros)
+    assert encode(decode(raw, name)) == encode(ours)
+
+
+@pytest.mark.parametrize("name", ["sensor_msgs/msg/PointCloud2", "geometry_msgs/msg/Pose",
+                                  "sensor_msgs/msg/CameraInfo", "visualization_msgs/msg/Marker",
+                                  "diagnostic_msgs/msg/DiagnosticArray"])
+def test_a_message_without_fields_is_all_zero_as_in_ros(name):
+    serialization = pytest.importorskip("rclpy.serialization", reason="needs rclpy")
+    theirs = ros_message(name)
+    if name.endswith(("Pose", "Marker")):  # ROS starts at the unit quaternion
+        pose = theirs if name.endswith("Pose") else theirs.pose
+        pose.orientation.w = 0.0
+    got = serialization.deserialize_message(encode(bag_message(name)), message_class(name))
+    assert got == theirs
+
+
+def test_a_field_that_is_not_there_is_a_type_error():
+    with pytest.raises(TypeError, match="has no field 'colour'"):
+        bag_message("visualization_msgs/msg/Marker", colour=1)
+
+
+def test_bytes_that_are_no_message_are_an_input_error():
+    raw = encode(MESSAGES["markers"](bag_message))
+    for size in range(0, len(raw), 7):
+        with pytest.raises(InputError, match=f"^{size} bytes are no visualization_msgs"):
+            decode(raw[:size], "visualization_msgs/msg/MarkerArray")
