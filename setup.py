@@ -64,7 +64,8 @@ setup(
         "odometry": ["kiss-icp>=1.2"],
         "onnx": ["onnx>=1.16", "onnxruntime>=1.18", "onnxscript>=0.2", "torch>=2.6"],
         "train": ["tensorboard>=2.15"],
-        "benchmark": ["cloth-simulation-filter>=1.1.5", "dbscan>=1.0", "opencv-python-headless>=4.8"],
+        "benchmark": ["cloth-simulation-filter>=1.1.5", "dbscan>=1.0",
+                      "opencv-python-headless>=4.8"],
     },
     entry_points={"console_scripts": [
         "lidar-perception = lidar_perception.cli.main:main",

@@ -22,9 +22,8 @@ from benchmark.simulation import measure_simulation
 from benchmark.timing import spread
 from lidar_perception.candidates.segmented import points_in_view
 from lidar_perception.candidates.warm_up import warm_up
-from lidar_perception.data.kitti.folder import KittiFrame, open_kitti
-from lidar_perception.data.recording import Recorded, open_recording
-from lidar_perception.data.semantickitti import open_semantic_kitti
+from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, Frame, Recording
+from lidar_perception.data.open import open_recording
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.threshold import segment_by_threshold
 from lidar_perception.runs.files import write_text
@@ -39,10 +38,9 @@ FEW = 3              # frames with a pedestrian, below which those without serve
 
 
 @click.command(context_settings=dict(help_option_names=["-h", "--help"]))
-@click.option("--kitti", type=click.Path(path_type=Path), required=True, metavar="ROOT",
-              help="KITTI folder with Pedestrian labels.")
-@click.option("--semantic-kitti", type=click.Path(path_type=Path), metavar="ROOT",
-              help="SemanticKITTI folder; without it the ground methods are timed but not scored.")
+@click.option("--data", type=click.Path(path_type=Path), required=True, metavar="PATH",
+              multiple=True, help="A recording with Pedestrian labels and a camera, such as KITTI. "
+              "A second one, with labelled points (SemanticKITTI), scores the ground methods too.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Write the figures to this file.")
 @click.option("--repeat", type=click.IntRange(1), default=5, show_default=True,
@@ -51,21 +49,25 @@ FEW = 3              # frames with a pedestrian, below which those without serve
               help="Frames for the single algorithms, evenly spread over the folder.")
 @click.option("--graph/--no-graph", default=True, show_default=True,
               help="Also replay a bag of the frames through the nodes at 10 Hz.")
-def main(kitti: Path, semantic_kitti: Path | None, json_file: Path | None, repeat: int,
-         count: int, graph: bool) -> None:
+def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int,
+         graph: bool) -> None:
     """Time our candidate pipeline beside a plain scikit-learn + OpenCV reading of the paper, and
     each algorithm beside its peers, and the steps of every version of EG-PointPillars and of the
     PointNet detector. Peers that are not installed are left out.
 
     \b
     Example:
-      lidar benchmark --kitti /data/kitti/object --json benchmark.json
+      lidar benchmark --data /data/kitti/object --json benchmark.json
     """
-    recording = open_recording(kitti=kitti)
-    frames = [r for r in recording if isinstance(r, Recorded) and len(pedestrians(r))]
+    recordings = [open_recording(path) for path in data]
+    recording = next((each for each in recordings if {BOXES, CAMERA} <= each.has), recordings[0])
+    recording.require(BOXES, "benchmark")
+    recording.require(CAMERA, "benchmark")
+    frames = [f for f in recording if len(pedestrians(f.truth()))]
     if not frames:
-        raise InputError(f"{kitti} has no frame with a Pedestrian label")
-    labelled = spread(open_semantic_kitti(semantic_kitti), count) if semantic_kitti else []
+        raise InputError(f"{recording.path} has no frame with a Pedestrian label")
+    labelled = [f for each in recordings if POINT_LABELS in each.has
+                for f in spread(each.frames, count)]
     warm_up()
     content = {"machine": {"cpu": cpu_name(), "cores": os.cpu_count(), "python":
                            platform.python_version(), "numpy": np.__version__},
@@ -73,8 +75,8 @@ def main(kitti: Path, semantic_kitti: Path | None, json_file: Path | None, repea
                "candidates": compare(frames, repeat)}
     print_comparison(content["candidates"])
     in_view = [points_in_view(f, camera, ViewParams(enabled=True))[1].xyz
-               for f, camera in _with_camera(kitti, frames, count)]
-    scans = _full_scans(open_kitti(kitti), count)
+               for f, camera in _with_camera(recording, frames, count)]
+    scans = _full_scans(recording, count)
     content |= _measure(in_view, scans, repeat)
     if scans:
         content["detection"] = measure_detection(scans, repeat)
@@ -87,22 +89,21 @@ def main(kitti: Path, semantic_kitti: Path | None, json_file: Path | None, repea
     content["simulation"] = measure_simulation(count, repeat)
     print_measured(content["simulation"])
     if graph:
-        content["graph"] = {name: measure_graph(kitti, single)
+        content["graph"] = {name: measure_graph(recording, single)
                             for name, single in (("three_nodes", False), ("one_node", True))}
         print_graph(content["graph"])
     if json_file:
         write_text(json_file, json.dumps(content, indent=1))
 
 
-def _with_camera(kitti: Path, pedestrian: list[Recorded], count: int) -> list[tuple]:
-    """(frame, camera) of the frames with a pedestrian; of any frames where these are few."""
-    if len(pedestrian) >= FEW:
-        return [(r.frame, r.camera) for r in spread(pedestrian, count)]
-    return [(f.load(), f.calibration().camera()) for f in spread(open_kitti(kitti), count)]
+def _with_camera(recording: Recording, pedestrian: list[Frame], count: int) -> list[tuple]:
+    """(scan, camera) of the frames with a pedestrian; of any frames where these are few."""
+    chosen = pedestrian if len(pedestrian) >= FEW else recording.frames
+    return [(f.load(), f.camera()) for f in spread(chosen, count)]
 
 
-def _full_scans(every: list[KittiFrame], count: int) -> list[LidarFrame]:
-    whole = [f for f in every if f.points.stat().st_size > 16 * FULL_SCAN]
+def _full_scans(recording: Recording, count: int) -> list[LidarFrame]:
+    whole = [f for f in recording if len(f.load()) > FULL_SCAN]
     return [f.load() for f in spread(whole, count)]
 
 

@@ -12,14 +12,14 @@ from lidar_perception.candidates.refine import STAGES
 from lidar_perception.candidates.seed_sources import truth_seed
 from lidar_perception.candidates.segmented import Segmented, grounded_boxes
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.data.recording import Recorded
+from lidar_perception.data.frame import Frame
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.scoring.centres.report import pedestrians
 
 SAME = 0.02  # metres between boxes of the same candidate; planes of two RANSACs differ a little
 
 
-def compare(frames: list[Recorded], repeat: int) -> dict:
+def compare(frames: list[Frame], repeat: int) -> dict:
     """Medians over the frames of both, and how far their results agree."""
     ours: dict[str, list[float]] = {}
     plain: dict[str, list[float]] = {}
@@ -27,14 +27,14 @@ def compare(frames: list[Recorded], repeat: int) -> dict:
     agree = {"frames": len(frames), "labels_identical": 0, "candidates_same_given_ground": 0,
              "candidates": 0, "candidates_same": 0}
     for f in track(frames, "timing", len(frames)):
-        truth = pedestrians(f)
-        arguments = (f.frame.xyz, f.camera.projection, f.camera.width, f.camera.height, truth)
+        truth, scan, camera = pedestrians(f.truth()), f.load(), f.camera()
+        arguments = scan.xyz, camera.projection, camera.width, camera.height, truth
         theirs = [plain_stm_cpa.candidates(*arguments) for _ in range(min(repeat, 3))]
-        mine = [find_candidates(f.frame, truth_seed(truth), f.camera, PAPER)
+        mine = [find_candidates(scan, truth_seed(truth), camera, PAPER)
                 for _ in range(repeat)]
         _median_of_steps(plain, [r["ms"] for r in theirs])
         _median_of_steps(ours, [found.ms for _, found in mine])
-        _median_of_steps(best, [find_candidates(f.frame, truth_seed(truth), f.camera, BEST)[1].ms
+        _median_of_steps(best, [find_candidates(scan, truth_seed(truth), camera, BEST)[1].ms
                                 for _ in range(repeat)])
         result = theirs[0]
         # The same ground for both: then clusters must be identical, and so the candidates.

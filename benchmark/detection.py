@@ -9,13 +9,12 @@ import torch
 from rich.table import Table
 
 from benchmark.timing import spread
+from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.devices import chosen_device
-from lidar_perception.detectors.pointpillars.checkpoint import Header
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, network_config
-from lidar_perception.detectors.pointpillars.detector import Detector, TorchNetwork
+from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
 from lidar_perception.detectors.pointpillars.network import make_network
-from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
-from lidar_perception.param_fields import with_values
+from lidar_perception.detectors.pointpillars.params import STEPS
 from lidar_perception.runs.machine import cpu_name
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.types import LidarFrame
@@ -44,14 +43,14 @@ def measure_detection(scans: list[LidarFrame], repeat: int,
     return content
 
 
-def _medians(detectors: dict[str, Detector], scans: list[LidarFrame], repeat: int,
+def _medians(detectors: dict[str, PointPillarsDetector], scans: list[LidarFrame], repeat: int,
              title: str) -> dict[str, dict]:
     ms = {version: np.zeros((len(scans), repeat, len(STEPS))) for version in detectors}
     for i, scan in enumerate(track(scans, title, len(scans))):
         for j in range(repeat):
             for version, detector in detectors.items():
-                detector(scan)
-                ms[version][i, j] = [detector.ms[step] for step in STEPS]
+                found = detector(scan)
+                ms[version][i, j] = [found.ms[step] for step in STEPS]
     found = {}
     for version, runs in ms.items():
         steps = np.median(np.median(runs, axis=1), axis=0)
@@ -76,18 +75,18 @@ class Heard:
         return prediction
 
 
-def _random_detector(version: str, size: str, device: torch.device, scan: LidarFrame) -> Detector:
+def _random_detector(version: str, size: str, device: torch.device,
+                     scan: LidarFrame) -> PointPillarsDetector:
     """Warmed up, with thresholds that CANDIDATES anchors pass in this scan."""
     config = network_config(version, size)
     torch.manual_seed(0)
     heard = Heard(TorchNetwork(make_network(config).eval(), device))
-    detector = Detector(heard, Header(config), device)
+    detector = PointPillarsDetector(heard, Header(config), device)
     detector.warm_up()
     detector(scan)
     best = torch.sigmoid(heard.logits.amax(dim=1))
     least = float(best.topk(min(CANDIDATES, len(best))).values[-1])
-    detector.params = with_values(DetectorParams(), {
-        f"detection.scores.{name}": least for name in ("car", "pedestrian", "cyclist", "other")})
+    detector = detector.with_min_score(least)
     detector.network = heard.network
     detector(scan)
     return detector

@@ -9,19 +9,18 @@ from rich.table import Table
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.data.bag import Bag
-from lidar_perception.data.kitti.folder import open_kitti
-from lidar_perception.data.to_bag import kitti_scan, write_bag
+from lidar_perception.data.frame import Recording
+from lidar_perception.data.to_bag import write_bag
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.wire.topics import POINTS
 
 
-def measure_graph(kitti: Path, single: bool) -> dict:
+def measure_graph(recording: Recording, single: bool) -> dict:
     """Latency, losses and memory of the nodes at 10 Hz, without recording."""
     from lidar_perception.nodes.replay import replay
     with tempfile.TemporaryDirectory() as folder:
         drive, out = Path(folder) / "drive", Path(folder)
-        found = open_kitti(kitti)
-        write_bag(drive, track(map(kitti_scan, found), "writing a bag", len(found)))
+        write_bag(drive, track(recording, "writing a bag", len(recording)))
         with Bag(drive) as bag:
             clouds = bag.counts[POINTS]
         content = replay(drive, clouds, out, PAPER, single=single, record=False)

@@ -10,7 +10,7 @@ import numpy as np
 from benchmark import peers
 from benchmark.rows import against, measured, row
 from benchmark.timing import SLOW_REPEAT, Clock, spread, thin
-from lidar_perception.data.semantickitti import SemanticFrame
+from lidar_perception.data.frame import Frame
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.params import ClothParams, GroundParams, ThresholdParams
 from lidar_perception.ground.patchwork import segment_by_patchwork, silent_stdout
@@ -22,7 +22,7 @@ from lidar_perception.ground.threshold import (
     segment_by_threshold,
 )
 from lidar_perception.runs.terminal import track
-from lidar_perception.scoring.points.segmentation import PROTOCOLS, GroundReport
+from lidar_perception.scoring.points.segmentation import PROTOCOLS, GroundReport, ground_by_protocol
 from lidar_perception.types import LidarFrame
 
 PARAMS = GroundParams()
@@ -165,7 +165,7 @@ def _within(xyz: np.ndarray, params: ClothParams = PARAMS.cloth) -> np.ndarray:
     return xyz.compress((np.abs(xyz[:, :2]) <= params.max_range).all(axis=1), axis=0)
 
 
-def measure_labelled(frames: list[SemanticFrame], repeat: int) -> dict:
+def measure_labelled(frames: list[Frame], repeat: int) -> dict:
     """Precision, recall and F1 of our three methods and the cloth of the wheel by protocol."""
     missing = {"patchwork": peers.PATCHWORK.missing(), peers.CLOTH.name: peers.CLOTH.missing()}
     methods: dict[str, Callable] = {
@@ -178,12 +178,13 @@ def measure_labelled(frames: list[SemanticFrame], repeat: int) -> dict:
     with silent_stdout():
         clock = None
         for item in track(frames, "ground of labelled scans", len(frames)):
-            frame, semantic, _ = item.load()
+            frame, semantic = item.load(), item.point_truth().classes
             clock = clock or Clock(min(repeat, SLOW_REPEAT), calls(frame))
             for name, found in clock.time(calls(frame)).items():
-                reports[name].add(found, semantic, frame.xyz[:, 2], clock.ms[name][-1])
+                counts = ground_by_protocol(found, semantic, frame.xyz[:, 2])
+                reports[name].update(counts, clock.ms[name][-1])
     return {"scans": len(frames), "protocols": list(PROTOCOLS),
-            "methods": {name: reports[name].content() if name in reports
+            "methods": {name: reports[name].compute() if name in reports
                         else {"note": missing[name]} for name in methods}}
 
 

@@ -11,7 +11,7 @@ from rich.table import Table
 from benchmark.plain_pointnet2 import PlainPointNet2
 from benchmark.timing import interleaved
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.detectors.pointnet.checkpoint import Header
+from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of, network_input
 from lidar_perception.detectors.pointnet.config import pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
@@ -46,9 +46,9 @@ def measure_pointnet(scans: Sequence[LidarFrame], repeat: int) -> dict:
         calls["plain PointNet++ (SSG)"] = lambda c=some: _plain(plain, c, config.points)
         calls["detector"] = lambda s=scan: detector(s)
         interleaved(calls, 1)
-        ms, _ = interleaved(calls, repeat)
+        ms, said = interleaved(calls, repeat)
         rows.append(ms)
-        steps.append([detector.ms[step] for step in STEPS])
+        steps.append([said["detector"].ms[step] for step in STEPS])
         counts.append((len(some), len(every), len(scan)))
     middle = np.median(counts, axis=0)
     return {"clusters": float(middle[0]), "all_clusters": float(middle[1]),

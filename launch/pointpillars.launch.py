@@ -12,4 +12,4 @@ CONFIG = Path(__file__).resolve().parents[1] / "config" / "pointpillars.param.ya
 
 
 def generate_launch_description():
-    return detector_launch(POINTPILLARS, SINGLE_POINTPILLARS, CONFIG, "detection")
+    return detector_launch(POINTPILLARS, SINGLE_POINTPILLARS, CONFIG, "pointpillars")

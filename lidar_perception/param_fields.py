@@ -15,6 +15,20 @@ from typing import Any
 
 MAX_INT = 2**31 - 1
 
+# Old names, or old groups of them, and what they are called now.
+RENAMED = {
+    "detection.": "pointpillars.",
+    "seed.least_confidence": "seed.min_confidence",
+    "pointnet.least_points": "pointnet.min_points",
+    "data.least_points": "data.min_points",
+}
+
+
+def new_name(name: str) -> str | None:
+    """What a parameter of an older version is called now; None where it was not renamed."""
+    return next((new + name[len(old):] for old, new in RENAMED.items() if name.startswith(old)),
+                None)
+
 
 def param(default: Any, doc: str, *, unit: str = "", low: float | None = None,
           high: float | None = None, choices: tuple[str, ...] = (), fixed: bool = False) -> Any:
@@ -106,7 +120,9 @@ def with_values(params: Any, values: dict[str, Any]) -> Any:
     or wrong."""
     known = parameter_fields(params)
     if unknown := [name for name in values if name not in known]:
-        raise ValueError(f"unknown parameter {unknown[0]!r}; known are {', '.join(known)}")
+        remedy = (f"it is {new} now" if (new := new_name(unknown[0]))
+                  else f"known are {', '.join(known)}")
+        raise ValueError(f"unknown parameter {unknown[0]!r}; {remedy}")
     return _replaced(params, values, "")
 
 

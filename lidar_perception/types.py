@@ -35,6 +35,14 @@ class LidarFrame:
     stamp_ns: int = 0
     frame_id: str = ""
 
+    @staticmethod
+    def of(xyz: np.ndarray, intensity: np.ndarray | None = None, stamp_ns: int = 0,
+           frame_id: str = "") -> LidarFrame:
+        """The frame of the usable ones among returns (N, 3) as a sensor gives them."""
+        frame = LidarFrame(np.ascontiguousarray(xyz, np.float32), intensity, stamp_ns, frame_id)
+        usable = usable_returns(frame.xyz)
+        return frame if usable.all() else frame.take(np.flatnonzero(usable))
+
     def __len__(self) -> int:
         return len(self.xyz)
 

@@ -26,7 +26,8 @@ from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.seed_sources import truth_seed
 from lidar_perception.candidates.seeds import Seed
 from lidar_perception.candidates.silhouette import silhouettes, similarity
-from lidar_perception.data.kitti.folder import KittiFrame, open_kitti
+from lidar_perception.data.frame import Frame
+from lidar_perception.data.kitti.folder import open_kitti
 from lidar_perception.groups import group_points
 from lidar_perception.runs.files import write_text
 from lidar_perception.scoring.centres.matching import match_centres, range_bins
@@ -37,11 +38,11 @@ PENALTY = 1.0  # chosen on streets left out
 OUT = Path(module.__file__).with_name("confidence.json")
 
 
-def samples(frame: KittiFrame, seed: Seed, params: PipelineParams) -> dict | None:
+def samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | None:
     """Features of the clusters of one frame, against a seed of another frame, as one's own cluster
     says nothing; hit (K,) bool; bins of range of the clusters and of the pedestrians."""
     truth = frame.truth().of_class(PEDESTRIAN)
-    segmented = segment(frame.load(), frame.calibration().camera(), params)
+    segmented = segment(frame.load(), frame.camera(), params)
     boxes, ids = segmented.boxes, np.arange(1, len(segmented.boxes) + 1)
     if len(boxes) == 0:
         return None
@@ -60,7 +61,7 @@ def seed_of(job: tuple[str, int]) -> Seed | None:
     """The nearest pedestrian of a frame, as in the paper's protocol."""
     frame = open_kitti(job[0])[job[1]]
     try:
-        segmented = segment(frame.load(), frame.calibration().camera(), BEST)
+        segmented = segment(frame.load(), frame.camera(), BEST)
         return truth_seed(frame.truth().of_class(PEDESTRIAN))(segmented)
     except InputError:
         return None

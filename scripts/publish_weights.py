@@ -11,13 +11,13 @@ may have been trained on.
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 
-from lidar_perception.cli.detection import score_detector
-from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.detectors import checkpoint
 from lidar_perception.detectors.checkpoint import (
     POINTNET,
@@ -26,28 +26,28 @@ from lidar_perception.detectors.checkpoint import (
     save_checkpoint,
 )
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.detectors.pointnet.checkpoint import load_pointnet
+from lidar_perception.detectors.params import MIN_SCORE
+from lidar_perception.detectors.pointnet.network import load_pointnet
 from lidar_perception.detectors.pointnet.weights_file import WEIGHTS as POINTNET_WEIGHTS
-from lidar_perception.detectors.pointpillars.checkpoint import load_network
+from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
 from lidar_perception.runs.files import write_text
-from lidar_perception.runs.terminal import console, track
+from lidar_perception.runs.terminal import console
+from lidar_perception.scoring.detections import by_detector
 from lidar_perception.scoring.kitti.report import DetectionReport
+from lidar_perception.scoring.run import fill
 from lidar_perception.training.record import metrics_of, rounded
 
-LEAST_SCORE = 0.05  # AP needs boxes that a robot would not act on
 ROWS = (("bev_relaxed", "from above"), ("bev", "from above"), ("3d_relaxed", "in space"),
         ("3d", "in space"))
 
 
 def scores_of(weights: Path, folder: Path) -> dict[str, Any]:
     """What evaluate detection finds, as JSON."""
-    report, frames = DetectionReport(), open_kitti(folder)
-    work = score_detector(frames, open_detector(
-        weights, least_score=LEAST_SCORE), None, report)
-    for _ in track(work, folder.name, len(frames)):
-        pass
-    return report.content()
+    report = DetectionReport()
+    fill(report, open_recording(folder), by_detector(partial(open_detector, weights,
+                                                             min_score=MIN_SCORE)))
+    return report.compute()
 
 
 def card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]]) -> str:

@@ -7,7 +7,8 @@ from samples import CALIBRATION, STAMP, scene, walker_truth
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import Bag
-from lidar_perception.data.to_bag import Scan
+from lidar_perception.data.frame import Frame
+from lidar_perception.types import LidarFrame
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, TF_STATIC
 
 OTHER_CALIBRATION = Calibration(CALIBRATION.intrinsics * [[2], [2], [1]],
@@ -15,10 +16,16 @@ OTHER_CALIBRATION = Calibration(CALIBRATION.intrinsics * [[2], [2], [1]],
 LATCHED = {CAMERA_INFO, EXTRINSICS, TF_STATIC}
 
 
-def scans(count: int = 3) -> list[Scan]:
+def scans(count: int = 3) -> list[Frame]:
     """Truth in all but the second; the calibration changes after the second."""
-    return [Scan(scene(i), STAMP + i * 10**8, None if i == 1 else walker_truth(),
-                 CALIBRATION if i < 2 else OTHER_CALIBRATION) for i in range(count)]
+    return [Frame.of(str(i), cloud_frame(scene(i), STAMP + i * 10**8),
+                     None if i == 1 else walker_truth(),
+                     CALIBRATION if i < 2 else OTHER_CALIBRATION) for i in range(count)]
+
+
+def cloud_frame(cloud: np.ndarray, stamp_ns: int) -> LidarFrame:
+    """cloud (N, 4) [x y z intensity]."""
+    return LidarFrame(np.ascontiguousarray(cloud[:, :3]), cloud[:, 3].copy(), stamp_ns, "velodyne")
 
 
 def message_bytes(path) -> list[tuple[str, int, bytes]]:

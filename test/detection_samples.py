@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from lidar_perception.detectors.pointpillars.checkpoint import Header
+from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointpillars.config import NetworkConfig, network_config
-from lidar_perception.detectors.pointpillars.detector import CPU, Detector, TorchNetwork
+from lidar_perception.detectors.pointpillars.detector import CPU, PointPillarsDetector, TorchNetwork
 from lidar_perception.detectors.pointpillars.network import make_network
 from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.param_fields import with_values
@@ -69,19 +70,21 @@ def frame(seed: int = 0) -> LidarFrame:
 def eager(params: DetectorParams = DetectorParams(), score: float = 0.25) -> DetectorParams:
     """Parameters with which random weights find something."""
     names = ("car", "pedestrian", "cyclist", "other")
-    return with_values(params, {**{f"detection.scores.{n}": score for n in names},
-                                "detection.nms.iou": 0.2})
+    return with_values(params, {**{f"pointpillars.scores.{n}": score for n in names},
+                                "pointpillars.nms.iou": 0.2})
 
 
 def random_detector(version: str = "v0", params: DetectorParams | None = None,
-                    **changes) -> Detector:
+                    **changes) -> PointPillarsDetector:
     """With random weights."""
     config = tiny(version, **changes)
-    return Detector(TorchNetwork(lively(config)), Header(config), CPU, params or eager())
+    return PointPillarsDetector(TorchNetwork(lively(config)), Header(config), CPU,
+                                params or eager())
 
 
-def same(a: Detections, b: Detections, atol: float = 0.0) -> bool:
+def same(a: Detections | Found, b: Detections | Found, atol: float = 0.0) -> bool:
     """Whether both say the same, in the same order."""
+    a, b = (x.detections if isinstance(x, Found) else x for x in (a, b))
     return (len(a) == len(b) and np.array_equal(a.class_ids, b.class_ids)
             and np.allclose(a.boxes, b.boxes, rtol=0, atol=atol)
             and np.allclose(a.scores, b.scores, rtol=0, atol=atol))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from lidar_perception.detectors.pointnet.checkpoint import Header
+from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.config import PointNetConfig, pointnet_config
 from lidar_perception.detectors.pointnet.detector import PointNetDetector

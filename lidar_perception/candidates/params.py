@@ -92,7 +92,7 @@ class SeedParams(Params):
         choices=SEED_SOURCES)
     file: str = param("", "Template file for source 'file'; empty: the one that comes with the "
                       "package.")
-    least_confidence: float = param(0.3, "For source 'automatic': a cluster less like a pedestrian "
+    min_confidence: float = param(0.3, "For source 'automatic': a cluster less like a pedestrian "
                                     "than this is no seed.", low=0.0, high=1.0)
     click_radius: float = param(2.0, "A click takes the nearest cluster within this distance.",
                                 unit="m", low=0.01, high=100.0)

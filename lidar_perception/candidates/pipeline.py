@@ -11,6 +11,8 @@ from __future__ import annotations
 from dataclasses import replace
 from time import perf_counter
 
+import numpy as np
+
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.refine import Candidates, refine
@@ -22,14 +24,17 @@ from lidar_perception.types import LidarFrame
 
 
 def segment(frame: LidarFrame, camera: Camera | None = None,
-            params: PipelineParams = PipelineParams()) -> Segmented:
-    """Stages up to the boxes. InputError if the crop is on and there is no camera."""
+            params: PipelineParams = PipelineParams(), *, ground: np.ndarray | None = None,
+            cluster_ids: np.ndarray | None = None) -> Segmented:
+    """Stages up to the boxes; ground (N,) bool and cluster_ids (N,) int of the frame's points are
+    computed where they are None. InputError if the crop is on and there is no camera."""
     t0 = perf_counter()
     places, seen = points_in_view(frame, camera, params.view)
     t1 = perf_counter()
-    ground = segment_ground(seen, params.ground)
+    ground = segment_ground(seen, params.ground) if ground is None else ground[places]
     t2 = perf_counter()
-    cluster_ids = cluster_obstacles(seen.xyz, ground, params.clustering)
+    cluster_ids = (cluster_obstacles(seen.xyz, ground, params.clustering) if cluster_ids is None
+                   else cluster_ids[places])
     t3 = perf_counter()
     boxes = grounded_boxes(seen.xyz, ground, cluster_ids, params.boxes.shape)
     t4 = perf_counter()
@@ -39,12 +44,11 @@ def segment(frame: LidarFrame, camera: Camera | None = None,
 
 
 def find_candidates(frame: LidarFrame, seed: SeedSource, camera: Camera | None = None,
-                    params: PipelineParams = PipelineParams()) -> tuple[Segmented, Candidates]:
-    """The whole pipeline on one frame; ms of the result covers every step of params.STEPS.
-
-    InputError where the seed source has no seed for this frame.
-    """
-    segmented = segment(frame, camera, params)
+                    params: PipelineParams = PipelineParams(),
+                    **columns: np.ndarray | None) -> tuple[Segmented, Candidates]:
+    """The whole pipeline on one frame; ms of the result covers every step of params.STEPS;
+    columns as in segment(). InputError where the seed source has no seed for this frame."""
+    segmented = segment(frame, camera, params, **columns)
     return segmented, refined(segmented, seed, params)
 
 

@@ -29,5 +29,5 @@ def warm_up() -> None:
                                             ("cloth", "euclidean", "l_shape", True)):
         params = with_values(base, {
             "ground.method": ground, "clustering.method": clustering, "boxes.shape": boxes,
-            "confidence.enabled": sure, "seed.least_confidence": 0.0})
+            "confidence.enabled": sure, "seed.min_confidence": 0.0})
         find_candidates(LidarFrame(xyz), automatic_seed(seed, params), forward, params)

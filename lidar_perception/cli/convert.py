@@ -1,53 +1,43 @@
-"""convert: data sets to bags."""
+"""convert: labelled frames to a bag."""
 
 from __future__ import annotations
 
+from itertools import islice
 from pathlib import Path
 
 import click
+from rich.markup import escape
 
-from lidar_perception.data.kitti.folder import open_kitti
-from lidar_perception.data.to_bag import kitti_scan, write_bag
+from lidar_perception.cli.data import limit_option, opened, split_option
 from lidar_perception.runs.terminal import console, track
-from lidar_perception.types import InputError
 
 
-@click.group()
-def convert() -> None:
-    """Turn a data set into a rosbag2 bag."""
-
-
-@convert.command()
-@click.argument("root", type=click.Path(path_type=Path))
+@click.command()
+@click.argument("data", type=click.Path(path_type=Path), metavar="PATH")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Bag folder to make.")
 @click.option("--images", is_flag=True, help="Take the left colour images along, as PNG.")
-@click.option("--frames", type=click.IntRange(1), help="Only the first so many frames.")
+@split_option
+@limit_option
 @click.option("--force", is_flag=True, help="Replace the bag if it exists.")
-def kitti(root: Path, out: Path, images: bool, frames: int | None, force: bool) -> None:
-    """KITTI 3D object, tracking or raw data at ROOT to one MCAP bag.
+def convert(data: Path, out: Path, images: bool, split: Path | None, limit: int | None,
+            force: bool) -> None:
+    """KITTI, nuScenes or SemanticKITTI at PATH, or another bag, to one MCAP bag.
 
     Topics: /points, /ground_truth/detections, /camera/camera_info, /camera/extrinsics, /tf_static,
     and with --images /camera/image/compressed. Scans that cannot be read are left out, named and
     counted; the exit code is then 1.
 
     \b
-    Example:
-      lidar-perception convert kitti /data/kitti/tracking --out tracking.bag
+    Examples:
+      lidar-perception convert /data/kitti/tracking --out tracking.bag
+      lidar-perception convert /data/nuscenes/v1.0-mini --out nuscenes.bag
     """
-    wanted = open_kitti(root)[:frames]
-    skipped: list[str] = []
-
-    def scans():
-        for frame in track(wanted, f"converting {root}", len(wanted)):
-            try:
-                scan = kitti_scan(frame, images)
-            except InputError as error:
-                skipped.append(str(error))
-                continue
-            yield scan
-
-    count = write_bag(out, scans(), force=force)
-    console.print(f"{out}: {count} scans of {len(wanted)}")
+    from lidar_perception.data.to_bag import write_bag
+    recording = opened(data, split=split)
+    count, skipped = min(len(recording), limit or len(recording)), []
+    frames = track(islice(recording, count), f"converting {data}", count)
+    written = write_bag(out, frames, images=images, force=force, skipped=skipped)
+    console.print(f"{out}: {written} scans of {count}")
     for line in skipped:
-        console.print(f"[yellow]left out[/]: {line}")
+        console.print(f"[yellow]left out[/]: {escape(line)}")
     raise SystemExit(1 if skipped else 0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import click
 import numpy as np
@@ -12,24 +13,26 @@ import numpy as np
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.warm_up import warm_up
-from lidar_perception.cli.evaluate import view_as_recorded
+from lidar_perception.cli.data import WHAT, a_path, opened
+from lidar_perception.cli.evaluate.candidates import view_as_recorded
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag_frames import BagFrames
+from lidar_perception.data.frame import BOXES
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
 from lidar_perception.nodes.graph import cloud_topic, result_topics
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console, errors, track
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.wire.messages import column, to_detections, to_frame
-from lidar_perception.wire.topics import POINTS, TRUTH
+from lidar_perception.wire.topics import TRUTH
 from msg_utils.markers import from_marker_array
 
 
 @click.command()
-@click.option("--kitti", type=click.Path(path_type=Path), metavar="ROOT",
-              help="Replay a KITTI folder instead of the simulated drive.")
-@click.option("--bag", type=click.Path(path_type=Path),
-              help="Replay a bag with /points and /ground_truth/detections.")
+@a_path("--data", f"Replay this instead of the simulated drive: {WHAT}", "PATH")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("out/demo"),
               show_default=True, help="Folder for the results.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
@@ -40,8 +43,8 @@ from msg_utils.markers import from_marker_array
               help="Speed of the replay.")
 @click.option("--single", is_flag=True, help="All stages in one process instead of three.")
 @parameter_options(PAPER)
-def demo(kitti: Path | None, bag: Path | None, out: Path, frames: int, drive_seed: int,
-         rate: float, single: bool, params: PipelineParams) -> None:
+def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float, single: bool,
+         params: PipelineParams) -> None:
     """Replay a drive through the real nodes over DDS and score the pedestrian candidates.
 
     Without options: makes a simulated drive with walking pedestrians, writes it as a rosbag2 bag,
@@ -51,19 +54,16 @@ def demo(kitti: Path | None, bag: Path | None, out: Path, frames: int, drive_see
     \b
     Examples:
       lidar-perception demo
-      lidar-perception demo --kitti /data/kitti/tracking
-      lidar-perception demo --bag drive.bag --rate 0.5 --single
+      lidar-perception demo --data /data/kitti/tracking
+      lidar-perception demo --data drive.bag --rate 0.5 --single
     """
-    if kitti is not None and bag is not None:
-        raise click.UsageError("give --kitti or --bag, not both")
+    recording = None if data is None else opened(data)
     for old in ("drive", "result", "logs"):
         shutil.rmtree(out / old, ignore_errors=True)
-    drive = bag or _make_bag(out / "drive", kitti, frames, drive_seed)
-    with Bag(drive) as opened:
-        opened.require(POINTS)
-        opened.require(TRUTH)
-        clouds = opened.counts[POINTS]
-    params = view_as_recorded(drive, params)
+    drive = _bag(out / "drive", recording, frames, drive_seed)
+    played = open_recording(drive)
+    played.require(BOXES, "demo")
+    clouds, params = len(played), view_as_recorded(played, params)
     from lidar_perception.nodes.replay import replay
     with errors.status("loading compiled code (the first time: compiling, about a minute)"):
         warm_up()
@@ -82,18 +82,18 @@ def demo(kitti: Path | None, bag: Path | None, out: Path, frames: int, drive_see
         raise SystemExit(1)
 
 
-def _make_bag(path: Path, kitti: Path | None, frames: int, drive_seed: int) -> Path:
-    from lidar_perception.data.kitti.folder import open_kitti
-    from lidar_perception.data.to_bag import kitti_scan, write_bag
-    if kitti is not None:
-        found = open_kitti(kitti)
-        scans = track(map(kitti_scan, found), f"converting {kitti}", len(found))
+def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
+    """The bag to replay: the one that was given, or one made of it, or of a simulated drive."""
+    if recording is not None and isinstance(recording.frames, BagFrames):
+        return recording.path
+    if recording is not None:
+        found = track(recording, f"converting {recording.path}", len(recording))
     else:
         from lidar_perception.simulation.scene import CROWDED
         from lidar_perception.simulation.to_bag import simulated_scans
-        scans = track(simulated_scans(drive_seed, frames, streets=CROWDED), "simulating a drive",
+        found = track(simulated_scans(drive_seed, frames, streets=CROWDED), "simulating a drive",
                       frames)
-    write_bag(path, scans, force=True)
+    write_bag(path, found, force=True)
     return path
 
 

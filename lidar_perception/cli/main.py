@@ -12,12 +12,12 @@ from lidar_perception import __version__
 COMMANDS = {  # verb -> module.function, and its line in the overview
     "demo": ("demo.demo", "Replay a drive through the real nodes and score the result."),
     "convert": ("convert.convert", "Turn a data set into a rosbag2 bag."),
-    "evaluate": ("evaluate.evaluate", "Score the algorithms without ROS."),
+    "evaluate": ("evaluate.group.evaluate", "Score the algorithms without ROS."),
     "compare": ("compare.compare", "Run every detector on the same frames, side by side."),
     "reproduce": ("reproduce.reproduce", "Measure every table of the STM-CPA paper."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),
     "simulate": ("simulate.simulate", "Write simulated scans as a bag or a data set."),
-    "train": ("train.train", "Train a network on KITTI folders or simulated streets."),
+    "train": ("train.train", "Train a network on labelled frames or simulated streets."),
     "import-weights": ("weights.import_weights", "Read PointPillars weights of other projects."),
     "export": ("weights.export", "Write a network for another runtime."),
     "info": ("info.info", "Say what is in a bag."),
@@ -36,7 +36,7 @@ class LazyGroup(click.Group):
     def get_command(self, ctx: click.Context, name: str) -> click.Command | None:
         if name not in COMMANDS:
             return None
-        module, function = COMMANDS[name][0].split(".")
+        module, _, function = COMMANDS[name][0].rpartition(".")
         return getattr(importlib.import_module(f"lidar_perception.cli.{module}"), function)
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
@@ -47,15 +47,15 @@ class LazyGroup(click.Group):
 @click.group(cls=LazyGroup, context_settings=dict(help_option_names=["-h", "--help"]))
 @click.version_option(__version__, prog_name="lidar-perception")
 def cli() -> None:
-    """LiDAR perception for ROS 2: ground, clusters, pedestrian candidates.
+    """LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned detectors.
 
     \b
     Examples:
       lidar-perception demo
-      lidar-perception demo --kitti /data/kitti/tracking
-      lidar-perception convert kitti /data/kitti/object --out kitti.bag
-      lidar-perception evaluate candidates --kitti /data/kitti/object --json scores.json
-      lidar-perception reproduce stm-cpa --kitti /data/kitti/object --out report
+      lidar-perception demo --data /data/kitti/tracking
+      lidar-perception convert /data/kitti/object --out kitti.bag
+      lidar-perception evaluate candidates --data /data/kitti/object --json scores.json
+      lidar-perception reproduce stm-cpa --data /data/kitti/object --out report
       lidar-perception run perception --ros-args -r '~/input/points:=/points'
 
     Exit codes: 0 done, 1 ran but something failed, 2 the command or its input cannot be used.

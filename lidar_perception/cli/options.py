@@ -11,7 +11,7 @@ import click
 import yaml
 
 from lidar_perception.candidates.configurations import CONFIGURATIONS
-from lidar_perception.param_fields import flatten, parameter_fields, with_values
+from lidar_perception.param_fields import flatten, new_name, parameter_fields, with_values
 from lidar_perception.types import InputError
 
 
@@ -95,6 +95,8 @@ def read_config(path: Path, params: Any) -> dict[str, Any]:
         for name, value in _dotted(section["ros__parameters"] or {}):
             if name in known:
                 values[name] = value
+            elif (new := new_name(name)) in known:
+                raise InputError(f"{path}: '{name}' is called '{new}' now; rename it")
     return values
 
 

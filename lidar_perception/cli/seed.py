@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.seed_sources import clicked_seed, truth_seed
 from lidar_perception.candidates.seeds import save_seed
 from lidar_perception.candidates.silhouette import to_pixels
+from lidar_perception.cli.data import data_option, opened
 from lidar_perception.cli.options import parameter_options
-from lidar_perception.data.recording import Recorded, open_recording
+from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.runs.terminal import console
 from lidar_perception.scoring.centres.report import pedestrians
 from lidar_perception.types import InputError
@@ -22,16 +24,15 @@ from lidar_perception.wire.params import ViewParams
 
 
 @click.command()
-@click.option("--kitti", type=click.Path(path_type=Path), metavar="ROOT", help="KITTI folder.")
-@click.option("--bag", type=click.Path(path_type=Path), help="Bag with /points.")
+@data_option
 @click.option("--frame", "number", type=click.IntRange(0), metavar="N",
               help="Number of the frame; default: the first with a Pedestrian label.")
 @click.option("--at", nargs=3, type=float, metavar="X Y Z",
               help="A point on the pedestrian, in the LiDAR frame; default: the nearest label.")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Template to write.")
 @parameter_options(PipelineParams(view=ViewParams(enabled=True)))
-def seed(kitti: Path | None, bag: Path | None, number: int | None,
-         at: tuple[float, float, float] | None, out: Path, params: PipelineParams) -> None:
+def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, out: Path,
+         params: PipelineParams) -> None:
     """Take the silhouette and height of one pedestrian as a template for later runs.
 
     Use it with --seed-source file --seed-file OUT, or with the parameters seed.source and
@@ -39,32 +40,30 @@ def seed(kitti: Path | None, bag: Path | None, number: int | None,
 
     \b
     Examples:
-      lidar-perception seed --kitti /data/kitti/object --out pedestrian.json
-      lidar-perception seed --bag drive --frame 12 --at 8.2 -1.5 -0.8 --out pedestrian.json
+      lidar-perception seed --data /data/kitti/object --out pedestrian.json
+      lidar-perception seed --data drive --frame 12 --at 8.2 -1.5 -0.8 --out pedestrian.json
     """
-    if (kitti is None) == (bag is None):
-        raise click.UsageError("give either --kitti ROOT or --bag FILE")
-    recorded = _pick(open_recording(kitti=kitti, bag=bag), number, labelled=at is None)
-    if recorded.camera is None:
+    frame = _pick(opened(data), number, labelled=at is None)
+    camera = frame.camera()
+    if camera is None:
         params = replace(params, view=ViewParams(enabled=False))
-    segmented = segment(recorded.frame, recorded.camera, params)
+    segmented = segment(frame.load(), camera, params)
     source = (clicked_seed(np.array(at), params.seed) if at is not None
-              else truth_seed(pedestrians(recorded)))
+              else truth_seed(pedestrians(frame.truth())))
     template = source(segmented)
     save_seed(template, out)
     for row in to_pixels(template.silhouette(params))[::2]:
         console.print("".join(".#"[bit] for bit in row.astype(int)), markup=False)
-    console.print(f"{out}: frame {recorded.name}, height {template.height:.2f} m")
+    console.print(f"{out}: frame {frame.name}, height {template.height:.2f} m")
 
 
-def _pick(recording, number: int | None, labelled: bool) -> Recorded:
-    for i, recorded in enumerate(recording):
-        if isinstance(recorded, InputError):
-            if i == number:
-                raise recorded
-            continue
-        if i == number or (number is None and (not labelled or len(pedestrians(recorded)))):
-            return recorded
-    raise InputError(f"{recording.path} has no frame {number}; it has {recording.count}"
+def _pick(recording: Recording, number: int | None, labelled: bool) -> Frame:
+    for i, frame in enumerate(recording):
+        if i == number:
+            return frame
+        with suppress(InputError):
+            if number is None and (not labelled or len(pedestrians(frame.truth()))):
+                return frame
+    raise InputError(f"{recording.path} has no frame {number}; it has {len(recording)}"
                      if number is not None else
                      f"{recording.path} has no Pedestrian label; give --frame and --at")

@@ -11,7 +11,8 @@ from pathlib import Path
 import click
 
 from lidar_perception import __version__
-from lidar_perception.data.recording import Recorded, open_recording
+from lidar_perception.cli.data import opened
+from lidar_perception.data.frame import BOXES, Frame
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.folder import is_finished, unfinished
@@ -40,25 +41,25 @@ from lidar_perception.types import InputError
 @click.option("--people", type=click.FloatRange(0), default=1.0, show_default=True,
               help="How many times as many pedestrians and cyclists as in KITTI.")
 @click.option("--streets-of", type=click.IntRange(1), metavar="N",
-              help="Go on with the next street after N scans. Default: 1 for kitti, 20 s of "
+              help="Change to the next street after N scans. Default: 1 for kitti, 20 s of "
                    "driving for the others.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes that write the folders of a data "
               "set. Default: one for each core.")
-@click.option("--resume", is_flag=True, help="Go on with a data set that was not finished.")
+@click.option("--resume", is_flag=True, help="Resume a data set that was not finished.")
 @click.option("--force", is_flag=True, help="Replace what was simulated into --out before.")
-@click.option("--compare", "kitti", type=click.Path(path_type=Path), metavar="KITTI_ROOT",
-              help="Compare with the labelled scans of a KITTI folder; nothing is made.")
+@click.option("--compare", "real", type=click.Path(path_type=Path), metavar="PATH",
+              help="Compare with the labelled scans of a data set or bag; nothing is made.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="With --compare: write every curve to this file.")
 @click.option("--png", type=click.Path(path_type=Path), metavar="FILE",
               help="With --compare: draw every curve.")
 def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed: int,
              kind: str | None, people: float, streets_of: int | None, jobs: int | None,
-             resume: bool, force: bool, kitti: Path | None, json_file: Path | None,
+             resume: bool, force: bool, real: Path | None, json_file: Path | None,
              png: Path | None) -> None:
     """Write labelled scans of simulated streets as a bag or data set, or measure how real they are.
 
-    A data set that was stopped is marked by a file INCOMPLETE; --resume goes on with it.
+    A data set that was stopped is marked by a file INCOMPLETE; --resume finishes it.
 
     \b
     Examples:
@@ -66,23 +67,23 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
       lidar-perception simulate --format kitti --frames 1000 --out training_data
       lidar-perception simulate --compare /data/kitti/object --png realism.png
     """
-    if (out is None) == (kitti is None):
-        raise click.UsageError("give either --out FOLDER or --compare KITTI_ROOT")
+    if (out is None) == (real is None):
+        raise click.UsageError("give either --out FOLDER or --compare PATH")
     streets = Streets(kind, people)
-    if kitti is not None:
-        _compare(kitti, frames, seed, streets, json_file, png)
+    if real is not None:
+        _compare(real, frames, seed, streets, json_file, png)
         return
     if json_file or png:
         raise click.UsageError("--json and --png go with --compare")
     if resume and force:
-        raise click.UsageError("--resume goes on, --force starts again: give one of them")
+        raise click.UsageError("--resume resumes, --force starts again: give one of them")
     sensor = sensor_named(sensor_name)
     plan = Plan(layout, sensor, seed, frames,
                 streets_of or (1 if layout == "kitti" else longest_drive(sensor)), streets)
     if layout == "mcap":
         if resume:
             raise click.UsageError("a bag is one file and cannot be resumed; make kitti-tracking, "
-                                   "which can, and turn it into a bag with 'convert kitti'")
+                                   "which can, and turn it into a bag with 'convert'")
         _bag(out, plan, force)
     else:
         _data_set(out, plan, sensor_name, jobs or len(os.sched_getaffinity(0)), resume, force)
@@ -118,25 +119,27 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
     except InputError as error:
         if not begun:
             raise
-        raise click.ClickException(f"{error}; what is done stays, go on with --resume") from None
+        raise click.ClickException(f"{error}; what is done stays, --resume continues") from None
     console.print(f"{out} is complete: there is nothing to do" if complete else
                   f"{out}: {plan.frames} scans" + (f", {plan.frames - len(missing)} of them from "
                                                    "before" if resume else ""), soft_wrap=True)
 
 
-def _compare(kitti: Path, frames: int, seed: int, streets: Streets, json_file: Path | None,
+def _compare(real: Path, frames: int, seed: int, streets: Streets, json_file: Path | None,
              png: Path | None) -> None:
     from lidar_perception.candidates.configurations import PAPER
     from lidar_perception.candidates.warm_up import warm_up
-    from lidar_perception.simulation.realism.compare import compare, labelled, measure
+    from lidar_perception.simulation.realism.compare import compare, evenly, measure
     from lidar_perception.simulation.realism.report import draw_realism, print_realism
 
-    recording = labelled(open_recording(kitti=kitti))
+    recording = opened(real)
+    recording.require(BOXES, "simulate --compare")
+    chosen = evenly(recording)
     warm_up()
-    real = measure(track(recording, "measuring real scans", recording.count), PAPER)
-    simulated = measure(track(_scans(seed, frames, streets), "measuring simulated scans", frames),
+    measured = measure(track(chosen, "measuring real scans", len(chosen)), PAPER)
+    simulated = measure(track(_frames(seed, frames, streets), "measuring simulated scans", frames),
                         PAPER)
-    content = {"kitti": str(kitti), "seed": seed, **compare(real, simulated)}
+    content = {"data": str(real), "seed": seed, **compare(measured, simulated)}
     if json_file:
         write_text(json_file, json.dumps(content, indent=1))
     if png:
@@ -146,10 +149,9 @@ def _compare(kitti: Path, frames: int, seed: int, streets: Streets, json_file: P
         console.print(f"picture: {png}", soft_wrap=True)
 
 
-def _scans(seed: int, count: int, streets: Streets) -> Iterator[Recorded]:
+def _frames(seed: int, count: int, streets: Streets) -> Iterator[Frame]:
     """The first scans of streets seed, seed + 1, ..., with labels of the objects whose centre the
     camera sees, as in KITTI."""
-    camera = FORWARD_CAMERA.camera()
     for street in range(seed, seed + count):
-        frame, labels = next(iter(drive(street, 1, streets=streets)))
-        yield Recorded(f"street {street}", frame, labels_in_view(labels), camera)
+        scan, labels = next(iter(drive(street, 1, streets=streets)))
+        yield Frame.of(f"street {street}", scan, labels_in_view(labels), FORWARD_CAMERA)

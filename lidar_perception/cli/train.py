@@ -23,19 +23,19 @@ PAPER_ABLATION = (75.52, 80.15, 81.33, 83.44, 85.10, 86.33, 86.89, 88.96)  # pap
 
 SCENES_AND_RUN = (
     click.option("--data", multiple=True, required=True, metavar="DIR|sim",
-                 help="What to train on: a KITTI folder, or simulated streets; may be repeated to "
-                 "mix them."),
+                 help="What to train on: a data set or bag, or simulated streets; may be repeated "
+                 "to mix them."),
     click.option("--val", multiple=True, metavar="DIR|sim",
                  help="What to validate on. Default: frames held out of --data, and other "
                  "simulated streets."),
     click.option("--split", type=click.Path(path_type=Path), metavar="FILE",
-                 help="Train on the frames of the KITTI folder that are named in this file, one a "
-                 "line."),
+                 help="Train on the frames of --data, or whole sequences, that are named in this "
+                 "file, one a line."),
     click.option("--val-split", type=click.Path(path_type=Path), metavar="FILE",
                  help="Likewise the frames to validate on."),
     click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR",
                  help="Folder for best.safetensors, last.safetensors, logs and the state."),
-    click.option("--resume", is_flag=True, help="Go on with the run in --out, if there is one."),
+    click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one."),
     click.option("--init", type=click.Path(path_type=Path), metavar="FILE",
                  help="Begin with the weights of this checkpoint, as far as they fit."),
     click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N."),
@@ -63,10 +63,10 @@ def train() -> None:
 def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
                  val_split: Path | None, out: Path, resume: bool, init: Path | None, device: str,
                  jobs: int, params: PointPillarsTraining) -> None:
-    """PointPillars and EG-PointPillars, on KITTI folders, simulated streets, or both.
+    """PointPillars and EG-PointPillars, on labelled frames, simulated streets, or both.
 
     The best weights so far, by AP on what is validated on, lie in OUT/best.safetensors. Ctrl-C
-    saves and stops; --resume goes on, also after a kill. Several GPUs: torchrun.
+    saves and stops; --resume continues, also after a kill. Several GPUs: torchrun.
 
     \b
     Examples:
@@ -84,7 +84,7 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
     from lidar_perception.training.loop import train as run
     from lidar_perception.training.pointpillars.task import (
         Preparation,
-        judged_scan,
+        frame_to_judge,
         make_task,
         narrowed,
     )
@@ -102,15 +102,15 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
             if rank() == 0 and not (resume and database.is_file()):
                 raw = Stream(sources, None, params.seed)
                 scenes = RawScenes(raw).some(wanted.database_scans, jobs)
-                cut_objects(scenes, config.classes, params.data.least_points).save(database)
+                cut_objects(scenes, config.classes, params.data.min_points).save(database)
             wait()
         seen = narrowed(config, params.ahead, params.aside)
-        stream = Stream(sources, Preparation(seen, params.augment, params.data.least_points,
+        stream = Stream(sources, Preparation(seen, params.augment, params.data.min_points,
                                              database), params.seed)
         batches = Batches(stream, params.batch, jobs, rank(), world())
         about = about_data(data, val, stream, held_out, init)
-        task = make_task(config, params, batches, JudgedScenes(held_out, judged_scan), out, place,
-                         about, commit(), init)
+        task = make_task(config, params, batches, JudgedScenes(held_out, frame_to_judge), out,
+                         place, about, commit(), init)
         progress = run(task, params, out, place, resume)
         if rank() > 0:
             return
@@ -125,7 +125,7 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
 def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
              val_split: Path | None, out: Path, resume: bool, init: Path | None, device: str,
              jobs: int, ablation: bool, params: PointNetTraining) -> None:
-    """The cluster network of paper C, on KITTI folders, simulated streets, or both.
+    """The cluster network of paper C, on labelled frames, simulated streets, or both.
 
     Scenes are cut into clusters by the package's own ground and clustering; with --data-cache the
     clusters are kept, too. The best weights so far lie in OUT/best.safetensors, their scores
@@ -173,7 +173,7 @@ def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[
     may_begin(out, resume)
     config = pointnet_config(params.network)
     cache = Path(params.data.cache) / "clusters" if params.data.cache else None
-    sources, held_out = (tuple(CutScenes(source, config, params.data.least_points, cache)
+    sources, held_out = (tuple(CutScenes(source, config, params.data.min_points, cache)
                                for source in part) for part in scenes)
     stream = Stream(sources, ClusterPreparation(config, params.augment), params.seed)
     batches = Batches(stream, params.batch, jobs, rank(), world())
@@ -186,7 +186,7 @@ def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[
 
 def print_ablation(out: Path) -> None:
     """The best of each row beside the paper's mAP on KITTI (Table 5)."""
-    from lidar_perception.detectors.pointnet.checkpoint import read_header
+    from lidar_perception.detectors.checkpoint import read_header
     from lidar_perception.detectors.pointnet.config import ABLATIONS
     from lidar_perception.scoring.tables import narrow_table
     table = narrow_table("Ablation, simulated or KITTI frames validated on", "network", "paper mAP",
@@ -212,7 +212,7 @@ def tell(progress: Progress, batches: Batches, out: Path) -> None:
         console.print(f"{out / 'best.safetensors'}: score {progress.best:.2f} at step "
                       f"{progress.best_step}", soft_wrap=True)
     if progress.stopped:
-        console.print(f"stopped at step {progress.step}; --resume goes on", soft_wrap=True)
+        console.print(f"stopped at step {progress.step}; --resume continues", soft_wrap=True)
         sys.exit(130)
 
 

@@ -27,7 +27,7 @@ def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:
       lidar-perception import-weights pointpillar_7728.pth --out pointpillars.safetensors
       lidar-perception import-weights car.pth --classes Car --out car.safetensors
     """
-    from lidar_perception.detectors.pointpillars.checkpoint import Header, save_checkpoint
+    from lidar_perception.detectors.checkpoint import Header, save_checkpoint
     from lidar_perception.detectors.pointpillars.import_weights import import_weights as converted
     names = tuple(name.strip() for name in classes.split(",") if name.strip())
     config, network, project = converted(source, names)
@@ -55,7 +55,7 @@ def onnx(weights: Path, out: Path) -> None:
     Examples:
       lidar-perception export onnx v4.safetensors --out v4.onnx
     """
-    from lidar_perception.detectors.pointpillars.checkpoint import load_network
+    from lidar_perception.detectors.pointpillars.network import load_network
     from lidar_perception.detectors.pointpillars.onnx import export_onnx
     header, network = load_network(weights)
     export_onnx(network.eval(), header, out)

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from lidar_perception.camera import Calibration
-from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS, read_velodyne
+from lidar_perception.data.frame import POINT_LABELS, POSES, Frame, PointTruth, Recording
+from lidar_perception.data.kitti.calibration import homogeneous, matrices, matrix
+from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS, load_velodyne, read_velodyne
 from lidar_perception.data.kitti.write import numbers, write_velodyne
 from lidar_perception.runs.files import write_bytes
-from lidar_perception.types import InputError, LidarFrame, usable_returns
-from lidar_perception.wire.topics import LIDAR_FRAME
+from lidar_perception.types import InputError, usable_returns
 
 UNLABELLED = (0, 1)  # unlabelled; outlier, such as a reflection: nobody knows what these points are
 # road, parking, sidewalk, other-ground, lane-marking, terrain
@@ -24,30 +25,20 @@ THINGS = {10: "car", 11: "bicycle", 13: "bus", 15: "motorcycle", 16: "on-rails",
 MOVING = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20}
 
 
-@dataclass(frozen=True)
-class SemanticFrame:
-    """One labelled scan; nothing is read before load()."""
-
-    name: str
-    points: Path
-    labels: Path
-    stamp_ns: int
-
-    def load(self) -> tuple[LidarFrame, np.ndarray, np.ndarray]:
-        """The frame of N usable points, their classes (N,) uint16 (0 = unlabelled) and instances
-        (N,) uint16 (0 = none). InputError where a file is missing, cut or of another scan."""
-        cloud, labels = read_velodyne(self.points), _read_labels(self.labels)
-        if len(labels) != len(cloud):
-            raise InputError(f"{self.labels} has {len(labels)} labels for the {len(cloud)} points "
-                             f"of {self.points}; download both again")
-        usable = usable_returns(cloud[:, :3])
-        cloud, labels = cloud.compress(usable, axis=0), labels.compress(usable)
-        frame = LidarFrame(np.ascontiguousarray(cloud[:, :3]), cloud[:, 3].copy(), self.stamp_ns,
-                           LIDAR_FRAME)
-        return frame, (labels & 0xFFFF).astype(np.uint16), (labels >> 16).astype(np.uint16)
+def recognises(path: Path) -> bool:
+    """Whether a SemanticKITTI folder lies there."""
+    return any((path / folder).is_dir() for folder in ("sequences", "dataset/sequences"))
 
 
-def open_semantic_kitti(root: str | Path) -> list[SemanticFrame]:
+def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
+    """The frames of open_semantic_kitti."""
+    frames = open_semantic_kitti(path)
+    posed = any(frame.native.is_file() for frame in frames)
+    return Recording(path, "SemanticKITTI", frames,
+                     frozenset({POINT_LABELS} | ({POSES} if posed else set())))
+
+
+def open_semantic_kitti(root: str | Path) -> list[Frame]:
     """The labelled scans of ROOT/sequences/NN or ROOT/dataset/sequences/NN, in order; only the
     file lists are read. Sequences without a labels folder, as the test ones, are left out.
     InputError says what is missing."""
@@ -55,18 +46,49 @@ def open_semantic_kitti(root: str | Path) -> list[SemanticFrame]:
     if not root.is_dir():
         raise InputError(f"{root} is not a folder; give the folder of a SemanticKITTI download")
     folder = root / "dataset" if (root / "dataset/sequences").is_dir() else root
-    scans = [(sequence, scan) for sequence in sorted(folder.glob("sequences/*/"))
-             for scan in sorted(sequence.glob("velodyne/*.bin"))]
+    scans = [(sequence, i, scan) for sequence in sorted(folder.glob("sequences/*/"))
+             for i, scan in enumerate(sorted(sequence.glob("velodyne/*.bin")))]
     if not scans:
         raise InputError(f"{root} has no SemanticKITTI scans: expected "
                          "sequences/00/velodyne/*.bin beside sequences/00/labels/*.label")
-    frames = [SemanticFrame(f"{sequence.name}/{scan.stem}", scan,
-                            sequence / f"labels/{scan.stem}.label", START_NS + i * PERIOD_NS)
-              for i, (sequence, scan) in enumerate(scans) if (sequence / "labels").is_dir()]
+    frames = []
+    for number, (sequence, i, scan) in enumerate(scans):
+        if (sequence / "labels").is_dir():
+            stamp = START_NS + number * PERIOD_NS
+            frames.append(Frame(
+                f"{sequence.name}/{scan.stem}", stamp, partial(load_velodyne, scan, stamp),
+                point_truth=partial(_point_truth, scan, sequence / f"labels/{scan.stem}.label"),
+                pose=partial(_pose, sequence, i), sequence=sequence.name, index=i, points=scan,
+                native=sequence / "poses.txt"))
     if not frames:
         raise InputError(f"{root} has scans but no labels: expected "
                          "sequences/00/labels/*.label; download the labels of SemanticKITTI too")
     return frames
+
+
+def _point_truth(scan: Path, path: Path) -> PointTruth:
+    """Labels of the usable points. InputError where a file is missing, cut or of another scan."""
+    cloud, labels = read_velodyne(scan), _read_labels(path)
+    if len(labels) != len(cloud):
+        raise InputError(f"{path} has {len(labels)} labels for the {len(cloud)} points of {scan}; "
+                         "download both again")
+    labels = labels.compress(usable_returns(cloud[:, :3]))
+    return PointTruth((labels & 0xFFFF).astype(np.uint16), (labels >> 16).astype(np.uint16))
+
+
+def _pose(sequence: Path, i: int) -> np.ndarray | None:
+    """(4, 4) the LiDAR's frame of scan i in that of the first scan, as pose_line wrote it; None
+    without poses.txt. InputError for files that are not as they should be."""
+    poses, calibration = sequence / "poses.txt", sequence / "calib.txt"
+    if not poses.is_file():
+        return None
+    lidar_to_camera = matrix(matrices(calibration), calibration, "Tr", (3, 4))
+    try:
+        moved = np.array(poses.read_text().splitlines()[i].split(), float).reshape(3, 4)
+    except (OSError, ValueError, IndexError) as error:
+        raise InputError(f"cannot read pose {i} of {poses} ({error}); download it again") from None
+    to_camera = homogeneous(lidar_to_camera)
+    return np.linalg.inv(to_camera) @ homogeneous(moved) @ to_camera
 
 
 def _read_labels(path: Path) -> np.ndarray:

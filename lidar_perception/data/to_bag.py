@@ -1,17 +1,16 @@
-"""Labelled scans to one rosbag2 bag, as the nodes and the evaluation expect it."""
+"""Labelled frames to one rosbag2 bag, as the nodes and the evaluation expect it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import LATCHED_QOS, BagWriter
-from lidar_perception.data.kitti.folder import KittiFrame
-from lidar_perception.types import GroundTruth
+from lidar_perception.data.frame import Frame
+from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import camera_info, extrinsics, truth_markers
 from lidar_perception.wire.topics import (
@@ -31,55 +30,58 @@ from msg_utils.stamps import header_message
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 
 
-@dataclass(frozen=True)
-class Scan:
-    """cloud (N, 4) float32 [x y z intensity]; truth, calibration and image (a PNG file) where
-    there are any."""
+def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False,
+              force: bool = False, skipped: list[str] | None = None) -> int:
+    """Write frames in order; returns how many. The calibration is written, latched, whenever it
+    changes, before the scan it belongs to: as CameraInfo, as TransformStamped and as TF. images:
+    the camera's PNG files too, where they are.
 
-    cloud: np.ndarray
-    stamp_ns: int
-    truth: GroundTruth | None = None
-    calibration: Calibration | None = None
-    image: Path | None = None
-
-
-def kitti_scan(frame: KittiFrame, images: bool = False) -> Scan:
-    """Read all of a KITTI frame. InputError names the file that is missing or broken."""
-    image = frame.image if images and frame.image and frame.image.exists() else None
-    return Scan(frame.cloud(), frame.stamp_ns, frame.truth(), frame.calibration(), image)
-
-
-def write_bag(path: str | Path, scans: Iterable[Scan], *, force: bool = False) -> int:
-    """Write scans in order; returns how many. The calibration is written, latched, whenever it
-    changes, before the scan it belongs to: as CameraInfo, as TransformStamped and as TF."""
+    A frame that cannot be read is left out, and the reason put into skipped; InputError without
+    such a list, and where the bag cannot be written.
+    """
     with BagWriter(path, force=force) as bag:
         bag.add_topic(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", LATCHED_QOS)
         bag.add_topic(EXTRINSICS, "geometry_msgs/msg/TransformStamped", LATCHED_QOS)
         bag.add_topic(TF_STATIC, "tf2_msgs/msg/TFMessage", LATCHED_QOS)
         bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
-        count, shown, calibration = 0, frozenset(), None
-        for scan in scans:
-            header = header_message(scan.stamp_ns, LIDAR_FRAME, bag_message)
-            if scan.calibration is not None and scan.calibration is not calibration:
-                calibration = scan.calibration
-                _write_calibration(bag, calibration, scan.stamp_ns, header)
-            if scan.truth is not None:
-                markers = truth_markers(scan.truth, header, bag_message, shown)
+        count, shown, written = 0, frozenset(), None
+        for frame in frames:
+            try:
+                scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
+            except InputError as error:
+                if skipped is None:
+                    raise
+                skipped.append(str(error))
+                continue
+            header = header_message(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
+            if calibration is not None and calibration is not written:
+                written = calibration
+                _write_calibration(bag, calibration, frame.stamp_ns, header)
+            if truth is not None:
+                markers = truth_markers(truth, header, bag_message, shown)
                 shown = marker_keys(markers)
-                bag.write(TRUTH, scan.stamp_ns, markers)
-            if scan.image is not None:
-                if IMAGE not in bag.channels:
-                    bag.add_topic(IMAGE, "sensor_msgs/msg/CompressedImage")
-                camera_header = header_message(scan.stamp_ns, CAMERA_FRAME, bag_message)
-                pixels = np.fromfile(scan.image, np.uint8)
-                bag.write(IMAGE, scan.stamp_ns, bag_message(
-                    "sensor_msgs/msg/CompressedImage", header=camera_header, format="png",
-                    data=pixels))
-            points = np.ascontiguousarray(scan.cloud, np.float32).view(POINT).reshape(-1)
-            bag.write(POINTS, scan.stamp_ns, from_array(points, header, bag_message))
+                bag.write(TRUTH, frame.stamp_ns, markers)
+            if images and frame.image is not None and frame.image.exists():
+                _write_image(bag, frame.image, frame.stamp_ns)
+            bag.write(POINTS, frame.stamp_ns, from_array(_points(scan), header, bag_message))
             count += 1
     return count
+
+
+def _points(scan: LidarFrame) -> np.ndarray:
+    """(N,) of POINT; without an intensity, only x y z."""
+    if scan.intensity is None:
+        return np.ascontiguousarray(scan.xyz).view(np.dtype(POINT.descr[:3])).reshape(-1)
+    return np.column_stack([scan.xyz, scan.intensity]).astype(np.float32).view(POINT).reshape(-1)
+
+
+def _write_image(bag: BagWriter, image: Path, stamp_ns: int) -> None:
+    if IMAGE not in bag.channels:
+        bag.add_topic(IMAGE, "sensor_msgs/msg/CompressedImage")
+    header = header_message(stamp_ns, CAMERA_FRAME, bag_message)
+    bag.write(IMAGE, stamp_ns, bag_message("sensor_msgs/msg/CompressedImage", header=header,
+                                           format="png", data=np.fromfile(image, np.uint8)))
 
 
 def _write_calibration(bag: BagWriter, calibration: Calibration, stamp_ns: int,

@@ -1,47 +1,61 @@
-"""What detectors with a network share: the device, what takes over, and what is said of a frame."""
+"""What detectors with a network share: their parameters, the device, and what takes over."""
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from time import perf_counter
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import torch
 
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.devices import CPU
-from lidar_perception.detectors.params import NetworkParams
+from lidar_perception.detectors.params import NetworkParams, ScoreParams
 from lidar_perception.types import InputError
 
 Result = TypeVar("Result")
 
 
 class NetworkDetector:
-    """Base of the detectors. params, their parameters, may be replaced at any time. After each call
-    ms holds the time of each step (on CUDA after synchronisation), problem why nothing, or little,
-    can be found in this frame, or None, and best, where no score reached its threshold, the highest
-    score of each class. fallback: why the CPU took over, or None.
+    """Base of the detectors. params, their parameters, may be replaced at any time; the group that
+    has the network's name is its own. fallback: why the CPU took over, or None.
     """
 
-    def __init__(self, header: Header, device: torch.device, params: Any, steps: tuple[str, ...]):
+    def __init__(self, header: Header, device: torch.device, params: Any):
         self.header, self.config, self.params, self.device = header, header.config, params, device
-        self.ms: dict[str, float] = dict.fromkeys(steps, 0.0)
-        self.problem: str | None = None
-        self.best: dict[str, float] = {}
         self.fallback: str | None = None
 
     @property
     def settings(self) -> NetworkParams:
         """The network's own group of params."""
-        raise NotImplementedError
+        return getattr(self.params, self.header.network)
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """What it was trained to detect."""
+        return self.config.classes
+
+    @property
+    def min_scores(self) -> dict[str, float]:
+        """By class, the least score of a detection."""
+        return {name: self.settings.scores.of_class(name) for name in self.classes}
+
+    def with_min_score(self, min_score: float) -> Self:
+        """The same detector, of the same network, with this least score for every class."""
+        other = copy.copy(self)
+        settings = replace(self.settings, scores=ScoreParams.all_alike(min_score))
+        other.params = replace(self.params, **{self.header.network: settings})
+        return other
 
     def place(self, device: torch.device) -> None:
         """Bring the network, and what it needs, to a device."""
         raise NotImplementedError
 
     def move(self, device: torch.device) -> None:
-        """Run on another device from now on, or on the CPU if there is no memory left on it."""
+        """Run on another device from now on, or on the CPU if it is out of memory."""
         self.device = device
         try:
             self.place(device)
@@ -49,7 +63,7 @@ class NetworkDetector:
             self._fall_back(error)
 
     def guarded(self, work: Callable[[], Result]) -> Result:
-        """What work() gives; once more on the CPU if the device runs out of memory. InputError
+        """What work() gives; once more on the CPU if the device is out of memory. InputError
         where the CPU may not take over."""
         try:
             return work()
@@ -59,10 +73,10 @@ class NetworkDetector:
 
     def _fall_back(self, error: Exception) -> None:
         if self.device == CPU or not self.settings.cpu_fallback:
-            raise InputError(f"no memory left on {self.device}; use the CPU or a smaller network"
+            raise InputError(f"{self.device} is out of memory; use the CPU or a smaller network"
                              ) from error
-        self.fallback = self.problem = (f"{self.device} has no memory left, so the network runs on "
-                                        "the CPU; close other programs and start again")
+        self.fallback = (f"{self.device} is out of memory, so the network runs on the CPU; close "
+                         "other programs and start again")
         self.move(CPU)
 
     def now(self) -> float:
@@ -71,9 +85,10 @@ class NetworkDetector:
             torch.cuda.synchronize(self.device)
         return perf_counter()
 
-    def nothing_passed(self, highest: Iterable[float]) -> None:
-        """Keep the highest score of each class, as none reached its threshold."""
-        self.best = dict(zip(self.config.classes, highest))
-        if any(map(math.isnan, self.best.values())):
-            self.problem = ("the network's scores are not numbers (NaN); the weights or the "
-                            "intensity are broken")
+    def nothing_passed(self, highest: Iterable[float]) -> tuple[dict[str, float], str | None]:
+        """The highest score of each class, where none reached its threshold, and what is wrong if
+        they are no numbers."""
+        best = dict(zip(self.classes, highest))
+        broken = any(map(math.isnan, best.values()))
+        return best, ("the network's scores are not numbers (NaN); the weights or the intensity "
+                      "are broken" if broken else None)

@@ -7,41 +7,57 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Protocol, Self
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
+from lidar_perception.detectors.pointnet.config import PointNetConfig
+from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError
 
 KEY = "lidar_perception"  # of the metadata, whose values are strings
 FORMAT = 1
 
-POINTPILLARS, POINTNET = "pointpillars", "pointnet"  # names of networks in headers
-USES = {  # name -> what it is, and where it is used
-    POINTPILLARS: ("PointPillars", "the node pointpillars_detector and detection.weights"),
-    POINTNET: ("PointNet", "the node pointnet_detector and pointnet.weights"),
+
+
+class Config(Protocol):
+    """What a network looks like, a dataclass. network: its name in NETWORKS."""
+
+    network: ClassVar[str]
+    classes: Any  # tuple of names
+    title: Any    # which one of its network, a str
+
+    @classmethod
+    def of_json(cls, content: dict[str, Any], source: str) -> Self:
+        """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
+
+
+POINTPILLARS, POINTNET = NetworkConfig.network, PointNetConfig.network
+NETWORKS: dict[str, tuple[str, str, type[Config]]] = {  # what it is, where it is used, its config
+    POINTPILLARS: ("PointPillars", "the node pointpillars_detector and pointpillars.weights",
+                   NetworkConfig),
+    POINTNET: ("PointNet", "the node pointnet_detector and pointnet.weights", PointNetConfig),
 }
 
 
 @dataclass(frozen=True)
 class Header:
-    """What is known about weights. training: data, steps, time, seed; metrics: AP and the like, or
-    empty; commit: of the code that trained them. All of it can be JSON.
-
-    Each network has a header of its own, which says its name and how its config, a dataclass, is
-    read.
-    """
-
-    network: ClassVar[str]
-    read_config: ClassVar[Callable[[dict[str, Any], str], Any]]  # content, source -> config
+    """What is known about weights. config: of the network; training: data, steps, time, seed;
+    metrics: AP and the like, or empty; commit: of the code that trained them. All of it can be
+    JSON."""
 
     config: Any
     training: dict[str, Any] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)
     commit: str = ""
+
+    @property
+    def network(self) -> str:
+        """Its name in NETWORKS."""
+        return self.config.network
 
     def text(self) -> str:
         """As JSON."""
@@ -49,17 +65,18 @@ class Header:
                                config=dataclasses.asdict(self.config), training=self.training,
                                metrics=self.metrics, commit=self.commit))
 
-    @classmethod
-    def of_text(cls, text: str | None, source: str) -> Self:
-        """The inverse of text. InputError naming source, also if it is of another network."""
+    @staticmethod
+    def of_text(text: str | None, source: str, kind: type[Config] | None = None) -> Header:
+        """The inverse of text. InputError naming source, also if its config is not of this
+        kind."""
         content = _content(text, source)
-        if content["network"] != cls.network:
-            what, use = USES[content["network"]]
-            wanted, own_use = USES[cls.network]
-            raise InputError(f"{source} holds a {what}, which is for {use}; {own_use} take a "
+        title, use, config = NETWORKS[content["network"]]
+        if kind is not None and content["network"] != kind.network:
+            wanted, own_use, _ = NETWORKS[kind.network]
+            raise InputError(f"{source} holds a {title}, which is for {use}; {own_use} take a "
                              f"{wanted}")
-        return cls(cls.read_config(content["config"], source), content["training"],
-                   content["metrics"], content["commit"])
+        return Header(config.of_json(content["config"], source), content["training"],
+                      content["metrics"], content["commit"])
 
 
 def _content(text: str | None, source: str) -> dict[str, Any]:
@@ -72,9 +89,9 @@ def _content(text: str | None, source: str) -> dict[str, Any]:
         # The first files had no such key.
         parts = {"network": content.get("network", POINTPILLARS),
                  **{name: content[name] for name in ("config", "training", "metrics", "commit")}}
-        if parts["network"] not in USES:
+        if parts["network"] not in NETWORKS:
             raise InputError(f"{source} holds a network {parts['network']!r}, this version knows "
-                             f"{' and '.join(USES)}")
+                             f"{' and '.join(NETWORKS)}")
         return parts
     except InputError:
         raise
@@ -84,7 +101,7 @@ def _content(text: str | None, source: str) -> dict[str, Any]:
 
 
 def network_of(path: str | Path) -> str:
-    """Which network a checkpoint is of, a name of USES. InputError if it cannot be read."""
+    """Which network a checkpoint is of, a name of NETWORKS. InputError if it cannot be read."""
     return _content(_read(Path(path), tensors=False)[0], str(path))["network"]
 
 
@@ -103,23 +120,20 @@ def _stored(value: torch.Tensor, half: bool) -> torch.Tensor:
     return value.contiguous()
 
 
-H = TypeVar("H", bound=Header)
+def read_header(path: str | Path, kind: type[Config] | None = None) -> Header:
+    """The header alone. InputError for a file that is missing, broken or without one, or whose
+    config is not of this kind."""
+    return Header.of_text(_read(Path(path), tensors=False)[0], str(path), kind)
 
 
-def read_header(path: str | Path, kind: type[H]) -> H:
-    """The header alone. InputError for a file that is missing, broken, without one, or of another
-    network."""
-    return kind.of_text(_read(Path(path), tensors=False)[0], str(path))
-
-
-def read(path: str | Path, kind: type[H]) -> tuple[H, dict[str, torch.Tensor]]:
+def read(path: str | Path, kind: type[Config]) -> tuple[Header, dict[str, torch.Tensor]]:
     """Header, and the tensors as they are stored, on the CPU. InputError as read_header."""
     text, tensors = _read(Path(path))
-    return kind.of_text(text, str(path)), tensors
+    return Header.of_text(text, str(path), kind), tensors
 
 
-def load(path: str | Path, kind: type[H], make: Callable[[Any], torch.nn.Module],
-         expected: Any = None) -> tuple[H, torch.nn.Module]:
+def load(path: str | Path, kind: type[Config], make: Callable[[Any], torch.nn.Module],
+         expected: Any = None) -> tuple[Header, torch.nn.Module]:
     """Header, and the network that make(config) gives with the weights of the file: float32 on the
     CPU, in training mode. InputError as read_header, where the weights do not fit, and where the
     config is another than expected."""
@@ -138,10 +152,10 @@ def load(path: str | Path, kind: type[H], make: Callable[[Any], torch.nn.Module]
     return header, network
 
 
-def adopt(network: torch.nn.Module, path: str | Path, kind: type[Header]) -> tuple[int, int]:
-    """Begin with the weights of a checkpoint of a network of the kind, of any config: each layer of
-    the same name and shape is taken, of one with other inputs those that both have (new
-    ones begin at 0); the rest stays as it is. How many tensors were taken, and of how many.
+def adopt(network: torch.nn.Module, path: str | Path, kind: type[Config]) -> tuple[int, int]:
+    """Begin with the weights of a checkpoint of a network of this kind, of any config: each layer
+    of the same name and shape is taken, of one with other inputs those that both have (new ones
+    begin at 0); the rest stays as it is. How many tensors were taken, and of how many.
     InputError as read, and where nothing fits."""
     _, tensors = read(path, kind)
     state = network.state_dict()

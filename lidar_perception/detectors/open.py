@@ -1,45 +1,36 @@
-"""Any detector of this package from its weights: frames in, detections out."""
+"""Any detector of this package from its weights."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
-from lidar_perception.detectors.checkpoint import POINTNET, network_of
-from lidar_perception.param_fields import parameter_fields, with_values
-from lidar_perception.types import Detections, LidarFrame
+from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.checkpoint import POINTNET, POINTPILLARS, network_of
+from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
+from lidar_perception.detectors.pointpillars.detector import load_detector
+from lidar_perception.param_fields import with_values
 
-
-class AnyDetector(Protocol):
-    """detector(frame) -> Detections in the frame's own coordinates. After each call ms holds the
-    time of each step, and problem why nothing, or little, can be found, or None."""
-
-    ms: Mapping[str, float]
-    problem: str | None
-
-    def __call__(self, frame: LidarFrame) -> Detections: ...
+LOAD: dict[str, Callable[..., NetworkDetector]] = {  # by network
+    POINTPILLARS: load_detector,
+    POINTNET: load_pointnet_detector,
+}
 
 
-def open_detector(path: str | Path, device: str = "auto",
+def open_detector(path: str | Path = "", device: str = "auto", *,
                   sensor_height: float | None = None,
-                  least_score: float | None = None) -> AnyDetector:
-    """The detector of a checkpoint of either network, or of an exported one (.onnx), with its
-    default parameters; with sensor_height for a sensor so many metres above the ground, with
-    least_score that threshold for every class. InputError for a file that cannot be used, or a
-    device that is not there."""
+                  min_score: float | None = None) -> NetworkDetector:
+    """The detector of a checkpoint of any network, or of an exported one (.onnx), with its default
+    parameters; without a path PointPillars v4 compact, which comes with the package.
+
+    sensor_height: metres of the sensor above the ground, if not KITTI's; min_score: the threshold
+    of every class, if not the default. InputError for a file that cannot be used, or a device that
+    is not there.
+    """
     path = Path(path)
-    if path.suffix != ".onnx" and network_of(path) == POINTNET:
-        from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
-        detector = load_pointnet_detector(path, device)
-    else:
-        from lidar_perception.detectors.pointpillars.detector import load_detector
-        detector = load_detector(path, device)
-    changed: dict[str, float] = {}
+    exported = path.suffix == ".onnx" or path == Path()
+    detector = LOAD[POINTPILLARS if exported else network_of(path)](path, device)
     if sensor_height is not None:
-        changed["ground.sensor_pose.height"] = sensor_height
-    if least_score is not None:
-        changed |= dict.fromkeys((field for field in parameter_fields(detector.params)
-                                  if ".scores." in field), least_score)
-    detector.params = with_values(detector.params, changed)
-    return detector
+        detector.params = with_values(detector.params,
+                                      {"ground.sensor_pose.height": sensor_height})
+    return detector if min_score is None else detector.with_min_score(min_score)

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from lidar_perception.param_fields import Params, param
 
+MIN_SCORE = 0.05  # of the boxes that average precision is made of: more than a robot would act on
+
 
 @dataclass(frozen=True)
 class ScoreParams(Params):
@@ -15,6 +17,11 @@ class ScoreParams(Params):
     pedestrian: float = param(0.3, "Least score of a Pedestrian.", low=0.0, high=1.0)
     cyclist: float = param(0.3, "Least score of a Cyclist.", low=0.0, high=1.0)
     other: float = param(0.3, "Least score of any other class of the weights.", low=0.0, high=1.0)
+
+    @staticmethod
+    def all_alike(score: float) -> ScoreParams:
+        """One threshold for every class."""
+        return ScoreParams(score, score, score, score)
 
     def of_class(self, name: str) -> float:
         """The threshold of a class of types.CLASSES."""

@@ -9,7 +9,7 @@ import numpy as np
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.ground.params import GroundParams, SensorPoseParams
 from lidar_perception.ground.segment import level, segment_ground
-from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, Detections, LidarFrame
 
 
 def visible(frame: LidarFrame, config: NetworkConfig,
@@ -53,11 +53,6 @@ def with_intensity_scaled(frame: LidarFrame, factor: float) -> LidarFrame:
     return replace(frame, intensity=frame.intensity * np.float32(factor))
 
 
-def require_columns(frame: LidarFrame, **columns: np.ndarray | None) -> None:
-    """InputError naming a column, if there is one, that has not a value for each point."""
-    for name, column in columns.items():
-        if column is not None and len(column) != len(frame):
-            raise InputError(f"{name} has {len(column)} values for {len(frame)} points")
 
 
 def made_up_frame(pose: SensorPoseParams) -> LidarFrame:

@@ -9,11 +9,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from lidar_perception.detectors.contract import Found
 from lidar_perception.nodes.main import one_at_a_time
 from lidar_perception.nodes.outputs import DetectionOutputs
 from lidar_perception.nodes.runtime import CLOUD, ERROR, OK, WARN, LidarNode
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.types import Detections, InputError, LidarFrame
+from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.messages import column, to_frame
 from msg_utils.stamps import to_ns
 
@@ -97,16 +98,16 @@ class DetectorNode(LidarNode):
             self.detector.params = self.params
             found = self.detector(frame, ground=None if ground is None else ground > 0,
                                   cluster_ids=ids)
-            self.outputs.publish(msg.header, found, self.detector.ms)
+            self.outputs.publish(msg.header, found.detections, found.ms)
         self._diagnose(frame, found)
 
-    def _diagnose(self, frame: LidarFrame, found: Detections) -> None:
-        problem = self.detector.problem or self.sensor.problem(frame)
-        self.counts.update(detections=len(found), device=str(self.detector.device))
+    def _diagnose(self, frame: LidarFrame, found: Found) -> None:
+        problem = found.problem or self.sensor.problem(frame)
+        self.counts.update(detections=len(found.detections), device=str(self.detector.device))
         self.counts["best scores"] = " ".join(
-            f"{name} {score:.2f}" for name, score in self.detector.best.items())
+            f"{name} {score:.2f}" for name, score in found.best.items())
         if problem:
             self.report(WARN, problem)
         else:
-            self.report(OK, "detecting" if len(found) else "nothing found: every score is below "
-                        f"its threshold in {self.group}.scores")
+            self.report(OK, "detecting" if len(found.detections) else "nothing detected: every "
+                        f"score is below its threshold in {self.group}.scores")

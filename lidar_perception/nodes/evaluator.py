@@ -8,7 +8,7 @@ from typing import Any
 from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
 from lidar_perception.params import EvaluatorParams
 from lidar_perception.runs.files import write_text
-from lidar_perception.scoring.centres.report import CandidateReport
+from lidar_perception.scoring.centres.report import CandidateReport, CandidateResult
 from lidar_perception.types import PEDESTRIAN, InputError
 from lidar_perception.wire.messages import to_detections, to_truth
 from msg_utils.markers import from_marker_array
@@ -35,7 +35,7 @@ class Evaluator(LidarNode):
             node, what = topic.split("/")[1], topic.rsplit("/", 1)[1]
             name = node if what == "processing_time_ms" else what.removesuffix("_ms")
             self.input(topic, "std_msgs/msg/Float64",
-                       lambda m, n=name: self.result.add_times({n: m.data}), RELIABLE)
+                       lambda m, n=name: self.result.update_times({n: m.data}), RELIABLE)
         self.create_timer(WRITE_PERIOD, self.write)
 
     def _add(self, kind: str, msg: Any) -> None:
@@ -61,8 +61,8 @@ class Evaluator(LidarNode):
         truth = to_truth(frame["truth"]).of_class(PEDESTRIAN)
         if len(truth) or not self.params.only_with_pedestrians:
             found = {s: to_detections(frame[s]) for s in self.params.stages}
-            self.result.add(truth, {s: d.boxes[d.class_ids == PEDESTRIAN]
-                                    for s, d in found.items()})
+            self.result.update(CandidateResult(truth, {s: d.boxes[d.class_ids == PEDESTRIAN]
+                                                       for s, d in found.items()}, {}))
         self.counts.update(scored=self.result.frames, **{
             f"F1 of {s}": f"{score.table()['all']['f1']:.3f}"
             for s, score in self.result.scores.items()})
@@ -70,7 +70,7 @@ class Evaluator(LidarNode):
 
     def write(self) -> None:
         if self.params.file:
-            content = self.result.content()
+            content = self.result.compute()
             content["lost_frames"] = self.counts["incomplete"] + len(self.waiting)
             write_text(self.params.file, json.dumps(content, indent=1))
 

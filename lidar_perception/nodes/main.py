@@ -24,8 +24,8 @@ NODES = {  # executable -> class; the module has the executable's name
     "candidate_refinement": "CandidateRefinement",
     "evaluator": "Evaluator",
     "perception": "Perception",
-    "pointpillars_detector": "PointPillarsDetector",
-    "pointnet_detector": "PointNetDetector",
+    "pointpillars_detector": "PointPillarsNode",
+    "pointnet_detector": "PointNetNode",
 }
 
 

@@ -11,10 +11,10 @@ from lidar_perception.nodes.detector_node import DetectorNode
 
 if TYPE_CHECKING:
     from lidar_perception.detectors.pointnet.config import PointNetConfig
-    from lidar_perception.detectors.pointnet.detector import PointNetDetector as Detector
+    from lidar_perception.detectors.pointnet.detector import PointNetDetector
 
 
-class PointNetDetector(DetectorNode):
+class PointNetNode(DetectorNode):
     """Reads the column `cluster_id`; without it the node finds ground and clusters itself."""
 
     group = "pointnet"
@@ -25,7 +25,7 @@ class PointNetDetector(DetectorNode):
     def weights(self) -> Path:
         return weights_file(self.params.pointnet)
 
-    def load(self, weights: Path, device: str) -> Detector:
+    def load(self, weights: Path, device: str) -> PointNetDetector:
         from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
         return load_pointnet_detector(weights, device, self.params)
 

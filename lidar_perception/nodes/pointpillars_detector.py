@@ -5,27 +5,27 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
 from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.nodes.detector_node import DetectorNode
 
 if TYPE_CHECKING:
     from lidar_perception.detectors.pointpillars.config import NetworkConfig
-    from lidar_perception.detectors.pointpillars.detector import Detector
 
 
-class PointPillarsDetector(DetectorNode):
+class PointPillarsNode(DetectorNode):
     """Reads the columns of its experts where the cloud has them."""
 
-    group = "detection"
+    group = "pointpillars"
 
     def __init__(self, **options: Any):
         super().__init__("pointpillars_detector", DetectorParams(), STEPS, **options)
 
     def weights(self) -> Path:
-        return weights_file(self.params.detection)
+        return weights_file(self.params.pointpillars)
 
-    def load(self, weights: Path, device: str) -> Detector:
+    def load(self, weights: Path, device: str) -> PointPillarsDetector:
         from lidar_perception.detectors.pointpillars.detector import load_detector
         return load_detector(weights, device, self.params)
 

@@ -27,7 +27,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from std_msgs.msg import Float64
 
-from lidar_perception.param_fields import flatten, parameter_fields, with_values
+from lidar_perception.param_fields import flatten, new_name, parameter_fields, with_values
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message, decode, encode, typestore
 from msg_utils.messages import message_class
@@ -72,6 +72,9 @@ class LidarNode(Node):
 
     def _declare(self, params: Any) -> Any:
         declared = {}
+        for name in self._parameter_overrides:
+            if (new := new_name(name)) in parameter_fields(params):
+                raise InputError(f"parameter '{name}' is called '{new}' now; rename it")
         for name, f in parameter_fields(params).items():
             kind = LISTS[f.metadata["item"]] if isinstance(f.default, tuple) else TYPES[
                 type(f.default)]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from lidar_perception.data.kitti.folder import KittiFrame
+from lidar_perception.data.frame import Frame
 
 
 @dataclass(frozen=True)
@@ -87,6 +87,6 @@ class Experiment:
     name: str
     title: str
     question: str
-    measure: Callable[[list[KittiFrame], int], dict[str, Any]]
+    measure: Callable[[Sequence[Frame], int], dict[str, Any]]
     sections: Callable[[list[dict[str, Any]]], list[Section]]
     settings: dict[str, Any] = field(default_factory=dict)

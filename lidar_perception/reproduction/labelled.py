@@ -9,7 +9,7 @@ import numpy as np
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.seeds import Seed, seed_from_truth
 from lidar_perception.candidates.segmented import Segmented
-from lidar_perception.data.kitti.folder import KittiFrame
+from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, InputError, LidarFrame
 
@@ -29,18 +29,20 @@ class Labelled:
         return self.truth.of_class(PEDESTRIAN)
 
 
-def load_labelled(frame: KittiFrame) -> Labelled:
+def load_labelled(frame: Frame) -> Labelled:
     """The frame read. InputError, naming the file, where one cannot be read, is empty or not
     there, or where no Pedestrian is labelled."""
     truth = frame.truth()  # first: most frames of KITTI end here
     if truth is None:
-        raise InputError(f"{frame.points} has no labels; put them beside the scans")
+        raise InputError(f"{frame.points or frame.name} has no labels; put them beside the scans")
     if PEDESTRIAN not in truth.class_ids:
         raise InputError("no Pedestrian is labelled; the paper leaves such frames out")
-    scan, camera = frame.load(), frame.calibration().camera()
+    scan, camera = frame.load(), frame.camera()
+    if camera is None:
+        raise InputError(f"{frame.name} has no camera calibration, to whose view the paper crops")
     if not camera.in_view(scan.xyz).any():
-        raise InputError(f"{frame.points} has no point in the camera's view; download it and its "
-                         "calibration again")
+        raise InputError(f"{frame.points or frame.name} has no point in the camera's view; "
+                         "download it and its calibration again")
     return Labelled(scan, camera, truth)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from lidar_perception.candidates.seeds import Seed
 from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import oriented_boxes
-from lidar_perception.data.kitti.folder import KittiFrame
+from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import bev_and_3d_iou
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.param_fields import flatten, with_values
@@ -34,7 +35,7 @@ from lidar_perception.types import InputError
 NUMBERS = StmCpaParams()
 
 
-def measure(frames: list[KittiFrame], number: int) -> dict[str, Any]:
+def measure(frames: Sequence[Frame], number: int) -> dict[str, Any]:
     """The record of one frame. Lists of five go by RANGE_NAMES.
 
     pedestrians: true ones. no_seed: why there was no seed, or None; then nothing is found, and the

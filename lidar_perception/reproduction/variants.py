@@ -15,7 +15,7 @@ from lidar_perception.candidates.seed_sources import automatic_seed
 from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.candidates.silhouette import cpa_scales, silhouettes
-from lidar_perception.data.kitti.folder import KittiFrame
+from lidar_perception.data.frame import Frame
 from lidar_perception.groups import group_points
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.experiment import (
@@ -76,7 +76,7 @@ def study(name: str, title: str, question: str, find: Finder, variants: Sequence
                       functools.partial(sections, title, tuple(variants)), settings)
 
 
-def measure(find: Finder, frames: list[KittiFrame], number: int) -> dict[str, Any]:
+def measure(find: Finder, frames: Sequence[Frame], number: int) -> dict[str, Any]:
     """The record of one frame: variant -> see score()."""
     labelled = load_labelled(frames[number])
     return {"frame": frames[number].name,

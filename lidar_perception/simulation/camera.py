@@ -18,12 +18,12 @@ FORWARD_CAMERA = Calibration(
 # People who label leave out what they can hardly see. The least of the 20 pedestrians of the real
 # frames at hand has 16 points; of KITTI's they are few that have less than 5.
 LEAST_VISIBLE = 0.15  # share of the object
-LEAST_POINTS = 5
+MIN_POINTS = 5
 
 
 def worth_a_label(truth: GroundTruth) -> np.ndarray:
     """(K,) bool: the simulated objects of which enough is seen."""
-    return np.array([e["visible"] >= LEAST_VISIBLE and e["num_points"] >= LEAST_POINTS
+    return np.array([e["visible"] >= LEAST_VISIBLE and e["num_points"] >= MIN_POINTS
                      for e in truth.extras], bool)
 
 

@@ -1,12 +1,11 @@
-"""Simulated drives as scans for a bag, with a camera like KITTI's."""
+"""Simulated drives as labelled frames, with a camera like KITTI's."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
-import numpy as np
-
-from lidar_perception.data.to_bag import Scan
+from lidar_perception.data.frame import Frame
 from lidar_perception.simulation.camera import FORWARD_CAMERA, labels_in_view
 from lidar_perception.simulation.drive import longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Streets
@@ -16,14 +15,15 @@ GAP_NS = 10 * 10**9  # between the drives along two streets, as between KITTI's 
 
 
 def simulated_scans(seed: int, frames: int, sensor: Sensor = HDL64E,
-                    streets_of: int | None = None, streets: Streets = ANY) -> Iterator[Scan]:
-    """Scans with the forward camera and, as in KITTI, labels of the objects whose centre it sees:
+                    streets_of: int | None = None, streets: Streets = ANY) -> Iterator[Frame]:
+    """Frames with the forward camera and, as in KITTI, labels of the objects whose centre it sees:
     streets_of (default: as many as fit) of each of the streets seed, seed + 1, ..."""
     each = streets_of or longest_drive(sensor)
     drive_ns = GAP_NS + round(each * 10**9 / sensor.rate)
     for number in range(frames):
         street, moment = divmod(number, each)
         scan = scan_at(seed + street, moment, sensor, streets)
-        cloud = np.column_stack([scan.frame.xyz, scan.frame.intensity])
-        yield Scan(cloud, scan.frame.stamp_ns + street * drive_ns, labels_in_view(scan.truth),
-                   FORWARD_CAMERA)
+        frame = replace(scan.frame, stamp_ns=scan.frame.stamp_ns + street * drive_ns)
+        yield Frame.of(f"{street:04}/{moment:06}", frame, labels_in_view(scan.truth),
+                       FORWARD_CAMERA, pose=scan.pose.copy, sequence=f"{street:04}", index=moment,
+                       sensor_height=sensor.height)

@@ -25,7 +25,7 @@ APART = 0.3           # m from every labelled box
 MOST = 20             # of a scene
 
 
-def cut_objects(scenes: Iterable[Scene], classes: tuple[str, ...], least_points: int) -> Database:
+def cut_objects(scenes: Iterable[Scene], classes: tuple[str, ...], min_points: int) -> Database:
     """The wanted objects of some classes that have enough points; where boxes overlap, none. If
     people are among them, things that look like people, too."""
     chosen = [CLASSES.index(name) for name in classes]
@@ -35,12 +35,12 @@ def cut_objects(scenes: Iterable[Scene], classes: tuple[str, ...], least_points:
         alone = overlap.sum(axis=1) <= 1
         for i in np.flatnonzero(scene.wanted & alone & np.isin(scene.class_ids, chosen)):
             own = scene.points[inside(scene.points, scene.boxes[i], 0.0)]
-            if len(own) >= least_points:
+            if len(own) >= min_points:
                 boxes.append(scene.boxes[i:i + 1])
                 class_ids.append(scene.class_ids[i])
                 points.append(own)
         if PEDESTRIAN in chosen:
-            things, of_things = things_in(scene, least_points, np.random.default_rng(n))
+            things, of_things = things_in(scene, min_points, np.random.default_rng(n))
             boxes.append(things)
             class_ids.extend([THING] * len(things))
             points.extend(of_things)
@@ -49,7 +49,7 @@ def cut_objects(scenes: Iterable[Scene], classes: tuple[str, ...], least_points:
                     np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
 
 
-def things_in(scene: Scene, least_points: int,
+def things_in(scene: Scene, min_points: int,
               rng: np.random.Generator) -> tuple[np.ndarray, list[np.ndarray]]:
     """Boxes (K, 7) float64, from the ground up along the axes, and the points (N, 4) of each: the
     clusters of obstacles of a person's width with so many points that touch no box of the scene; at
@@ -64,7 +64,7 @@ def things_in(scene: Scene, least_points: int,
     floor = ground_under(xyz[ground], boxes[:, :2])
     boxes[:, 5] = high[:, 2] - floor
     boxes[:, 2] = floor + boxes[:, 5] / 2
-    kept = ((sizes >= least_points) & (boxes[:, 3:5].max(axis=1, initial=0) <= WIDEST)
+    kept = ((sizes >= min_points) & (boxes[:, 3:5].max(axis=1, initial=0) <= WIDEST)
             & (boxes[:, 5] >= HEIGHTS[0]) & (boxes[:, 5] <= HEIGHTS[1])
             & (low[:, 2] - floor <= MOST_GAP))
     kept = np.flatnonzero(kept)

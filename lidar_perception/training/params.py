@@ -126,7 +126,7 @@ class DataParams(Params):
                              "seed, where neither --val nor --split is given.", low=0.0,
                              high=0.9)
     view: bool = param(True, "Use the points in KITTI's image only, as its labels end there.")
-    least_points: int = param(5, "An object, or a cluster, with fewer points is not learned "
+    min_points: int = param(5, "An object, or a cluster, with fewer points is not learned "
                               "from.", low=1, high=1000)
 
 

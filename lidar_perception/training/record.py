@@ -11,7 +11,7 @@ import numpy as np
 from torch import nn
 
 from lidar_perception import __version__
-from lidar_perception.detectors.checkpoint import Header, adopt, save_checkpoint
+from lidar_perception.detectors.checkpoint import Config, Header, adopt, save_checkpoint
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors
 from lidar_perception.training.data import Batches
@@ -28,18 +28,18 @@ def record_of(params: LoopParams, batches: Batches, record: dict[str, Any],
             "params": flatten(params), "version": __version__}
 
 
-def keeper(out: Path, kind: type[Header], config: Any, params: LoopParams, batches: Batches,
+def keeper(out: Path, config: Any, params: LoopParams, batches: Batches,
            about: dict[str, Any], commit: str) -> Callable[[str, nn.Module, dict[str, Any]], None]:
     """keep(name, module, record) of a Task: writes out/name.safetensors."""
     def keep(name: str, module: nn.Module, record: dict[str, Any]) -> None:
-        header = kind(config, record_of(params, batches, record, about),
+        header = Header(config, record_of(params, batches, record, about),
                       rounded(record.get("metrics", {})), commit)
         save_checkpoint(out / f"{name}.safetensors", module, header)
 
     return keep
 
 
-def begun_with(network: nn.Module, init: Path | None, kind: type[Header]) -> nn.Module:
+def begun_with(network: nn.Module, init: Path | None, kind: type[Config]) -> nn.Module:
     """The network, with the weights of init as far as they fit; what does not is said."""
     if init is not None:
         taken, count = adopt(network, init, kind)

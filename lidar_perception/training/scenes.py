@@ -1,6 +1,6 @@
-"""Where labelled scenes come from: KITTI folders, and simulated streets with a cache on disk.
+"""Where labelled scenes come from: recordings, and simulated streets with a cache on disk.
 
-A source has a length, scene(i) to train on, and judged(i) to validate on. It can be sent to other
+A source has a length, scene(i) to train on, and frame(i) to validate on. It can be sent to other
 processes: files are opened where they are read.
 """
 
@@ -12,14 +12,13 @@ import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 from zipfile import BadZipFile
 
 import numpy as np
 
 from lidar_perception import __version__
-from lidar_perception.camera import Calibration
-from lidar_perception.data.kitti.folder import KittiFrame, open_kitti
+from lidar_perception.data.frame import Frame
+from lidar_perception.data.open import open_recording
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels, worth_a_label
 from lidar_perception.simulation.drive import longest_drive, scan_at
@@ -29,21 +28,12 @@ from lidar_perception.training.augment import Scene
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 
 
-class Judged(NamedTuple):
-    """A frame to validate on, as evaluate detection takes it."""
-
-    name: str
-    frame: LidarFrame
-    truth: GroundTruth
-    calibration: Calibration
-
-
 @dataclass(frozen=True)
-class KittiScenes:
-    """The frames of a KITTI folder with these names. view: the points in the image only, as the
-    labels end there."""
+class RecordedScenes:
+    """The frames of a recording with these names. view: the points in the image only, where there
+    is a camera, as the labels end there."""
 
-    root: Path
+    path: Path
     names: tuple[str, ...]
     view: bool = True
 
@@ -51,45 +41,31 @@ class KittiScenes:
         return len(self.names)
 
     @cached_property
-    def _frames(self) -> dict[str, KittiFrame]:
-        return {frame.name: frame for frame in open_kitti(self.root)}
+    def _frames(self) -> dict[str, Frame]:
+        recording = open_recording(self.path)
+        numbers = {frame.name: i for i, frame in enumerate(recording)}
+        return {name: recording.frames[numbers[name]] for name in self.names}
 
     def __getstate__(self) -> dict:
         return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # open where it is read
 
     def scene(self, i: int) -> Scene:
         """InputError naming the file that cannot be used."""
-        _, frame, truth, calibration = self.judged(i)
-        points = np.column_stack([frame.xyz, frame.intensity])
-        if self.view:
-            points = points[calibration.camera().in_view(frame.xyz)]
-        return Scene(points, truth.boxes, truth.class_ids, np.ones(len(truth), bool))
+        frame = self.frame(i)
+        scan, truth, camera = frame.load(), frame.truth(), frame.camera()
+        intensity = np.zeros(len(scan), np.float32) if scan.intensity is None else scan.intensity
+        points = np.column_stack([scan.xyz, intensity])
+        if self.view and camera is not None:
+            points = points[camera.in_view(scan.xyz)]
+        return Scene(points, truth.boxes, truth.class_ids, np.ones(len(truth), bool),
+                     around=camera is None)
 
-    def judged(self, i: int) -> Judged:
-        """The whole scan. InputError naming the file that cannot be used."""
+    def frame(self, i: int) -> Frame:
+        """To validate on: the whole scan. InputError if it has no labels."""
         frame = self._frames[self.names[i]]
-        truth = frame.truth()
-        if truth is None:
-            raise InputError(f"{frame.points} has no labels")
-        return Judged(frame.name, frame.load(), truth, frame.calibration())
-
-
-def kitti_names(root: Path, split: Path | None = None) -> tuple[str, ...]:
-    """The names of the frames of a KITTI folder, or of those that a split file names, one a line.
-    InputError names what is not there."""
-    known = {frame.name: None for frame in open_kitti(root)}
-    if split is None:
-        return tuple(known)
-    try:
-        names = tuple(dict.fromkeys(split.read_text().split()))
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the split {split}: {error}") from None
-    if not names:
-        raise InputError(f"{split} names no frame; it needs one a line, such as 000000")
-    if unknown := [name for name in names if name not in known]:
-        raise InputError(f"{split} names the frame {unknown[0]} ({len(unknown)} such), which is "
-                         f"not in {root}")
-    return names
+        if frame.truth() is None:
+            raise InputError(f"{frame.points or frame.name} has no labels")
+        return frame
 
 
 def random_split(names: tuple[str, ...], share: float,
@@ -137,11 +113,12 @@ class SimulatedScenes:
         return Scene(np.column_stack([frame.xyz, frame.intensity]), truth.boxes, truth.class_ids,
                      worth_a_label(truth), around=True)
 
-    def judged(self, i: int) -> Judged:
-        """With the labels that KITTI would have: in the image of a camera that looks ahead."""
-        frame, truth = self.scan(i)
+    def frame(self, i: int) -> Frame:
+        """To validate on: with the labels that KITTI would have, in the image of a camera that
+        looks ahead."""
+        scan, truth = self.scan(i)
         street, part = self._at(i)
-        return Judged(f"street {street} frame {part}", frame, kitti_labels(truth), FORWARD_CAMERA)
+        return Frame.of(f"street {street} frame {part}", scan, kitti_labels(truth), FORWARD_CAMERA)
 
     def scan(self, i: int) -> tuple[LidarFrame, GroundTruth]:
         """The frame and all its objects, from the cache if they are there."""

@@ -6,10 +6,12 @@ from collections.abc import Sized
 from pathlib import Path
 from typing import Any
 
+from lidar_perception.data.frame import BOXES
+from lidar_perception.data.open import open_recording
 from lidar_perception.simulation.scene import Streets
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.params import DataParams
-from lidar_perception.training.scenes import KittiScenes, SimulatedScenes, kitti_names, random_split
+from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes, random_split
 from lidar_perception.types import InputError
 
 SIM = "sim"  # the name of simulated streets where a folder could stand
@@ -24,25 +26,25 @@ def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | N
     folders = [Path(name) for name in data if name != SIM]
     val_folders = [Path(name) for name in val if name != SIM] or ([] if val else folders)
     if split is not None and len(folders) != 1:
-        raise InputError("--split names frames of one KITTI folder in --data; give one")
+        raise InputError("--split names frames of one recording in --data; give one")
     if val_split is not None and len(val_folders) != 1:
-        raise InputError("--val-split names frames of one KITTI folder; give one in --val")
+        raise InputError("--val-split names frames of one recording; give one in --val")
     train_on, judge_on = [], []
     for folder in folders:
-        names, held = kitti_names(folder, split), ()
+        names, held = names_of(folder, split), ()
         if val_split is not None and folder in val_folders:
-            held = kitti_names(folder, val_split)
+            held = names_of(folder, val_split)
             names = tuple(name for name in names if name not in set(held))
         elif not val:
             names, held = random_split(names, settings.val_share, seed)
         if not names:
             raise InputError(f"{folder}: no frame is left to train on")
-        train_on.append(KittiScenes(folder, names, settings.view))
+        train_on.append(RecordedScenes(folder, names, settings.view))
         if held:
-            judge_on.append(KittiScenes(folder, held, settings.view))
+            judge_on.append(RecordedScenes(folder, held, settings.view))
     for folder in val_folders if val else ():
         if folder not in folders or val_split is None:
-            judge_on.append(KittiScenes(folder, kitti_names(folder, val_split), settings.view))
+            judge_on.append(RecordedScenes(folder, names_of(folder, val_split), settings.view))
     if SIM in data:
         train_on.append(_streets(FIRST_STREET, settings.scans, settings.people, settings,
                                  settings.street_scans))
@@ -50,6 +52,14 @@ def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | N
         judge_on.append(_streets(FIRST_VALIDATION_STREET, settings.val_scans, settings.val_people,
                                  settings))
     return tuple(train_on), tuple(judge_on)
+
+
+def names_of(path: Path, split: Path | None = None) -> tuple[str, ...]:
+    """The names of the frames of a recording, or of those that a split file names. InputError
+    names what is not there, and a recording without labelled boxes."""
+    recording = open_recording(path, split=split)
+    recording.require(BOXES, "train")
+    return tuple(frame.name for frame in recording)
 
 
 def _streets(first: int, scans: int, people: float, settings: DataParams, per_street: int = 1):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from lidar_perception.camera import Calibration, Camera
 from lidar_perception.types import (
@@ -88,9 +89,9 @@ def column(msg: Any, name: str, places: np.ndarray) -> np.ndarray | None:
     return points[name].take(places)
 
 
-def camera_of(info: Any, transform: Any) -> Camera:
-    """Camera from CameraInfo and the TransformStamped between the LiDAR frame and the camera's,
-    in either direction. InputError when P is empty or the frames do not fit."""
+def calibration_of(info: Any, transform: Any) -> Calibration:
+    """From CameraInfo and the TransformStamped between the LiDAR frame and the camera's, in either
+    direction. InputError when P is empty or the frames do not fit."""
     intrinsics = np.asarray(info.p, float).reshape(3, 4)
     if intrinsics[0, 0] <= 0 or info.width == 0 or info.height == 0:
         raise InputError("CameraInfo has no projection matrix P or no image size; calibrate the "
@@ -100,12 +101,21 @@ def camera_of(info: Any, transform: Any) -> Camera:
     if not abs(np.linalg.norm(rotation) - 1) < 1e-3:
         raise InputError("the LiDAR-to-camera transform has no unit quaternion")
     parent, child = transform.header.frame_id, transform.child_frame_id
-    if info.header.frame_id == parent:  # the LiDAR's pose in the camera frame: turn it round
-        return Camera.of_lidar_pose(intrinsics, rotation, translation, info.width, info.height)
-    if info.header.frame_id != child:
-        raise InputError(f"CameraInfo is in frame '{info.header.frame_id}' but the transform links "
-                         f"'{parent}' and '{child}'")
-    return Camera.of(intrinsics, rotation, translation, info.width, info.height)
+    lidar_to_camera = np.eye(4)
+    lidar_to_camera[:3, :3] = Rotation.from_quat(rotation).as_matrix()
+    lidar_to_camera[:3, 3] = translation
+    if info.header.frame_id != parent:  # it is the camera's pose in the LiDAR frame: turn it round
+        if info.header.frame_id != child:
+            raise InputError(f"CameraInfo is in frame '{info.header.frame_id}' but the transform "
+                             f"links '{parent}' and '{child}'")
+        lidar_to_camera[:3, :3] = lidar_to_camera[:3, :3].T
+        lidar_to_camera[:3, 3] = -lidar_to_camera[:3, :3] @ translation
+    return Calibration(intrinsics, lidar_to_camera, int(info.width), int(info.height))
+
+
+def camera_of(info: Any, transform: Any) -> Camera:
+    """The camera of calibration_of."""
+    return calibration_of(info, transform).camera()
 
 
 def camera_info(calibration: Calibration, header: Any, make: Any) -> Any:

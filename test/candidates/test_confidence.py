@@ -274,9 +274,9 @@ def test_an_automatic_seed_is_the_likeliest_cluster_or_the_template():
     one = segment(LidarFrame(np.concatenate([
         board(9.0, 0.55), np.float32([[x, y, FLOOR] for x in np.arange(3, 20, 0.4)
                                       for y in np.arange(-8, 8, 0.4)])])), params=params)
-    assert automatic_seed(template, with_values(params, {"seed.least_confidence": 1.0}))(one) \
+    assert automatic_seed(template, with_values(params, {"seed.min_confidence": 1.0}))(one) \
         is template
-    own = automatic_seed(template, with_values(params, {"seed.least_confidence": 0.0}))(one)
+    own = automatic_seed(template, with_values(params, {"seed.min_confidence": 0.0}))(one)
     assert own is not template and np.hypot(*own.xyz[:, :2].mean(axis=0)) == pytest.approx(9, abs=1)
 
 

@@ -17,7 +17,7 @@ from lidar_perception.detectors.pointpillars.box_coder import decode
 from lidar_perception.detectors.pointpillars.config import (
     SIZES,
     VERSIONS,
-    from_json,
+    NetworkConfig,
     network_config,
 )
 from lidar_perception.detectors.pointpillars.losses import detection_loss
@@ -57,7 +57,7 @@ def some_map(config, seed=0) -> torch.Tensor | None:
 @pytest.mark.parametrize("size", SIZES)
 def test_a_config_survives_json(version, size):
     config = network_config(version, size, classes=("Cyclist", "Car"))
-    assert from_json(dataclasses.asdict(config)) == config
+    assert NetworkConfig.of_json(dataclasses.asdict(config)) == config
     assert config.classes == ("Cyclist", "Car") and config.grid == (496, 432)
 
 

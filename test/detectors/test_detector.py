@@ -11,13 +11,13 @@ from detection_samples import eager, frame, lively, random_detector, same, tiny
 
 from lidar_perception.clustering.cluster import cluster
 from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
+from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointpillars import detector as detector_module
-from lidar_perception.detectors.pointpillars.checkpoint import Header
 from lidar_perception.detectors.pointpillars.config import VERSIONS, network_config
 from lidar_perception.detectors.pointpillars.detector import (
     CPU,
     STEPS,
-    Detector,
+    PointPillarsDetector,
     TorchNetwork,
     chosen_device,
 )
@@ -53,9 +53,9 @@ def test_columns_that_are_given_say_the_same_as_those_that_are_computed(version)
     ids[ids > 0] *= 3  # whatever the numbers
     assert flat.any() and ids.max() >= 6
     computed = detector(scan)
-    assert len(computed) > 3
-    for columns in (flat, None), (None, ids), (flat.astype(np.uint8), ids):
-        assert same(detector(scan, *columns), computed)
+    assert len(computed.detections) > 3
+    for ground, cluster_ids in (flat, None), (None, ids), (flat.astype(np.uint8), ids):
+        assert same(detector(scan, ground=ground, cluster_ids=cluster_ids), computed)
 
 
 def test_versions_see_what_the_paper_says():
@@ -134,26 +134,27 @@ def test_what_is_visible_does_not_depend_on_the_height_of_the_sensor():
 
 def test_detections_are_above_their_thresholds_in_order_and_apart():
     detector = random_detector("v4")
-    found = detector(frame())
+    said = detector(frame())
+    found = said.detections
     assert (np.diff(found.scores) <= 0).all() and (found.scores >= 0.25).all()
     assert {*found.class_ids} <= {CLASSES.index(n) for n in detector.config.classes}
-    assert detector.problem is None and list(detector.ms) == list(STEPS)
-    assert detector.ms["network"] > 0
+    assert said.problem is None and list(said.ms) == list(STEPS)
+    assert said.ms["network"] > 0
     middle = float(np.median(found.scores[found.class_ids == found.class_ids[0]]))
     name = CLASSES[found.class_ids[0]].lower()
-    detector.params = with_values(detector.params, {f"detection.scores.{name}": middle})
-    fewer = detector(frame())
+    detector.params = with_values(detector.params, {f"pointpillars.scores.{name}": middle})
+    fewer = detector(frame()).detections
     assert fewer.scores[fewer.class_ids == found.class_ids[0]].min() >= middle
-    detector.params = with_values(detector.params, {"detection.nms.max_boxes": 2})
+    detector.params = with_values(detector.params, {"pointpillars.nms.max_boxes": 2})
     assert same(detector(frame()), fewer[:2])
 
 
 def test_another_height_of_the_sensor_moves_the_boxes_only():
     detector = random_detector("v4")
-    scan, found = frame(), detector(frame())
+    scan, found = frame(), detector(frame()).detections
     higher = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
     detector.params = with_values(detector.params, {"ground.sensor_pose.height": 2.23})
-    moved = detector(higher)
+    moved = detector(higher).detections
     assert same(replace(moved, boxes=moved.boxes + np.float32([0, 0, 0.5, 0, 0, 0, 0])), found,
                 1e-3)
 
@@ -175,13 +176,13 @@ def test_intensity_is_scaled_and_may_be_left_out():
     found = detector(scan)
     half = replace(scan, intensity=scan.intensity / 2)
     assert not same(detector(half), found)
-    detector.params = with_values(detector.params, {"detection.intensity_scale": 2.0})
+    detector.params = with_values(detector.params, {"pointpillars.intensity_scale": 2.0})
     assert same(detector(half), found)
     without = detector(replace(scan, intensity=None))
-    assert "no intensity" in detector.problem
-    detector.params = with_values(detector.params, {"detection.intensity_scale": 0.0})
-    assert same(detector(scan), without) and detector.problem is None
-    assert same(detector(replace(scan, intensity=None)), without) and detector.problem is None
+    assert "no intensity" in without.problem
+    detector.params = with_values(detector.params, {"pointpillars.intensity_scale": 0.0})
+    for blind in scan, replace(scan, intensity=None):
+        assert same(detector(blind), without) and detector(blind).problem is None
 
 
 @pytest.mark.parametrize("xyz, words", [
@@ -190,33 +191,32 @@ def test_intensity_is_scaled_and_may_be_left_out():
 @pytest.mark.parametrize("version", ["v0", "v4"])
 def test_a_cloud_with_nothing_to_see_has_no_detections_and_a_reason(version, xyz, words):
     detector = random_detector(version)
-    assert len(detector(LidarFrame(np.asarray(xyz, np.float32)))) == 0
-    assert words in detector.problem and detector.ms["network"] == 0
-    detector(frame())
-    assert detector.problem is None
+    found = detector(LidarFrame(np.asarray(xyz, np.float32)))
+    assert len(found.detections) == 0 and words in found.problem and found.ms["network"] == 0
+    assert detector(frame()).problem is None
 
 
 def test_ground_alone_has_no_detections_and_a_reason():
     detector, scan = random_detector("v4"), frame()
-    assert len(detector(scan, np.ones(len(scan), bool))) == 0
-    assert "ground.sensor_pose" in detector.problem
+    found = detector(scan, ground=np.ones(len(scan), bool))
+    assert len(found.detections) == 0 and "ground.sensor_pose" in found.problem
 
 
 def test_where_nothing_passes_the_best_scores_are_said():
     detector, scan = random_detector("v4", eager(score=0.0)), frame()
-    found = detector(scan)
-    assert detector.best == {}
+    assert detector(scan).best == {}
+    found = detector(scan).detections
     highest = {name: float(found.scores[found.class_ids == CLASSES.index(name)].max())
                for name in detector.config.classes if CLASSES.index(name) in found.class_ids}
-    detector.params = eager(score=1.0)
-    assert len(detector(scan)) == 0 and detector.problem is None
-    assert list(detector.best) == list(detector.config.classes)
-    assert max(detector.best.values()) == pytest.approx(max(highest.values()))
-    assert all(detector.best[name] >= score - 1e-6 for name, score in highest.items())
+    nothing = detector.with_min_score(1.0)(scan)
+    assert len(nothing.detections) == 0 and nothing.problem is None
+    assert list(nothing.best) == list(detector.classes)
+    assert max(nothing.best.values()) == pytest.approx(max(highest.values()))
+    assert all(nothing.best[name] >= score - 1e-6 for name, score in highest.items())
+    assert same(detector(scan), found)  # which keeps its own threshold
     for parameter in detector.network.network.head.parameters():
         parameter.fill_(np.nan)
-    detector(scan)
-    assert "NaN" in detector.problem
+    assert "NaN" in detector(scan).problem
 
 
 def test_many_points_and_broken_ones_are_no_trouble():
@@ -224,14 +224,16 @@ def test_many_points_and_broken_ones_are_no_trouble():
     xyz = np.tile(scan.xyz, (250, 1))
     xyz[:5] = [[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [1e9, 0, 0], [-np.inf, 0, np.nan]]
     assert len(xyz) > 900_000
-    detector(LidarFrame(xyz, np.tile(scan.intensity, 250)), np.zeros(len(xyz), bool),
-             np.tile(np.arange(len(scan)), 250))
-    assert detector.problem is None
+    found = detector(LidarFrame(xyz, np.tile(scan.intensity, 250)), ground=np.zeros(len(xyz), bool),
+                     cluster_ids=np.tile(np.arange(len(scan)), 250))
+    assert found.problem is None
 
 
 def test_columns_of_another_length_are_refused():
     with pytest.raises(InputError, match="ground has 3 values"):
-        random_detector()(frame(), np.zeros(3, bool))
+        random_detector()(frame(), ground=np.zeros(3, bool))
+    with pytest.raises(TypeError):  # columns are named, so that none is taken for the other
+        random_detector()(frame(), np.zeros(len(frame()), bool))
 
 
 class OutOfMemory(TorchNetwork):
@@ -255,13 +257,15 @@ def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(monkeypatch
     real = detector_module.make_pillars
     monkeypatch.setattr(detector_module, "make_pillars", lambda clouds, config: real(
         [c if c.device.type == "cpu" else torch.zeros(1, 4) for c in clouds], config))
-    broken = Detector(OutOfMemory(lively(config)), Header(config), torch.device("meta"), eager())
-    assert same(broken(scan), random_detector()(scan))
-    assert "CPU" in broken.problem and broken.device == CPU
-    assert same(broken(scan), random_detector()(scan)) and "CPU" in broken.problem
-    never = with_values(eager(), {"detection.cpu_fallback": False})
-    with pytest.raises(InputError, match="no memory"):
-        Detector(OutOfMemory(lively(config)), Header(config), torch.device("meta"), never)(scan)
+    meta = torch.device("meta")
+    broken = PointPillarsDetector(OutOfMemory(lively(config)), Header(config), meta, eager())
+    for _ in range(2):
+        found = broken(scan)
+        assert same(found, random_detector()(scan)) and "CPU" in found.problem
+        assert broken.device == CPU
+    never = with_values(eager(), {"pointpillars.cpu_fallback": False})
+    with pytest.raises(InputError, match="out of memory"):
+        PointPillarsDetector(OutOfMemory(lively(config)), Header(config), meta, never)(scan)
 
 
 @pytest.mark.parametrize("name, words", [("tpu", "no device 'tpu'"), ("mps", "no device 'mps'"),
@@ -278,6 +282,5 @@ def test_real_scans_of_any_version_go_through(data):
     scan = open_kitti(data / "kitti_object")[0].load()
     for version in VERSIONS:
         config = network_config(version, "compact")
-        detector = Detector(TorchNetwork(lively(config)), Header(config), CPU)
-        detector(scan)
-        assert detector.problem is None and detector.ms["network"] > 0
+        found = PointPillarsDetector(TorchNetwork(lively(config)), Header(config), CPU)(scan)
+        assert found.problem is None and found.ms["network"] > 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import automatic_seed
 from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.hybrid.candidates import RescoredCandidates
 from lidar_perception.detectors.hybrid.judging import combined, judged
 from lidar_perception.detectors.hybrid.params import ConfirmingParams, RescoringParams
@@ -45,7 +45,7 @@ def judge():
 @pytest.fixture(scope="module")
 def found(judge):
     """What a low threshold leaves: the frame's segmentation and candidates."""
-    pipeline = RescoredCandidates(judge, RescoringParams(least_confidence=0.0), PIPELINE).pipeline
+    pipeline = RescoredCandidates(judge, RescoringParams(min_confidence=0.0), PIPELINE).pipeline
     segmented, candidates = find_candidates(cloud(), SEED, None, pipeline)
     assert len(candidates.final) >= 4
     return segmented, candidates
@@ -59,8 +59,8 @@ def clusters(found):
 
 
 def rescored(judge, **changes) -> Detections:
-    params = RescoringParams(**{"least_confidence": 0.0, "threshold": 0.0, **changes})
-    return RescoredCandidates(judge, params, PIPELINE)(cloud(), SEED)
+    params = RescoringParams(**{"min_confidence": 0.0, "threshold": 0.0, **changes})
+    return RescoredCandidates(judge, SEED, None, params, PIPELINE)(cloud()).detections
 
 
 def by_score(found: Detections) -> Detections:
@@ -123,18 +123,18 @@ def test_the_threshold_leaves_what_scores_as_much(judge):
 
 
 def test_times_and_problems_are_told(judge):
-    detector = RescoredCandidates(judge, pipeline=PIPELINE)
-    detector(cloud(), SEED)
-    assert detector.problem is None and {"clustering", "stm", "network"} <= {*detector.ms}
-    empty = LidarFrame(np.zeros((0, 3), np.float32))
-    assert len(detector(empty, SEED)) == 0 and "empty" in detector.problem
+    detector = RescoredCandidates(judge, SEED, pipeline=PIPELINE)
+    found = detector(cloud())
+    assert found.problem is None and {"clustering", "stm", "network"} <= {*found.ms}
+    nothing = detector(LidarFrame(np.zeros((0, 3), np.float32)))
+    assert len(nothing.detections) == 0 and "empty" in nothing.problem
     with pytest.raises(InputError, match="no camera calibration"):
-        RescoredCandidates(judge)(cloud(), SEED)
+        RescoredCandidates(judge, SEED)(cloud())
 
 
 def test_a_network_that_knows_no_pedestrian_cannot_judge_candidates():
     with pytest.raises(InputError, match="no Pedestrian, only Car"):
-        RescoredCandidates(random_detector(classes=("Car",), sizes=((4, 2, 1.5),)))
+        RescoredCandidates(random_detector(classes=("Car",), sizes=((4, 2, 1.5),)), SEED)
 
 
 @pytest.fixture(scope="module")
@@ -146,14 +146,14 @@ def proposals():
 
 
 def confirmed(judge, proposals, frame=None, **changes) -> Detections:
-    stub = SimpleNamespace(problem="as the proposer says", ms={})
-    proposer = type("Stub", (), {**vars(stub), "__call__": lambda self, frame: proposals})()
+    def proposer(frame, **columns) -> Found:
+        return Found(proposals, problem="as the proposer says")
     detector = ConfirmedProposals(proposer, judge, ConfirmingParams(**{"threshold": 0.0,
                                                                        **changes}))
-    result = detector(cloud() if frame is None else frame)
-    assert detector.problem == "as the proposer says"
-    assert {*detector.ms} == {"proposals", "ground", "clusters", "network"}
-    return result
+    found = detector(cloud() if frame is None else frame)
+    assert found.problem == "as the proposer says"
+    assert {*found.ms} == {"proposals", "ground", "clusters", "network"}
+    return found.detections
 
 
 def test_with_weight_0_the_proposals_stand_as_they_are(judge, proposals):
@@ -176,7 +176,7 @@ def test_with_weight_1_those_with_points_get_the_networks_probability(judge, pro
 
 
 def test_few_points_say_nothing(judge, proposals):
-    assert same(confirmed(judge, proposals, least_points=1_000_000), proposals)
+    assert same(confirmed(judge, proposals, min_points=1_000_000), proposals)
 
 
 def test_a_higher_sensor_sees_the_same(judge, proposals):

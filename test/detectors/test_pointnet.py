@@ -212,7 +212,7 @@ def test_every_switch_of_the_ablation_changes_the_network_or_the_clusters():
 
 def test_a_config_survives_json_and_what_cannot_be_is_said():
     config = pointnet_config("pointnet2", points=64)
-    assert config_module.from_json(asdict(config)) == config
+    assert config_module.PointNetConfig.of_json(asdict(config)) == config
     with pytest.raises(InputError, match="no network 'resnet'"):
         pointnet_config("resnet")
     with pytest.raises(InputError, match="Bus"):
@@ -220,7 +220,7 @@ def test_a_config_survives_json_and_what_cannot_be_is_said():
     with pytest.raises(InputError, match="length"):
         pointnet_config(classes=("Car",))
     with pytest.raises(InputError, match="later version"):
-        config_module.from_json({"wings": 2})
+        config_module.PointNetConfig.of_json({"wings": 2})
     for wrong in dict(radii=(0.4, 0.2, 0.1)), dict(centroids=500), dict(neighbours=(1, 2)):
         with pytest.raises(InputError):
             pointnet_config(**wrong)

@@ -19,11 +19,13 @@ from samples import object_folder
 
 from lidar_perception.cli.main import cli
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.detectors.checkpoint import network_of
+from lidar_perception.detectors.checkpoint import Header, network_of, read_header, save_checkpoint
+from lidar_perception.detectors.checkpoint import Header as PointPillarsHeader
+from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet import weights_file as weights_module
-from lidar_perception.detectors.pointnet.checkpoint import Header, load_pointnet, read_header
 from lidar_perception.detectors.pointnet.detector import PointNetDetector, load_pointnet_detector
+from lidar_perception.detectors.pointnet.network import load_pointnet
 from lidar_perception.detectors.pointnet.params import (
     CLUSTERING,
     GROUND,
@@ -31,9 +33,8 @@ from lidar_perception.detectors.pointnet.params import (
     PointNetDetectorParams,
 )
 from lidar_perception.detectors.pointnet.predict import CHUNK
-from lidar_perception.detectors.pointpillars.checkpoint import Header as PointPillarsHeader
-from lidar_perception.detectors.pointpillars.checkpoint import load_network, save_checkpoint
-from lidar_perception.detectors.pointpillars.detector import Detector
+from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
+from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.detectors.view import in_sensor_frame
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import level, segment_ground
@@ -61,8 +62,9 @@ def moved(found: Detections, turn: float = 0.0, shift=(0, 0, 0)) -> Detections:
     return replace(found, boxes=boxes)
 
 
-def alike(a: Detections, b: Detections, atol: float = 1e-4) -> bool:
+def alike(a: Detections | Found, b: Detections | Found, atol: float = 1e-4) -> bool:
     """Whether both say the same; scores that hardly differ may have changed places."""
+    a, b = (x.detections if isinstance(x, Found) else x for x in (a, b))
     if len(a) != len(b):
         return False
     left = set(range(len(b)))
@@ -80,7 +82,7 @@ def alike(a: Detections, b: Detections, atol: float = 1e-4) -> bool:
 
 def test_columns_that_are_given_say_the_same_as_those_that_are_computed(ids):
     detector, scan = random_detector(), frame()
-    computed = detector(scan)
+    computed = detector(scan).detections
     assert len(computed) > 3 and len(set(computed.class_ids)) > 1
     flat = segment_ground(scan, GROUND)
     for columns in (dict(cluster_ids=ids), dict(ground=flat), dict(ground=flat.astype("u1")),
@@ -90,19 +92,21 @@ def test_columns_that_are_given_say_the_same_as_those_that_are_computed(ids):
 
 def test_the_numbers_of_clusters_do_not_matter(ids):
     detector, scan = random_detector(), frame()
-    found = detector(scan, ids)
-    assert same(detector(scan, np.where(ids > 0, ids + 100_000, 0)), found)
-    assert same(detector(scan, np.where(ids > 0, ids, -1)), found)
-    assert same(detector(scan, np.where(ids > 0, ids.astype(np.int64) * 2**40, -(2**50))), found)
+    found = detector(scan, cluster_ids=ids).detections
+    assert same(detector(scan, cluster_ids=np.where(ids > 0, ids + 100_000, 0)), found)
+    assert same(detector(scan, cluster_ids=np.where(ids > 0, ids, -1)), found)
+    huge = np.where(ids > 0, ids.astype(np.int64) * 2**40, -(2**50))
+    assert same(detector(scan, cluster_ids=huge), found)
     turn = np.random.default_rng(0).permutation(ids.max()) + 1
     permuted = np.concatenate([[0], turn])[ids]
-    assert not np.array_equal(permuted, ids) and alike(detector(scan, permuted), found)
+    assert not np.array_equal(permuted, ids) and alike(detector(scan, cluster_ids=permuted), found)
 
 
 def test_clusters_do_not_know_of_each_other(ids):
     detector, scan = random_detector(), frame()
-    everything = detector(scan, ids)
-    alone = [detector(scan, np.where(ids == i, ids, 0)) for i in range(1, ids.max() + 1)]
+    everything = detector(scan, cluster_ids=ids).detections
+    alone = [detector(scan, cluster_ids=np.where(ids == i, ids, 0)).detections
+             for i in range(1, ids.max() + 1)]
     joined = Detections(*(np.concatenate([getattr(one, part) for one in alone])
                           for part in ("boxes", "class_ids", "scores")))
     assert alike(joined, everything)
@@ -112,146 +116,146 @@ def test_a_frame_without_clusters_has_no_detections_and_a_reason(ids):
     detector, scan = random_detector(), frame()
     nothing = np.zeros(len(scan), np.int32)
     far = LidarFrame(np.float32([[9, 0, -1], [20, 3, 0]]), np.zeros(2, np.float32))
-    for clouds, words in (
-            ((LidarFrame(np.zeros((0, 3), np.float32)),), "empty"),
-            ((LidarFrame(np.full((5, 3), np.nan, np.float32)),), "no finite point"),
-            ((scan, nothing), "no clusters"), ((scan, nothing - 1), "no clusters"),
-            ((far,), "no clusters"), ((scan, None, np.ones(len(scan), bool)), "no clusters"),
-            ((scan, np.arange(len(scan))), "fewer than 5 points")):
-        assert len(detector(*clouds)) == 0 and words in detector.problem, words
-        assert detector.best == {} and list(detector.ms) == list(STEPS)
-        detector(scan, ids)
-        assert detector.problem is None and detector.ms["network"] > 0
+    for cloud, columns, words in (
+            (LidarFrame(np.zeros((0, 3), np.float32)), {}, "empty"),
+            (LidarFrame.of(np.full((5, 3), np.nan, np.float32)), {}, "no finite point"),
+            (scan, {"cluster_ids": nothing}, "no clusters"),
+            (scan, {"cluster_ids": nothing - 1}, "no clusters"), (far, {}, "no clusters"),
+            (scan, {"ground": np.ones(len(scan), bool)}, "no clusters"),
+            (scan, {"cluster_ids": np.arange(len(scan))}, "fewer than 5 points")):
+        found = detector(cloud, **columns)
+        assert len(found.detections) == 0 and words in found.problem, words
+        assert found.best == {} and list(found.ms) == list(STEPS)
+        found = detector(scan, cluster_ids=ids)
+        assert found.problem is None and found.ms["network"] > 0
 
 
 def test_small_and_large_clusters_and_many_are_no_trouble(ids):
     rng = np.random.default_rng(0)
-    detector = random_detector(with_values(eager(), {"pointnet.least_points": 1}))
+    detector = random_detector(with_values(eager(), {"pointnet.min_points": 1}))
     batches = []
     detector.network.register_forward_hook(lambda net, given, _: batches.append(len(given[0])))
     one = LidarFrame(np.float32([[9, 0, -1]]), np.ones(1, np.float32))
-    assert len(detector(one, np.ones(1, int))) == 1
+    assert len(detector(one, cluster_ids=np.ones(1, int)).detections) == 1
     xyz = rng.uniform([5, -3, -1.7], [9, 3, 2], (50_000, 3)).astype(np.float32)
     big = LidarFrame(xyz, rng.uniform(0, 1, len(xyz)).astype(np.float32))
-    assert len(detector(big, np.ones(len(xyz), int))) == 1
+    assert len(detector(big, cluster_ids=np.ones(len(xyz), int)).detections) == 1
     spots = rng.uniform(-80, 80, (5000, 1, 3)) * [1, 1, 0.01]
     xyz = (spots + rng.normal(0, 0.2, (5000, 6, 3))).reshape(-1, 3).astype(np.float32)
     batches.clear()
-    found = detector(LidarFrame(xyz, np.zeros(len(xyz), np.float32)), np.repeat(
-        np.arange(5000), 6) + 1)
+    found = detector(LidarFrame(xyz, np.zeros(len(xyz), np.float32)),
+                     cluster_ids=np.repeat(np.arange(5000), 6) + 1)
     assert sum(batches) == 5000 and max(batches) <= CHUNK
-    assert len(found) == detector.params.pointnet.nms.max_boxes and detector.problem is None
+    assert len(found.detections) == detector.params.pointnet.nms.max_boxes
+    assert found.problem is None
 
 
 # where the sensor is
 
 def test_the_scene_turned_about_the_sensor_has_its_boxes_turned(ids):
     detector, scan = random_detector(), frame()
-    found = detector(scan, ids)
+    found = detector(scan, cluster_ids=ids).detections
     cos, sin = np.cos(2.0), np.sin(2.0)
     turn = np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])
     turned = replace(scan, xyz=(scan.xyz @ turn).astype(np.float32))
-    assert alike(detector(turned, ids), moved(found, 2.0), 2e-3)
+    assert alike(detector(turned, cluster_ids=ids), moved(found, 2.0), 2e-3)
 
 
 def test_another_height_of_the_sensor_moves_the_boxes_only(ids):
     detector, scan = random_detector(), frame()
-    for columns in ((ids,), ()):
+    for columns in {"cluster_ids": ids}, {}:
         detector.params = eager()
-        found = detector(scan, *columns)
+        found = detector(scan, **columns).detections
         higher = replace(scan, xyz=scan.xyz - np.float32([0, 0, 0.5]))
         # heights are measured from the ground that is there, so that nobody need say it
-        assert alike(detector(higher, *columns), moved(found, shift=(0, 0, -0.5)), 1e-3)
+        assert alike(detector(higher, **columns), moved(found, shift=(0, 0, -0.5)), 1e-3)
         detector.params = with_values(eager(), {"ground.sensor_pose.height": 2.23})
-        assert alike(detector(higher, *columns), moved(found, shift=(0, 0, -0.5)), 1e-3)
+        assert alike(detector(higher, **columns), moved(found, shift=(0, 0, -0.5)), 1e-3)
 
 
 @pytest.mark.parametrize("roll, pitch", [(3.1416, 0.0), (0.0, 0.2)])
 def test_a_tilted_sensor_finds_the_same_boxes_in_its_own_frame(roll, pitch, ids):
     pose = SensorPoseParams(roll=roll, pitch=pitch)
     detector, scan = random_detector(), frame()
-    found = detector(scan, ids)
+    found = detector(scan, cluster_ids=ids).detections
     back = level(np.eye(3, dtype=np.float32), pose).T
     detector.params = with_values(eager(), {"ground.sensor_pose.roll": roll,
                                             "ground.sensor_pose.pitch": pitch,
                                             "pointnet.nms.iou": 1.0})
-    seen = detector(replace(scan, xyz=scan.xyz @ back), ids)
+    seen = detector(replace(scan, xyz=scan.xyz @ back), cluster_ids=ids).detections
     detector.params = with_values(eager(), {"pointnet.nms.iou": 1.0})
-    assert alike(seen, in_sensor_frame(detector(scan, ids), pose), 2e-3) and len(found) > 3
+    assert alike(seen, in_sensor_frame(
+        detector(scan, cluster_ids=ids).detections, pose), 2e-3) and len(found) > 3
 
 
 # scores, boxes, intensity
 
 def test_detections_are_above_their_thresholds_in_order_and_apart(ids):
     detector, scan = random_detector(), frame()
-    found = detector(scan, ids)
+    found = detector(scan, cluster_ids=ids).detections
     assert (np.diff(found.scores) <= 0).all() and len(found) > 3
     middle = float(np.median(found.scores[found.class_ids == found.class_ids[0]]))
     name = CLASSES[found.class_ids[0]].lower()
     detector.params = with_values(eager(), {f"pointnet.scores.{name}": middle})
-    fewer = detector(scan, ids)
+    fewer = detector(scan, cluster_ids=ids).detections
     assert fewer.scores[fewer.class_ids == found.class_ids[0]].min() >= np.float32(middle)
     others = found[found.class_ids != found.class_ids[0]]
     assert len(others) and same(fewer[fewer.class_ids != found.class_ids[0]], others)
     detector.params = with_values(eager(), {"pointnet.nms.max_boxes": 2})
-    assert same(detector(scan, ids), found[:2])
+    assert same(detector(scan, cluster_ids=ids), found[:2])
     halves = ids.copy()  # two clusters of one thing: one box of them stays
     thing = np.flatnonzero(ids == 1)
     halves[thing[::2]] = ids.max() + 1
     detector.params = with_values(eager(), {"pointnet.nms.iou": 1.0})
-    both = detector(scan, halves)
+    both = detector(scan, cluster_ids=halves).detections
     detector.params = with_values(eager(), {"pointnet.nms.iou": 0.05,
                                             "pointnet.nms.across_classes": True})
-    assert len(both) > len(detector(scan, halves))
+    assert len(both) > len(detector(scan, cluster_ids=halves).detections)
 
 
 def test_where_nothing_passes_the_best_scores_are_said(ids):
     detector, scan = random_detector(), frame()
-    found = detector(scan, ids)
-    assert detector.best == {} and len(found) == ids.max()
-    detector.params = eager(score=1.0)
-    assert len(detector(scan, ids)) == 0 and detector.problem is None
-    assert list(detector.best) == ["Car", "Pedestrian", "Cyclist"]
-    assert max(detector.best.values()) == pytest.approx(found.scores.max())
+    found = detector(scan, cluster_ids=ids).detections
+    assert detector(scan, cluster_ids=ids).best == {} and len(found) == ids.max()
+    nothing = detector.with_min_score(1.0)(scan, cluster_ids=ids)
+    assert len(nothing.detections) == 0 and nothing.problem is None
+    assert list(nothing.best) == ["Car", "Pedestrian", "Cyclist"]
+    assert max(nothing.best.values()) == pytest.approx(found.scores.max())
+    assert same(detector(scan, cluster_ids=ids), found)  # which keeps its own threshold
 
 
 @pytest.mark.parametrize("layer", ["classes", "box"])
 def test_what_is_not_a_number_is_left_out_and_said(layer, ids):
     detector, scan = random_detector(), frame()
-    expected = detector(scan, np.where(ids == 2, 0, ids))
+    expected = detector(scan, cluster_ids=np.where(ids == 2, 0, ids)).detections
     intensity = np.where(ids == 2, np.float32(np.nan), scan.intensity)
-    assert same(detector(replace(scan, intensity=intensity), ids), expected)
-    assert f"1 of {ids.max()} clusters" in detector.problem and "NaN" in detector.problem
+    found = detector(replace(scan, intensity=intensity), cluster_ids=ids)
+    assert same(found, expected)
+    assert f"1 of {ids.max()} clusters" in found.problem and "NaN" in found.problem
     getattr(detector.network, layer).bias.fill_(np.nan)
-    assert len(detector(scan, ids)) == 0 and "NaN" in detector.problem
+    found = detector(scan, cluster_ids=ids)
+    assert len(found.detections) == 0 and "NaN" in found.problem
 
 
 def test_intensity_is_scaled_and_may_be_left_out(ids):
     detector, scan = random_detector(), frame()
-    found = detector(scan, ids)
+    found = detector(scan, cluster_ids=ids).detections
     half = replace(scan, intensity=scan.intensity / 2)
-    assert not same(detector(half, ids), found)
+    assert not same(detector(half, cluster_ids=ids), found)
     detector.params = with_values(eager(), {"pointnet.intensity_scale": 2.0})
-    assert same(detector(half, ids), found)
-    without = detector(replace(scan, intensity=None), ids)
-    assert "no intensity" in detector.problem
+    assert same(detector(half, cluster_ids=ids), found)
+    without = detector(replace(scan, intensity=None), cluster_ids=ids)
+    assert "no intensity" in without.problem
     detector.params = with_values(eager(), {"pointnet.intensity_scale": 0.0})
-    assert same(detector(scan, ids), without) and detector.problem is None
-    assert same(detector(replace(scan, intensity=None), ids), without)
-    assert detector.problem is None
+    for blind in scan, replace(scan, intensity=None):
+        found = detector(blind, cluster_ids=ids)
+        assert same(found, without) and found.problem is None
 
 
-def test_broken_points_are_left_out(ids):
-    detector, scan = random_detector(), frame()
-    found = detector(scan, ids)
-    bad = np.float32([[np.nan, 0, 0], [np.inf, 0, 0], [0, 0, 0], [1e9, 0, 0], [-np.inf, 0, 1]])
-    broken = LidarFrame(np.concatenate([scan.xyz, bad]),
-                        np.append(scan.intensity, np.ones(5, np.float32)))
-    assert same(detector(broken, np.append(ids, np.ones(5, int))), found)
-    assert alike(detector(broken), detector(scan)) and detector.problem is None
+def test_columns_of_another_length_are_refused():
     for name in "cluster_ids", "ground":
         with pytest.raises(InputError, match=f"{name} has 3 values"):
-            detector(scan, **{name: np.zeros(3, int)})
+            random_detector()(frame(), **{name: np.zeros(3, int)})
 
 
 # devices
@@ -259,7 +263,7 @@ def test_broken_points_are_left_out(ids):
 def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(ids, monkeypatch):
     """As if everything but the CPU had no memory."""
     from lidar_perception.detectors.pointnet import detector as module
-    scan, expected, real = frame(), random_detector()(frame(), ids), module.predict
+    scan, expected, real = frame(), random_detector()(frame(), cluster_ids=ids), module.predict
     broken = random_detector()
 
     def predict(network, clusters):
@@ -268,13 +272,13 @@ def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(ids, monkey
         return real(network, clusters)
     monkeypatch.setattr(module, "predict", predict)
     broken.device = torch.device("meta")
-    assert same(broken(scan, ids), expected)
-    assert "CPU" in broken.problem and broken.device == CPU
-    assert same(broken(scan, ids), expected) and "CPU" in broken.problem
+    for _ in range(2):
+        found = broken(scan, cluster_ids=ids)
+        assert same(found, expected) and "CPU" in found.problem and broken.device == CPU
     broken.device = torch.device("meta")
     broken.params = with_values(eager(), {"pointnet.cpu_fallback": False})
-    with pytest.raises(InputError, match="no memory"):
-        broken(scan, ids)
+    with pytest.raises(InputError, match="out of memory"):
+        broken(scan, cluster_ids=ids)
 
 
 # weights
@@ -347,22 +351,23 @@ def test_weights_of_another_network_or_other_classes_are_refused(saved, tmp_path
 
 def test_fewer_classes_are_found_as_what_they_are(ids):
     config = small(classes=("Pedestrian",), sizes=small().sizes[1:2])
-    found = PointNetDetector(lively(config), Header(config), CPU, eager())(frame(), ids)
+    found = PointNetDetector(lively(config), Header(config), CPU, eager())(
+        frame(), cluster_ids=ids).detections
     assert len(found) > 3 and {*found.class_ids} == {CLASSES.index("Pedestrian")}
 
 
 def test_one_function_opens_both(saved, tmp_path):
     path, other, _ = saved
     pointnet, pointpillars = open_detector(path, "cpu"), open_detector(other, "cpu")
-    assert isinstance(pointnet, PointNetDetector) and isinstance(pointpillars, Detector)
+    assert isinstance(pointnet, PointNetDetector) and isinstance(pointpillars, PointPillarsDetector)
     assert pointnet.params.clustering == CLUSTERING and pointnet.params.ground == GROUND
     ablated = small(dynamic_threshold=False)
     save_checkpoint(tmp_path / "a.safetensors", lively(ablated), Header(ablated))
     clustering = open_detector(tmp_path / "a.safetensors", "cpu").params.clustering
     assert clustering == ablated.clustering != CLUSTERING
     for detector in pointnet, pointpillars:
-        assert isinstance(detector(frame()), Detections)
-        assert detector.ms["network"] > 0 and detector.problem is None
+        found = detector(frame())
+        assert found.ms["network"] > 0 and found.problem is None
     for name, words in ("none.safetensors", "no checkpoint"), ("none.onnx", "onnx"):
         with pytest.raises(InputError, match=words):
             open_detector(tmp_path / name)
@@ -399,7 +404,6 @@ def test_real_scans_of_any_network_go_through(data):
     scan = open_kitti(data / "kitti_object")[0].load()
     for name in "improved", "pointnet", "pointnet2":
         config = small(name)
-        detector = PointNetDetector(lively(config), Header(config), CPU,
-                                    PointNetDetectorParams())
-        detector(scan)
-        assert detector.problem is None and detector.ms["network"] > 0
+        found = PointNetDetector(lively(config), Header(config), CPU,
+                                 PointNetDetectorParams())(scan)
+        assert found.problem is None and found.ms["network"] > 0

@@ -45,7 +45,7 @@ def test_each_finds_most_cars_that_are_plain_to_see(file):
         ahead = (scan.truth.boxes[:, 0] > 5) & (scan.truth.boxes[:, 0] < 35) & (
             np.abs(scan.truth.boxes[:, 1]) < 20)
         boxes = scan.truth.boxes[cars & plain & ahead]
-        detections = detector(scan.frame)
+        detections = detector(scan.frame).detections
         mine = detections.boxes[detections.class_ids == CLASSES.index("Car")]
         found += len(boxes)
         hits += len(match_centres(mine[:, :3], boxes[:, :3], 1.0)[0])

@@ -13,23 +13,17 @@ from click.testing import CliRunner
 from detection_samples import eager, frame, lively, random_detector, same, tiny
 
 from lidar_perception.cli.main import cli
-from lidar_perception.detectors.checkpoint import adopt
+from lidar_perception.detectors.checkpoint import Header, adopt, read_header, save_checkpoint
 from lidar_perception.detectors.pointpillars import weights_file as weights_module
-from lidar_perception.detectors.pointpillars.checkpoint import (
-    Header,
-    load_network,
-    read_header,
-    save_checkpoint,
-)
 from lidar_perception.detectors.pointpillars.config import VERSIONS, network_config
 from lidar_perception.detectors.pointpillars.detector import (
     CPU,
-    Detector,
+    PointPillarsDetector,
     TorchNetwork,
     load_detector,
 )
 from lidar_perception.detectors.pointpillars.import_weights import import_weights
-from lidar_perception.detectors.pointpillars.network import make_network
+from lidar_perception.detectors.pointpillars.network import load_network, make_network
 from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import InputError
@@ -64,7 +58,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
         torch.testing.assert_close(value, network.state_dict()[name], atol=1e-7,
                                    rtol=0 if value.ndim < 2 else 2**-10)
     found = load_detector(path, "cpu", eager())(frame())
-    assert len(found) and same(found, Detector(TorchNetwork(network), header, CPU,
+    assert len(found) and same(found, PointPillarsDetector(TorchNetwork(network), header, CPU,
                                                eager())(frame()))
 
 
@@ -72,11 +66,11 @@ def test_a_checkpoint_of_another_network_is_refused_with_both_values(saved):
     path, _, _ = saved
     with pytest.raises(InputError, match=r"version is v4, asked for was v2"):
         load_network(path, tiny("v2"))
-    wanted = with_values(DetectorParams(), {"detection.version": "v1"})
+    wanted = with_values(DetectorParams(), {"pointpillars.version": "v1"})
     with pytest.raises(InputError, match=r"holds version v4, asked for was v1"):
         load_detector(path, "cpu", wanted)
     with pytest.raises(InputError, match=r"holds size compact, asked for was full"):
-        load_detector(path, "cpu", with_values(DetectorParams(), {"detection.size": "full"}))
+        load_detector(path, "cpu", with_values(DetectorParams(), {"pointpillars.size": "full"}))
 
 
 def test_a_network_begins_with_what_fits_of_another(saved):
@@ -150,16 +144,16 @@ def test_weights_that_do_not_come_with_the_package_are_asked_for(tmp_path, monke
     monkeypatch.setattr(weights_module, "WEIGHTS", tmp_path)
     with pytest.raises(InputError, match="no weights for v4 compact"):
         load_detector("", "cpu")
-    wanted = with_values(eager(), {"detection.version": "v1"})
+    wanted = with_values(eager(), {"pointpillars.version": "v1"})
     config = tiny("v1")
     save_checkpoint(tmp_path / "pointpillars_v1_compact.safetensors", lively(config),
                     Header(config))
     assert same(load_detector("", "cpu", wanted)(frame()), random_detector("v1")(frame()))
-    named = with_values(eager(), {"detection.weights": str(
+    named = with_values(eager(), {"pointpillars.weights": str(
         tmp_path / "pointpillars_v1_compact.safetensors")})
     assert same(load_detector("", "cpu", named)(frame()), random_detector("v1")(frame()))
     with pytest.raises(InputError, match="no checkpoint /nowhere"):
-        load_detector("", "cpu", with_values(eager(), {"detection.weights": "/nowhere"}))
+        load_detector("", "cpu", with_values(eager(), {"pointpillars.weights": "/nowhere"}))
 
 
 # export
@@ -175,7 +169,7 @@ def test_an_exported_network_finds_the_same(version, changes, tmp_path):
     export_onnx(network, header, tmp_path / "n.onnx")
     exported = load_detector(tmp_path / "n.onnx", "auto", eager(score=0.1))
     assert exported.header == header and isinstance(exported.network, OnnxNetwork)
-    expected = Detector(TorchNetwork(network), header, CPU, eager(score=0.1))(frame())
+    expected = PointPillarsDetector(TorchNetwork(network), header, CPU, eager(score=0.1))(frame())
     assert len(expected) and same(exported(frame()), expected, 1e-4)
 
 

@@ -20,10 +20,10 @@ from test_pointpillars_node import assert_equal, message, received
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
 from lidar_perception.cli.options import read_config
-from lidar_perception.detectors.pointnet.checkpoint import Header, save_checkpoint
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
+from lidar_perception.detectors.checkpoint import Header as PointPillarsHeader
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams
-from lidar_perception.detectors.pointpillars.checkpoint import Header as PointPillarsHeader
 from lidar_perception.nodes.graph import POINTNET
 from lidar_perception.nodes.main import run
 from lidar_perception.param_fields import flatten, with_values
@@ -171,4 +171,4 @@ def test_weights_that_cannot_be_used_are_a_diagnostic(make, words, processes, pe
 
 def test_help_knows_the_node(capsys):
     assert run(NODE, [NODE, "--help"]) == 0
-    assert "pointnet.least_points (default 5)" in capsys.readouterr().out
+    assert "pointnet.min_points (default 5)" in capsys.readouterr().out

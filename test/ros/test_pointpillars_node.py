@@ -19,7 +19,7 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
 from lidar_perception.cli.options import read_config
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.detectors.pointpillars.checkpoint import Header, save_checkpoint
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.pointpillars.detector import STEPS, load_detector
 from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.graph import POINTPILLARS
@@ -50,7 +50,7 @@ def weights(tmp_path_factory) -> Path:
 
 def values(weights, **changes):
     """Parameters of the node, as flat as a launch file has them; unchanged ones are left out."""
-    params = with_values(eager(), {"detection.weights": str(weights), "detection.threads": 1,
+    params = with_values(eager(), {"pointpillars.weights": str(weights), "pointpillars.threads": 1,
                                    **changes})
     defaults = flatten(DetectorParams())
     return {k: v for k, v in flatten(params).items() if v != defaults[k]}
@@ -75,7 +75,7 @@ def received(messages, stamp):
 
 
 def offline(weights, msg, params=None, *columns):
-    params = params or with_values(eager(), {"detection.threads": 1})
+    params = params or with_values(eager(), {"pointpillars.threads": 1})
     detector = load_detector(weights, "cpu", params)
     return detector(to_frame(msg, params.input.intensity_max)[0], *columns)
 
@@ -186,16 +186,16 @@ def test_thresholds_change_at_run_time_and_what_cannot_is_refused(processes, pee
     for name, value in ("weights", "other.safetensors"), ("device", "cuda"), ("version", "v0"):
         refused = change(f"detection.{name}", type=text, string_value=value)
         assert not refused.successful and "read-only" in refused.reason
-    refused = change("detection.scores.car", type=double, double_value=1.5)
+    refused = change("pointpillars.scores.car", type=double, double_value=1.5)
     assert not refused.successful and refused.reason
     refused = change("ground.method", type=text, string_value="dream")
     assert not refused.successful and "patchwork" in refused.reason
     described, = peer.call(f"/{NODE}/describe_parameters", DescribeParameters,
-                           DescribeParameters.Request(names=["detection.scores.car"])).descriptors
+                           DescribeParameters.Request(names=["pointpillars.scores.car"])).descriptors
     assert described.floating_point_range[0].to_value == 1.0 and "Car" in described.description
 
     for name in ("car", "pedestrian", "cyclist"):
-        peer.set_parameter(f"/{NODE}", f"detection.scores.{name}", 1.0)
+        peer.set_parameter(f"/{NODE}", f"pointpillars.scores.{name}", 1.0)
     peer.send(talker, message(2), lambda: received(found, 2) is not None, "no detections")
     assert len(received(found, 2)) == 0
     peer.wait(lambda: "below its threshold" in peer.message_of(NODE), "the reason")
@@ -208,34 +208,35 @@ def test_thresholds_change_at_run_time_and_what_cannot_is_refused(processes, pee
 def checkpoint_of_another_size(folder):
     path = folder / "v0.safetensors"
     save_checkpoint(path, lively(tiny("v0")), Header(tiny("v0")))
-    return {"detection.weights": str(path), "detection.version": "v4"}
+    return {"pointpillars.weights": str(path), "pointpillars.version": "v4"}
 
 
 def cut_checkpoint(folder):
     checkpoint_of_another_size(folder)
     whole = (folder / "v0.safetensors").read_bytes()
     (folder / "cut.safetensors").write_bytes(whole[:len(whole) // 2])
-    return {"detection.weights": str(folder / "cut.safetensors")}
+    return {"pointpillars.weights": str(folder / "cut.safetensors")}
 
 
 def broken_weights(folder):
     network = lively(tiny("v0"))
     network.head.scores.bias.fill_(np.nan)
     save_checkpoint(folder / "nan.safetensors", network, Header(tiny("v0")))
-    return {"detection.weights": str(folder / "nan.safetensors")}
+    return {"pointpillars.weights": str(folder / "nan.safetensors")}
 
 
 UNUSABLE = {  # parameters made in a folder; level, words of the diagnostic
-    "nowhere": (lambda folder: {"detection.weights": "/nowhere.safetensors"}, 2,
+    "nowhere": (lambda folder: {"pointpillars.weights": "/nowhere.safetensors"}, 2,
                 "there is no checkpoint /nowhere.safetensors"),
     "another version": (checkpoint_of_another_size, 2, "holds version v0, asked for was v4"),
     "cut": (cut_checkpoint, 2, "is no checkpoint, or was cut short"),
-    "no CUDA": (lambda folder: {**checkpoint_of_another_size(folder), "detection.version": "auto",
-                                "detection.device": "cuda:99", "detection.cpu_fallback": False}, 2,
+    "no CUDA": (lambda folder: {**checkpoint_of_another_size(folder),
+                                "pointpillars.version": "auto", "pointpillars.device": "cuda:99",
+                                "pointpillars.cpu_fallback": False}, 2,
                 "'cuda:99' is asked for"),
     "no CUDA, the CPU instead": (lambda folder: {
-        **checkpoint_of_another_size(folder), "detection.version": "auto",
-        "detection.device": "cuda:99"}, 1, "the CPU is used"),
+        **checkpoint_of_another_size(folder), "pointpillars.version": "auto",
+        "pointpillars.device": "cuda:99"}, 1, "the CPU is used"),
     "NaN": (broken_weights, 1, "not numbers (NaN)"),
 }
 
@@ -260,8 +261,8 @@ def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, pee
     if missing is None:
         pytest.skip("weights of all versions and sizes come with the package")
     version, size = missing.split()
-    processes.start(NODE, REMAP, {**RELIABLE_IN, "detection.version": version,
-                                  "detection.size": size})
+    processes.start(NODE, REMAP, {**RELIABLE_IN, "pointpillars.version": version,
+                                  "pointpillars.size": size})
     talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
     peer.send(talker, message(1), lambda: f"no weights for {missing}" in peer.message_of(NODE),
               "the diagnostic")
@@ -275,4 +276,4 @@ def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, pee
 
 def test_help_and_run_know_the_node(capsys):
     assert run(NODE, [NODE, "--help"]) == 0
-    assert "detection.scores.pedestrian (default 0.3)" in capsys.readouterr().out
+    assert "pointpillars.scores.pedestrian (default 0.3)" in capsys.readouterr().out

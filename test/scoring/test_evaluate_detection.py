@@ -57,7 +57,7 @@ def detector(monkeypatch):
     was asked."""
     made = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
 
-    def open_detector(path, device="auto", least_score=None):
+    def open_detector(path, device="auto", min_score=None):
         made.asked.append((str(path), device))
 
         def detect(frame):

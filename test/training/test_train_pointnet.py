@@ -9,9 +9,10 @@ from click.testing import CliRunner
 
 from lidar_perception.cli import train as train_module
 from lidar_perception.cli.main import cli
+from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.detectors.pointnet.checkpoint import load_pointnet, read_header
 from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS
+from lidar_perception.detectors.pointnet.network import load_pointnet
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.params import PointNetTraining

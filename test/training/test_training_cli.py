@@ -10,8 +10,8 @@ from click.testing import CliRunner
 from samples import object_folder, walker_label, write
 
 from lidar_perception.cli.main import cli
+from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.pointpillars import config as config_module
-from lidar_perception.detectors.pointpillars.checkpoint import read_header
 from lidar_perception.detectors.pointpillars.detector import load_detector
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.sensor import sensor_named

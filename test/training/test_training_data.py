@@ -242,7 +242,7 @@ def test_what_nobody_needs_to_find_is_neither_object_nor_background():
         near = (labels == IGNORED) & (kinds == 0)
         assert near.any() and (near | (labels == BACKGROUND) | (kinds != 0)).all()
         assert (found[near] != BACKGROUND).all()
-    few_points = Preparation(config, STILL, least_points=10**4)(scene_of_two(), rng)
+    few_points = Preparation(config, STILL, min_points=10**4)(scene_of_two(), rng)
     assert not few_points.counted.any()
 
 

@@ -23,10 +23,10 @@ MOST_SKEW = 0.01  # of a rotation that was rounded
 def read_calibration(path: Path, image: Path | None = None) -> Calibration:
     """calib/*.txt of the object and tracking benchmarks. The image, where there is one, gives
     the size. InputError names the file and the missing matrix."""
-    values = _matrices(path)
-    intrinsics = _matrix(values, path, "P2", (3, 4))
-    rectify = _matrix(values, path, "R0_rect", (3, 3), "R_rect")
-    velodyne = _matrix(values, path, "Tr_velo_to_cam", (3, 4), "Tr_velo_cam")
+    values = matrices(path)
+    intrinsics = matrix(values, path, "P2", (3, 4))
+    rectify = matrix(values, path, "R0_rect", (3, 3), "R_rect")
+    velodyne = matrix(values, path, "Tr_velo_to_cam", (3, 4), "Tr_velo_cam")
     size = _png_size(image) or _size_by_focal_length(intrinsics)
     return Calibration(intrinsics, _pose(path, rectify, velodyne), *size)
 
@@ -34,15 +34,16 @@ def read_calibration(path: Path, image: Path | None = None) -> Calibration:
 def read_raw_calibration(day: Path) -> Calibration:
     """calib_cam_to_cam.txt and calib_velo_to_cam.txt of a raw recording day."""
     cameras, lidar = day / "calib_cam_to_cam.txt", day / "calib_velo_to_cam.txt"
-    values, pose = _matrices(cameras), _matrices(lidar)
-    velodyne = np.column_stack([_matrix(pose, lidar, "R", (3, 3)), _matrix(pose, lidar, "T", (3,))])
-    width, height = _matrix(values, cameras, "S_rect_02", (2,)).astype(int)
-    rectify = _matrix(values, cameras, "R_rect_00", (3, 3))
-    return Calibration(_matrix(values, cameras, "P_rect_02", (3, 4)),
+    values, pose = matrices(cameras), matrices(lidar)
+    velodyne = np.column_stack([matrix(pose, lidar, "R", (3, 3)), matrix(pose, lidar, "T", (3,))])
+    width, height = matrix(values, cameras, "S_rect_02", (2,)).astype(int)
+    rectify = matrix(values, cameras, "R_rect_00", (3, 3))
+    return Calibration(matrix(values, cameras, "P_rect_02", (3, 4)),
                             _pose(day, rectify, velodyne), width, height)
 
 
-def _matrices(path: Path) -> dict[str, np.ndarray]:
+def matrices(path: Path) -> dict[str, np.ndarray]:
+    """The numbers of each line "NAME: ..." of a file. InputError where it cannot be read."""
     try:
         lines = path.read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -59,8 +60,9 @@ def _matrices(path: Path) -> dict[str, np.ndarray]:
     return values
 
 
-def _matrix(values: dict, path: Path, name: str, shape: tuple[int, ...],
-            other: str = "") -> np.ndarray:
+def matrix(values: dict, path: Path, name: str, shape: tuple[int, ...],
+           other: str = "") -> np.ndarray:
+    """The one of a name, or else of another. InputError, naming the file, if it is not there."""
     found = values.get(name, values.get(other))
     if found is None or found.size != np.prod(shape):
         raise InputError(f"{path} has no {name} of {int(np.prod(shape))} numbers; download KITTI's "
@@ -70,7 +72,7 @@ def _matrix(values: dict, path: Path, name: str, shape: tuple[int, ...],
 
 def _pose(path: Path, rectify: np.ndarray, velodyne: np.ndarray) -> np.ndarray:
     """(4, 4) LiDAR into the rectified camera frame."""
-    pose = _homogeneous(rectify) @ _homogeneous(velodyne)
+    pose = homogeneous(rectify) @ homogeneous(velodyne)
     turn = pose[:3, :3]
     if not (np.isfinite(pose).all() and np.allclose(turn @ turn.T, np.eye(3), atol=MOST_SKEW)
             and np.linalg.det(turn) > 0):
@@ -79,7 +81,8 @@ def _pose(path: Path, rectify: np.ndarray, velodyne: np.ndarray) -> np.ndarray:
     return pose
 
 
-def _homogeneous(matrix: np.ndarray) -> np.ndarray:
+def homogeneous(matrix: np.ndarray) -> np.ndarray:
+    """(4, 4) of (3, 3) or (3, 4)."""
     full = np.eye(4)
     full[:3, :matrix.shape[1]] = matrix
     return full

@@ -4,48 +4,27 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from lidar_perception.camera import Calibration
+from lidar_perception.data.frame import BOXES, CAMERA, Frame, Recording
 from lidar_perception.data.kitti.calibration import read_calibration, read_raw_calibration
 from lidar_perception.data.kitti.labels import (
     read_object_labels,
     read_tracking_labels,
     read_tracklets,
 )
-from lidar_perception.types import GroundTruth, InputError, LidarFrame, usable_returns
+from lidar_perception.types import GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 START_NS = 1_316_995_200 * 10**9  # 26 September 2011, the first day of KITTI's recordings
 PERIOD_NS = 10**8                 # the sensor turns at 10 Hz
 GAP_NS = 10 * 10**9               # between recordings that share a bag
 SCANS = ("velodyne_reduced", "velodyne")  # of one name, the full scan wins
-
-
-@dataclass(frozen=True)
-class KittiFrame:
-    """One scan. truth() is None where the folder has no labels; image may not exist."""
-
-    name: str
-    points: Path
-    stamp_ns: int
-    calibration: Callable[[], Calibration]
-    truth: Callable[[], GroundTruth | None]
-    image: Path | None = None
-
-    def cloud(self) -> np.ndarray:
-        """(N, 4) float32 [x y z reflectance], as in the file."""
-        return read_velodyne(self.points)
-
-    def load(self) -> LidarFrame:
-        cloud = self.cloud()
-        cloud = cloud.compress(usable_returns(cloud[:, :3]), axis=0)
-        return LidarFrame(np.ascontiguousarray(cloud[:, :3]), cloud[:, 3].copy(), self.stamp_ns,
-                          LIDAR_FRAME)
 
 
 def read_velodyne(path: Path) -> np.ndarray:
@@ -60,109 +39,143 @@ def read_velodyne(path: Path) -> np.ndarray:
     return raw.reshape(-1, 4)
 
 
-def open_kitti(root: str | Path, scans: bool = True) -> list[KittiFrame]:
+def load_velodyne(path: Path, stamp_ns: int) -> LidarFrame:
+    """The usable points of a .bin file."""
+    cloud = read_velodyne(path)
+    return LidarFrame.of(cloud[:, :3], cloud[:, 3].copy(), stamp_ns, LIDAR_FRAME)
+
+
+def recognises(path: Path) -> bool:
+    """Whether a KITTI folder lies there, of any layout, or labels that wait for one."""
+    return (any((folder / name).is_dir() for folder in (path / "training", path)
+                for name in (*SCANS, "label_2"))
+            or any(next(path.glob(f"{days}velodyne_points/data"), None)
+                   for days in ("", "*/", "*/*/")))
+
+
+def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
+    """The frames of open_kitti."""
+    frames, layout, labelled = _open(path, scans)
+    lost = tuple((label.stem, f"{label} has no scan; download it again")
+                 for label in labels_without_scan(path)) if scans else ()
+    return Recording(path, f"KITTI {layout}", frames,
+                     frozenset({CAMERA} | ({BOXES} if labelled else set())), lost)
+
+
+def open_kitti(root: str | Path, scans: bool = True) -> list[Frame]:
     """The frames of a KITTI folder, in order of time; nothing is read but the file lists.
 
     root is a 3D-object or tracking folder (with velodyne/, or its parent with training/), or a
     raw drive, day or folder of days. Without scans, labels are enough to make a frame in the
     object layout: its points may not exist. InputError says what is missing.
     """
-    root = Path(root)
+    return _open(Path(root), scans)[0]
+
+
+def _open(root: Path, scans: bool) -> tuple[list[Frame], str, bool]:
+    """The frames, the layout, and whether there are labels."""
     if not root.is_dir():
         raise InputError(f"{root} is not a folder; give the folder of a KITTI download")
     for folder in (root / "training", root):
         known = SCANS if scans else (*SCANS, "label_2")
         if any((folder / name).is_dir() for name in known):
-            tracking = (folder / "label_02").is_dir() or any(folder.glob("velodyne/*/"))
-            frames = _tracking(folder) if tracking else _object(folder, scans)
+            if (folder / "label_02").is_dir() or any(
+                    any(folder.glob(f"{name}/*/")) for name in SCANS):
+                frames, layout = _tracking(folder), "tracking data"
+            else:
+                frames, layout = _object(folder, scans), "object data"
+            labelled = (folder / "label_02").is_dir() or (folder / "label_2").is_dir()
             break
     else:
-        frames = _raw(root)
+        frames, layout = _raw(root), "raw drives"
+        labelled = any((frame.native / "tracklet_labels.xml").exists() for frame in frames)
     if not frames:
         raise InputError(f"{root} has no KITTI scans: expected training/velodyne/*.bin (object), "
                          "training/velodyne/0000/*.bin (tracking) or "
                          "DATE/DRIVE_sync/velodyne_points/data/*.bin (raw)")
-    return frames
+    return frames, layout, labelled
 
 
-def labels_without_scan(root: str | Path) -> list[Path]:
+def labels_without_scan(root: Path) -> list[Path]:
     """Label files of a 3D-object folder whose scans are not there."""
-    return sorted(label for folder in (Path(root) / "training", Path(root))
+    return sorted(label for folder in (root / "training", root)
                   for label in folder.glob("label_2/*.txt")
                   if not any((folder / name / f"{label.stem}.bin").exists() for name in SCANS))
 
 
-def _object(folder: Path, scans: bool) -> list[KittiFrame]:
+def _object(folder: Path, scans: bool) -> list[Frame]:
     files = {} if scans else {p.stem: folder / f"velodyne/{p.stem}.bin"
                               for p in folder.glob("label_2/*.txt")}
     files |= {p.stem: p for name in SCANS for p in folder.glob(f"{name}/*.bin")}
     frames = []
     for i, (name, points) in enumerate(sorted(files.items())):
         image, label = folder / f"image_2/{name}.png", folder / f"label_2/{name}.txt"
-        calibration = functools.cache(
-            functools.partial(read_calibration, folder / f"calib/{name}.txt", image))
-
-        def truth(label=label, calibration=calibration):
-            return (read_object_labels(label, calibration().lidar_to_camera)
-                    if label.exists() else None)
-
-        frames.append(KittiFrame(name, points, START_NS + i * PERIOD_NS, calibration, truth, image))
+        calibration = functools.cache(partial(read_calibration, folder / f"calib/{name}.txt",
+                                              image))
+        stamp = START_NS + i * PERIOD_NS
+        frames.append(Frame(name, stamp, partial(load_velodyne, points, stamp),
+                            partial(_object_truth, label, calibration), calibration=calibration,
+                            index=i, points=points, image=image))
     return frames
 
 
-def _tracking(folder: Path) -> list[KittiFrame]:
+def _object_truth(label: Path, calibration: Callable[[], Calibration]) -> GroundTruth | None:
+    return read_object_labels(label, calibration().lidar_to_camera) if label.exists() else None
+
+
+def _tracking(folder: Path) -> list[Frame]:
     frames, start = [], START_NS
-    for sequence in sorted(folder.glob("velodyne/*/")):
-        scans = sorted(sequence.glob("*.bin"))
-        images = folder / "image_02" / sequence.name
-        calibration = functools.cache(functools.partial(
-            read_calibration, folder / f"calib/{sequence.name}.txt",
+    drives = {drive.name: drive for name in SCANS for drive in sorted(folder.glob(f"{name}/*/"))}
+    for name, drive in sorted(drives.items()):
+        scans = sorted(drive.glob("*.bin"))
+        images = folder / "image_02" / name
+        calibration = functools.cache(partial(
+            read_calibration, folder / f"calib/{name}.txt",
             images / f"{scans[0].stem}.png" if scans else None))
-        labels = folder / f"label_02/{sequence.name}.txt"
-
-        @functools.cache
-        def all_labels(labels=labels, calibration=calibration):
-            return read_tracking_labels(labels, calibration().lidar_to_camera)
-
-        def truth(frame, labels=labels, all_labels=all_labels):
-            return all_labels().get(frame, _NO_OBJECTS) if labels.exists() else None
-
+        truth = _truth_by_number(folder / f"label_02/{name}.txt", lambda path, c=calibration:
+                                 read_tracking_labels(path, c().lidar_to_camera))
         for points in scans:
-            frame = _number(points)
-            stamp = start + (frame - _number(scans[0])) * PERIOD_NS
-            frames.append(KittiFrame(f"{sequence.name}/{points.stem}", points, stamp, calibration,
-                                     functools.partial(truth, frame),
-                                     images / f"{points.stem}.png"))
+            number = _number(points)
+            stamp = start + (number - _number(scans[0])) * PERIOD_NS
+            frames.append(Frame(f"{name}/{points.stem}", stamp,
+                                partial(load_velodyne, points, stamp), partial(truth, number),
+                                calibration=calibration, sequence=name, index=number,
+                                points=points, image=images / f"{points.stem}.png"))
         start = frames[-1].stamp_ns + GAP_NS if frames else start
     return frames
 
 
-def _raw(root: Path) -> list[KittiFrame]:
+def _raw(root: Path) -> list[Frame]:
     drives = {p.parent.parent for pattern in
               ("velodyne_points/data", "*/velodyne_points/data", "*/*/velodyne_points/data")
               for p in root.glob(pattern + "/*.bin")}
     frames = []
     for drive in sorted(d.parent for d in drives):
-        calibration = functools.cache(functools.partial(read_raw_calibration, drive.parent))
-        tracklets = drive / "tracklet_labels.xml"
-
-        @functools.cache
-        def all_labels(tracklets=tracklets):
-            return read_tracklets(tracklets)
-
-        def truth(frame, tracklets=tracklets, all_labels=all_labels):
-            return all_labels().get(frame, _NO_OBJECTS) if tracklets.exists() else None
-
+        calibration = functools.cache(partial(read_raw_calibration, drive.parent))
+        truth = _truth_by_number(drive / "tracklet_labels.xml", read_tracklets)
         stamps = _raw_stamps(drive / "velodyne_points" / "timestamps.txt")
         for points in sorted((drive / "velodyne_points/data").glob("*.bin")):
-            frame = _number(points)
-            if frame >= len(stamps):
+            number = _number(points)
+            if number >= len(stamps):
                 raise InputError(f"{drive}/velodyne_points/timestamps.txt has {len(stamps)} lines "
                                  f"but there is a scan {points.name}; download the drive again")
-            frames.append(KittiFrame(f"{drive.name}/{points.stem}", points, stamps[frame],
-                                     calibration, functools.partial(truth, frame),
-                                     drive / f"image_02/data/{points.stem}.png"))
+            stamp = stamps[number]
+            frames.append(Frame(f"{drive.name}/{points.stem}", stamp,
+                                partial(load_velodyne, points, stamp), partial(truth, number),
+                                calibration=calibration, sequence=drive.name, index=number,
+                                points=points, image=drive / f"image_02/data/{points.stem}.png",
+                                native=drive))
     return sorted(frames, key=lambda f: f.stamp_ns)
+
+
+def _truth_by_number(path: Path, read: Callable[[Path], dict[int, GroundTruth]]
+                     ) -> Callable[[int], GroundTruth | None]:
+    """The labels of a frame by its number, from the file of its drive, read once."""
+    labels = functools.cache(partial(read, path))
+
+    def truth(number: int) -> GroundTruth | None:
+        return labels().get(number, _NO_OBJECTS) if path.exists() else None
+    return truth
 
 
 def _number(scan: Path) -> int:

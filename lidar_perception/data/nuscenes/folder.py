@@ -10,10 +10,12 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from lidar_perception.data.frame import BOXES, POSES, Frame, Recording
 from lidar_perception.data.nuscenes.boxes import matrices
 from lidar_perception.data.nuscenes.labels import NuscenesLabels, read_labels
 from lidar_perception.data.nuscenes.tables import Tables
@@ -26,47 +28,33 @@ FULL_REFLECTION = 255   # intensity
 
 
 @dataclass(frozen=True, eq=False)
-class NuscenesFrame:
-    """One key frame. token is the sample's; turn (3, 3) from the sensor's axes to the frame's;
-    pose (4, 4) from the frame to the global one; ego (3,) where the vehicle is there; labels()
-    are in the global frame, None where the version has none. Nothing is read before it is asked
-    for, and the labels of all frames together."""
+class KeyFrame:
+    """What the detection task asks for besides: the sample's token; pose (4, 4) from the frame to
+    the global one; ego (3,) where the vehicle is there; labels() in the global frame, None where
+    the version has none, read with those of all frames together."""
 
-    name: str
     token: str
-    points: Path
-    stamp_ns: int
-    turn: np.ndarray
     pose: np.ndarray
     ego: np.ndarray
-    sensor_height: float
     labels: Callable[[], NuscenesLabels | None]
 
-    def cloud(self) -> np.ndarray:
-        """(N, 5) float32 [x y z intensity ring], as in the file: in the sensor's own axes,
-        intensity 0..255."""
-        return read_sweep(self.points)
 
-    def load(self) -> LidarFrame:
-        """The usable points without those on the vehicle itself."""
-        return self.load_rings()[0]
+def load_sweep(path: Path, turn: np.ndarray, stamp_ns: int) -> LidarFrame:
+    """The usable points of a .pcd.bin file without those on the vehicle itself; turn (3, 3) from
+    the sensor's axes to the frame's."""
+    cloud = read_sweep(path)
+    away = (np.abs(cloud[:, :2]) >= OWN_VEHICLE).any(axis=1)
+    cloud = cloud.compress(away & usable_returns(cloud[:, :3]), axis=0)
+    xyz = (cloud[:, :3].astype(np.float64) @ turn.T).astype(np.float32)
+    return LidarFrame(np.ascontiguousarray(xyz), cloud[:, 3] / np.float32(FULL_REFLECTION),
+                      stamp_ns, LIDAR_FRAME)
 
-    def load_rings(self) -> tuple[LidarFrame, np.ndarray]:
-        """As load, and the beam (N,) uint8 of each point, 0 is the lowest."""
-        cloud = self.cloud()
-        kept = usable_returns(cloud[:, :3])
-        kept &= (np.abs(cloud[:, :2]) >= OWN_VEHICLE).any(axis=1)
-        cloud = cloud.compress(kept, axis=0)
-        xyz = (cloud[:, :3].astype(np.float64) @ self.turn.T).astype(np.float32)
-        frame = LidarFrame(np.ascontiguousarray(xyz), cloud[:, 3] / np.float32(FULL_REFLECTION),
-                           self.stamp_ns, LIDAR_FRAME)
-        return frame, cloud[:, 4].astype(np.uint8)
 
-    def truth(self) -> GroundTruth | None:
-        """The labels in the frame's own coordinates, see NuscenesLabels.in_frame; also those
-        without points."""
-        labels = self.labels()
-        return None if labels is None else labels.in_frame(self.pose)
+def _truth(key: KeyFrame) -> GroundTruth | None:
+    """The labels in the frame's own coordinates, see NuscenesLabels.in_frame; also those without
+    points."""
+    labels = key.labels()
+    return None if labels is None else labels.in_frame(key.pose)
 
 
 def read_sweep(path: Path) -> np.ndarray:
@@ -83,8 +71,32 @@ def read_sweep(path: Path) -> np.ndarray:
     return raw.reshape(-1, 5)
 
 
+def recognises(path: Path) -> bool:
+    """Whether a nuScenes folder lies there, or that of a version in one."""
+    return bool(_versions(path)) or (path / "sample_data.json").is_file()
+
+
+def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
+    """The key frames of ROOT, which has one version, or of ROOT/VERSION."""
+    if (path / "sample_data.json").is_file():
+        root, version = path.parent, path.name
+    else:
+        root, (version, *others) = path, _versions(path)
+        if others:
+            raise InputError(f"{path} has several versions; give one: " + ", ".join(
+                str(path / name) for name in (version, *others)))
+    frames = open_nuscenes(root, version)
+    labelled = (root / version / "sample_annotation.json").is_file()
+    return Recording(path, f"nuScenes {version}", frames,
+                     frozenset({POSES} | ({BOXES} if labelled else set())))
+
+
+def _versions(root: Path) -> list[str]:
+    return sorted(table.parent.name for table in root.glob("*/sample_data.json"))
+
+
 def open_nuscenes(root: str | Path, version: str = "v1.0-mini",
-                  scenes: Sequence[str] | None = None) -> list[NuscenesFrame]:
+                  scenes: Sequence[str] | None = None) -> list[Frame]:
     """The key frames of ROOT/VERSION, in the order of the scene table and of time; with scenes, of
     these only and in their order. Sweeps and labels are read later. InputError says which folder,
     table or scene is missing or wrong."""
@@ -103,14 +115,17 @@ def open_nuscenes(root: str | Path, version: str = "v1.0-mini",
     sweeps = _sweeps(tables, times)
     mounts = _poses(tables, "calibrated_sensor", {mount for _, _, _, mount in sweeps.values()})
     poses = _poses(tables, "ego_pose", {pose for _, _, pose, _ in sweeps.values()})
-    all_labels = functools.cache(functools.partial(read_labels, tables, times))
+    all_labels = functools.cache(partial(read_labels, tables, times))
     frames, counts = [], dict.fromkeys(rank.values(), 0)
     for number, (scene, _, token) in enumerate(samples):
         file, time, pose, mount = sweeps[token]
-        frames.append(NuscenesFrame(
-            f"{scene_names[scene]}/{counts[scene]:02}", token, tables.root / file, time * 1000,
-            mounts[mount][:3, :3], _at_sensor(poses[pose], mounts[mount]), poses[pose][:3, 3],
-            float(mounts[mount][2, 3]), functools.partial(_of_frame, all_labels, number)))
+        place, turn = _at_sensor(poses[pose], mounts[mount]), mounts[mount][:3, :3]
+        key = KeyFrame(token, place, poses[pose][:3, 3], partial(_of_frame, all_labels, number))
+        frames.append(Frame(
+            f"{scene_names[scene]}/{counts[scene]:02}", time * 1000,
+            partial(load_sweep, tables.root / file, turn, time * 1000), partial(_truth, key),
+            pose=place.copy, sequence=scene_names[scene], index=counts[scene],
+            sensor_height=float(mounts[mount][2, 3]), points=tables.root / file, native=key))
         counts[scene] += 1
     return frames
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from lidar_perception.data.frame import Frame
 from lidar_perception.data.nuscenes.boxes import ATTRIBUTES, NAMES, GlobalBoxes, in_global
-from lidar_perception.data.nuscenes.folder import NuscenesFrame
 from lidar_perception.runs.files import write_text
 from lidar_perception.types import CLASSES, Detections, InputError
 
@@ -19,7 +20,7 @@ META = {"use_camera": False, "use_lidar": True, "use_radar": False, "use_map": F
         "use_external": True}
 
 
-def to_results(found: Detections, frame: NuscenesFrame) -> GlobalBoxes:
+def to_results(found: Detections, frame: Frame) -> GlobalBoxes:
     """Detections of a frame as nuScenes has them, without a velocity and an attribute. Only the
     classes in DETECTED, and the best MOST_BOXES of them. InputError for numbers that are not
     finite."""
@@ -30,7 +31,7 @@ def to_results(found: Detections, frame: NuscenesFrame) -> GlobalBoxes:
     kinds = kinds[found.class_ids]
     chosen = np.flatnonzero(kinds >= 0)
     chosen = chosen[np.argsort(-found.scores[chosen], kind="stable")][:MOST_BOXES]
-    return GlobalBoxes.of(*in_global(found.boxes[chosen], frame.pose), kinds[chosen],
+    return GlobalBoxes.of(*in_global(found.boxes[chosen], frame.native.pose), kinds[chosen],
                           scores=found.scores[chosen])
 
 
@@ -49,9 +50,9 @@ def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:
     write_text(path, json.dumps({"meta": META, "results": rows}))
 
 
-def read_results(path: Path, frames: list[NuscenesFrame]) -> list[GlobalBoxes]:
-    """The boxes of each frame; those of other frames are left out. InputError names the frame that
-    is missing and the box that is wrong."""
+def read_results(path: Path, frames: Sequence[Frame]) -> dict[str, GlobalBoxes]:
+    """The boxes of each frame by its name; those of other frames are left out. InputError names the
+    frame that is missing and the box that is wrong."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -62,11 +63,13 @@ def read_results(path: Path, frames: list[NuscenesFrame]) -> list[GlobalBoxes]:
     if not isinstance(results, dict):
         raise InputError(f"{path} has no 'results'; it needs them in the format of nuScenes' "
                          "detection task: {\"meta\": ..., \"results\": {sample token: [boxes]}}")
-    if missing := [f for f in frames if f.token not in results]:
-        raise InputError(f"{path} has no boxes of {missing[0].name}, sample {missing[0].token} "
-                         f"({len(missing)} of {len(frames)} such); a frame without detections "
-                         "needs an empty list, and --scenes says which scenes to score")
-    return [_boxes(f"{path}: {frame.name}", results[frame.token]) for frame in frames]
+    if missing := [f for f in frames if f.native.token not in results]:
+        raise InputError(f"{path} has no boxes of {missing[0].name}, sample "
+                         f"{missing[0].native.token} ({len(missing)} of {len(frames)} such); a "
+                         "frame without detections needs an empty list, and --split says which "
+                         "scenes to score")
+    return {frame.name: _boxes(f"{path}: {frame.name}", results[frame.native.token])
+            for frame in frames}
 
 
 def _boxes(where: str, rows: list) -> GlobalBoxes:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -12,54 +13,72 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import explain_nothing
+from lidar_perception.detectors.contract import Found, require_columns
 from lidar_perception.detectors.hybrid.judging import judged, seen_by
 from lidar_perception.detectors.hybrid.params import RescoringParams
 from lidar_perception.detectors.nms import suppressed
 from lidar_perception.detectors.pointnet.clusters import clusters_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.param_fields import with_values
-from lidar_perception.types import Detections, InputError, LidarFrame
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
+
+PERSON = CLASSES[PEDESTRIAN]
 
 
 class RescoredCandidates:
-    """detector(frame, seed, camera) -> Detections of pedestrians, in the frame's own coordinates.
+    """A detector of pedestrians, see contract.py.
 
-    judge: a network that knows Pedestrian, else InputError. pipeline: how candidates are found;
-    their score must be a confidence (confidence.enabled). ms and problem as of other detectors.
+    judge: a network that knows Pedestrian, else InputError. seed, camera: as of CandidateDetector.
+    pipeline: how candidates are looked for; their score must be a confidence (confidence.enabled).
     """
 
-    def __init__(self, judge: PointNetDetector, params: RescoringParams = RescoringParams(),
-                 pipeline: PipelineParams = BEST):
-        if "Pedestrian" not in judge.config.classes:
-            raise InputError("the network knows no Pedestrian, only "
-                             f"{', '.join(judge.config.classes)}; candidates need one that does")
-        self.judge, self.params = judge, params
+    def __init__(self, judge: PointNetDetector, seed: SeedSource, camera: Camera | None = None,
+                 params: RescoringParams = RescoringParams(), pipeline: PipelineParams = BEST):
+        if PERSON not in judge.classes:
+            raise InputError(f"the network knows no {PERSON}, only {', '.join(judge.classes)}; "
+                             "candidates need one that does")
+        self.judge, self.seed, self.camera, self.params = judge, seed, camera, params
         self.pipeline = with_values(pipeline, {"confidence.enabled": True,
-                                               "confidence.threshold": params.least_confidence})
-        self.ms: dict[str, float] = {}
-        self.problem: str | None = None
+                                               "confidence.threshold": params.min_confidence})
 
-    def __call__(self, frame: LidarFrame, seed: SeedSource,
-                 camera: Camera | None = None) -> Detections:
-        """The candidates by their combined score, best first. InputError where there is no seed,
-        and without a camera where the pipeline crops to its view."""
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Pedestrian."""
+        return (PERSON,)
+
+    @property
+    def min_scores(self) -> dict[str, float]:
+        """By class, the least score of a detection."""
+        return {PERSON: self.params.threshold}
+
+    def with_min_score(self, min_score: float) -> RescoredCandidates:
+        """The same detector with this least score."""
+        return RescoredCandidates(self.judge, self.seed, self.camera,
+                                  replace(self.params, threshold=min_score), self.pipeline)
+
+    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
+                 cluster_ids: np.ndarray | None = None) -> Found:
+        """See contract.Detector: the candidates by their combined score, best first. InputError
+        where there is no seed, and without a camera where the pipeline crops to its view."""
+        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
         params, pose = self.params, self.pipeline.ground.sensor_pose
-        segmented, found = find_candidates(frame, seed, camera, self.pipeline)
-        self.problem = explain_nothing(len(frame), segmented.ground, segmented.cluster_ids)
+        segmented, candidates = find_candidates(frame, self.seed, self.camera, self.pipeline,
+                                                ground=ground, cluster_ids=cluster_ids)
         t0 = perf_counter()
-        chosen = np.flatnonzero(np.isin(segmented.cluster_ids, found.clusters))
+        chosen = np.flatnonzero(np.isin(segmented.cluster_ids, candidates.clusters))
         seen = seen_by(self.judge, frame.take(segmented.places), pose)
         clusters = clusters_of(seen.take(chosen), segmented.cluster_ids[chosen]).on(
             seen.xyz.compress(segmented.ground, axis=0))
-        result, whole = judged(self.judge, found.final, clusters, params.weight, pose)
+        result, whole = judged(self.judge, candidates.final, clusters, params.weight, pose)
         result = result[result.scores >= params.threshold] if params.box == "cluster" else (
             self._whole(result, whole))
         result = result[np.argsort(-result.scores, kind="stable")]
-        self.ms = {**found.ms, "network": (perf_counter() - t0) * 1e3}
-        return result
+        return Found(result, {**candidates.ms, "network": (perf_counter() - t0) * 1e3},
+                     explain_nothing(len(frame), segmented.ground, segmented.cluster_ids))
 
-    def _whole(self, found: Detections, boxes: np.ndarray) -> Detections:
+    def _whole(self, detections: Detections, boxes: np.ndarray) -> Detections:
         """The detections with these boxes; of those that overlap the best."""
-        found = Detections(boxes, found.class_ids, found.scores)[
-            found.scores >= self.params.threshold]
-        return found[suppressed(found.boxes, found.scores, found.class_ids, self.params.overlap)]
+        detections = Detections(boxes, detections.class_ids, detections.scores)[
+            detections.scores >= self.params.threshold]
+        return detections[suppressed(detections.boxes, detections.scores, detections.class_ids,
+                                     self.params.overlap)]

@@ -23,7 +23,7 @@ class JudgingParams(Params):
 class RescoringParams(JudgingParams):
     """STM-CPA candidates, scored again by the class of their points."""
 
-    least_confidence: float = param(0.05, "Candidates less like a pedestrian than this are left "
+    min_confidence: float = param(0.05, "Candidates less like a pedestrian than this are left "
                                     "out before the network is asked.", low=0.0, high=1.0)
     box: str = param("network", "cluster: around the points that are seen, down to the ground. "
                      "network: around the whole pedestrian, as the network makes it out.",
@@ -39,5 +39,5 @@ class ConfirmingParams(JudgingParams):
 
     margin: float = param(0.2, "Points so far outside a proposal's box belong to its cluster, too.",
                           unit="m", low=0.0, high=5.0)
-    least_points: int = param(5, "A proposal with fewer points that are not ground keeps its own "
+    min_points: int = param(5, "A proposal with fewer points that are not ground keeps its own "
                               "score.", low=1, high=1_000_000)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
 
+from lidar_perception.detectors.contract import Detector, Found
 from lidar_perception.detectors.hybrid.judging import judged, known, seen_by
 from lidar_perception.detectors.hybrid.params import ConfirmingParams
-from lidar_perception.detectors.open import AnyDetector
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.view import levelled_ground
@@ -17,34 +18,50 @@ from lidar_perception.types import Detections, LidarFrame
 
 
 class ConfirmedProposals:
-    """detector(frame) -> Detections, in the frame's own coordinates.
+    """A detector, see contract.py.
 
-    proposer: finds boxes. judge: whose network reads their points; its params say how the sensor
-    hangs and what is ground. Boxes stay the proposer's. ms and problem as of other detectors.
+    proposer: a detector that proposes boxes. judge: whose network reads their points; its params
+    say how the sensor is mounted and what is ground. Boxes stay the proposer's.
     """
 
-    def __init__(self, proposer: AnyDetector, judge: PointNetDetector,
+    def __init__(self, proposer: Detector, judge: PointNetDetector,
                  params: ConfirmingParams = ConfirmingParams()):
         self.proposer, self.judge, self.params = proposer, judge, params
-        self.ms: dict[str, float] = {}
-        self.problem: str | None = None
 
-    def __call__(self, frame: LidarFrame) -> Detections:
-        """The proposals by their combined score, best first."""
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The proposer's."""
+        return self.proposer.classes
+
+    @property
+    def min_scores(self) -> dict[str, float]:
+        """By class, the least score of a detection."""
+        return dict.fromkeys(self.classes, self.params.threshold)
+
+    def with_min_score(self, min_score: float) -> ConfirmedProposals:
+        """The same detector with this least score of what comes out; the proposer keeps its own."""
+        return ConfirmedProposals(self.proposer, self.judge,
+                                  replace(self.params, threshold=min_score))
+
+    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
+                 cluster_ids: np.ndarray | None = None) -> Found:
+        """See contract.Detector: the proposals by their combined score, best first."""
         params, t0 = self.params, perf_counter()
-        proposals = self.proposer(frame)
-        self.problem = self.proposer.problem
+        proposed = self.proposer(frame, ground=ground, cluster_ids=cluster_ids)
+        proposals = proposed.detections
         t1 = perf_counter()
         t2 = t3 = t1
         if len(proposals):
             pose = self.judge.params.ground.sensor_pose
             seen = seen_by(self.judge, frame, pose)
-            ground = levelled_ground(seen, self.judge.params.ground)
+            if ground is None:
+                ground = levelled_ground(seen, self.judge.params.ground)
+            ground = np.asarray(ground, bool)
             obstacles = np.flatnonzero(~ground)
             t2 = perf_counter()
             clusters = points_of(proposals.boxes, frame.take(obstacles), seen.take(obstacles),
                                  params.margin)
-            asked = np.flatnonzero((clusters.sizes >= params.least_points)
+            asked = np.flatnonzero((clusters.sizes >= params.min_points)
                                    & known(self.judge, proposals.class_ids))
             clusters = clusters.take(asked).on(seen.xyz.compress(ground, axis=0))
             t3 = perf_counter()
@@ -53,10 +70,10 @@ class ConfirmedProposals:
             kept = np.flatnonzero(scores >= params.threshold)
             kept = kept[np.argsort(-scores[kept], kind="stable")]
             proposals = Detections(proposals.boxes[kept], proposals.class_ids[kept], scores[kept])
-        self.ms = {step: seconds * 1e3 for step, seconds in (
+        ms = {step: seconds * 1e3 for step, seconds in (
             ("proposals", t1 - t0), ("ground", t2 - t1), ("clusters", t3 - t2),
             ("network", perf_counter() - t3))}
-        return proposals
+        return Found(proposals, ms, proposed.problem, proposed.best)
 
 
 def points_of(boxes: np.ndarray, frame: LidarFrame, seen: LidarFrame, margin: float) -> Clusters:

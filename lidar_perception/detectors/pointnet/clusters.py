@@ -75,7 +75,7 @@ class ClusterInput:
     azimuths: np.ndarray
 
 
-def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, least_points: int = 1,
+def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, min_points: int = 1,
                 ground: np.ndarray | None = None) -> Clusters:
     """The clusters of a frame of N points, with numbers (N,) int, 0 and below for none, that have
     enough points, by their numbers. Without an intensity it is 0. ground (N,) bool: the points
@@ -84,7 +84,7 @@ def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, least_points: int = 
     order = np.argsort(ids, kind="stable")
     order = order[np.searchsorted(ids[order], 1):]
     known, sizes = np.unique(ids[order], return_counts=True)
-    kept = sizes >= least_points
+    kept = sizes >= min_points
     order = order[np.repeat(kept, sizes)]
     points = np.zeros((len(order), 4), np.float32)
     points[:, :3] = frame.xyz[order]

@@ -8,7 +8,7 @@ A checkpoint holds the dataclass as JSON, so that weights always come with their
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 from lidar_perception.clustering.params import ClusteringParams, EuclideanParams
 from lidar_perception.detectors.config_json import config_of
@@ -37,6 +37,8 @@ class PointNetConfig:
     parts of the circle. sizes: l w h of each class, metres, that sizes are relative to.
     """
 
+    network: ClassVar[str] = "pointnet"
+
     name: str = "improved"
     classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist")
     dynamic_threshold: bool = True
@@ -60,6 +62,12 @@ class PointNetConfig:
     yaw_bins: int = 12
     sizes: tuple[tuple[float, ...], ...] = tuple(MEAN_SIZES.values())
 
+    @classmethod
+    def of_json(cls, content: dict[str, Any], source: str = "the header") -> PointNetConfig:
+        """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
+        return config_of(cls, content, source, {
+        "sizes": lambda sizes: tuple(map(tuple, sizes))})
+
     def __post_init__(self) -> None:
         if unknown := [name for name in self.classes if name not in CLASSES]:
             raise ValueError(f"there is no class {unknown[0]!r}; known are {', '.join(CLASSES)}")
@@ -71,6 +79,11 @@ class PointNetConfig:
             raise ValueError("radii must rise, and neighbours be at most as many as points")
         if not self.coarse <= self.centroids <= self.points:
             raise ValueError("coarse must be at most centroids, and these at most points")
+
+    @property
+    def title(self) -> str:
+        """Which PointNet, for people: nothing for the one of the paper."""
+        return "" if self.name == "improved" else f"({self.name})"
 
     @property
     def groups(self) -> tuple[tuple[float, int], ...]:
@@ -121,9 +134,3 @@ def pointnet_config(name: str = "improved", **changes: Any) -> PointNetConfig:
         return replace(PointNetConfig(name=name, **NETWORKS[name]), **changes)
     except (ValueError, TypeError) as error:
         raise InputError(str(error)) from None
-
-
-def from_json(content: dict[str, Any], source: str = "the header") -> PointNetConfig:
-    """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
-    return config_of(PointNetConfig, content, source, {
-        "sizes": lambda sizes: tuple(map(tuple, sizes))})

@@ -10,11 +10,12 @@ import torch
 
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.contract import Found, require_columns
 from lidar_perception.detectors.devices import CPU, chosen_device
 from lidar_perception.detectors.nms import suppressed
-from lidar_perception.detectors.pointnet.checkpoint import Header, load_pointnet
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
-from lidar_perception.detectors.pointnet.network import PointNet, fused
+from lidar_perception.detectors.pointnet.network import PointNet, fused, load_pointnet
 from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams, PointNetParams
 from lidar_perception.detectors.pointnet.predict import Predictions, found, predict
 from lidar_perception.detectors.pointnet.weights_file import weights_file
@@ -23,83 +24,76 @@ from lidar_perception.detectors.view import (
     levelled,
     levelled_ground,
     made_up_frame,
-    require_columns,
     with_intensity_scaled,
 )
-from lidar_perception.types import Detections, LidarFrame, usable_returns
+from lidar_perception.types import LidarFrame
 
 
 class PointNetDetector(NetworkDetector):
-    """detector(frame) -> Detections, in the frame's own coordinates. The whole cloud is looked at.
+    """Paper C's detector, see contract.py. The whole cloud is looked at.
 
     network: as loaded or trained; its norms are folded into its layers, in place.
     """
 
     def __init__(self, network: PointNet, header: Header, device: torch.device = CPU,
                  params: PointNetDetectorParams = PointNetDetectorParams()):
-        super().__init__(header, device, params, STEPS)
+        super().__init__(header, device, params)
         self.network = fused(network).to(device)
 
-    @property
-    def settings(self) -> PointNetParams:
-        """The network's own group of params."""
-        return self.params.pointnet
-
-    def __call__(self, frame: LidarFrame, cluster_ids: np.ndarray | None = None,
-                 ground: np.ndarray | None = None) -> Detections:
-        """The objects in a frame of N points. ground (N,) bool and cluster_ids (N,) int, 0 and
-        below = none, are computed if they are None. InputError for columns of another length, and
-        where CUDA has no memory left and the CPU may not take over."""
-        require_columns(frame, cluster_ids=cluster_ids, ground=ground)
+    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
+                 cluster_ids: np.ndarray | None = None) -> Found:
+        """See contract.Detector. InputError also where CUDA is out of memory and the CPU may not
+        take over."""
+        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
         t0 = perf_counter()
         pose = self.params.ground.sensor_pose
         seen = with_intensity_scaled(levelled(frame, pose), self.settings.intensity_scale)
-        usable = usable_returns(frame.xyz)
         t1 = perf_counter()
         if ground is None:
             ground = levelled_ground(seen, self.params.ground)
-        ground = np.asarray(ground, bool) & usable
+        ground = np.asarray(ground, bool)
         t2 = perf_counter()
         if cluster_ids is None:
             cluster_ids = cluster_obstacles(seen.xyz, ground, self.params.clustering)
         t3 = perf_counter()
-        cluster_ids = np.where(usable, cluster_ids, 0)
-        clusters = clusters_of(seen, cluster_ids, self.settings.least_points, ground)
-        self.problem, self.best = self._problem(frame, usable, cluster_ids, clusters), {}
-        self.problem = self.problem or self.fallback
+        clusters = clusters_of(seen, cluster_ids, self.settings.min_points, ground)
         t4 = self.now()
         predicted = self.guarded(lambda: predict(self.network, clusters))
         t5 = self.now()
-        detections = in_sensor_frame(self._detections(predicted), pose)
+        detections, best, broken = self._detections(predicted)
+        detections = in_sensor_frame(detections, pose)
         t6 = perf_counter()
-        self.ms = {step: seconds * 1e3 for step, seconds in zip(
+        ms = {step: seconds * 1e3 for step, seconds in zip(
             STEPS, (t1 - t0 + t4 - t3, t2 - t1, t3 - t2, t5 - t4, t6 - t5))}
-        return detections
+        problem = broken or self._problem(frame, cluster_ids, clusters) or self.fallback
+        return Found(detections, ms, problem, best)
 
-    def _detections(self, predicted: Predictions) -> Detections:
-        settings, classes = self.settings, self.config.classes
+    def _detections(self, predicted: Predictions) -> tuple:
+        """Detections, and what nothing_passed gives."""
+        settings, best, broken = self.settings, {}, None
         sound = np.isfinite(np.column_stack([predicted.probabilities, predicted.boxes])).all(axis=1)
         if not sound.all():
-            self.problem = ("the network's outputs are not numbers (NaN) for "
-                            f"{len(sound) - sound.sum()} of {len(sound)} clusters; the weights or "
-                            "the intensity are broken")
-        least = [settings.scores.of_class(name) for name in classes]
+            broken = ("the network's outputs are not numbers (NaN) for "
+                      f"{len(sound) - sound.sum()} of {len(sound)} clusters; the weights or the "
+                      "intensity are broken")
         predicted = predicted.take(np.flatnonzero(sound))
-        detections = found(predicted, self.config, least, settings.nms)
+        detections = found(predicted, self.config, list(self.min_scores.values()), settings.nms)
         if len(detections) == 0 and sound.any():
-            self.nothing_passed(predicted.probabilities[:, :len(classes)].max(axis=0).tolist())
-        return detections
+            highest = predicted.probabilities[:, :len(self.classes)].max(axis=0)
+            best, nan = self.nothing_passed(highest.tolist())
+            broken = nan or broken
+        return detections, best, broken
 
-    def _problem(self, frame: LidarFrame, usable: np.ndarray, cluster_ids: np.ndarray,
+    def _problem(self, frame: LidarFrame, cluster_ids: np.ndarray,
                  clusters: Clusters) -> str | None:
-        if not usable.any():
+        if len(frame) == 0:
             return "the cloud is empty or has no finite point"
         if not (cluster_ids > 0).any():
             return ("no clusters; are ground.sensor_pose, and the numbers of clustering.euclidean "
                     "or clustering.dbscan, right for this sensor?")
         if len(clusters) == 0:
-            return (f"every cluster has fewer than {self.settings.least_points} points; lower "
-                    "pointnet.least_points")
+            return (f"every cluster has fewer than {self.settings.min_points} points; lower "
+                    "pointnet.min_points")
         if frame.intensity is None and self.settings.intensity_scale:
             return "the cloud has no intensity, which the network was trained with; it reads zeros"
         return None
@@ -112,7 +106,7 @@ class PointNetDetector(NetworkDetector):
         """Run every part once on made-up points, so that what is compiled is compiled."""
         scan = made_up_frame(self.params.ground.sensor_pose)
         self(scan)
-        self(scan, np.arange(len(scan)) // 20)
+        self(scan, cluster_ids=np.arange(len(scan)) // 20)
         suppressed(np.ones((2, 7)), np.ones(2), np.zeros(2, int), 0.5)
 
 

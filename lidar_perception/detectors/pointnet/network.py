@@ -13,14 +13,17 @@ the place.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
+from lidar_perception.detectors.checkpoint import Header, load
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 
 POINT, CONTEXT = 5, 6   # numbers that describe a point, and a whole cluster; see clusters.py
@@ -180,9 +183,16 @@ def make_pointnet(config: PointNetConfig) -> PointNet:
 
 
 def fused(network: PointNet) -> PointNet:
-    """The network for inference, in place, with every batch norm inside the layer before it."""
-    network.eval()
+    """A copy for inference, with every batch norm inside the layer before it."""
+    network = copy.deepcopy(network).eval()
     for module in network.modules():
         if isinstance(module, LinearNormRelu) and isinstance(module[1], nn.BatchNorm1d):
             module[0], module[1] = fuse_linear_bn_eval(module[0], module[1]), nn.Identity()
     return network
+
+
+def load_pointnet(path: str | Path,
+                  expected: PointNetConfig | None = None) -> tuple[Header, PointNet]:
+    """Header and network of a checkpoint, in float32 on the CPU, in training mode. InputError if
+    the file cannot be used, or holds another network than expected."""
+    return load(path, PointNetConfig, make_pointnet, expected)

@@ -18,7 +18,7 @@ STEPS = ("preprocess", "ground", "clustering", "network", "postprocess")  # each
 class PointNetParams(NetworkParams):
     """Which network, where it runs, which clusters it reads, and what counts as found."""
 
-    least_points: int = param(5, "Clusters of fewer points are left out.", low=1, high=1_000_000)
+    min_points: int = param(5, "Clusters of fewer points are left out.", low=1, high=1_000_000)
 
 
 INPUT = InputParams()

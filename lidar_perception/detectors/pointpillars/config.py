@@ -8,7 +8,7 @@ JSON, so that weights always come with their network.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from lidar_perception.detectors.config_json import config_of
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError
@@ -76,6 +76,8 @@ class NetworkConfig:
     of heading begin, rad.
     """
 
+    network: ClassVar[str] = "pointpillars"
+
     version: str = "v0"
     size: str = "full"
     remove_ground: bool = False
@@ -103,6 +105,11 @@ class NetworkConfig:
     anchors_at: str = "cells"
     direction_offset: float = 0.7853981633974483
 
+    @classmethod
+    def of_json(cls, content: dict[str, Any], source: str = "the header") -> NetworkConfig:
+        """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
+        return config_of(cls, content, source, {"anchors": _anchors})
+
     def __post_init__(self) -> None:
         height, width = self.grid
         total = 1
@@ -117,6 +124,11 @@ class NetworkConfig:
             raise ValueError(f"there is no class {unknown[0]!r}; known are {', '.join(CLASSES)}")
         if self.zero_row and not self.max_points:
             raise ValueError("zero_row needs max_points")
+
+    @property
+    def title(self) -> str:
+        """Which PointPillars, for people."""
+        return f"{self.version} {self.size}"
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -164,11 +176,6 @@ def network_config(version: str = "v0", size: str = "full",
         return NetworkConfig(**{**settings, **changes})
     except ValueError as error:
         raise InputError(str(error)) from None
-
-
-def from_json(content: dict[str, Any], source: str = "the header") -> NetworkConfig:
-    """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
-    return config_of(NetworkConfig, content, source, {"anchors": _anchors})
 
 
 def _anchors(content: list[dict[str, Any]]) -> tuple[AnchorClass, ...]:

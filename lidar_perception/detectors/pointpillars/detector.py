@@ -13,20 +13,25 @@ import torch
 from torch import Tensor
 
 from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.contract import Found, require_columns
 from lidar_perception.detectors.devices import CPU, chosen_device
 from lidar_perception.detectors.nms import best_of_each, suppressed
 from lidar_perception.detectors.pointpillars.anchors import make_anchors
 from lidar_perception.detectors.pointpillars.box_coder import decode
-from lidar_perception.detectors.pointpillars.checkpoint import Header, load_network
 from lidar_perception.detectors.pointpillars.expert import NetworkInput, network_input
-from lidar_perception.detectors.pointpillars.network import PointPillars, Prediction, fused
-from lidar_perception.detectors.pointpillars.params import STEPS, DetectionParams, DetectorParams
+from lidar_perception.detectors.pointpillars.network import (
+    PointPillars,
+    Prediction,
+    fused,
+    load_network,
+)
+from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
 from lidar_perception.detectors.pointpillars.pillars import Pillars, make_pillars
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.detectors.view import (
     in_sensor_frame,
     made_up_frame,
-    require_columns,
     visible,
     with_intensity_scaled,
 )
@@ -49,25 +54,19 @@ class TorchNetwork:
         return head.logits(features)[0], lambda anchors: head.boxes_at(features, anchors)
 
 
-class Detector(NetworkDetector):
-    """detector(frame) -> Detections, in the frame's own coordinates."""
+class PointPillarsDetector(NetworkDetector):
+    """EG-PointPillars of any version as a detector, see contract.py."""
 
     def __init__(self, network: Any, header: Header, device: torch.device,
                  params: DetectorParams = DetectorParams()):
-        super().__init__(header, device, params, STEPS)
+        super().__init__(header, device, params)
         self.network = network
         self.anchors = make_anchors(self.config, device)
 
-    @property
-    def settings(self) -> DetectionParams:
-        """The network's own group of params."""
-        return self.params.detection
-
-    def __call__(self, frame: LidarFrame, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> Detections:
-        """The objects in a frame of N points. ground (N,) bool and cluster_ids (N,) int, 0 = none,
-        are computed if the version needs them and they are None. InputError for columns of another
-        length, and where CUDA has no memory left and the CPU may not take over."""
+    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
+                 cluster_ids: np.ndarray | None = None) -> Found:
+        """See contract.Detector; columns are computed only if the version needs them. InputError
+        also where CUDA is out of memory and the CPU may not take over."""
         require_columns(frame, ground=ground, cluster_ids=cluster_ids)
         t0 = perf_counter()
         pose = self.params.ground.sensor_pose
@@ -79,20 +78,21 @@ class Detector(NetworkDetector):
             None if cluster_ids is None else cluster_ids.take(places),
             self.params.ground, self.params.clustering)
         t2 = perf_counter()
-        self.problem, self.best = self._problem(frame, seen, inputs) or self.fallback, {}
+        problem = self._problem(frame, seen, inputs)
         if len(inputs.points) == 0:
-            self.ms = dict(zip(STEPS, ((t1 - t0) * 1e3, (t2 - t1) * 1e3, 0.0, 0.0)))
-            return Detections.none()
+            return Found(Detections.none(),
+                         dict(zip(STEPS, ((t1 - t0) * 1e3, (t2 - t1) * 1e3, 0.0, 0.0))),
+                         problem or self.fallback)
         with torch.inference_mode():
-            t3, t4, found = self.guarded(lambda: self._predict(inputs))
-            found = in_sensor_frame(found, pose)
+            t3, t4, detections, best, broken = self.guarded(lambda: self._predict(inputs))
+            detections = in_sensor_frame(detections, pose)
         t5 = perf_counter()
-        self.ms = dict(zip(STEPS, (
+        ms = dict(zip(STEPS, (
             (t1 - t0 + t3 - t2) * 1e3, (t2 - t1) * 1e3, (t4 - t3) * 1e3, (t5 - t4) * 1e3)))
-        return found
+        return Found(detections, ms, broken or problem or self.fallback, best)
 
-    def _predict(self, inputs: NetworkInput) -> tuple[float, float, Detections]:
-        """When the network began and ended, and what it found."""
+    def _predict(self, inputs: NetworkInput) -> tuple:
+        """When the network began and ended, detections, and what nothing_passed gives."""
         points = torch.from_numpy(inputs.points).to(self.device)
         maps = None
         if inputs.cluster_map is not None:
@@ -101,15 +101,15 @@ class Detector(NetworkDetector):
         begun = self.now()
         logits, boxes_at = self.network(pillars, maps)
         ended = self.now()
-        return begun, ended, self._detections(logits, boxes_at)
+        return begun, ended, *self._detections(logits, boxes_at)
 
-    def _detections(self, logits: Tensor, boxes_at: Callable) -> Detections:
-        settings = self.settings
+    def _detections(self, logits: Tensor, boxes_at: Callable) -> tuple:
+        settings, best_scores, broken = self.settings, {}, None
         limits = logits.new_tensor([_logit(settings.scores.of_class(name))
                                     for name in self.config.classes])
         chosen = torch.nonzero((logits >= limits).any(dim=1))[:, 0]
         if len(chosen) == 0:
-            self.nothing_passed(torch.sigmoid(logits.amax(dim=0)).tolist())
+            best_scores, broken = self.nothing_passed(torch.sigmoid(logits.amax(dim=0)).tolist())
         best, kinds = logits[chosen].max(dim=1)
         valid = torch.nonzero(best >= limits[kinds])[:, 0]
         if len(valid) > settings.nms.candidates:
@@ -119,7 +119,8 @@ class Detector(NetworkDetector):
         boxes = decode(codes.float(), directions.argmax(dim=1), self.anchors[chosen],
                        self.config.direction_offset).cpu().numpy()
         scores, kinds = torch.sigmoid(best).cpu().numpy(), kinds.cpu().numpy()
-        return best_of_each(boxes, scores, kinds, self.config.classes, settings.nms)
+        detections = best_of_each(boxes, scores, kinds, self.config.classes, settings.nms)
+        return detections, best_scores, broken
 
     def _problem(self, frame: LidarFrame, seen: LidarFrame, inputs: NetworkInput) -> str | None:
         if len(frame) == 0:
@@ -154,13 +155,13 @@ def _logit(score: float) -> float:
 
 
 def load_detector(path: str | Path = "", device: str = "auto",
-                  params: DetectorParams = DetectorParams()) -> Detector:
+                  params: DetectorParams = DetectorParams()) -> PointPillarsDetector:
     """A detector from a checkpoint (.safetensors) or an exported network (.onnx); with an empty
     path the one that params name, or else the one that comes with the package. InputError where it
     is missing, or not of the version and size that params ask for, or device is not there."""
-    path = Path(path) if str(path) not in ("", ".") else weights_file(params.detection)
-    if params.detection.threads:
-        torch.set_num_threads(params.detection.threads)
+    path = Path(path) if str(path) not in ("", ".") else weights_file(params.pointpillars)
+    if params.pointpillars.threads:
+        torch.set_num_threads(params.pointpillars.threads)
     if path.suffix == ".onnx":
         from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork
         header, network = OnnxNetwork.load(path)
@@ -173,12 +174,12 @@ def load_detector(path: str | Path = "", device: str = "auto",
         header, loaded = load_network(path)
         network = TorchNetwork(loaded, CPU)
     for name in "version", "size":
-        wanted, found = getattr(params.detection, name), getattr(header.config, name)
+        wanted, found = getattr(params.pointpillars, name), getattr(header.config, name)
         if wanted not in ("auto", found):
             raise InputError(f"{path} holds {name} {found}, asked for was {wanted}; change "
-                             f"detection.{name} or detection.weights")
-    detector = Detector(network, header, CPU, params)
+                             f"pointpillars.{name} or pointpillars.weights")
+    detector = PointPillarsDetector(network, header, CPU, params)
     detector.move(place)
-    if params.detection.warm_up:
+    if params.pointpillars.warm_up:
         detector.warm_up()
     return detector

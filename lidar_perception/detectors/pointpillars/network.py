@@ -12,6 +12,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
@@ -19,6 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
+from lidar_perception.detectors.checkpoint import Header, load
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 
@@ -231,3 +233,10 @@ def fused(network: PointPillars) -> PointPillars:
     net = network.pillar_net
     net.linear, net.norm = fuse_linear_bn_eval(net.linear, net.norm), nn.Identity()
     return network.to(memory_format=torch.channels_last)
+
+
+def load_network(path: str | Path,
+                 expected: NetworkConfig | None = None) -> tuple[Header, PointPillars]:
+    """Header and network of a checkpoint, in float32 on the CPU, in training mode. InputError if
+    the file cannot be used, or holds another network than expected."""
+    return load(path, NetworkConfig, make_network, expected)

@@ -14,7 +14,8 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from lidar_perception.detectors.pointpillars.checkpoint import KEY, Header
+from lidar_perception.detectors.checkpoint import KEY, Header
+from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.network import PointPillars, Prediction, fused
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 from lidar_perception.runs.files import write_bytes
@@ -93,7 +94,7 @@ class OnnxNetwork:
             reason = str(error).splitlines()[0]
             raise InputError(f"ONNX Runtime cannot read {path}: {reason}") from None
         text = session.get_modelmeta().custom_metadata_map.get(KEY)
-        return Header.of_text(text, str(path)), OnnxNetwork(session)
+        return Header.of_text(text, str(path), NetworkConfig), OnnxNetwork(session)
 
     def to(self, device: torch.device) -> None:
         """Stays on the CPU."""

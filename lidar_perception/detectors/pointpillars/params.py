@@ -14,7 +14,7 @@ STEPS = ("preprocess", "experts", "network", "postprocess")  # of which each has
 
 
 @dataclass(frozen=True)
-class DetectionParams(NetworkParams):
+class PointPillarsParams(NetworkParams):
     """Which PointPillars, where it runs, and what counts as found."""
 
     weights: str = param("", "Checkpoint (.safetensors) or exported network (.onnx); empty: the "
@@ -41,4 +41,4 @@ class DetectorParams:
     input: InputParams = INPUT
     ground: GroundParams = EXPERT_GROUND
     clustering: ClusteringParams = EXPERT_CLUSTERING
-    detection: DetectionParams = DetectionParams()
+    pointpillars: PointPillarsParams = PointPillarsParams()

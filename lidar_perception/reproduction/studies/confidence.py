@@ -3,6 +3,7 @@ it means what it says."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from lidar_perception.candidates.confidence import confidence, shape_features
 from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.pipeline import refined
-from lidar_perception.data.kitti.folder import KittiFrame
+from lidar_perception.data.frame import Frame
 from lidar_perception.groups import group_points
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.experiment import (
@@ -38,7 +39,7 @@ NAMES = (*SCORES, SHAPE)
 BINS = np.linspace(0, 1, 11)
 
 
-def measure(frames: list[KittiFrame], number: int) -> dict[str, Any]:
+def measure(frames: Sequence[Frame], number: int) -> dict[str, Any]:
     """The record: pedestrians, how many; scored: name -> [score, 1 hit | 0] of each candidate. A
     hit is decided before the scores: each pedestrian has at most one candidate."""
     labelled = load_labelled(frames[number])

@@ -5,6 +5,7 @@ things?"""
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,8 @@ from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import oriented_boxes
-from lidar_perception.data.kitti.folder import PERIOD_NS, KittiFrame
+from lidar_perception.data.frame import Frame
+from lidar_perception.data.kitti.folder import PERIOD_NS
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.param_fields import flatten, with_values
@@ -40,7 +42,7 @@ TRULY_MOVES = 0.5   # m/s
 LEAST = 1e-3        # of a probability, so that its odds are finite
 
 
-def measure(frames: list[KittiFrame], number: int) -> dict[str, Any]:
+def measure(frames: Sequence[Frame], number: int) -> dict[str, Any]:
     """The record of one frame: variants as in variants.py; motion: [moving that are said to move,
     moving, standing that are said to stand, standing] of the pedestrians found with 5 scans."""
     labelled = load_labelled(frames[number])
@@ -96,7 +98,7 @@ def persistent(now: Found, earlier: list[Found], poses: np.ndarray) -> Found:
     return now._replace(scores=expit(np.mean(odds, axis=0)))
 
 
-def _scans_before(frames: list[KittiFrame], number: int, count: int) -> list[KittiFrame]:
+def _scans_before(frames: Sequence[Frame], number: int, count: int) -> Sequence[Frame]:
     """The scans before this one in the same recording, the oldest first."""
     sequence = frames[number].name.rpartition("/")[0]
     if not sequence:
@@ -141,7 +143,7 @@ def _with_boxes(xyz: np.ndarray, ids: np.ndarray, single: Segmented) -> Segmente
 
 
 def _told_apart(boxes: np.ndarray, speed: np.ndarray, labelled: Labelled,
-                before: list[KittiFrame], poses: np.ndarray) -> list[int]:
+                before: Sequence[Frame], poses: np.ndarray) -> list[int]:
     """Counts of the far pedestrians that have a cluster, see measure()."""
     first = before[0].truth()
     tracks = {e["track_id"]: box for box, e in zip(first.boxes, first.extras) if "track_id" in e}

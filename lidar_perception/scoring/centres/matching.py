@@ -54,7 +54,7 @@ class Score:
         self.tp, self.fp, self.fn = (np.zeros(len(RANGE_NAMES), int) for _ in range(3))
         self.error = np.zeros(len(RANGE_NAMES))
 
-    def add(self, found: np.ndarray, truth: np.ndarray) -> None:
+    def update(self, found: np.ndarray, truth: np.ndarray) -> None:
         """One frame: found boxes (K, 7), true boxes (M, 7)."""
         counts = counts_by_range(found, truth, match_centres(found, truth))
         for total, count in zip((self.tp, self.fp, self.fn, self.error), counts):

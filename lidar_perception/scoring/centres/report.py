@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -17,10 +18,70 @@ from lidar_perception.candidates.seed_sources import (
     truth_seed,
 )
 from lidar_perception.candidates.seeds import Seed, load_seed
-from lidar_perception.candidates.segmented import Segmented
-from lidar_perception.data.recording import Recorded, Recording
+from lidar_perception.candidates.warm_up import warm_up
+from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, range_bins
-from lidar_perception.types import PEDESTRIAN, InputError
+from lidar_perception.scoring.run import Start
+from lidar_perception.types import PEDESTRIAN, GroundTruth, InputError
+
+
+def pedestrians(truth: GroundTruth | None) -> np.ndarray:
+    """(M, 7) true Pedestrian boxes; none where there are no labels."""
+    return np.zeros((0, 7)) if truth is None else truth.of_class(PEDESTRIAN)
+
+
+@dataclass(frozen=True)
+class CandidateResult:
+    """One frame: true pedestrian boxes (M, 7), boxes (K, 7) by stage, time of each step, and why
+    there were none, or None; name: of the frame."""
+
+    truth: np.ndarray
+    boxes: dict[str, np.ndarray]
+    ms: dict[str, float]
+    problem: str | None = None
+    name: str = ""
+
+
+def by_pipeline(params: PipelineParams) -> Start:
+    """Run the candidate pipeline on every frame with a pedestrian, as paper A does."""
+    return partial(_by_pipeline, params)
+
+
+def _by_pipeline(params: PipelineParams, recording: Recording
+                 ) -> Callable[[Frame], CandidateResult | None]:
+    warm_up()
+    template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
+    return partial(of_frame, params=params, template=template)
+
+
+def of_frame(frame: Frame, params: PipelineParams,
+             template: Seed | None = None) -> CandidateResult | None:
+    """The pipeline on one frame, with the seed of seed_source(); None without a pedestrian."""
+    truth = pedestrians(frame.truth())
+    if len(truth) == 0:
+        return None
+    scan, camera = frame.load(), frame.camera()
+    try:
+        _, found = find_candidates(scan, seed_source(truth, template, params), camera, params)
+    except InputError as error:  # no seed, or no camera: this frame has no candidates
+        return CandidateResult(truth, boxes_by_stage(Candidates.none()), {},
+                               f"{frame.name}: {error}")
+    return CandidateResult(truth, boxes_by_stage(found), found.ms, name=frame.name)
+
+
+def boxes_by_stage(candidates: Candidates) -> dict[str, np.ndarray]:
+    """Name of each stage to its boxes (K, 7)."""
+    return {stage: getattr(candidates, stage).boxes for stage in STAGES}
+
+
+def seed_source(truth: np.ndarray, template: Seed | None, params: PipelineParams) -> SeedSource:
+    """Where a frame's seed comes from: its true pedestrians (M, 7) without a template, the paper's
+    protocol, else what params say."""
+    if template is None:
+        return truth_seed(truth)
+    if params.seed.source == "automatic":
+        return automatic_seed(template, params)
+    return fixed_seed(template)
 
 
 @dataclass
@@ -31,20 +92,35 @@ class CandidateReport:
     times: dict[str, list[float]] = field(default_factory=dict)
     truth: list[np.ndarray] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
-    frames: int = 0
+    names: list[str] = field(default_factory=list)
 
-    def add(self, truth: np.ndarray, found: dict[str, np.ndarray]) -> None:
-        """One frame: true pedestrian boxes (M, 7), boxes (K, 7) by stage."""
-        self.frames += 1
-        self.truth.append(truth)
-        for stage, boxes in found.items():
-            self.scores.setdefault(stage, Score()).add(boxes, truth)
+    @property
+    def frames(self) -> int:
+        return len(self.truth)
 
-    def add_times(self, ms: dict[str, float]) -> None:
+    def with_most(self) -> str | None:
+        """Name of the frame with most pedestrians, the first of several, of those where nothing
+        was wrong; None without one."""
+        counts = {name: len(truth) for name, truth in zip(self.names, self.truth) if name}
+        return max(counts, key=counts.__getitem__, default=None)
+
+    def update(self, result: CandidateResult) -> None:
+        """One frame."""
+        if result.problem is not None:
+            self.skipped.append(result.problem)
+        self.truth.append(result.truth)
+        self.names.append(result.name)
+        for stage, boxes in result.boxes.items():
+            self.scores.setdefault(stage, Score()).update(boxes, result.truth)
+        if result.ms:
+            self.update_times({**result.ms, "total": sum(result.ms.values())})
+
+    def update_times(self, ms: dict[str, float]) -> None:
+        """Times of steps that come by themselves, as from the topics of nodes."""
         for step, value in ms.items():
             self.times.setdefault(step, []).append(value)
 
-    def content(self) -> dict:
+    def compute(self) -> dict:
         """What the JSON file holds."""
         truth = np.concatenate(self.truth) if self.truth else np.zeros((0, 7))
         by_range = np.bincount(range_bins(truth), minlength=len(RANGE_NAMES))
@@ -56,48 +132,3 @@ class CandidateReport:
             "ms": {step: float(np.median(values)) for step, values in self.times.items()},
             "skipped": self.skipped,
         }
-
-
-def pedestrians(recorded: Recorded) -> np.ndarray:
-    """(M, 7) true Pedestrian boxes; none where there are no labels."""
-    return recorded.truth.of_class(PEDESTRIAN) if recorded.truth else np.zeros((0, 7))
-
-
-def boxes_by_stage(candidates: Candidates) -> dict[str, np.ndarray]:
-    """Name of each stage to its boxes (K, 7)."""
-    return {stage: getattr(candidates, stage).boxes for stage in STAGES}
-
-
-def evaluate(recording: Iterable[Recorded | InputError] | Recording, params: PipelineParams,
-             report: CandidateReport) -> Iterator[tuple[Recorded, Segmented, Candidates] | None]:
-    """Run the pipeline over a recording and fill the report; yields after every frame what was
-    found, or None where the frame has no pedestrian or cannot be read."""
-    template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
-    for recorded in recording:
-        if isinstance(recorded, InputError):
-            report.skipped.append(str(recorded))
-            yield None
-            continue
-        truth = pedestrians(recorded)
-        if len(truth) == 0:
-            yield None
-            continue
-        try:
-            segmented, found = find_candidates(recorded.frame, _seed(truth, template, params),
-                                               recorded.camera, params)
-            ms = found.ms
-        except InputError as error:  # no seed, or no camera: this frame has no candidates
-            report.skipped.append(f"{recorded.name}: {error}")
-            segmented, found, ms = None, Candidates.none(), {}
-        report.add(truth, boxes_by_stage(found))
-        if ms:
-            report.add_times({**ms, "total": sum(ms.values())})
-        yield None if segmented is None else (recorded, segmented, found)
-
-
-def _seed(truth: np.ndarray, template: Seed | None, params: PipelineParams) -> SeedSource:
-    if template is None:
-        return truth_seed(truth)
-    if params.seed.source == "automatic":
-        return automatic_seed(template, params)
-    return fixed_seed(template)

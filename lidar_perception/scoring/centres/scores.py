@@ -21,7 +21,7 @@ class CentreScores:
 
     frames: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
 
-    def add(self, truth: np.ndarray, boxes: np.ndarray, scores: np.ndarray) -> None:
+    def update(self, truth: np.ndarray, boxes: np.ndarray, scores: np.ndarray) -> None:
         """One frame; left out, as in the paper, where truth is empty."""
         if len(truth):
             order = np.lexsort([*boxes.T, -scores])
@@ -45,14 +45,14 @@ class CentreScores:
         last = np.append(scores[1:] < scores[:-1], True)  # equal scores are kept together
         return float(scores[last][np.argmax(f1[last])])
 
-    def table(self, least_score: float = -np.inf) -> dict[str, dict]:
-        """The table of matching.Score for detections that score least_score or more."""
+    def table(self, min_score: float = -np.inf) -> dict[str, dict]:
+        """The table of matching.Score for detections that score min_score or more."""
         total = Score()
         for truth, boxes, scores in self.frames:
-            total.add(boxes[scores >= least_score], truth)
+            total.update(boxes[scores >= min_score], truth)
         return total.table()
 
-    def content(self) -> dict:
+    def compute(self) -> dict:
         """What the JSON file holds."""
         best = self.best_score()
         return {"frames": len(self.frames), "ground_truth": sum(len(t) for t, _, _ in self.frames),

@@ -6,19 +6,19 @@ its caches, falls on all of them alike.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import suppress
-from dataclasses import dataclass, field
-from time import perf_counter
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
-from lidar_perception.camera import Calibration
-from lidar_perception.data.kitti.folder import KittiFrame
-from lidar_perception.data.recording import Recorded
+from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.detectors.contract import Detector
+from lidar_perception.scoring.detections import Detected, detected
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
 from lidar_perception.scoring.kitti.report import ROWS, DetectionReport
-from lidar_perception.types import Detections, InputError
+from lidar_perception.scoring.run import Start
+from lidar_perception.types import Detections
 
 AP_ROWS = tuple(row for row, (metric, _) in ROWS.items() if metric != "image")
 
@@ -27,85 +27,55 @@ AP_ROWS = tuple(row for row, (metric, _) in ROWS.items() if metric != "image")
 class Contender:
     """A detector in the comparison.
 
-    find(recorded): what it finds in a frame with labels and camera, boxes of low score too; None
-    where a frame is none of its business. InputError where it cannot use the frame. classes: those
-    that it knows. operating: score from which its pedestrians count as found when it is in use.
-    source: its weights, empty without any.
+    detector_of(frame): the detector for a frame, which keeps boxes of low score; None where the
+    frame is none of its business. operating: score from which its pedestrians count as detected
+    when it is in use. source: its weights, empty without any.
     """
 
     name: str
-    find: Callable[[Recorded], Detections | None]
+    detector_of: Callable[[Frame], Detector | None]
     classes: tuple[str, ...] = SCORED
     operating: float = 0.3
     source: str = ""
 
 
-@dataclass
-class Outcome:
-    """What a contender has found so far. failed: frames that it refused, with the reason; their
-    objects count as missed."""
-
-    contender: Contender
-    report: DetectionReport = field(default_factory=DetectionReport)
-    failed: list[str] = field(default_factory=list)
-
-    def add(self, recorded: Recorded, calibration: Calibration) -> None:
-        """Run on one frame."""
-        found, begin = None, perf_counter()
-        try:
-            found = self.contender.find(recorded)
-            if found is not None:
-                self.report.ms.append((perf_counter() - begin) * 1e3)
-        except InputError as error:
-            self.failed.append(f"{recorded.name}: {error}")
-        found = Detections.none() if found is None else found
-        sound = np.isfinite(np.column_stack([found.boxes, found.scores])).all(axis=1)
-        if not sound.all():
-            self.failed.append(f"{recorded.name}: {(~sound).sum()} boxes are not finite")
-        self.report.add(recorded.name, recorded.truth, found[sound], calibration)
-
-    def content(self) -> dict:
-        """As JSON: percent, ms, counts."""
-        ap, centres = self.report.content()["ap"], self.report.pedestrians
-        precision = {name: {row: {level: _r40(ap[name][row][level]) for level in DIFFICULTIES}
-                            for row in AP_ROWS} if name in self.contender.classes else None
-                     for name in ap}
-        best = centres.best_score()
-        scores = {"operating": self.contender.operating, "best": best}
-        return {
-            "weights": self.contender.source, "classes": list(self.contender.classes),
-            "ap": precision, "mean_ap": {row: mean_moderate(precision, row) for row in AP_ROWS},
-            "pedestrian_centres": {
-                key: {"score": score, **centres.table(np.inf if score is None else score)["all"]}
-                for key, score in scores.items()},
-            "ms": float(np.median(self.report.ms)) if self.report.ms else None,
-            "ms_of_frames": [round(ms, 3) for ms in self.report.ms],
-            "frames": len(self.report.ms), "failed": self.failed}
+def by_contenders(open_: Callable[[], list[Contender]]) -> Start:
+    """Run every contender that open_() gives on every frame with labels, in turns; gives their
+    Detected by name. The first frame is run once more before it counts, as a first run also loads
+    what was compiled."""
+    return partial(_by_contenders, open_)
 
 
-def compare(frames: list[KittiFrame], outcomes: list[Outcome],
-            skipped: list[str]) -> Iterator[None]:
-    """Run every contender on every frame with labels; yields after each frame. Files that cannot be
-    read go into skipped. The first frame is run once more before it counts, as a first run also
-    loads what was compiled."""
-    warm = False
-    for i, frame in enumerate(frames):
-        try:
-            truth, calibration = frame.truth(), frame.calibration()
-            recorded = None if truth is None else Recorded(frame.name, frame.load(), truth,
-                                                           calibration.camera())
-        except InputError as error:
-            skipped.append(str(error))
-            recorded = None
-        if recorded is not None:
-            if not warm:
-                for outcome in outcomes:
-                    with suppress(InputError):
-                        outcome.contender.find(recorded)
-                warm = True
-            for outcome in in_turn(outcomes, i):
-                outcome.add(recorded, calibration)
-        yield
+def _by_contenders(open_: Callable[[], list[Contender]], recording: Recording
+                   ) -> Callable[[Frame], dict[str, Detected] | None]:
+    contenders, state = open_(), {"turn": 0}
+
+    def measure(frame: Frame) -> dict[str, Detected] | None:
+        truth, calibration = frame.truth(), frame.calibration()
+        if truth is None:
+            return None
+        frame = Frame.of(frame.name, frame.load(), truth, calibration)  # read once for all
+        if state["turn"] == 0:
+            for contender in contenders:
+                _one(contender, frame)
+        order = in_turn(contenders, state["turn"])
+        state["turn"] += 1
+        return {each.name: _one(each, frame) for each in order}
+    return measure
+
+
+def _one(contender: Contender, frame: Frame) -> Detected:
+    """What a contender says of a frame, without boxes that are not finite."""
+    detector = contender.detector_of(frame)
+    if detector is None:
+        return Detected(frame.name, frame.truth(), Detections.none(), frame.calibration())
+    result = detected(detector, frame, frame.truth(), frame.calibration())
+    boxes, scores = result.detections.boxes, result.detections.scores
+    sound = np.isfinite(np.column_stack([boxes, scores])).all(axis=1)
+    if sound.all():
+        return result
+    return replace(result, detections=result.detections[sound],
+                   problem=f"{(~sound).sum()} boxes are not finite")
 
 
 def in_turn(items: list, turn: int) -> list:
@@ -114,11 +84,59 @@ def in_turn(items: list, turn: int) -> list:
     return items[begin:] + items[:begin]
 
 
-def objects(outcome: Outcome) -> dict[str, dict[str, int]]:
-    """How many labels there are to find, by class and difficulty; the same for all contenders."""
+@dataclass
+class ComparisonReport:
+    """The report of each contender, by name; skipped: frames that could not be read."""
+
+    contenders: list[Contender]
+    reports: dict[str, DetectionReport] = field(init=False)
+    skipped: list[str] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.reports = {each.name: DetectionReport() for each in self.contenders}
+
+    @property
+    def first(self) -> DetectionReport:
+        """Whose frames and labels are those of all."""
+        return next(iter(self.reports.values()))
+
+    def update(self, results: dict[str, Detected]) -> None:
+        """One frame."""
+        for name, result in results.items():
+            self.reports[name].update(result)
+
+    def compute(self) -> dict:
+        """What the JSON file holds of the contenders, by name, and of the labels."""
+        rows = {each.name: outcome(each, self.reports[each.name]) for each in self.contenders}
+        return {"frames": len(self.first.frames), "objects": objects(self.first), "rows": rows,
+                "skipped": self.skipped}
+
+
+def outcome(contender: Contender, report: DetectionReport) -> dict:
+    """As JSON: percent, ms, counts. failed: frames that it refused, with the reason; their objects
+    count as missed."""
+    ap, centres = report.compute()["ap"], report.pedestrians
+    precision = {name: {row: {level: _r40(ap[name][row][level]) for level in DIFFICULTIES}
+                        for row in AP_ROWS} if name in contender.classes else None
+                 for name in ap}
+    scores = {"operating": contender.operating, "best": centres.best_score()}
+    return {
+        "weights": contender.source, "classes": list(contender.classes),
+        "ap": precision, "mean_ap": {row: mean_moderate(precision, row) for row in AP_ROWS},
+        "pedestrian_centres": {
+            key: {"score": score, **centres.table(np.inf if score is None else score)["all"]}
+            for key, score in scores.items()},
+        "ms": float(np.median(report.ms)) if report.ms else None,
+        "ms_of_frames": [round(ms, 3) for ms in report.ms],
+        "frames": len(report.ms), "failed": report.skipped}
+
+
+def objects(report: DetectionReport) -> dict[str, dict[str, int]]:
+    """How many labels there are to detect, by class and difficulty; the same for all
+    contenders."""
     return {name: {level: row["objects"] if (row := rows["3d"][level]) else 0
                    for level in DIFFICULTIES}
-            for name, rows in outcome.report.content()["ap"].items()}
+            for name, rows in report.compute()["ap"].items()}
 
 
 def mean_moderate(precision: dict[str, dict | None], row: str) -> float | None:

@@ -45,7 +45,7 @@ class ComparedFrame:
     excused: np.ndarray
 
 
-def compare(true: CameraObjects, found: CameraObjects) -> ComparedFrame:
+def compared(true: CameraObjects, found: CameraObjects) -> ComparedFrame:
     """All overlaps of a frame. The order in which detections came makes no difference."""
     found = found.take(np.lexsort([*found.boxes.T, *found.image_boxes.T, -found.scores]))
     shared = _shared_pixels(found.image_boxes, true.image_boxes)

@@ -1,6 +1,6 @@
 """Detections against labels: KITTI's average precision, and pedestrians by centre distance.
 
-Frames are added one by one; content() is what the JSON file holds.
+update() adds a frame; compute() is what the JSON file holds.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from lidar_perception.camera import Calibration
 from lidar_perception.scoring.centres.scores import CentreScores
+from lidar_perception.scoring.detections import Detected
 from lidar_perception.scoring.kitti.camera_objects import camera_objects, scored_labels
 from lidar_perception.scoring.kitti.matched_heights import heights_off, matched_heights
 from lidar_perception.scoring.kitti.protocol import (
@@ -22,10 +22,10 @@ from lidar_perception.scoring.kitti.protocol import (
     ComparedFrame,
     Comparison,
     Precision,
-    compare,
+    compared,
     precision,
 )
-from lidar_perception.types import PEDESTRIAN, Detections, GroundTruth, InputError
+from lidar_perception.types import PEDESTRIAN, Detections, InputError
 
 # Row of the JSON file: metric and overlap.
 ROWS = {"image": ("image", STRICT), "bev": ("bev", STRICT), "3d": ("3d", STRICT),
@@ -42,30 +42,36 @@ class DetectionReport:
     skipped: list[str] = field(default_factory=list)
     with_camera: bool = True
 
-    def add(self, name: str, truth: GroundTruth, found: Detections | GroundTruth,
-            calibration: Calibration | None = None) -> None:
-        """One frame. found: detections, or labels with a score in extras (a result file).
+    def update(self, result: Detected) -> None:
+        """One frame, as detections.py measures it.
 
         With a calibration, detections outside the image are ignored, as labels end there. Without
         one there are no scores in the image, and the difficulty is that of occlusion alone.
         InputError, with the frame's name, for a number that is not finite.
         """
+        if result.problem is not None:
+            self.skipped.append(f"{result.name}: {result.problem}")
+        if result.ms is not None:
+            self.ms.append(result.ms)
+        truth, found, calibration = result.truth, result.detections, result.calibration
+        if truth is None:
+            return
         found = scored_labels(found) if isinstance(found, Detections) else found
         try:
             true_objects, objects = (camera_objects(x, calibration) for x in (truth, found))
         except InputError as error:
-            raise InputError(f"{name}: {error}") from None
-        self.frames.append(compare(true_objects, objects))
+            raise InputError(f"{result.name}: {error}") from None
+        self.frames.append(compared(true_objects, objects))
         self.with_camera &= calibration is not None
         chosen = found.class_ids == PEDESTRIAN
         chosen &= objects.pixels_high[:len(found)] > 0
-        self.pedestrians.add(truth.of_class(PEDESTRIAN), found.boxes[chosen],
-                             objects.scores[:len(found)][chosen])
+        self.pedestrians.update(truth.of_class(PEDESTRIAN), found.boxes[chosen],
+                                objects.scores[:len(found)][chosen])
 
-    def content(self) -> dict:
+    def compute(self) -> dict:
         """What the JSON file holds; ap in percent."""
         result = {"frames": len(self.frames), "ap": {}, "map_3d": None, "matched": {},
-                  "diagnosis": [], "pedestrian_centres": self.pedestrians.content(),
+                  "diagnosis": [], "pedestrian_centres": self.pedestrians.compute(),
                   "ms": float(np.median(self.ms)) if self.ms else None, "skipped": self.skipped}
         if self.frames:
             together = Comparison.of(self.frames)

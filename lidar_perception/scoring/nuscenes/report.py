@@ -1,51 +1,123 @@
-"""Detections against the labels of nuScenes, frame by frame; content() is what the JSON file holds.
-"""
+"""Detections against the labels of nuScenes: update() adds a frame, compute() is what the JSON file
+holds."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 
+from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
-from lidar_perception.data.nuscenes.folder import NuscenesFrame
-from lidar_perception.data.nuscenes.results import DETECTED
+from lidar_perception.data.nuscenes.results import DETECTED, read_results, to_results
+from lidar_perception.detectors.contract import Detector
+from lidar_perception.scoring.detections import detected
 from lidar_perception.scoring.nuscenes.protocol import ClassScores, class_scores, counted, summary
+from lidar_perception.scoring.run import Start
+from lidar_perception.types import InputError
 
 OURS = tuple(DETECTED.values())
+
+
+@dataclass(frozen=True)
+class KeyFrameResult:
+    """One key frame: boxes as a result file has them; truth and counted, labels and boxes that
+    count, None without labels; ms and problem as of Detected."""
+
+    token: str
+    boxes: GlobalBoxes
+    truth: GlobalBoxes | None
+    counted: GlobalBoxes | None
+    ms: float | None = None
+    problem: str | None = None
+
+
+def key_frame(frame: Frame, boxes: GlobalBoxes, ms: float | None = None,
+              problem: str | None = None) -> KeyFrameResult:
+    """What counts of the boxes and of the labels of a frame of nuScenes."""
+    key = frame.native
+    labels = key.labels()
+    if labels is None:
+        return KeyFrameResult(key.token, boxes, None, None, ms, problem)
+    racks = labels.racks()
+    return KeyFrameResult(key.token, boxes, labels.boxes[counted(labels.boxes, key.ego, racks)],
+                          boxes[counted(boxes, key.ego, racks)], ms, problem)
+
+
+def by_detector(open_: Callable[[], Detector], unlabelled: bool) -> Start:
+    """Run the detector that open_() gives on every key frame with labels, with unlabelled on
+    all."""
+    return partial(_by_detector, open_, unlabelled)
+
+
+def _by_detector(open_: Callable[[], Detector], unlabelled: bool,
+                 recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
+    detector = open_()
+
+    def measure(frame: Frame) -> KeyFrameResult | None:
+        if frame.native.labels() is None and not unlabelled:
+            return None
+        result = detected(detector, frame, None, None)
+        boxes, problem = GlobalBoxes.none(), result.problem
+        try:
+            boxes = to_results(result.detections, frame)
+        except InputError as error:
+            problem = str(error)
+        return key_frame(frame, boxes, result.ms,
+                         None if problem is None else f"{frame.name}: {problem}")
+    return measure
+
+
+def by_file(path: Path) -> Start:
+    """Read a result file of nuScenes' detection task."""
+    return partial(_by_file, path)
+
+
+def _by_file(path: Path, recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
+    boxes = read_results(path, list(recording))
+    return lambda frame: (None if frame.native.labels() is None
+                          else key_frame(frame, boxes[frame.name]))
 
 
 @dataclass
 class NuscenesReport:
     """Labels and detections that count, by frame, and what could not be scored; ms of the detector
-    by frame, where it was run here."""
+    by frame, where it was run here; boxes by sample token, for a result file."""
 
     truth: list[GlobalBoxes] = field(default_factory=list)
-    found: list[GlobalBoxes] = field(default_factory=list)
+    detections: list[GlobalBoxes] = field(default_factory=list)
     ms: list[float] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
+    boxes: dict[str, GlobalBoxes] = field(default_factory=dict)
 
     @property
     def frames(self) -> int:
         return len(self.truth)
 
-    def add(self, frame: NuscenesFrame, found: GlobalBoxes) -> None:
-        """A frame that has labels."""
-        labels = frame.labels()
-        racks = labels.racks()
-        self.truth.append(labels.boxes[counted(labels.boxes, frame.ego, racks)])
-        self.found.append(found[counted(found, frame.ego, racks)])
+    def update(self, result: KeyFrameResult) -> None:
+        """One key frame."""
+        self.boxes[result.token] = result.boxes
+        if result.problem is not None:
+            self.skipped.append(result.problem)
+        if result.ms is not None:
+            self.ms.append(result.ms)
+        if result.truth is not None:
+            self.truth.append(result.truth)
+            self.detections.append(result.counted)
 
-    def content(self) -> dict:
+    def compute(self) -> dict:
         """What the JSON file holds: ap, map and nds in percent. all: the mean over the ten classes,
         as nuScenes ranks detectors; ours: over the three that the package's detectors know."""
         result = {"frames": self.frames, "classes": {}, "all": None, "ours": None,
                   "ms": float(np.median(self.ms)) if self.ms else None, "skipped": self.skipped}
         if self.frames:
-            truth, found = (GlobalBoxes.together(parts) for parts in (self.truth, self.found))
+            truth, found = (GlobalBoxes.together(parts) for parts in (self.truth, self.detections))
             numbers = [np.repeat(np.arange(self.frames), [len(part) for part in parts])
-                       for parts in (self.truth, self.found)]
+                       for parts in (self.truth, self.detections)]
             scores = {name: class_scores(name, truth, numbers[0], found, numbers[1])
                       for name in NAMES}
             result["classes"] = {name: _class_content(s) for name, s in scores.items()}

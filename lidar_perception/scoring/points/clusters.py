@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidar_perception.camera import Camera
-from lidar_perception.detectors.pointnet.clusters import Clusters
-from lidar_perception.detectors.pointnet.predict import Predictions
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
+from lidar_perception.detectors.pointnet.network import fused, load_pointnet
+from lidar_perception.detectors.pointnet.predict import Predictions, predict
 from lidar_perception.geometry import points_in_box
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.scoring.run import Start
 from lidar_perception.types import CLASSES, GroundTruth
 
 UNKNOWN = -1              # a label of which nothing is said
@@ -19,7 +26,7 @@ SURE, UNSURE = 0.5, 0.15  # a cluster with this share of its points in a box is 
                           # less than the second it is background
 BORDER = 0.05             # m: points so near to a box are taken for its own, as labels are rounded
 NEITHER = ("Van", "Person_sitting", "Tram", "Truck")  # look like a class, and are none of it
-LEAST_POINTS = 10         # clusters with fewer do not count
+MIN_POINTS = 10         # clusters with fewer do not count
 
 
 def labelled(clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray,
@@ -76,6 +83,57 @@ def kinds_of(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
                      for name in (CLASSES[i] for i in class_ids)], np.int64)
 
 
+def confusions(clusters: Clusters, labels: np.ndarray, predictions: Predictions,
+               point_truth: np.ndarray, cluster_ids: np.ndarray,
+               classes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Counts (K + 1, K + 1) by true and by predicted class, background last, of one frame's
+    clusters with labels and what the network says of them, and of all N points with their labels
+    and the numbers of their clusters, 0 for none."""
+    shape = len(classes) + 1, len(classes) + 1
+    of_clusters, of_points = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
+    kinds = predictions.probabilities.argmax(axis=1)
+    counted = (labels >= 0) & (clusters.sizes >= MIN_POINTS)
+    np.add.at(of_clusters, (labels[counted], kinds[counted]), 1)
+    largest = max(int(cluster_ids.max(initial=0)), int(clusters.ids.max(initial=0)))
+    of_number = np.full(largest + 1, len(classes))
+    of_number[clusters.ids] = kinds
+    known = point_truth >= 0
+    np.add.at(of_points, (point_truth[known], of_number[cluster_ids[known]]), 1)
+    return of_clusters, of_points
+
+
+def by_network(weights: Path) -> Start:
+    """Ask a cluster network of every frame with labelled boxes, of its points in the image."""
+    return partial(_by_network, weights)
+
+
+def _by_network(weights: Path, recording: Recording) -> Callable[[Frame], Any]:
+    network = fused(load_pointnet(weights)[1])
+    config, background = network.config, len(network.config.classes)
+
+    def measure(frame: Frame) -> tuple[np.ndarray, np.ndarray] | None:
+        truth = frame.truth()
+        if truth is None:
+            return None
+        scan = frame.load()
+        ground = segment_ground(scan, config.ground)
+        ids = cluster_obstacles(scan.xyz, ground, config.clustering)
+        camera = frame.camera()
+        if camera is None:  # then all around is labelled
+            indices, hidden = np.arange(len(scan)), lambda xyz: np.zeros(len(xyz), bool)
+        else:
+            indices, hidden = np.flatnonzero(camera.in_view(scan.xyz)), partial(uncared, truth,
+                                                                               camera)
+        seen, ids = scan.take(indices), ids[indices]
+        made = clusters_of(seen, ids, ground=ground[indices])
+        labels, _ = labelled(made, truth.boxes, truth.class_ids, config.classes)
+        labels = unknown_where(labels, made, hidden(made.points[:, :3]), background)
+        points = point_labels(seen.xyz, truth.boxes, truth.class_ids, config.classes)
+        points[(points == background) & hidden(seen.xyz)] = UNKNOWN
+        return confusions(made, labels, predict(network, made), points, ids, config.classes)
+    return measure
+
+
 @dataclass
 class ClusterScores:
     """Counts (K + 1, K + 1) by true and by found class, background last, of clusters and of all
@@ -91,24 +149,16 @@ class ClusterScores:
         count = len(self.classes) + 1
         self.clusters, self.points = (np.zeros((count, count), np.int64) for _ in range(2))
 
-    def add(self, clusters: Clusters, labels: np.ndarray, predictions: Predictions,
-            point_truth: np.ndarray, cluster_ids: np.ndarray) -> None:
-        """One frame: clusters with labels, what the network says of them, and of all N points the
-        labels and the numbers of their clusters, 0 for none."""
-        kinds = predictions.probabilities.argmax(axis=1)
-        counted = (labels >= 0) & (clusters.sizes >= LEAST_POINTS)
-        np.add.at(self.clusters, (labels[counted], kinds[counted]), 1)
-        largest = max(int(cluster_ids.max(initial=0)), int(clusters.ids.max(initial=0)))
-        of_number = np.full(largest + 1, len(self.classes))
-        of_number[clusters.ids] = kinds
-        known = point_truth >= 0
-        np.add.at(self.points, (point_truth[known], of_number[cluster_ids[known]]), 1)
+    def update(self, counts: tuple[np.ndarray, np.ndarray]) -> None:
+        """One frame: counts of its clusters and of its points, as confusions() gives them."""
+        self.clusters += counts[0]
+        self.points += counts[1]
         self.frames += 1
 
-    def content(self) -> dict[str, Any]:
+    def compute(self) -> dict[str, Any]:
         """As JSON; shares in percent, None without objects."""
         return {"frames": self.frames, "classes": [*self.classes, "background"],
-                "least_points": LEAST_POINTS, "clusters": _scores(self.clusters, self.classes),
+                "min_points": MIN_POINTS, "clusters": _scores(self.clusters, self.classes),
                 "points": _scores(self.points, self.classes), "skipped": self.skipped}
 
 

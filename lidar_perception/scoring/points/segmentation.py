@@ -55,6 +55,12 @@ def ground_counts(found: np.ndarray, ground: np.ndarray, counted: np.ndarray) ->
     return np.bincount(case.compress(counted), minlength=4)
 
 
+def ground_by_protocol(found: np.ndarray, semantic: np.ndarray,
+                       z: np.ndarray) -> dict[str, np.ndarray]:
+    """ground_counts of each protocol: found (N,) bool, classes (N,), heights (N,) metres."""
+    return {name: ground_counts(found, *true_ground(semantic, z, name)) for name in PROTOCOLS}
+
+
 def ground_row(counts: np.ndarray) -> dict:
     """Counts (4,) and their ratios for the JSON file. A ratio without cases is 0."""
     tp, fp, fn, tn = counts.tolist()
@@ -71,13 +77,13 @@ class GroundReport:
         default_factory=lambda: {name: np.zeros(4, np.int64) for name in PROTOCOLS})
     ms: list[float] = field(default_factory=list)
 
-    def add(self, found: np.ndarray, semantic: np.ndarray, z: np.ndarray, ms: float) -> None:
-        """One scan: found (N,) bool, classes (N,), heights (N,), time of the method."""
-        for name, counts in self.counts.items():
-            counts += ground_counts(found, *true_ground(semantic, z, name))
+    def update(self, counts: dict[str, np.ndarray], ms: float) -> None:
+        """One scan: counts of ground_by_protocol, time of the method."""
+        for name, total in self.counts.items():
+            total += counts[name]
         self.ms.append(ms)
 
-    def content(self) -> dict:
+    def compute(self) -> dict:
         """What the JSON file holds."""
         return {"scans": len(self.ms), "ms": _median(self.ms),
                 "protocols": {name: ground_row(c) for name, c in self.counts.items()}}
@@ -186,22 +192,24 @@ def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
 class ClusterReport:
     """Scores of one clustering method over the frames."""
 
-    frames: list[tuple[Objects, ClusterScore]] = field(default_factory=list)
+    frames: list[tuple[tuple[str, ...], np.ndarray, ClusterScore]] = field(default_factory=list)
     ms: list[float] = field(default_factory=list)
 
-    def add(self, cluster_ids: np.ndarray, objects: Objects, ms: float) -> None:
-        """One frame: cluster_ids (N,), its objects, time of the method."""
-        self.frames.append((objects, score_clusters(cluster_ids, objects)))
+    def update(self, classes: tuple[str, ...], ranges: np.ndarray, score: ClusterScore,
+               ms: float) -> None:
+        """One frame: classes and ranges (K,) of its Objects, score_clusters(), time."""
+        self.frames.append((classes, ranges, score))
         self.ms.append(ms)
 
-    def content(self) -> dict:
+    def compute(self) -> dict:
         """What the JSON file holds. precision: share of the judged clusters that are hits."""
-        classes = np.array([c for objects, _ in self.frames for c in objects.classes], str)
-        bins = np.searchsorted(RANGE_LIMITS, _joined(o.ranges for o, _ in self.frames), "right")
-        columns = [_joined(getattr(score, name) for _, score in self.frames)
+        classes = np.array([c for names, _, _ in self.frames for c in names], str)
+        ranges = _joined(each for _, each, _ in self.frames)
+        bins = np.searchsorted(RANGE_LIMITS, ranges, "right")
+        columns = [_joined(getattr(score, name) for _, _, score in self.frames)
                    for name in ("iou", "pieces", "shared")]
         everything = _object_row(*columns)
-        clusters, judged = (sum(getattr(score, name) for _, score in self.frames)
+        clusters, judged = (sum(getattr(score, name) for _, _, score in self.frames)
                             for name in ("clusters", "judged"))
         hits = everything["hits"]
         return {"frames": len(self.frames), "ms": _median(self.ms), "clusters": clusters,

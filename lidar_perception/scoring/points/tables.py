@@ -15,8 +15,6 @@ from lidar_perception.types import LidarFrame
 # Patchwork++ on sequences 00 to 10 of SemanticKITTI, mean of the sequences, in percent: precision,
 # recall, F1. The first from the paper (IROS 2022, Table I), the second from its repository.
 PUBLISHED = {"without vegetation": (94.92, 98.18, 96.51), "with vegetation": (93.72, 92.33, 92.87)}
-SOURCES = {"semantic_kitti": "SemanticKITTI instances", "kitti": "KITTI boxes",
-           "bag": "boxes of the bag"}
 
 
 def print_scores(content: dict, ground_method: str, console: Console) -> None:
@@ -24,7 +22,7 @@ def print_scores(content: dict, ground_method: str, console: Console) -> None:
     if content["ground"]:
         _print_ground(content["ground"], console)
     for source, reports in content["clusters"].items():
-        _print_clusters(reports, f"Clusters against {SOURCES[source]}, ground by {ground_method}",
+        _print_clusters(reports, f"Clusters of {source}, ground by {ground_method}",
                         console)
     print_skipped(content["skipped"], console)
 

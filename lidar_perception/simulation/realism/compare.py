@@ -14,18 +14,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.stats import binom
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.refine import STAGES
-from lidar_perception.data.kitti.folder import KittiFrame
-from lidar_perception.data.recording import Recorded, Recording
+from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.matching import RANGE_NAMES
-from lidar_perception.scoring.centres.report import CandidateReport, evaluate
+from lidar_perception.scoring.centres.report import CandidateReport, of_frame
 from lidar_perception.simulation.realism.scan_statistics import (
     CLASSES,
     CURVES,
@@ -54,23 +53,25 @@ class Measured:
     objects: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CLASSES, 0))
     skipped: list[str] = field(default_factory=list)
 
-    def add(self, recorded: Recorded, protocol: PipelineParams) -> None:
+    def update(self, frame: Frame, protocol: PipelineParams) -> None:
         """One scan; protocol is that of the pipeline's scores. A scan that is cropped to the
-        camera's view counts for its objects only."""
+        camera's view counts for its objects only. InputError where it cannot be read."""
+        scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
         # The threshold's trial planes depend on the order of the points; here nothing shall.
-        frame = recorded.frame.take(np.lexsort(recorded.frame.xyz.T))
-        recorded = replace(recorded, frame=frame)
+        scan = scan.take(np.lexsort(scan.xyz.T))
+        frame = Frame.of(frame.name, scan, truth, calibration)
         self.scans += 1
-        if is_whole(recorded.frame):
+        if is_whole(scan):
             self.whole_scans += 1
-            self._extend(scan_rows(recorded.frame, with_values(protocol, {"view.enabled": False})))
-        if recorded.truth is not None:
-            self._extend(object_rows(recorded))
-            for name in recorded.truth.labels:
+            self._extend(scan_rows(scan, with_values(protocol, {"view.enabled": False})))
+        if truth is not None:
+            self._extend(object_rows(scan, truth, frame.camera()))
+            for name in truth.labels:
                 if name in CLASSES:
                     self.objects[name] += 1
-            for _ in evaluate([recorded], protocol, self.report):
-                pass
+            result = of_frame(frame, protocol)
+            if result is not None:
+                self.report.update(result)
 
     def _extend(self, rows: dict) -> None:
         for curve, values in rows.items():
@@ -82,24 +83,26 @@ class Measured:
                 "pedestrian_frames": self.report.frames, "skipped": self.skipped}
 
 
-def labelled(recording: Recording) -> Recording:
-    """The recording of a KITTI folder, or an even choice of MOST_SCANS of it; InputError if no
-    scan has labels."""
-    if not any(map(_may_have_labels, recording.frames)):
+def evenly(recording: Recording) -> list[Frame]:
+    """The frames of a recording, or an even choice of MOST_SCANS of them; InputError if no scan has
+    labels."""
+    count = min(len(recording), MOST_SCANS)
+    chosen = np.linspace(0, len(recording) - 1, count).astype(int)
+    frames = [recording.frames[i] for i in chosen]
+    if not any(map(_may_have_labels, frames)):
         raise InputError(f"{recording.path} has no labels; give the training folder with label_2 "
                          "(object) or label_02 (tracking), or a raw drive with tracklets")
-    chosen = np.linspace(0, recording.count - 1, min(recording.count, MOST_SCANS)).astype(int)
-    return replace(recording, frames=[recording.frames[i] for i in chosen], count=len(chosen))
+    return frames
 
 
-def measure(scans: Iterable[Recorded | InputError], protocol: PipelineParams) -> Measured:
+def measure(scans: Iterable[Frame], protocol: PipelineParams) -> Measured:
     """Every curve of the scans; those that cannot be read are skipped. InputError if all are."""
     measured = Measured()
-    for item in scans:
-        if isinstance(item, InputError):
-            measured.skipped.append(str(item))
-        else:
-            measured.add(item, protocol)
+    for frame in scans:
+        try:
+            measured.update(frame, protocol)
+        except InputError as error:
+            measured.skipped.append(str(error))
     if measured.skipped and not measured.scans:
         raise InputError(f"none of {len(measured.skipped)} scans can be read: "
                          f"{measured.skipped[0]}")
@@ -109,7 +112,7 @@ def measure(scans: Iterable[Recorded | InputError], protocol: PipelineParams) ->
 def compare(real: Measured, simulated: Measured) -> dict:
     """The curves side by side, as the JSON file holds them."""
     sides = {"real": real, "simulated": simulated}
-    tables = {side: measured.report.content() for side, measured in sides.items()}
+    tables = {side: measured.report.compute() for side, measured in sides.items()}
     curves = {}
     for name, curve in CURVES.items():
         stage, _, score = name.partition(" ")
@@ -140,7 +143,7 @@ def factor_off(bin_row: dict) -> float:
     return max(value, 1 / value)
 
 
-def _may_have_labels(frame: KittiFrame) -> bool:
+def _may_have_labels(frame: Frame) -> bool:
     try:
         return frame.truth() is not None
     except InputError:  # what is wrong is reported when the scan is measured

@@ -12,22 +12,22 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
+from lidar_perception.camera import Camera
 from lidar_perception.candidates.boxes import height_matches
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.refine import STAGES
-from lidar_perception.data.recording import Recorded
 from lidar_perception.geometry import box_corners, horizontal_range, points_in_box, to_box_frame
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.centres.matching import RANGE_NAMES
 from lidar_perception.simulation.realism.roughness import roughness
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import GroundTruth, LidarFrame
 
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 PERSON_HEIGHT = 1.7       # metres; the seed's height for the height filter of paper A's stage 1
 SECTORS, WHOLE = 36, 27   # of a turn; a scan with points in fewer is cropped to a camera's view
-LEAST_POINTS = 5          # of an object whose extent or intensity is measured
+MIN_POINTS = 5          # of an object whose extent or intensity is measured
 LEAST_IN_BIN = 50         # points of a scan in a range bin whose ground share is measured
 QUERIES, LEAST_QUERIES = 600, 10  # points in a range bin whose neighbour is measured
 RANGES = np.array([0.0, 5, 10, 15, 20, 30, 40, 60, 80, np.inf])
@@ -120,16 +120,15 @@ def scan_rows(frame: LidarFrame, params: PipelineParams = PipelineParams()) -> d
     return {curve: np.atleast_2d(np.asarray(row, float)) for curve, row in rows.items()}
 
 
-def object_rows(recorded: Recorded) -> dict:
+def object_rows(frame: LidarFrame, truth: GroundTruth, camera: Camera | None) -> dict:
     """Curve to the rows (K, B) of the labelled objects with a point that the camera sees whole: of
-    the others KITTI's labels and cropped scans hold a part. Occluded ones, as their labels say,
-    count for `points of all` and intensity only."""
+    the others KITTI's labels and cropped scans hold a part; of all without a camera. Occluded ones,
+    as their labels say, count for `points of all` and intensity only."""
     rows: dict[str, list] = {}
-    frame, truth = recorded.frame, recorded.truth
     bins = len(_BY_OBJECT_RANGE)
     for i, (box, name) in enumerate(zip(truth.boxes, truth.labels)):
         place = _bin(horizontal_range(box[None]), OBJECT_RANGES)[0]
-        if name not in CLASSES or place == bins or not _seen_whole(recorded, box):
+        if name not in CLASSES or place == bins or not _seen_whole(camera, box):
             continue
         inside = np.flatnonzero(points_in_box(frame.xyz, box))
         if len(inside) == 0:
@@ -137,13 +136,13 @@ def object_rows(recorded: Recorded) -> dict:
         values = {"points of all": len(inside)}
         if truth.extras[i].get("occluded", 0) == 0:
             values |= {"points": len(inside), "density": len(inside) / square_degrees(box)}
-            if len(inside) >= LEAST_POINTS:
+            if len(inside) >= MIN_POINTS:
                 own = to_box_frame(frame.xyz[inside].astype(float), box) / box[3:6]
                 values |= dict(zip(("length", "width", "height"), np.ptp(own, axis=0)))
                 values["above"] = (own[:, 2] > BELT - 0.5).mean()
         new = {f"{name} {what}": np.where(np.arange(bins) == place, value, np.nan)
                for what, value in values.items()}
-        if frame.intensity is not None and len(inside) >= LEAST_POINTS:
+        if frame.intensity is not None and len(inside) >= MIN_POINTS:
             new |= _intensity(name, frame.intensity[inside])
         for curve, row in new.items():
             rows.setdefault(curve, []).append(row)
@@ -159,8 +158,8 @@ def square_degrees(box: np.ndarray) -> float:
     return float(np.prod(np.degrees(2 * np.arctan2([width / 2, box[5] / 2], reach))))
 
 
-def _seen_whole(recorded: Recorded, box: np.ndarray) -> bool:
-    return recorded.camera is None or recorded.camera.in_view(box_corners(box[None])[0]).all()
+def _seen_whole(camera: Camera | None, box: np.ndarray) -> bool:
+    return camera is None or camera.in_view(box_corners(box[None])[0]).all()
 
 
 def _bin(values: np.ndarray, limits: np.ndarray) -> np.ndarray:

@@ -43,11 +43,11 @@ class CutScene:
 @dataclass(frozen=True)
 class CutScenes:
     """scene(i): the clusters of a scene of `scenes`, as a network of the config is to see them, of
-    least_points or more. cache: folder for them, or None."""
+    min_points or more. cache: folder for them, or None."""
 
     scenes: Any
     config: PointNetConfig
-    least_points: int = 5
+    min_points: int = 5
     cache: Path | None = None
 
     def __len__(self) -> int:
@@ -55,7 +55,7 @@ class CutScenes:
 
     def judged(self, i: int) -> Any:
         """The scan that it is cut from, with what evaluation needs."""
-        return self.scenes.judged(i)
+        return self.scenes.frame(i)
 
     def scene(self, i: int) -> CutScene:
         """InputError naming the file that cannot be used."""
@@ -65,7 +65,7 @@ class CutScenes:
                 return _read(path)
             except (OSError, ValueError, KeyError, EOFError, BadZipFile):
                 path.unlink(missing_ok=True)  # it is made again
-        made = cut(self.scenes.scene(i), self.config, self.least_points)
+        made = cut(self.scenes.scene(i), self.config, self.min_points)
         if path is not None:
             _write(path, made)
         return made
@@ -74,16 +74,16 @@ class CutScenes:
         if self.cache is None:
             return None
         made = (self.scenes, self.config.ground, self.config.clustering, self.config.classes,
-                self.least_points, __version__)
+                self.min_points, __version__)
         return self.cache / f"{hashlib.sha1(repr(made).encode()).hexdigest()[:12]}_{i:08}.npz"
 
 
-def cut(scene: Scene, config: PointNetConfig, least_points: int) -> CutScene:
+def cut(scene: Scene, config: PointNetConfig, min_points: int) -> CutScene:
     """The clusters of a scene, and after them the points around each object that is wanted."""
     frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
     ground = segment_ground(frame, config.ground)
     clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering),
-                           least_points, ground)
+                           min_points, ground)
     labels, owners = labelled(clusters, scene.boxes, scene.class_ids, config.classes)
     boxes = np.zeros((len(clusters), 7))
     boxes[owners >= 0] = scene.boxes[owners[owners >= 0]]
@@ -91,7 +91,7 @@ def cut(scene: Scene, config: PointNetConfig, least_points: int) -> CutScene:
     for i in np.flatnonzero(scene.wanted):
         name = CLASSES[scene.class_ids[i]]
         inside = points_in_box(frame.xyz, scene.boxes[i], AROUND) & (ids == 0) & ~ground
-        if name in config.classes and inside.sum() >= least_points:
+        if name in config.classes and inside.sum() >= min_points:
             around.append(i)
             ids[inside] = len(around)
     loose = clusters_of(frame, ids, ground=ground)

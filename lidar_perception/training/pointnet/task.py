@@ -13,14 +13,15 @@ import torch
 from torch import Tensor, nn
 
 from lidar_perception.camera import Calibration
+from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.box_head import BoxTargets, cluster_loss, encode
 from lidar_perception.detectors.pointnet.calibration import calibrate, calibration_error
-from lidar_perception.detectors.pointnet.checkpoint import Header
 from lidar_perception.detectors.pointnet.clusters import ClusterInput, Clusters, network_input
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
 from lidar_perception.detectors.pointnet.predict import found, outputs_of, predict
 from lidar_perception.geometry import points_in_box
+from lidar_perception.scoring.detections import Detected
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import noisy, with_reflector
 from lidar_perception.training.data import Batches, JudgedScenes, loaded
@@ -32,7 +33,6 @@ from lidar_perception.types import GroundTruth, InputError
 
 FEWEST = 3          # points that are left of a cluster, at least
 SCORED_POINTS = 10  # clusters with fewer do not count in the accuracy
-LEAST = 0.05        # score: boxes of lower ones cost precision only where recall has ended
 
 
 @dataclass(frozen=True)
@@ -162,15 +162,16 @@ class JudgedClusters:
     clusters: Clusters
     labels: np.ndarray
     truth: GroundTruth
-    calibration: Calibration
+    calibration: Calibration | None
 
 
 def judged_clusters(source: CutScenes, i: int) -> JudgedClusters:
     """Scene i of a source, to validate on. InputError naming the file that cannot be used."""
     scene = source.scene(i)
     made = np.flatnonzero(~scene.loose)
-    name, _, truth, calibration = source.judged(i)
-    return JudgedClusters(name, scene.clusters.take(made), scene.labels[made], truth, calibration)
+    frame = source.frame(i)
+    return JudgedClusters(frame.name, scene.clusters.take(made), scene.labels[made], frame.truth(),
+                          frame.calibration())
 
 
 def validated(network: PointNet, scenes: Sequence[JudgedClusters]) -> dict[str, float]:
@@ -187,9 +188,9 @@ def validated(network: PointNet, scenes: Sequence[JudgedClusters]) -> dict[str, 
     report, predictions = DetectionReport(), []
     for scene in scenes:
         predictions.append(predict(network, scene.clusters))
-        boxes = found(predictions[-1], config, [LEAST] * len(config.classes))
-        report.add(scene.name, scene.truth, boxes, scene.calibration)
-    metrics = metrics_of(report.content(), "bev", config.classes)
+        boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
+        report.update(Detected(scene.name, scene.truth, boxes, scene.calibration))
+    metrics = metrics_of(report.compute(), "bev", config.classes)
     known = (labels >= 0) & (sizes >= SCORED_POINTS)
     probabilities = np.concatenate([p.probabilities for p in predictions])[known]
     right, objects = probabilities.argmax(axis=1) == labels[known], labels[known] < len(
@@ -204,7 +205,7 @@ def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches
               commit: str = "", init: Path | None = None) -> Task:
     """The task of training a network of a config; see training.pointpillars.make_task."""
     torch.manual_seed(params.seed)
-    network = begun_with(make_pointnet(config), init, Header).to(device)
+    network = begun_with(make_pointnet(config), init, PointNetConfig).to(device)
     judged: list[JudgedClusters] = []
 
     def validate(module: PointNet) -> dict[str, float]:
@@ -215,4 +216,4 @@ def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches
         return validated(module, judged)
 
     return Task(network, make_loss(config, device), batches, validate,
-                keeper(out, Header, config, params, batches, about, commit), batches.epoch, about)
+                keeper(out, config, params, batches, about, commit), batches.epoch, about)

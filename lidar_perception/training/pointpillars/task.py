@@ -12,14 +12,17 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.contract import Detector
+from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
-from lidar_perception.detectors.pointpillars.checkpoint import Header
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
-from lidar_perception.detectors.pointpillars.detector import Detector, TorchNetwork
+from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
 from lidar_perception.detectors.pointpillars.expert import network_input
 from lidar_perception.detectors.pointpillars.losses import detection_loss
 from lidar_perception.detectors.pointpillars.network import PointPillars, make_network
-from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
 from lidar_perception.detectors.pointpillars.pillars import make_pillars
 from lidar_perception.detectors.pointpillars.targets import (
     BACKGROUND,
@@ -31,7 +34,7 @@ from lidar_perception.detectors.pointpillars.targets import (
     stacked,
 )
 from lidar_perception.detectors.view import visible
-from lidar_perception.param_fields import with_values
+from lidar_perception.scoring.detections import detected
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import Scene, augmented, faced
@@ -41,13 +44,11 @@ from lidar_perception.training.params import AugmentParams, PointPillarsTraining
 from lidar_perception.training.putting import inside
 from lidar_perception.training.record import begun_with, keeper, metrics_of
 from lidar_perception.training.run import Task
-from lidar_perception.training.scenes import Judged
-from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
+from lidar_perception.types import CLASSES, InputError, LidarFrame
 
 # Boxes of low score cost precision only where recall has ended; fewer of them are quicker.
-VALIDATED = with_values(DetectorParams(), {
-    **{f"detection.scores.{name}": 0.1 for name in ("car", "pedestrian", "cyclist", "other")},
-    "detection.warm_up": False})
+VALIDATED = DetectorParams(pointpillars=PointPillarsParams(scores=ScoreParams.all_alike(0.1),
+                                                           warm_up=False))
 LIKE = {other: name for name, other in NEIGHBOURS.items()}  # Van: Car, Person_sitting: Pedestrian
 
 
@@ -71,7 +72,7 @@ class Preparation:
 
     config: NetworkConfig
     augment: AugmentParams
-    least_points: int = 5
+    min_points: int = 5
     database: Path | None = None
 
     @cached_property
@@ -103,7 +104,7 @@ class Preparation:
         within = ((scene.boxes[:, :2] >= low[:2]) & (scene.boxes[:, :2] < high[:2])).all(axis=1)
         kept = np.flatnonzero(within & (labels >= 0))
         counted = [bool(scene.wanted[i]) and names[i] not in LIKE
-                   and len(inside(xyz, scene.boxes[i], 0.0)) >= self.least_points
+                   and len(inside(xyz, scene.boxes[i], 0.0)) >= self.min_points
                    for i in kept]
         return scene.boxes[kept].astype(np.float32), labels[kept], np.array(counted, bool)
 
@@ -163,20 +164,21 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     return loss
 
 
-def judged_scan(source: Any, i: int) -> Judged:
-    """Scene i of a source, to validate on. InputError naming the file that cannot be used."""
-    return source.judged(i)
+def frame_to_judge(source: Any, i: int) -> Frame:
+    """Scene i of a source, read, to validate on. InputError naming the file that cannot be
+    used."""
+    frame = source.frame(i)
+    return Frame.of(frame.name, frame.load(), frame.truth(), frame.calibration())
 
 
-def score_detector(detector: Callable[[LidarFrame], Detections], scenes: JudgedScenes,
-                   jobs: int = 0) -> DetectionReport:
+def validation_report(detector: Detector, scenes: JudgedScenes, jobs: int = 0) -> DetectionReport:
     """The detector on every scene, by KITTI's protocol."""
     report = DetectionReport()
     for item, in loaded(scenes, ([n] for n in range(len(scenes))), jobs):
         report.skipped += item.skipped
         if item.sample is not None:
-            name, frame, truth, calibration = item.sample
-            report.add(name, truth, detector(frame), calibration)
+            frame = item.sample
+            report.update(detected(detector, frame, frame.truth(), frame.calibration()))
     return report
 
 
@@ -187,14 +189,15 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
     resumed run must have the same. init: checkpoint to begin with, see checkpoint.adopt. Weights
     are written to out/best.safetensors and out/last.safetensors."""
     torch.manual_seed(params.seed)
-    network = begun_with(make_network(config), init, Header)
+    network = begun_with(make_network(config), init, NetworkConfig)
     network = network.to(device, memory_format=torch.channels_last)
 
     def validate(module: PointPillars) -> dict[str, float]:
-        detector = Detector(TorchNetwork(module, device), Header(config), device, VALIDATED)
-        content = score_detector(detector, validation, batches.jobs).content()
+        detector = PointPillarsDetector(TorchNetwork(module, device), Header(config), device,
+                                        VALIDATED)
+        content = validation_report(detector, validation, batches.jobs).compute()
         return metrics_of(content, params.score, config.classes)
 
     seen = narrowed(config, params.ahead, params.aside)
     return Task(network, make_loss(seen, device), batches, validate,
-                keeper(out, Header, config, params, batches, about, commit), batches.epoch, about)
+                keeper(out, config, params, batches, about, commit), batches.epoch, about)

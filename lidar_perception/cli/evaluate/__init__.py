@@ -1,0 +1,1 @@
+"""evaluate: the algorithms against labels, without ROS."""

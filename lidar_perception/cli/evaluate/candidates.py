@@ -1,0 +1,90 @@
+"""evaluate candidates: paper A's protocol, without ROS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.cli.data import (
+    a_path,
+    frame_options,
+    json_option,
+    no_labels,
+    one_way,
+    opened,
+    write_json,
+)
+from lidar_perception.cli.options import parameter_options
+from lidar_perception.param_fields import with_values
+from lidar_perception.runs.terminal import console, errors
+
+
+def view_as_recorded(recording: Any, params: PipelineParams) -> PipelineParams:
+    """params with the crop to the camera off, and a note, if the recording has no camera."""
+    from lidar_perception.data.frame import CAMERA
+    if params.view.enabled and CAMERA not in recording.has:
+        errors.print(f"{recording.path} has no camera calibration: the whole scan is processed")
+        return with_values(params, {"view.enabled": False})
+    return params
+
+
+@click.command()
+@frame_options
+@json_option
+@a_path("--png", "Draw the frame with most pedestrians from above.")
+@parameter_options(PAPER)
+def candidates(data: Path, split: Path | None, limit: int | None, jobs: int, dask: str | None,
+               json_file: Path | None, png: Path | None, params: PipelineParams) -> None:
+    """Pedestrian candidates of paper A (STM-CPA) against the Pedestrian labels.
+
+    The paper's protocol unless flags say otherwise: frames with a pedestrian, points in the
+    camera's view, the nearest labelled pedestrian as seed, hits within 1.0 m of the 3D centre.
+
+    \b
+    Examples:
+      lidar-perception evaluate candidates --data /data/kitti/object --json scores.json
+      lidar-perception evaluate candidates --data drive.bag --seed-source file
+    """
+    from lidar_perception.data.frame import BOXES
+    from lidar_perception.scoring.centres.report import CandidateReport, by_pipeline
+    from lidar_perception.scoring.centres.tables import print_candidate_report
+    from lidar_perception.scoring.run import fill
+
+    where = one_way(jobs, dask)
+    recording = opened(data, split=split)
+    recording.require(BOXES, "evaluate candidates")
+    params = view_as_recorded(recording, params)
+    if params.seed.source == "click":
+        raise click.UsageError("there is nobody to click here; use --seed-source file")
+    report = CandidateReport()
+    fill(report, recording, by_pipeline(params), limit=limit, **where)
+    content = report.compute()
+    write_json(json_file, content)
+    if report.frames == 0:
+        raise no_labels(recording, report.skipped, "a Pedestrian label")
+    print_candidate_report(content, console)
+    if png is not None:
+        _draw(png, recording, report, params)
+
+
+def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> None:
+    """The frame with most pedestrians of those that have candidates."""
+    from lidar_perception.candidates.pipeline import find_candidates
+    from lidar_perception.candidates.seeds import load_seed
+    from lidar_perception.scoring.centres.report import pedestrians, seed_source
+    from lidar_perception.scoring.pictures import draw_frame
+    best = report.with_most()
+    if best is None:
+        return
+    template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
+    frame = next(frame for frame in recording if frame.name == best)
+    truth = pedestrians(frame.truth())
+    segmented, found = find_candidates(frame.load(), seed_source(truth, template, params),
+                                       frame.camera(), params)
+    draw_frame(png, segmented.xyz, segmented.ground, segmented.cluster_ids, truth,
+               found.final.boxes, title=f"frame {frame.name}")
+    console.print(f"picture: {png}")

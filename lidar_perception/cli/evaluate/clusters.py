@@ -1,0 +1,56 @@
+"""evaluate clusters: a cluster network's classes against labels, without ROS."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from lidar_perception.cli.data import (
+    a_path,
+    frame_options,
+    json_option,
+    no_labels,
+    one_way,
+    opened,
+    write_json,
+)
+from lidar_perception.runs.terminal import console
+
+
+@click.command()
+@frame_options
+@a_path("--weights", "Checkpoint of a cluster network. Default: the one that comes with the "
+        "package.")
+@json_option
+def clusters(data: Path, split: Path | None, limit: int | None, jobs: int, dask: str | None,
+             weights: Path | None, json_file: Path | None) -> None:
+    """Classes that a cluster network (paper C) gives to clusters, and so to points.
+
+    Clusters are made as the network asks for. One is an object if half of its points or more lie
+    in the object's box, and background if less than 15 percent lie in any; the others, and Van,
+    Truck, Tram, Person_sitting and what lies in a DontCare region, do not count. Only points in
+    the image count, as labels end there; without a camera all do.
+
+    \b
+    Example:
+      lidar-perception evaluate clusters --data /data/kitti/object --json clusters.json
+    """
+    from lidar_perception.data.frame import BOXES
+    from lidar_perception.detectors.checkpoint import read_header
+    from lidar_perception.detectors.pointnet.config import PointNetConfig
+    from lidar_perception.detectors.pointnet.weights_file import WEIGHTS
+    from lidar_perception.scoring.points.cluster_tables import print_cluster_scores
+    from lidar_perception.scoring.points.clusters import ClusterScores, by_network
+    from lidar_perception.scoring.run import fill
+
+    where, file = one_way(jobs, dask), weights or WEIGHTS
+    scores = ClusterScores(read_header(file, PointNetConfig).config.classes)
+    recording = opened(data, split=split)
+    recording.require(BOXES, "evaluate clusters")
+    fill(scores, recording, by_network(file), limit=limit, **where)
+    content = {"source": str(weights or "the package's own"), **scores.compute()}
+    write_json(json_file, content)
+    if not scores.frames:
+        raise no_labels(recording, scores.skipped)
+    print_cluster_scores(content, console)

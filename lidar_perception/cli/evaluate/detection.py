@@ -1,0 +1,90 @@
+"""evaluate detection: boxes with scores against labels, without ROS."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import click
+
+from lidar_perception.cli.data import (
+    a_path,
+    device_option,
+    frame_options,
+    json_option,
+    no_labels,
+    one_way,
+    opened,
+    write_json,
+)
+from lidar_perception.detectors.params import MIN_SCORE
+from lidar_perception.runs.terminal import console
+from lidar_perception.types import InputError
+
+
+@click.command()
+@frame_options
+@a_path("--results", "Result files of any detector, in KITTI's format: DIR/000000.txt ...", "DIR")
+@a_path("--weights", "Run the detector of this checkpoint, PointPillars or PointNet.")
+@device_option
+@click.option("--min-score", type=click.FloatRange(0, 1), default=MIN_SCORE, show_default=True,
+              help="Boxes of --weights with a lower score are left out. AP is made of precision "
+              "at every recall, so it needs those that a robot would not act on.")
+@click.option("--keep", type=click.FloatRange(0, 1), default=1.0, metavar="SHARE",
+              help="Keep only this share of the points of each scan, 0..1, drawn at random but "
+              "always the same. Default: 1.")
+@a_path("--write-results", "Write what --weights detect as KITTI result files, frames without "
+        "labels too.", "DIR")
+@json_option
+def detection(data: Path, split: Path | None, limit: int | None, jobs: int, dask: str | None,
+              results: Path | None, weights: Path | None, device: str, min_score: float,
+              keep: float, write_results: Path | None, json_file: Path | None) -> None:
+    """Boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
+
+    Average precision in the image, from above and in space, and of orientation, at 40 and 11
+    recall points; pedestrians by centre distance as in the STM-CPA paper. Either of a detector's
+    result files, or of a checkpoint, which is run on every scan.
+
+    \b
+    Examples:
+      lidar-perception evaluate detection --data /data/kitti/object --results out/data
+      lidar-perception evaluate detection --data /data/kitti/object --weights v4.safetensors \\
+          --split val.txt --json scores.json --write-results out/data
+      lidar-perception evaluate detection --data drive --weights v4.safetensors --keep 0.1
+    """
+    from lidar_perception.data.frame import BOXES
+    from lidar_perception.detectors.open import open_detector
+    from lidar_perception.scoring.detections import by_detector, by_files
+    from lidar_perception.scoring.kitti.report import DetectionReport
+    from lidar_perception.scoring.kitti.tables import print_detection_report
+    from lidar_perception.scoring.run import fill
+
+    if (results is None) == (weights is None):
+        raise click.UsageError("give either --results DIR or --weights FILE")
+    if write_results is not None and weights is None:
+        raise click.UsageError("--write-results writes what --weights detect; --results DIR has "
+                               "its files already")
+    if keep != 1 and weights is None:
+        raise click.UsageError("--keep thins the scans that --weights see; --results DIR sees none")
+    where = one_way(jobs, dask)
+    recording = opened(data, split=split, scans=weights is not None)
+    if write_results is None:
+        recording.require(BOXES, "evaluate detection")
+    if results is not None:
+        if not results.is_dir():
+            raise InputError(f"{results} is not a folder; give the folder of the result files")
+        start = by_files(results)
+    else:
+        height = recording.frames[0].sensor_height
+        open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height)
+        start = by_detector(open_, keep, write_results)
+    report = DetectionReport()
+    fill(report, recording, start, limit=limit, **where)
+    content = {"source": str(results or weights), "keep": keep, **report.compute()}
+    write_json(json_file, content)
+    if write_results is not None:
+        console.print(f"result files: {write_results}")
+    if report.frames:
+        print_detection_report(content, console)
+    elif write_results is None or report.skipped:
+        raise no_labels(recording, report.skipped)

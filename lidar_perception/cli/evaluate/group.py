@@ -1,0 +1,20 @@
+"""evaluate: scores without ROS."""
+
+from __future__ import annotations
+
+import click
+
+from lidar_perception.cli.evaluate.candidates import candidates
+from lidar_perception.cli.evaluate.clusters import clusters
+from lidar_perception.cli.evaluate.detection import detection
+from lidar_perception.cli.evaluate.nuscenes import nuscenes
+from lidar_perception.cli.evaluate.segmentation import segmentation
+
+
+@click.group()
+def evaluate() -> None:
+    """Score the algorithms without ROS."""
+
+
+for command in candidates, clusters, detection, nuscenes, segmentation:
+    evaluate.add_command(command)

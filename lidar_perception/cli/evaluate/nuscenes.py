@@ -1,0 +1,82 @@
+"""evaluate nuscenes: boxes with scores against the labels of nuScenes."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import click
+
+from lidar_perception.cli.data import (
+    a_path,
+    device_option,
+    frame_options,
+    json_option,
+    no_labels,
+    one_way,
+    opened,
+    write_json,
+)
+from lidar_perception.runs.terminal import console
+from lidar_perception.types import InputError
+
+
+@click.command()
+@frame_options
+@a_path("--results", "Result file of any detector, in the format of nuScenes' detection task.",
+        "JSON")
+@a_path("--weights", "Run the detector of this checkpoint, PointPillars or PointNet.")
+@device_option
+@a_path("--write-results", "Write what --weights detect as a result file, frames without labels "
+        "too.", "JSON")
+@json_option
+def nuscenes(data: Path, split: Path | None, limit: int | None, jobs: int, dask: str | None,
+             results: Path | None, weights: Path | None, device: str, write_results: Path | None,
+             json_file: Path | None) -> None:
+    """Boxes by the protocol of nuScenes' detection task.
+
+    Average precision by centre distance at 0.5, 1, 2 and 4 m, the five errors of true positives and
+    NDS, over all ten classes, and over the three that our detectors know. Either of a result file,
+    or of a checkpoint, which is run on every key frame. PATH is the folder of nuScenes, or that of
+    one version in it; --split names scenes.
+
+    \b
+    Examples:
+      lidar-perception evaluate nuscenes --data /data/nuscenes --results results.json
+      lidar-perception evaluate nuscenes --data /data/nuscenes/v1.0-trainval \\
+          --split val.txt --weights v4.safetensors --json scores.json
+    """
+    from lidar_perception.data.nuscenes.folder import KeyFrame
+    from lidar_perception.data.nuscenes.results import write_results as write_result_file
+    from lidar_perception.detectors.open import open_detector
+    from lidar_perception.scoring.nuscenes.report import NuscenesReport, by_detector, by_file
+    from lidar_perception.scoring.nuscenes.tables import print_nuscenes_report
+    from lidar_perception.scoring.run import fill
+
+    if (results is None) == (weights is None):
+        raise click.UsageError("give either --results JSON or --weights FILE")
+    if write_results is not None and weights is None:
+        raise click.UsageError("--write-results writes what --weights detect; --results JSON is "
+                               "such a file already")
+    where = one_way(jobs, dask)
+    recording = opened(data, split=split)
+    first = recording.frames[0]
+    if not isinstance(first.native, KeyFrame):
+        raise InputError(f"{data} ({recording.layout}) is not nuScenes; use evaluate detection")
+    if results is not None:
+        start = by_file(results)
+    else:
+        start = by_detector(partial(open_detector, weights, device,
+                                    sensor_height=first.sensor_height), write_results is not None)
+    report = NuscenesReport()
+    fill(report, recording, start, limit=limit, **where)
+    content = {"source": str(results or weights), "version": recording.layout.split()[-1],
+               **report.compute()}
+    if write_results is not None:
+        write_result_file(write_results, report.boxes)
+        console.print(f"result file: {write_results}")
+    write_json(json_file, content)
+    if report.frames:
+        print_nuscenes_report(content, console)
+    elif write_results is None or report.skipped:
+        raise no_labels(recording, report.skipped)

@@ -1,0 +1,111 @@
+"""evaluate segmentation: scores of ground and clusters, without ROS."""
+
+from __future__ import annotations
+
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.markup import escape
+
+from lidar_perception.cli.data import (
+    WHAT,
+    a_path,
+    dask_option,
+    jobs_option,
+    json_option,
+    limit_option,
+    no_labels,
+    one_way,
+    opened,
+    split_option,
+    write_json,
+)
+from lidar_perception.cli.options import parameter_options
+from lidar_perception.clustering.params import CLUSTERING_METHODS
+from lidar_perception.ground.params import GROUND_METHODS
+from lidar_perception.runs.terminal import console, errors
+from lidar_perception.scoring.points.report import SegmentationParams
+
+
+class MethodList(click.ParamType):
+    """Comma-separated names of methods."""
+
+    name = "names"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple:
+        names = value if isinstance(value, tuple) else tuple(str(value).split(","))
+        known = GROUND_METHODS + CLUSTERING_METHODS
+        if unknown := [name for name in names if name not in known]:
+            self.fail(f"{unknown[0]!r} is no method; known are {', '.join(known)}", param, ctx)
+        return names
+
+
+@click.command()
+@a_path("--data", f"{WHAT} May be repeated.", "PATH", multiple=True, required=True)
+@split_option
+@limit_option
+@jobs_option
+@dask_option
+@click.option("--methods", type=MethodList(), default=GROUND_METHODS + CLUSTERING_METHODS,
+              help="Methods to score, of ground and of clustering, with commas between. "
+              "Default: all.")
+@json_option
+@a_path("--png", "Draw the ground of the first scan with labelled points from above.")
+@parameter_options(SegmentationParams())
+def segmentation(data: tuple[Path, ...], split: Path | None, limit: int | None, jobs: int,
+                 dask: str | None, methods: tuple, json_file: Path | None, png: Path | None,
+                 params: SegmentationParams) -> None:
+    """Ground and clusters against labels.
+
+    Ground: each method against the classes of SemanticKITTI's points. Clusters: each method, on
+    what --ground-method leaves, against SemanticKITTI's instances or labelled boxes; with boxes,
+    only the points in the camera's view where there is a calibration.
+
+    \b
+    Examples:
+      lidar-perception evaluate segmentation --data /data/semantickitti --png ground.png
+      lidar-perception evaluate segmentation --data /data/kitti/object --ground-method patchwork
+      lidar-perception evaluate segmentation --data drive.bag --methods dbscan --json scores.json
+    """
+    from lidar_perception.data.frame import BOXES, POINT_LABELS
+    from lidar_perception.scoring.points.report import SegmentationReport, by_methods
+    from lidar_perception.scoring.points.tables import draw_ground, print_scores
+    from lidar_perception.scoring.run import fill
+
+    where = one_way(jobs, dask)
+    grounds = tuple(name for name in GROUND_METHODS if name in methods)
+    clusterings = tuple(name for name in CLUSTERING_METHODS if name in methods)
+    # Everything is opened first: a typing error in the last path should not cost an hour.
+    recordings = [opened(path, split=split) for path in data]
+    labelled = [each for each in recordings if POINT_LABELS in each.has]
+    for recording in recordings:
+        if recording not in labelled:
+            recording.require(BOXES, "evaluate segmentation")
+    if png is not None and not (labelled and grounds):
+        raise click.UsageError("--png draws the ground of a scan with labelled points: give "
+                               "SemanticKITTI and a method of ground")
+    if not (labelled or clusterings):
+        raise click.UsageError("ground is scored on labelled points only: give SemanticKITTI or a "
+                               "method of clustering")
+    report = SegmentationReport()
+    for recording in recordings:
+        report.source = recording.layout
+        fill(report, recording, by_methods(params, grounds, clusterings), limit=limit,
+             title=recording.layout, **where)
+    content = report.compute()
+    write_json(json_file, content)
+    if not (report.ground or report.clusters):
+        raise no_labels(recordings[0], report.skipped)
+    if report.whole:
+        errors.print(f"{escape(', '.join(str(path) for path in data))}: {report.whole} frames "
+                     "without a camera calibration were taken as a whole")
+    print_scores(content, params.ground.method, console)
+    if png is not None:
+        from lidar_perception.scoring.points.report import ground_of_methods
+        for frame in islice(labelled[0], limit):
+            scan, labels, found = ground_of_methods(frame, params, grounds)
+            draw_ground(png, frame.name, scan, labels.classes, found)
+            break
+        console.print(f"picture: {png}")

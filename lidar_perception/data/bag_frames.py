@@ -1,0 +1,121 @@
+"""The clouds of a bag as labelled frames, with the labels and the camera that lie beside them."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+from lidar_perception.camera import Calibration
+from lidar_perception.data.bag import Bag
+from lidar_perception.data.frame import BOXES, CAMERA, Frame, Recording
+from lidar_perception.types import GroundTruth, InputError, LidarFrame
+from lidar_perception.wire.codec import decode
+from lidar_perception.wire.messages import calibration_of, to_frame, to_truth
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
+from msg_utils.markers import from_marker_array
+from msg_utils.stamps import SECOND
+
+BESIDE = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}}  # what is known by these topics
+
+
+def recognises(path: Path) -> bool:
+    """Whether a bag lies there: a file, or a folder with one."""
+    if path.is_file():
+        return True  # nothing else is one file
+    return (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
+
+
+def open_recording(path: Path, *, points: str = POINTS, scans: bool = True) -> Recording:
+    """Frames of the clouds on the topic `points`. InputError if there is none."""
+    with Bag(path) as bag:
+        bag.require(points)
+        topics = set(bag.topics)
+        frames = BagFrames(path, points, bag.topics[points], bag.counts[points])
+    has = frozenset(what for what, needed in BESIDE.items() if needed <= topics)
+    return Recording(path, f"rosbag2 bag, clouds on {points}", frames, has)
+
+
+class BagFrames(Sequence):
+    """The frames in order of time. Iterating reads the bag once; a frame by its number is looked
+    up in the bag's index, after one look through the bag for the times of all."""
+
+    def __init__(self, path: Path, points: str, kind: str, count: int):
+        self.path, self.points, self.kind, self.count = path, points, kind, count
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __iter__(self) -> Iterator[Frame]:
+        with Bag(self.path) as bag:
+            for i, (_, time, data) in enumerate(bag.raw({self.points})):
+                yield self._frame(i, time, data)
+
+    def __getitem__(self, i):
+        if isinstance(i, slice):
+            return [self[k] for k in range(*i.indices(self.count))]
+        if not -self.count <= i < self.count:
+            raise IndexError(i)
+        i %= self.count
+        time = self._times[i]
+        before = i - self._times.index(time)  # of the same time
+        with Bag(self.path) as bag:
+            same = [data for _, _, data in bag.raw({self.points}, time, time + 1)]
+        return self._frame(i, time, same[before])
+
+    @cached_property
+    def _times(self) -> list[int]:
+        with Bag(self.path) as bag:
+            return [time for _, time, _ in bag.raw({self.points})]
+
+    @cached_property
+    def _beside(self) -> tuple[dict[int, GroundTruth], list, list]:
+        """Labels by stamp, and calibrations and transforms by time: they are small, and may come
+        after their cloud."""
+        truth: dict[int, GroundTruth] = {}
+        infos, transforms = [], []
+        with Bag(self.path) as bag:
+            wanted = {TRUTH, CAMERA_INFO, EXTRINSICS} & set(bag.topics)
+            for topic, time, msg in bag.messages(wanted):
+                if topic == TRUTH:
+                    objects = from_marker_array(msg)
+                    truth[objects.stamp_ns or time] = to_truth(objects)
+                else:
+                    (infos if topic == CAMERA_INFO else transforms).append((time, msg))
+        return truth, infos, transforms
+
+    def _frame(self, i: int, time: int, data: bytes) -> Frame:
+        stamp = _stamp(data)
+        return Frame(str(time if stamp is None else stamp), time if stamp is None else stamp,
+                     partial(self._load, time, data), partial(self._truth, stamp),
+                     calibration=partial(self._calibration, time), index=i)
+
+    def _load(self, time: int, data: bytes) -> LidarFrame:
+        try:
+            return to_frame(decode(data, self.kind), intensity_max=0.0)[0]
+        except InputError as error:
+            raise InputError(f"{self.path}, topic {self.points} at {time} ns: {error}") from None
+
+    def _truth(self, stamp: int | None) -> GroundTruth | None:
+        return self._beside[0].get(stamp)
+
+    def _calibration(self, time: int) -> Calibration | None:
+        _, infos, transforms = self._beside
+        info, transform = _latest(infos, time), _latest(transforms, time)
+        return calibration_of(info, transform) if info and transform else None
+
+
+def _stamp(data: bytes) -> int | None:
+    """header.stamp of a serialised message; None if it is too short to have one."""
+    if len(data) < 12:
+        return None
+    seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
+    return seconds * SECOND + nanoseconds
+
+
+def _latest(messages: list, time: int) -> Any:
+    """The last message up to a time, or else the first: latched topics hold from the start."""
+    before = [m for t, m in messages if t <= time]
+    return before[-1] if before else messages[0][1] if messages else None

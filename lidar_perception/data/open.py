@@ -1,0 +1,66 @@
+"""One opener for every recording: it looks at what lies there, so that nobody need say it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from lidar_perception.data import bag_frames, semantickitti
+from lidar_perception.data.frame import Recording
+from lidar_perception.data.kitti import folder as kitti
+from lidar_perception.data.nuscenes import folder as nuscenes
+from lidar_perception.types import InputError
+from lidar_perception.wire.topics import POINTS
+
+# Each has recognises(path) and open_recording(path, ...); a new data set is one line here.
+LAYOUTS = (bag_frames, nuscenes, semantickitti, kitti)
+
+
+def open_recording(path: str | Path, *, split: str | Path | None = None, points: str = POINTS,
+                   scans: bool = True) -> Recording:
+    """The frames at a path: a rosbag2 bag, or a folder of KITTI (object, tracking, raw, or what
+    `simulate` wrote), nuScenes or SemanticKITTI, or one of its inner folders.
+
+    split: file that names frames or whole sequences, one a line; only these, in its order. points:
+    topic of the clouds of a bag. Without scans, labels are enough to make a frame of KITTI.
+    InputError says what is missing, and what can be opened.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise InputError(f"there is no {path}; give a bag or the folder of a data set")
+    layout = next((layout for layout in LAYOUTS if layout.recognises(path)), None)
+    if layout is None:
+        raise InputError(f"{path} is no recording that can be read: expected a rosbag2 bag, or "
+                         "the folder of KITTI (velodyne/ or training/velodyne/, or raw drives), "
+                         "nuScenes (v1.0-*/ and samples/) or SemanticKITTI (sequences/00/)")
+    recording = layout.open_recording(path, points=points, scans=scans)
+    recording = replace(recording, reopen=partial(open_recording, path, split=split, points=points,
+                                                  scans=scans))
+    return recording if split is None else _of_split(recording, Path(split))
+
+
+def _of_split(recording: Recording, split: Path) -> Recording:
+    """The frames that a file names, by themselves or by their sequence, each once."""
+    try:
+        names = split.read_text().split()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read the split {split}: {error}") from None
+    first = recording.frames[0].name
+    if not names:
+        raise InputError(f"{split} names no frame; it needs one a line, such as {first}")
+    frames = {frame.name: frame for frame in recording}
+    sequences: dict[str, list[str]] = {}
+    for name, frame in frames.items():
+        sequences.setdefault(frame.sequence, []).append(name)
+    chosen: dict[str, None] = {}
+    unknown: list[str] = []
+    for name in names:
+        found: Sequence[str] = [name] if name in frames else sequences.get(name, ())
+        chosen.update(dict.fromkeys(found))
+        unknown += [] if found else [name]
+    if unknown:
+        raise InputError(f"{split} names {unknown[0]} ({len(unknown)} such), which is not in "
+                         f"{recording.path}; its first frame is {first}")
+    return recording.chosen(list(chosen))

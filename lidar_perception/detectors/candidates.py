@@ -1,0 +1,58 @@
+"""STM-CPA candidates (paper A) as a detector of pedestrians: the pipeline, with its seed source."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from lidar_perception.camera import Camera
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import find_candidates
+from lidar_perception.candidates.seed_sources import SeedSource
+from lidar_perception.candidates.segmented import explain_nothing
+from lidar_perception.detectors.contract import Found, require_columns
+from lidar_perception.param_fields import with_values
+from lidar_perception.types import CLASSES, PEDESTRIAN, LidarFrame
+
+
+@dataclass(frozen=True)
+class CandidateDetector:
+    """A detector, see contract.py. seed: where the seed pedestrian comes from; camera: needed
+    where params crop to its view."""
+
+    seed: SeedSource
+    camera: Camera | None = None
+    params: PipelineParams = PipelineParams()
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """Pedestrian."""
+        return (CLASSES[PEDESTRIAN],)
+
+    @property
+    def _threshold(self) -> str:
+        """The parameter that says from which score on a candidate counts."""
+        return "confidence.threshold" if self.params.confidence.enabled else "stm.threshold"
+
+    @property
+    def min_scores(self) -> Mapping[str, float]:
+        """By class, the least score of a detection."""
+        group, name = self._threshold.split(".")
+        return {self.classes[0]: getattr(getattr(self.params, group), name)}
+
+    def with_min_score(self, min_score: float) -> CandidateDetector:
+        """The same detector with this least score."""
+        return CandidateDetector(self.seed, self.camera,
+                                 with_values(self.params, {self._threshold: min_score}))
+
+    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
+                 cluster_ids: np.ndarray | None = None) -> Found:
+        """See contract.Detector. InputError where there is no seed, and without a camera where
+        params crop to its view."""
+        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
+        segmented, candidates = find_candidates(frame, self.seed, self.camera, self.params,
+                                                ground=ground, cluster_ids=cluster_ids)
+        return Found(candidates.final, candidates.ms,
+                     explain_nothing(len(frame), segmented.ground, segmented.cluster_ids))

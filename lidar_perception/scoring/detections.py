@@ -1,0 +1,91 @@
+"""What a detector, or a file of its results, says of a frame, measured for any protocol."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+
+from lidar_perception.camera import Calibration
+from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.data.kitti.results import read_results, write_results
+from lidar_perception.detectors.contract import Detector
+from lidar_perception.scoring.run import RunError, Start
+from lidar_perception.scoring.thinning import thinned
+from lidar_perception.types import Detections, GroundTruth, InputError
+
+
+@dataclass(frozen=True)
+class Detected:
+    """One frame. detections: of a detector, or labels with a score in extras (a result file); ms:
+    of the detector, None where none ran; problem: why it refused the frame, whose objects are then
+    missed, or None. truth is None where the frame has no labels, calibration without a camera."""
+
+    name: str
+    truth: GroundTruth | None
+    detections: Detections | GroundTruth
+    calibration: Calibration | None = None
+    ms: float | None = None
+    problem: str | None = None
+
+
+def detected(detector: Detector, frame: Frame, truth: GroundTruth | None,
+             calibration: Calibration | None, keep: float = 1.0) -> Detected:
+    """Run a detector on a frame, of which it sees a share `keep` of the points. InputError where
+    the scan cannot be read."""
+    scan = thinned(frame.load(), keep, frame.name)
+    begin = perf_counter()
+    try:
+        found = detector(scan)
+    except InputError as error:
+        return Detected(frame.name, truth, Detections.none(), calibration, problem=str(error))
+    return Detected(frame.name, truth, found.detections, calibration,
+                    (perf_counter() - begin) * 1e3)
+
+
+def by_detector(open_: Callable[[], Detector], keep: float = 1.0,
+                folder: Path | None = None) -> Start:
+    """Run the detector that open_() gives on every frame with labels; with a folder on all frames,
+    and write what it says there as KITTI result files."""
+    return partial(_by_detector, open_, keep, folder)
+
+
+def _by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
+                 recording: Recording) -> Callable[[Frame], Detected | None]:
+    detector = open_()
+
+    def measure(frame: Frame) -> Detected | None:
+        truth, calibration = frame.truth(), frame.calibration()
+        if truth is None and folder is None:
+            return None
+        result = detected(detector, frame, truth, calibration, keep)
+        if folder is not None:
+            if calibration is None:
+                raise RunError(f"{recording.path} ({recording.layout}) has no camera calibration, "
+                               "which KITTI's result files need")
+            write_results(folder / f"{frame.name}.txt", result.detections, calibration)
+        return result
+    return measure
+
+
+def by_files(folder: Path) -> Start:
+    """Read KITTI result files, folder/NAME.txt, of every frame with labels."""
+    return partial(_by_files, folder)
+
+
+def _by_files(folder: Path, recording: Recording) -> Callable[[Frame], Detected | None]:
+    def measure(frame: Frame) -> Detected | None:
+        truth, calibration = frame.truth(), frame.calibration()
+        if truth is None:
+            return None
+        if calibration is None:
+            raise RunError(f"{recording.path} ({recording.layout}) has no camera calibration, in "
+                           "whose frame KITTI's result files are")
+        try:
+            found = read_results(folder / f"{frame.name}.txt", calibration.lidar_to_camera)
+        except InputError as error:
+            raise RunError(str(error)) from None
+        return Detected(frame.name, truth, found, calibration)
+    return measure

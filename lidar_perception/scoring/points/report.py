@@ -1,0 +1,152 @@
+"""Ground and clusters of every method against labelled points or boxes, frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.candidates.segmented import points_in_view
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.clustering.params import ClusteringParams
+from lidar_perception.data.frame import Frame, PointTruth, Recording
+from lidar_perception.ground.params import GroundParams
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.scoring.points.segmentation import (
+    ClusterReport,
+    GroundReport,
+    Objects,
+    ground_by_protocol,
+    objects_in_boxes,
+    objects_of_instances,
+    score_clusters,
+)
+from lidar_perception.scoring.run import Start
+from lidar_perception.types import LidarFrame
+from lidar_perception.wire.params import ViewParams
+
+
+@dataclass(frozen=True)
+class SegmentationParams:
+    """The groups that matter here. The camera's view is on: KITTI has labels there only."""
+
+    view: ViewParams = ViewParams(enabled=True)
+    ground: GroundParams = GroundParams()
+    clustering: ClusteringParams = ClusteringParams()
+
+
+@dataclass(frozen=True)
+class SegmentationResult:
+    """One frame: by ground method what GroundReport.update takes, by clustering method what
+    ClusterReport.update takes; whole: there was no camera to crop to."""
+
+    ground: dict[str, tuple] = field(default_factory=dict)
+    clusters: dict[str, tuple] = field(default_factory=dict)
+    whole: bool = False
+
+
+def by_methods(params: SegmentationParams, grounds: tuple[str, ...],
+               clusterings: tuple[str, ...]) -> Start:
+    """Run the methods on every frame with labels. Labelled points judge the ground, and clusters
+    by their instances; labelled boxes judge clusters, on the ground of params, in the camera's
+    view where there is a camera."""
+    return partial(_by_methods, params, grounds, clusterings)
+
+
+def _by_methods(params: SegmentationParams, grounds: tuple[str, ...], clusterings: tuple[str, ...],
+                recording: Recording) -> Callable[[Frame], SegmentationResult | None]:
+    timed = Timed()
+
+    def on_points(frame: Frame, labels: Any) -> SegmentationResult:
+        scan, found, ground = frame.load(), {}, {}
+        for name in grounds:
+            found[name], ms = timed(segment_ground, scan, replace(params.ground, method=name))
+            ground[name] = ground_by_protocol(found[name], labels.classes, scan.xyz[:, 2]), ms
+        if not clusterings:
+            return SegmentationResult(ground)
+        chosen = found.get(params.ground.method)
+        if chosen is None:
+            chosen = segment_ground(scan, params.ground)
+        objects = objects_of_instances(scan.xyz, labels.classes, labels.instances)
+        return SegmentationResult(ground, clustered(scan, chosen, objects))
+
+    def on_boxes(frame: Frame, truth: Any) -> SegmentationResult:
+        scan, camera = frame.load(), frame.camera()
+        if camera is not None:
+            _, scan = points_in_view(scan, camera, params.view)
+        return SegmentationResult({}, clustered(scan, segment_ground(scan, params.ground),
+                                                objects_in_boxes(scan.xyz, truth)),
+                                  whole=camera is None and params.view.enabled)
+
+    def clustered(scan: LidarFrame, ground: np.ndarray, objects: Objects) -> dict:
+        scores = {}
+        for name in clusterings:
+            ids, ms = timed(cluster_obstacles, scan.xyz, ground,
+                            replace(params.clustering, method=name))
+            scores[name] = objects.classes, objects.ranges, score_clusters(ids, objects), ms
+        return scores
+
+    def measure(frame: Frame) -> SegmentationResult | None:
+        labels = frame.point_truth()
+        if labels is not None:
+            return on_points(frame, labels)
+        truth = frame.truth()
+        return None if truth is None or not clusterings else on_boxes(frame, truth)
+    return measure
+
+
+class Timed:
+    """timed(function, *arguments): the result and the milliseconds; the first time of a method
+    after a run that loads compiled code."""
+
+    def __init__(self) -> None:
+        self.warm: set[tuple[Any, str]] = set()
+
+    def __call__(self, function: Callable, *arguments: Any) -> tuple[Any, float]:
+        key = function, arguments[-1].method
+        if key not in self.warm:
+            function(*arguments)
+            self.warm.add(key)
+        start = perf_counter()
+        result = function(*arguments)
+        return result, (perf_counter() - start) * 1e3
+
+
+@dataclass
+class SegmentationReport:
+    """Ground by method, clusters by source and method, frames left out. source: the layout of the
+    recording that comes next; whole: frames that had no camera to crop to."""
+
+    source: str = ""
+    ground: dict[str, GroundReport] = field(default_factory=dict)
+    clusters: dict[str, dict[str, ClusterReport]] = field(default_factory=dict)
+    skipped: list[str] = field(default_factory=list)
+    whole: int = 0
+
+    def update(self, result: SegmentationResult) -> None:
+        """One frame."""
+        for name, counts in result.ground.items():
+            self.ground.setdefault(name, GroundReport()).update(*counts)
+        for name, scores in result.clusters.items():
+            self.clusters.setdefault(self.source, {}).setdefault(
+                name, ClusterReport()).update(*scores)
+        self.whole += result.whole
+
+    def compute(self) -> dict[str, Any]:
+        """What the JSON file holds."""
+        return {"ground": {name: report.compute() for name, report in self.ground.items()},
+                "clusters": {source: {name: report.compute() for name, report in reports.items()}
+                             for source, reports in self.clusters.items()},
+                "skipped": self.skipped}
+
+
+def ground_of_methods(frame: Frame, params: SegmentationParams, grounds: tuple[str, ...]
+                      ) -> tuple[LidarFrame, PointTruth | None, dict[str, np.ndarray]]:
+    """A frame, its labels, and the ground (N,) bool by each method, for a picture."""
+    scan = frame.load()
+    return scan, frame.point_truth(), {
+        name: segment_ground(scan, replace(params.ground, method=name)) for name in grounds}

@@ -1,0 +1,167 @@
+"""The one loop over labelled frames: in this process, in many, or on the machines of a Dask
+cluster, in the order of the frames whatever is done where.
+
+    for name, result in results(recording, start, jobs=4): ...
+    fill(report, recording, start)          # update() with each result, skipped frames named
+
+start(recording) is called once in each process and gives measure(frame): what the frame says, any
+value that can be sent between processes, or None where it says nothing. InputError from measure, or
+from reading the frame in it, skips the frame.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import CancelledError
+from contextlib import closing
+from itertools import islice
+from typing import Any, Protocol
+from uuid import uuid4
+
+from threadpoolctl import threadpool_limits
+
+from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.runs.processes import in_processes
+from lidar_perception.runs.terminal import track
+from lidar_perception.types import InputError
+
+Start = Callable[[Recording], Callable[[Frame], Any]]
+
+CONNECT_S = 20.0  # for a Dask scheduler to answer and a first worker to come
+AHEAD = 2         # futures in flight for each thread of a Dask cluster
+
+
+class Report(Protocol):
+    """Collects what was measured. skipped: why frames do not count, a line each."""
+
+    skipped: list[str]
+
+    def update(self, result: Any) -> None:
+        """Add what measure() gave for one frame."""
+
+    def compute(self) -> dict[str, Any]:
+        """All of it, as JSON can hold it."""
+
+
+class Skipped(str):
+    """Why a frame could not be measured."""
+
+
+class RunError(InputError):
+    """Ends the whole run instead of skipping a frame: what is to be judged cannot be read."""
+
+
+def fill(report: Report, recording: Recording, start: Start, *, limit: int | None = None,
+         jobs: int = 1, dask: str | None = None, title: str = "evaluating") -> None:
+    """Update a report with the first `limit` frames of a recording, or all, under a progress bar.
+    InputError if a process or a cluster fails."""
+    count = min(len(recording), limit or len(recording))
+    found = results(recording, start, range(count), jobs=jobs, dask=dask)
+    with closing(found):
+        for _, result in track(found, title, count):
+            if isinstance(result, Skipped):
+                report.skipped.append(str(result))
+            elif result is not None:
+                report.update(result)
+
+
+def results(recording: Recording, start: Start, numbers: Sequence[int] | None = None, *,
+            jobs: int = 1, dask: str | None = None) -> Iterator[tuple[int, Any]]:
+    """(i, what measure gave for frame i, or Skipped) of the frames with these numbers, ascending,
+    or of all, in their order.
+
+    jobs processes measure, or with dask the workers of the cluster whose scheduler has that
+    address; they need this package and see the recording under the same path. InputError if a
+    process or a cluster fails.
+    """
+    numbers = range(len(recording)) if numbers is None else numbers
+    if dask is not None:
+        return in_order(_on_dask(dask, recording, start, numbers), numbers)
+    if jobs > 1 and len(numbers) > 1:
+        work = functools.partial(_worker, recording.reopen, start)
+        return in_order(in_processes(work, numbers, jobs, "measured frames"), numbers)
+    return _here(recording, start, numbers)
+
+
+def in_order(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]
+             ) -> Iterator[tuple[int, Any]]:
+    """The pairs (number, value) in the order of these numbers, each as soon as it can be."""
+    waiting: dict[int, Any] = {}
+    wanted = iter(numbers)
+    following = next(wanted, None)
+    for number, value in pairs:
+        waiting[number] = value
+        while following in waiting:
+            yield following, waiting.pop(following)
+            following = next(wanted, None)
+
+
+def _here(recording: Recording, start: Start, numbers: Sequence[int]) -> Iterator[tuple[int, Any]]:
+    measure, wanted = start(recording), set(numbers)
+    for i, frame in enumerate(islice(recording, max(wanted, default=-1) + 1)):
+        if i in wanted:
+            yield i, _measured(measure, frame)
+
+
+def _measured(measure: Callable[[Frame], Any], frame: Frame) -> Any:
+    try:
+        return measure(frame)
+    except RunError:
+        raise
+    except InputError as error:
+        return Skipped(error)
+    except Exception as error:
+        error.add_note(f"while frame {frame.name} was measured")
+        raise
+
+
+def _worker(reopen: Callable[[], Recording], start: Start) -> Callable[[int], tuple[int, Any]]:
+    """What takes the number of a frame to what is measured of it, made in the process that will
+    use it: frames are not sent to another."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # for libraries that are loaded later
+    threadpool_limits(1)
+    recording = reopen()
+    measure = start(recording)
+    return lambda i: (i, _measured(measure, recording.frames[i]))
+
+
+_kept_open = functools.lru_cache(maxsize=1)(lambda run, reopen, start: _worker(reopen, start))
+
+
+def _on_cluster(run: str, reopen: Callable[[], Recording], start: Start, i: int) -> tuple[int, Any]:
+    """As a worker, in a process that may serve other runs before and after."""
+    with threadpool_limits(1):
+        return _kept_open(run, reopen, start)(i)
+
+
+def _on_dask(address: str, recording: Recording, start: Start,
+             numbers: Sequence[int]) -> Iterator[tuple[int, Any]]:
+    """As the workers of a Dask cluster finish them."""
+    try:
+        import distributed
+        from distributed.comm import CommClosedError
+    except ImportError:
+        raise InputError("--dask needs the package distributed; pip install "
+                         "'lidar_perception[distributed]'") from None
+    work = functools.partial(_on_cluster, uuid4().hex, recording.reopen, start)
+    try:
+        client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
+        client.wait_for_workers(1, timeout=CONNECT_S)
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot reach a Dask scheduler with workers at {address}: "
+                         f"{str(error) or repr(error)}") from None
+    with client:
+        ahead = AHEAD * sum(client.nthreads().values())
+        waiting = iter(numbers)
+        running = distributed.as_completed(client.map(work, [*islice(waiting, ahead)], pure=False),
+                                           loop=client.loop)
+        try:
+            for future in running:
+                yield future.result()
+                for number in islice(waiting, 1):
+                    running.add(client.submit(work, number, pure=False))
+        except (distributed.KilledWorker, CommClosedError, CancelledError) as error:
+            raise InputError(f"the Dask cluster at {address} failed: {error}; what is done stays, "
+                             "the same command resumes") from None
