@@ -55,10 +55,11 @@ def compare(data: Path, split: Path | None, limit: int | None, jobs: int, dask: 
     recording = opened(data, split=split)
     recording.require(BOXES, "compare")
     with errors.status("loading detectors"):
-        found, missing = contenders(weights, device)
+        height = recording.frames[0].sensor_height
+        found, missing = contenders(weights, device, height)
     here = jobs == 1 and dask is None
     start = by_contenders((lambda: found) if here else partial(opened_in_a_process, weights,
-                                                               device))
+                                                               device, height))
     report = ComparisonReport(found)
     fill(report, recording, start, limit=limit, title="comparing", **where)
     if not report.first.frames:

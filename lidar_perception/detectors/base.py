@@ -14,6 +14,7 @@ import torch
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
+from lidar_perception.param_fields import with_values
 from lidar_perception.types import InputError
 
 Result = TypeVar("Result")
@@ -48,6 +49,12 @@ class NetworkDetector:
         other = copy.copy(self)
         settings = replace(self.settings, scores=ScoreParams.all_alike(min_score))
         other.params = replace(self.params, **{self.header.network: settings})
+        return other
+
+    def mounted_at(self, height: float) -> Self:
+        """The same detector, of the same network, for a sensor so many metres above the ground."""
+        other = copy.copy(self)
+        other.params = with_values(self.params, {"ground.sensor_pose.height": height})
         return other
 
     def place(self, device: torch.device) -> None:

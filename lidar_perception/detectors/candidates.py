@@ -47,6 +47,11 @@ class CandidateDetector:
         return CandidateDetector(self.seed, self.camera,
                                  with_values(self.params, {self._threshold: min_score}))
 
+    def mounted_at(self, height: float) -> CandidateDetector:
+        """The same detector for a sensor so many metres above the ground."""
+        return CandidateDetector(self.seed, self.camera, with_values(
+            self.params, {"ground.sensor_pose.height": height}))
+
     def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
         """See contract.Detector. InputError where there is no seed, and without a camera where

@@ -43,6 +43,10 @@ class Detector(Protocol):
     def with_min_score(self, min_score: float) -> Self:
         """The same detector with this least score for every class; this one stays as it is."""
 
+    def mounted_at(self, height: float) -> Self:
+        """The same detector for a sensor so many metres above the ground; this one stays as it
+        is."""
+
     def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
         """The objects in a frame of N points, N may be 0. ground (N,) bool and cluster_ids (N,)

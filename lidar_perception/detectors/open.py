@@ -1,36 +1,38 @@
-"""Any detector of this package from its weights."""
+"""Any detector of this package, by its name or from its weights."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
 
-from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.checkpoint import POINTNET, POINTPILLARS, network_of
+from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointpillars.detector import load_detector
-from lidar_perception.param_fields import with_values
 
-LOAD: dict[str, Callable[..., NetworkDetector]] = {  # by network
+# Each opens its detector: load(path, device), where an empty path means its own weights, if it has
+# any. A new detector is one line here.
+LOAD: dict[str, Callable[..., Detector]] = {
     POINTPILLARS: load_detector,
     POINTNET: load_pointnet_detector,
 }
 
 
-def open_detector(path: str | Path = "", device: str = "auto", *,
+def open_detector(weights: str | Path = POINTPILLARS, device: str = "auto", *,
                   sensor_height: float | None = None,
-                  min_score: float | None = None) -> NetworkDetector:
-    """The detector of a checkpoint of any network, or of an exported one (.onnx), with its default
-    parameters; without a path PointPillars v4 compact, which comes with the package.
+                  min_score: float | None = None) -> Detector:
+    """A detector by its name, a key of LOAD, with what comes with the package; or by its weights: a
+    checkpoint of any network, or an exported one (.onnx). Parameters are the defaults.
 
     sensor_height: metres of the sensor above the ground, if not KITTI's; min_score: the threshold
     of every class, if not the default. InputError for a file that cannot be used, or a device that
     is not there.
     """
-    path = Path(path)
-    exported = path.suffix == ".onnx" or path == Path()
-    detector = LOAD[POINTPILLARS if exported else network_of(path)](path, device)
+    if str(weights) in LOAD:
+        detector = LOAD[str(weights)]("", device)
+    else:
+        path = Path(weights)
+        detector = LOAD[POINTPILLARS if path.suffix == ".onnx" else network_of(path)](path, device)
     if sensor_height is not None:
-        detector.params = with_values(detector.params,
-                                      {"ground.sensor_pose.height": sensor_height})
+        detector = detector.mounted_at(sensor_height)
     return detector if min_score is None else detector.with_min_score(min_score)

@@ -25,7 +25,8 @@ from lidar_perception.types import InputError
 @click.command()
 @frame_options
 @a_path("--results", "Result files of any detector, in KITTI's format: DIR/000000.txt ...", "DIR")
-@a_path("--weights", "Run the detector of this checkpoint, PointPillars or PointNet.")
+@a_path("--weights", "Run the detector of this checkpoint, or one by its name: pointpillars or "
+        "pointnet, with the weights that come with the package.", "FILE|NAME")
 @device_option
 @click.option("--min-score", type=click.FloatRange(0, 1), default=MIN_SCORE, show_default=True,
               help="Boxes of --weights with a lower score are left out. AP is made of precision "

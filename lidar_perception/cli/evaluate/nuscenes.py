@@ -25,7 +25,8 @@ from lidar_perception.types import InputError
 @frame_options
 @a_path("--results", "Result file of any detector, in the format of nuScenes' detection task.",
         "JSON")
-@a_path("--weights", "Run the detector of this checkpoint, PointPillars or PointNet.")
+@a_path("--weights", "Run the detector of this checkpoint, or one by its name: pointpillars or "
+        "pointnet, with the weights that come with the package.", "FILE|NAME")
 @device_option
 @a_path("--write-results", "Write what --weights detect as a result file, frames without labels "
         "too.", "JSON")

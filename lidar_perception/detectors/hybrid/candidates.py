@@ -56,6 +56,11 @@ class RescoredCandidates:
         return RescoredCandidates(self.judge, self.seed, self.camera,
                                   replace(self.params, threshold=min_score), self.pipeline)
 
+    def mounted_at(self, height: float) -> RescoredCandidates:
+        """The same detector for a sensor so many metres above the ground."""
+        pipeline = with_values(self.pipeline, {"ground.sensor_pose.height": height})
+        return RescoredCandidates(self.judge, self.seed, self.camera, self.params, pipeline)
+
     def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
         """See contract.Detector: the candidates by their combined score, best first. InputError

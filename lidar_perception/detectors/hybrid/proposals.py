@@ -43,6 +43,11 @@ class ConfirmedProposals:
         return ConfirmedProposals(self.proposer, self.judge,
                                   replace(self.params, threshold=min_score))
 
+    def mounted_at(self, height: float) -> ConfirmedProposals:
+        """The same detector for a sensor so many metres above the ground."""
+        return ConfirmedProposals(self.proposer.mounted_at(height), self.judge.mounted_at(height),
+                                  self.params)
+
     def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
         """See contract.Detector: the proposals by their combined score, best first."""

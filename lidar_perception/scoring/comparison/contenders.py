@@ -26,9 +26,10 @@ from lidar_perception.detectors.pointnet.weights_file import weights_file as poi
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
+from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.report import pedestrians
 from lidar_perception.scoring.comparison.outcomes import Contender
-from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
+from lidar_perception.types import CLASSES, PEDESTRIAN, SENSOR_HEIGHT, InputError
 
 PROPOSER = "PointPillars v4 compact"  # whose proposals the hybrid confirms, if it is there
 NO_WEIGHTS = "no weights come with the package; give some with --weights"
@@ -67,26 +68,28 @@ def always(name: str, detector: Detector, source: str) -> Contender:
                      detector.min_scores.get(PERSON, 1.0), source)
 
 
-def contenders(weights: Sequence[Path] = (), device: str = "auto"
-               ) -> tuple[list[Contender], list[Missing]]:
+def contenders(weights: Sequence[Path] = (), device: str = "auto",
+               sensor_height: float = SENSOR_HEIGHT) -> tuple[list[Contender], list[Missing]]:
     """Every detector of the package that has weights, those of more weights, and hybrids; and those
-    that are missing. InputError for weights that cannot be used."""
+    that are missing. All are for a sensor so many metres above the ground. InputError for weights
+    that cannot be used."""
     warm_up()
     files, absent = _own_files()
     opened: list[Opened] = []
     for path in [*files, *weights]:
-        detector = open_detector(path, device)
+        detector = open_detector(path, device, sensor_height=sensor_height)
         opened.append(Opened(_name(detector, [each.name for each in opened]), detector, path))
     found = [each.contender() for each in opened]
     missing = [Missing(name, reason) for name, reason in absent.items()
                if name not in [each.name for each in opened]]
-    hybrids, lacking = _hybrids(opened)
-    return [*_candidates(), *found, *hybrids], [*missing, *lacking]
+    hybrids, lacking = _hybrids(opened, _mounted(BEST, sensor_height))
+    return [*_candidates(sensor_height), *found, *hybrids], [*missing, *lacking]
 
 
-def opened_in_a_process(weights: Sequence[Path], device: str) -> list[Contender]:
+def opened_in_a_process(weights: Sequence[Path], device: str,
+                        sensor_height: float) -> list[Contender]:
     """The contenders alone; a function that can be sent to another process."""
-    return contenders(weights, device)[0]
+    return contenders(weights, device, sensor_height)[0]
 
 
 def _own_files() -> tuple[list[Path], dict[str, str]]:
@@ -115,14 +118,19 @@ def _name(detector: NetworkDetector, taken: Sequence[str]) -> str:
     return name
 
 
-def _candidates() -> list[Contender]:
+def _mounted(params: PipelineParams, sensor_height: float) -> PipelineParams:
+    return with_values(params, {"ground.sensor_pose.height": sensor_height})
+
+
+def _candidates(sensor_height: float) -> list[Contender]:
     """STM-CPA of both configurations with the paper's seed, and the better one with its own."""
-    return [_seeded("STM-CPA paper", CandidateDetector, PAPER, _labelled),
-            _seeded("STM-CPA best", CandidateDetector, BEST, _labelled),
-            _seeded("STM-CPA best, auto", CandidateDetector, BEST, _own_seed(BEST))]
+    paper, best = (_mounted(params, sensor_height) for params in (PAPER, BEST))
+    return [_seeded("STM-CPA paper", CandidateDetector, paper, _labelled),
+            _seeded("STM-CPA best", CandidateDetector, best, _labelled),
+            _seeded("STM-CPA best, auto", CandidateDetector, best, _own_seed(best))]
 
 
-def _hybrids(opened: Sequence[Opened]) -> tuple[list[Contender], list[Missing]]:
+def _hybrids(opened: Sequence[Opened], best: PipelineParams) -> tuple[list[Contender], list[Missing]]:
     """STM-CPA and PointPillars, each with the first PointNet."""
     judge = next((each for each in opened if each.network == POINTNET), None)
     proposers = {each.name: each for each in reversed(opened) if each.network == POINTPILLARS}
@@ -133,9 +141,9 @@ def _hybrids(opened: Sequence[Opened]) -> tuple[list[Contender], list[Missing]]:
 
     def rescored(seed, camera, pipeline):
         return RescoredCandidates(judge.detector, seed, camera, RescoringParams(), pipeline)
-    own = RescoredCandidates(judge.detector, _no_seed).pipeline
-    found = [_seeded(names[0], rescored, BEST, _labelled, str(judge.source)),
-             _seeded(names[1], rescored, BEST, _own_seed(own), str(judge.source))]
+    own = rescored(_no_seed, None, best).pipeline
+    found = [_seeded(names[0], rescored, best, _labelled, str(judge.source)),
+             _seeded(names[1], rescored, best, _own_seed(own), str(judge.source))]
     if proposer is None:
         return found, [Missing(names[2], "there is no PointPillars to propose")]
     confirmed = ConfirmedProposals(proposer.detector.with_min_score(MIN_SCORE), judge.detector,
