@@ -130,7 +130,8 @@ def _candidates(sensor_height: float) -> list[Contender]:
             _seeded("STM-CPA best, auto", CandidateDetector, best, _own_seed(best))]
 
 
-def _hybrids(opened: Sequence[Opened], best: PipelineParams) -> tuple[list[Contender], list[Missing]]:
+def _hybrids(opened: Sequence[Opened], best: PipelineParams
+             ) -> tuple[list[Contender], list[Missing]]:
     """STM-CPA and PointPillars, each with the first PointNet."""
     judge = next((each for each in opened if each.network == POINTNET), None)
     proposers = {each.name: each for each in reversed(opened) if each.network == POINTPILLARS}
