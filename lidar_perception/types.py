@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-CLASSES = ("Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc",
-           "DontCare")
-PEDESTRIAN = CLASSES.index("Pedestrian")
+from lidar_perception.classes import CLASSES, PEDESTRIAN
+
+__all__ = ["CLASSES", "PEDESTRIAN", "Detections", "GroundTruth", "InputError", "LidarFrame",
+           "usable_returns"]
 
 MAX_RANGE = 1e5  # metres; what is farther is a broken return, not a point
 SENSOR_HEIGHT = 1.73  # metres: KITTI's sensor above the road. Defaults, anchors and simulation

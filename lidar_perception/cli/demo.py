@@ -13,6 +13,7 @@ import numpy as np
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.warm_up import warm_up
+from lidar_perception.classes import CLASSES, PEDESTRIAN
 from lidar_perception.cli.data import WHAT, a_path, opened
 from lidar_perception.cli.evaluate.candidates import view_as_recorded
 from lidar_perception.cli.options import parameter_options
@@ -106,7 +107,7 @@ def _draw_best(result: Path, picture: Path, single: bool) -> bool:
         for topic, _, msg in bag.messages({TRUTH, final} & set(bag.topics)):
             objects = from_marker_array(msg)
             boxes = (to_detections(objects).boxes if topic == final
-                     else objects.boxes[[x == "Pedestrian" for x in objects.labels]])
+                     else objects.boxes[[x == CLASSES[PEDESTRIAN] for x in objects.labels]])
             frames.setdefault(objects.stamp_ns, {})[topic] = boxes
         hits = {stamp: (len(match_centres(f[final], f[TRUTH])[0]), len(f[TRUTH]))
                 for stamp, f in frames.items() if len(f) == 2 and len(f[TRUTH])}

@@ -9,14 +9,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from lidar_perception.classes import BY_SIZE, CLASSES, DETECTED, MAX_DIAGONAL
 from lidar_perception.clustering.params import BOX_SHAPES
 from lidar_perception.clustering.rectangles import grouped, rectangles
-from lidar_perception.types import CLASSES
-
-# Class of a cluster by the diagonal of its box in x-y: paper B, Table 2, in metres. Its ranges
-# 0.40-1.71, 1.72-2.99 and 3.00-6.40 are rounded; here each goes on to the next.
-SMALLEST_DIAGONAL = {"Pedestrian": 0.40, "Cyclist": 1.72, "Car": 3.00}
-LARGEST_DIAGONAL = 6.40
 
 
 @njit(cache=True, nogil=True)
@@ -92,8 +87,9 @@ def class_by_diagonal(boxes: np.ndarray) -> np.ndarray:
     sides = np.asarray(boxes, np.float32).reshape(-1, 7)[:, 3:5]
     diagonal = np.hypot(sides[:, 0], sides[:, 1])  # float32, so that 6.40 is not above 6.40
     ids = np.full(len(diagonal), -1, np.int32)
-    for name, smallest in SMALLEST_DIAGONAL.items():
-        ids[(diagonal >= smallest) & (diagonal <= LARGEST_DIAGONAL)] = CLASSES.index(name)
+    for name in reversed(BY_SIZE):
+        ids[(diagonal >= DETECTED[name].min_diagonal) & (diagonal <= MAX_DIAGONAL)] = CLASSES.index(
+            name)
     return ids
 
 

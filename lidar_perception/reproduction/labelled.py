@@ -9,11 +9,12 @@ import numpy as np
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.seeds import Seed, seed_from_truth
 from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import points_in_box
 from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, InputError, LidarFrame
 
-VEHICLES = [CLASSES.index(name) for name in ("Car", "Van", "Truck", "Tram")]
+VEHICLES = [i for i, row in enumerate(TABLE) if row.vehicle]
 
 
 @dataclass(frozen=True)

@@ -9,12 +9,13 @@ from zipfile import BadZipFile
 
 import numpy as np
 
+from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN
 from lidar_perception.geometry import bev_iou
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.training.augment import BORDER, Scene, grown, turned, with_reflector
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.putting import floor_under, put_among
-from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
+from lidar_perception.types import InputError
 
 NEIGHBOURHOOD = 3.0  # m: the ground under an object is looked for so far around it
 GROUND_SHARE = 0.1   # of the points there lie lower
@@ -23,7 +24,6 @@ THINGS = (-1.1, 0.5)  # m from the sensor's height up: what is there is no groun
 SECTORS = 720        # directions that are told apart
 TRIES = 64           # of them drawn for an object
 DRAWN = 3
-CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
 THING = -1           # class of what is no object, see cut_objects.py
 HIDDEN = 0.3         # an object is hidden if more points than this share of its own are before it
 

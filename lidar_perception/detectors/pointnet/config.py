@@ -10,16 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
+from lidar_perception.classes import DETECTED
 from lidar_perception.clustering.params import ClusteringParams, EuclideanParams
 from lidar_perception.detectors.config_json import config_of
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.types import CLASSES, InputError
 
+
 # l w h in metres, means of KITTI's training labels (Geiger et al. 2012)
-MEAN_SIZES = {"Car": (3.88, 1.63, 1.53), "Pedestrian": (0.84, 0.66, 1.76),
-              "Cyclist": (1.76, 0.60, 1.74)}
-
-
 @dataclass(frozen=True)
 class PointNetConfig:
     """A network that looks at one cluster.
@@ -40,7 +38,7 @@ class PointNetConfig:
     network: ClassVar[str] = "pointnet"
 
     name: str = "improved"
-    classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist")
+    classes: tuple[str, ...] = tuple(DETECTED)
     dynamic_threshold: bool = True
     log_point_count: bool = True
     msg: bool = True
@@ -60,7 +58,7 @@ class PointNetConfig:
     global_channels: int = 128
     head_channels: tuple[int, ...] = (256, 128)
     yaw_bins: int = 12
-    sizes: tuple[tuple[float, ...], ...] = tuple(MEAN_SIZES.values())
+    sizes: tuple[tuple[float, ...], ...] = tuple(of.mean_size for of in DETECTED.values())
 
     @classmethod
     def of_json(cls, content: dict[str, Any], source: str = "the header") -> PointNetConfig:

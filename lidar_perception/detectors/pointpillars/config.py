@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+from lidar_perception.classes import DETECTED
 from lidar_perception.detectors.config_json import config_of
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError
 
@@ -47,10 +48,9 @@ class AnchorClass:
     unmatched: float
 
 
-# Sizes and overlaps: Lang et al., Section 4.1 and its code. They stand on the ground.
-ANCHORS = (AnchorClass("Car", (3.9, 1.6, 1.56), 1.56 / 2 - SENSOR_HEIGHT, 0.6, 0.45),
-           AnchorClass("Pedestrian", (0.8, 0.6, 1.73), 1.73 / 2 - SENSOR_HEIGHT, 0.5, 0.35),
-           AnchorClass("Cyclist", (1.76, 0.6, 1.73), 1.73 / 2 - SENSOR_HEIGHT, 0.5, 0.35))
+# They stand on the ground.
+ANCHORS = tuple(AnchorClass(name, of.anchor, of.anchor[2] / 2 - SENSOR_HEIGHT, of.matched,
+                            of.unmatched) for name, of in DETECTED.items())
 
 
 @dataclass(frozen=True)
@@ -158,10 +158,10 @@ class NetworkConfig:
 
 
 def network_config(version: str = "v0", size: str = "full",
-                   classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"),
+                   classes: tuple[str, ...] = tuple(DETECTED),
                    **changes: Any) -> NetworkConfig:
-    """The config of a version and size by name, for some of the three classes, with other fields
-    changed. InputError for a name that is none."""
+    """The config of a version and size by name, for some of the classes that are detected, with
+    other fields changed. InputError for a name that is none."""
     for name, choices in (version, VERSIONS), (size, SIZES):
         if name not in choices:
             raise InputError(f"there is no {name!r}; choose one of {', '.join(choices)}")

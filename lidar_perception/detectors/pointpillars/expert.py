@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from lidar_perception.classes import BY_SIZE
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
@@ -21,7 +22,7 @@ from lidar_perception.ground.params import GroundParams
 from lidar_perception.types import CLASSES, LidarFrame
 
 SPARSE = 16  # largest number of a cluster, in points, up to which a table of all numbers is made
-MAP_CLASSES = ("Car", "Cyclist", "Pedestrian")  # channels: vehicle, two-wheeler, pedestrian
+MAP_CLASSES = tuple(BY_SIZE)  # a channel each: vehicle, two-wheeler, pedestrian
 
 
 @dataclass(frozen=True)

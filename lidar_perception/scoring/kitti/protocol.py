@@ -16,16 +16,17 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
+from lidar_perception.classes import DETECTED, TABLE
 from lidar_perception.geometry import bev_and_3d_iou
 from lidar_perception.scoring.average_precision import at_recall, averages, recall_thresholds
 from lidar_perception.scoring.kitti.camera_objects import CameraObjects
 from lidar_perception.types import CLASSES
 
-SCORED = ("Car", "Pedestrian", "Cyclist")
-NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
+SCORED = tuple(DETECTED)
+NEIGHBOURS = {row.looks_like: row.name for row in TABLE if row.looks_like}
 METRICS = ("image", "bev", "3d")
-STRICT = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}     # overlap needed for a hit
-RELAXED = {"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25}  # seen from above and in space
+STRICT = {name: of.strict for name, of in DETECTED.items()}    # overlap needed for a hit
+RELAXED = {name: of.relaxed for name, of in DETECTED.items()}  # seen from above and in space
 DIFFICULTIES = ("easy", "moderate", "hard")
 LEAST_PIXELS = (40, 25, 25)        # height of the 2D box
 MOST_OCCLUDED = (0, 1, 2)

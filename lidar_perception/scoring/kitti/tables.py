@@ -5,13 +5,14 @@ from __future__ import annotations
 from rich.console import Console
 from rich.markup import escape
 
+from lidar_perception.classes import BY_SIZE
 from lidar_perception.scoring.average_precision import FEW
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES
 from lidar_perception.scoring.tables import narrow_table, print_skipped
 
 # The EG-PointPillars paper, Table 5: AP in space at 0.7 (Car) and 0.5; easy, moderate, hard. It
 # does not say at how many recall points.
-COLUMNS = ("Car", "Cyclist", "Pedestrian")
+COLUMNS = tuple(BY_SIZE)
 PAPER = {
     "PointPillars": ((84.00, 72.89, 68.24), (80.57, 61.96, 58.32), (52.66, 47.09, 43.21)),
     "V1": ((86.94, 76.06, 68.77), (79.53, 61.85, 58.18), (56.12, 50.96, 46.56)),

@@ -17,6 +17,7 @@ from lidar_perception.candidates.boxes import height_matches
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.refine import STAGES
+from lidar_perception.classes import DETECTED
 from lidar_perception.geometry import box_corners, horizontal_range, points_in_box, to_box_frame
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
@@ -24,7 +25,7 @@ from lidar_perception.scoring.centres.matching import RANGE_NAMES
 from lidar_perception.simulation.realism.roughness import roughness
 from lidar_perception.types import GroundTruth, LidarFrame
 
-CLASSES = ("Car", "Pedestrian", "Cyclist")
+CLASSES = tuple(DETECTED)
 PERSON_HEIGHT = 1.7       # metres; the seed's height for the height filter of paper A's stage 1
 SECTORS, WHOLE = 36, 27   # of a turn; a scan with points in fewer is cropped to a camera's view
 MIN_POINTS = 5          # of an object whose extent or intensity is measured

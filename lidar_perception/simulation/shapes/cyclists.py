@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidar_perception.classes import CLASSES, CYCLIST
 from lidar_perception.simulation.shapes.people import knee
 from lidar_perception.simulation.shapes.thing import (
     METAL,
@@ -45,11 +46,11 @@ class Rider(NamedTuple):
 
 def cyclist(rng: np.random.Generator) -> Thing:
     """Someone who rides; the box's length is the bicycle's, its width the handlebar's."""
-    size = draw_size(rng, "Cyclist")
+    size = draw_size(rng, CLASSES[CYCLIST])
     rider = Rider(size, rng.uniform(0.15, 0.6), rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.8),
                   rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75), rng.uniform(0.15, 0.75),
                   ("", "basket", "backpack")[rng.integers(3)])
-    return Thing(partial(riding, rider=rider), size, "Cyclist")
+    return Thing(partial(riding, rider=rider), size, CLASSES[CYCLIST])
 
 
 def riding(travelled: float, rider: Rider) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidar_perception.classes import CLASSES, PEDESTRIAN
 from lidar_perception.simulation.shapes.thing import (
     METAL,
     RUBBER,
@@ -57,7 +58,7 @@ def pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
     Faster walkers take longer steps, too: the steps grow with the root of the speed (Sekiya et
     al. 1996: length over rate is 0.0065 m min for all speeds).
     """
-    _, width, height = draw_size(rng, "Pedestrian")
+    _, width, height = draw_size(rng, CLASSES[PEDESTRIAN])
     if child:
         shrink = rng.uniform(0.62, 0.8)
         width, height = width * max(shrink, 0.7), height * shrink
@@ -67,7 +68,7 @@ def pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
     low, high = _covered(build)
     build = build._replace(shift=-(low + high) / 2)
     size = (max(high - low, SHORTEST * height), build.width, height)
-    return Thing(partial(walker, build=build), size, "Pedestrian")
+    return Thing(partial(walker, build=build), size, CLASSES[PEDESTRIAN])
 
 
 def _covered(build: Build) -> tuple[float, float]:

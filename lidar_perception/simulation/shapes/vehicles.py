@@ -6,6 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidar_perception.classes import CAR as CAR_ID
+from lidar_perception.classes import CLASSES
 from lidar_perception.simulation.shapes.thing import (
     GLASS,
     PLATE,
@@ -62,7 +64,7 @@ PANEL_VAN = Style(0.85, 0.70, 0.03, 0.01, 0.52, 0.56, 0.55)
 
 def car(rng: np.random.Generator, driver: bool = True) -> Thing:
     """A car of random size, body and paint. driver: whether someone sits in it."""
-    size = draw_size(rng, "Car")
+    size = draw_size(rng, CLASSES[CAR_ID])
     if size[2] > 1.62:
         style = SUV
     elif size[0] > 4.2:
@@ -70,7 +72,7 @@ def car(rng: np.random.Generator, driver: bool = True) -> Thing:
     else:
         style = (HATCHBACK, HATCHBACK, HATCHBACK, ESTATE, SEDAN)[rng.integers(5)]
     return rigid(_mottled(body(size, style, paint(rng), rng.uniform(0.6, 0.92), driver), rng),
-                 size, "Car")
+                 size, CLASSES[CAR_ID])
 
 
 def van(rng: np.random.Generator, driver: bool = True) -> Thing:
