@@ -1,5 +1,5 @@
-"""Makes docs/images/scene.png: a simulated scan with its ground, its clusters and the boxes that the
-shipped PointPillars v4 finds in it, in perspective: python docs/picture.py
+"""Makes docs/images/scene.png, a simulated scan with its ground, its clusters and the boxes of the
+PointPillars v4 that comes with the package, in perspective: python docs/picture.py
 """
 
 from __future__ import annotations
