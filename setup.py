@@ -32,8 +32,8 @@ def node_executables() -> list[str]:
 setup(
     name=NAME,
     version="0.1.0",
-    description="LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned detectors, "
-                "a simulator and training",
+    description="LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned "
+                "detectors, a simulator and training",
     long_description=Path("README.md").read_text(),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
@@ -65,7 +65,8 @@ setup(
         "odometry": ["kiss-icp>=1.2"],
         "onnx": ["onnx>=1.16", "onnxruntime>=1.18", "onnxscript>=0.2", "torch>=2.6"],
         "train": ["tensorboard>=2.15"],
-        "benchmark": ["cloth-simulation-filter>=1.1.5", "dbscan>=1.0", "opencv-python-headless>=4.8"],
+        "benchmark": ["cloth-simulation-filter>=1.1.5", "dbscan>=1.0",
+                      "opencv-python-headless>=4.8"],
     },
     entry_points={"console_scripts": [
         "lidar-perception = lidar_perception.cli.main:main",

@@ -99,7 +99,7 @@ NODES: dict[str, dict[str, Any]] = {
                  *CANDIDATES_OUT]),
     "pointpillars_detector": dict(
         params=DetectorParams(),
-        what="Detects cars, pedestrians and cyclists by PointPillars or one of the four versions of "
+        what="Detects cars, pedestrians and cyclists: PointPillars and the four versions of "
              "EG-PointPillars, see [detection](../detection.md). Loads and warms up before it "
              "subscribes. Without weights it says so in a diagnostic and publishes nothing. Warns "
              "if nothing can be found (the cloud is out of range, has no intensity, all of it is "
@@ -115,8 +115,8 @@ NODES: dict[str, dict[str, Any]] = {
                   "Time of each step.")]),
     "pointnet_detector": dict(
         params=PointNetDetectorParams(),
-        what="Detects cars, pedestrians and cyclists among the clusters of the whole cloud: each is "
-             "classified and gets a box, see [pointnet](../pointnet.md). Loads and warms up before "
+        what="Detects cars, pedestrians and cyclists among the clusters of the whole cloud: each "
+             "is classified and gets a box, see [pointnet](../pointnet.md). Loads and warms up before "
              "it subscribes. Without weights it says so in a diagnostic and publishes nothing. "
              "Warns if nothing can be found (no clusters, all of them too small, no intensity "
              "...), if CUDA is asked for and missing or out of memory, and if height or intensity "
