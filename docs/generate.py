@@ -116,8 +116,9 @@ NODES: dict[str, dict[str, Any]] = {
     "pointnet_detector": dict(
         params=PointNetDetectorParams(),
         what="Detects cars, pedestrians and cyclists among the clusters of the whole cloud: each "
-             "is classified and gets a box, see [pointnet](../pointnet.md). Loads and warms up before "
-             "it subscribes. Without weights it says so in a diagnostic and publishes nothing. "
+             "is classified and gets a box, see [pointnet](../pointnet.md). Loads and warms up "
+             "before it subscribes. Without weights it says so in a diagnostic and publishes "
+             "nothing. "
              "Warns if nothing can be found (no clusters, all of them too small, no intensity "
              "...), if CUDA is asked for and missing or out of memory, and if height or intensity "
              "do not fit; where every score is below its threshold the diagnostic has the best "

@@ -20,8 +20,8 @@ def convert() -> None:
 @convert.command()
 @click.argument("root", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Bag folder to make.")
-@click.option("--images", is_flag=True, help="Take the left colour images along, as PNG.")
-@click.option("--frames", type=click.IntRange(1), help="Only the first so many frames.")
+@click.option("--images", is_flag=True, help="Include the left colour images, as PNG.")
+@click.option("--frames", type=click.IntRange(1), help="Only the first N frames.")
 @click.option("--force", is_flag=True, help="Replace the bag if it exists.")
 def kitti(root: Path, out: Path, images: bool, frames: int | None, force: bool) -> None:
     """KITTI 3D object, tracking or raw data at ROOT to one MCAP bag.

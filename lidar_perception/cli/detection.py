@@ -32,13 +32,14 @@ from lidar_perception.types import Detections, InputError
 @click.option("--split", type=click.Path(path_type=Path), metavar="FILE",
               help="Score only the frames named in this file, one a line.")
 @click.option("--least-score", type=click.FloatRange(0, 1), default=0.05, show_default=True,
-              help="Boxes of --weights with a lower score are left out. AP is made of precision "
-              "at every recall, so it needs those that a robot would not act on.")
+              help="Leave out boxes of --weights with a lower score. AP needs low scores too, "
+              "because it averages precision over all recalls.")
 @click.option("--keep", type=click.FloatRange(0, 1), default=1.0, metavar="SHARE",
-              help="Keep only this share of the points of each scan, 0..1, drawn at random but "
-              "always the same. Default: 1.")
+              help="Keep only this share of the points of each scan, 0..1, drawn with a "
+              "fixed seed. Default: 1.")
 @click.option("--write-results", type=click.Path(path_type=Path), metavar="DIR",
-              help="Write what --weights find as KITTI result files, frames without labels too.")
+              help="Write the detections of --weights as KITTI result files, also of frames "
+              "without labels.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Write the scores to this file.")
 def detection(kitti: Path, results: Path | None, weights: Path | None, device: str,

@@ -48,7 +48,7 @@ def evaluate() -> None:
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Write the scores to this file.")
 @click.option("--png", type=click.Path(path_type=Path), metavar="FILE",
-              help="Draw the frame with most pedestrians from above.")
+              help="Draw the frame with the most pedestrians from above.")
 @parameter_options(PAPER)
 def candidates(kitti: Path | None, bag: Path | None, json_file: Path | None, png: Path | None,
                params: PipelineParams) -> None:

@@ -34,7 +34,8 @@ from lidar_perception.types import InputError
 @click.option("--device", default="auto", help="Where --weights run: auto, cpu, cuda. "
               "Default: auto.")
 @click.option("--write-results", type=click.Path(path_type=Path), metavar="JSON",
-              help="Write what --weights find as a result file, frames without labels too.")
+              help="Write the detections of --weights as a result file, also of frames "
+              "without labels.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Write the scores to this file.")
 def nuscenes(root: Path, version: str, scenes: Path | None, results: Path | None,

@@ -28,15 +28,15 @@ NAMES = ", ".join(STUDIES) or "none yet"
 @click.option("--kitti", type=click.Path(path_type=Path), metavar="ROOT", required=True,
               help="KITTI folder: 3D object, tracking or raw.")
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True,
-              help="Folder for the report; the same command goes on with one that was stopped.")
+              help="Folder for the report; the same command resumes a run that was stopped.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes. Default: one for each core.")
 @click.option("--dask", metavar="ADDRESS", help="Measure on the workers of the Dask scheduler at "
               "this address, such as tcp://10.0.0.1:8786, which see ROOT under the same path.")
 @click.option("--limit", type=click.IntRange(1), metavar="N", help="The first N scans only.")
-@click.option("--force", is_flag=True, help="Start again, whatever is in --out.")
+@click.option("--force", is_flag=True, help="Start over, whatever is in --out.")
 def reproduce(experiment: str, study: str | None, kitti: Path, out: Path, jobs: int | None,
               dask: str | None, limit: int | None, force: bool) -> None:
-    """Run the whole experiment of the STM-CPA paper and write a report beside its figures.
+    """Run the whole experiment of the STM-CPA paper and report each figure beside the paper's.
 
     DIR gets report.html, report.md, report.json, the tables as CSV and the figures as PNG, and
     frames.jsonl with the record of every frame.

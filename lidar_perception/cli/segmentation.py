@@ -87,7 +87,7 @@ class MethodList(click.ParamType):
               help="KITTI folder, 3D object, tracking or raw: clusters.")
 @click.option("--bag", type=click.Path(path_type=Path), help="Bag with ground truth: clusters.")
 @click.option("--methods", type=MethodList(), default=GROUND_METHODS + CLUSTERING_METHODS,
-              help="Methods to score, of ground and of clustering, with commas between. "
+              help="Methods to score, of ground and of clustering, separated by commas. "
               "Default: all.")
 @click.option("--limit", type=click.IntRange(min=1), metavar="N",
               help="Only the first N frames of each source.")

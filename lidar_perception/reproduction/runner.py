@@ -116,8 +116,8 @@ def _on_dask(address: str, experiment: Experiment, kitti: Path,
                 for number in islice(waiting, 1):
                     running.add(client.submit(work, number, pure=False))
         except (distributed.KilledWorker, CommClosedError, CancelledError) as error:
-            raise InputError(f"the Dask cluster at {address} failed: {error}; what is done stays, "
-                             "the same command goes on") from None
+            raise InputError(f"the Dask cluster at {address} failed: {error}; finished frames "
+                             "are kept, the same command resumes the run") from None
 
 
 _kept_open = functools.lru_cache(maxsize=1)(_open)

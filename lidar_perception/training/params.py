@@ -154,8 +154,10 @@ class ClusterAugmentParams(NoiseParams):
     """Which clusters of a scene are trained on, and how they are changed. 0 switches a change
     off."""
 
-    objects: int = param(24, "Clusters of each class taken from a scene, at most.", low=1, high=1000)
-    background: int = param(40, "Background clusters taken from a scene, at most.", low=0, high=10_000)
+    objects: int = param(24, "Clusters of each class taken from a scene, at most.", low=1,
+                         high=1000)
+    background: int = param(40, "Background clusters taken from a scene, at most.", low=0,
+                            high=10_000)
     box_shift: float = param(0.15, "Points around an object are cut by its box, shifted by this; "
                              "standard deviation.", unit="m", low=0.0, high=2.0)
     farther: float = param(1.5, "Some clusters are moved away, to up to 1 plus this times their "
