@@ -65,7 +65,7 @@ NODES: dict[str, dict[str, Any]] = {
     "ground_segmentation": dict(
         params=params.GroundNodeParams(),
         what="Marks the ground points of a cloud, by one plane, by Patchwork++ or by a cloth "
-             "simulation (`ground.method`). Warns if the sensor hangs at another height than "
+             "simulation (`ground.method`). Warns if the sensor is mounted at another height than "
              "`sensor_pose` says, and if the scale of the intensity does not fit.",
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN],
         outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS}."),
@@ -99,7 +99,7 @@ NODES: dict[str, dict[str, Any]] = {
                  *CANDIDATES_OUT]),
     "pointpillars_detector": dict(
         params=DetectorParams(),
-        what="Finds cars, pedestrians and cyclists: PointPillars and the four versions of "
+        what="Detects cars, pedestrians and cyclists: PointPillars and the four versions of "
              "EG-PointPillars, see [detection](../detection.md). Loads and warms up before it "
              "subscribes. Without weights it says so in a diagnostic and publishes nothing. Warns "
              "if nothing can be found (the cloud is out of range, has no intensity, all of it is "
@@ -115,9 +115,10 @@ NODES: dict[str, dict[str, Any]] = {
                   "Time of each step.")]),
     "pointnet_detector": dict(
         params=PointNetDetectorParams(),
-        what="Finds cars, pedestrians and cyclists among the clusters of the whole cloud: each is "
-             "classified and gets a box, see [pointnet](../pointnet.md). Loads and warms up before "
-             "it subscribes. Without weights it says so in a diagnostic and publishes nothing. "
+        what="Detects cars, pedestrians and cyclists among the clusters of the whole cloud: each "
+             "is classified and gets a box, see [pointnet](../pointnet.md). Loads and warms up "
+             "before it subscribes. Without weights it says so in a diagnostic and publishes "
+             "nothing. "
              "Warns if nothing can be found (no clusters, all of them too small, no intensity "
              "...), if CUDA is asked for and missing or out of memory, and if height or intensity "
              "do not fit; where every score is below its threshold the diagnostic has the best "

@@ -15,7 +15,7 @@ from lidar_perception.runs.terminal import console, track
 @click.command()
 @click.argument("data", type=click.Path(path_type=Path), metavar="PATH")
 @click.option("--out", type=click.Path(path_type=Path), required=True, help="Bag folder to make.")
-@click.option("--images", is_flag=True, help="Take the left colour images along, as PNG.")
+@click.option("--images", is_flag=True, help="Include the left colour images, as PNG.")
 @split_option
 @limit_option
 @click.option("--force", is_flag=True, help="Replace the bag if it exists.")

@@ -10,19 +10,19 @@ import click
 from lidar_perception import __version__
 
 COMMANDS = {  # verb -> module.function, and its line in the overview
-    "demo": ("demo.demo", "Replay a drive through the real nodes and score the result."),
+    "demo": ("demo.demo", "Replay a drive through the ROS 2 nodes and score the result."),
     "convert": ("convert.convert", "Turn a data set into a rosbag2 bag."),
     "evaluate": ("evaluate.group.evaluate", "Score the algorithms without ROS."),
     "compare": ("compare.compare", "Run every detector on the same frames, side by side."),
     "reproduce": ("reproduce.reproduce", "Measure every table of the STM-CPA paper."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),
-    "simulate": ("simulate.simulate", "Write simulated scans as a bag or a data set."),
-    "train": ("train.train", "Train a network on labelled frames or simulated streets."),
+    "simulate": ("simulate.simulate", "Write simulated, labelled scans as a bag or a data set."),
+    "train": ("train.train", "Train a detector on recordings or simulated streets."),
     "import-weights": ("weights.import_weights", "Read PointPillars weights of other projects."),
     "export": ("weights.export", "Write a network for another runtime."),
     "info": ("info.info", "Say what is in a bag."),
     "run": ("run.run_node", "Start one ROS node."),
-    "benchmark": ("checkout.benchmark", "Time the algorithms beside their peers."),
+    "benchmark": ("checkout.benchmark", "Time the algorithms next to their peers."),
     "test": ("checkout.test", "Run the tests of this checkout."),
 }
 
@@ -47,7 +47,8 @@ class LazyGroup(click.Group):
 @click.group(cls=LazyGroup, context_settings=dict(help_option_names=["-h", "--help"]))
 @click.version_option(__version__, prog_name="lidar-perception")
 def cli() -> None:
-    """LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned detectors.
+    """LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned detectors of
+    cars, pedestrians and cyclists, a simulator and training.
 
     \b
     Examples:

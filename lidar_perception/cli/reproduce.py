@@ -29,14 +29,14 @@ NAMES = ", ".join(STUDIES) or "none yet"
 @data_option
 @split_option
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True,
-              help="Folder for the report; the same command resumes one that was stopped.")
+              help="Folder for the report; the same command resumes a run that was stopped.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes. Default: one for each core.")
 @dask_option
 @limit_option
-@click.option("--force", is_flag=True, help="Start again, whatever is in --out.")
+@click.option("--force", is_flag=True, help="Start over, whatever is in --out.")
 def reproduce(experiment: str, study: str | None, data: Path, split: Path | None, out: Path,
               jobs: int | None, dask: str | None, limit: int | None, force: bool) -> None:
-    """Run the whole experiment of the STM-CPA paper and write a report beside its figures.
+    """Run the whole experiment of the STM-CPA paper and report each figure beside the paper's.
 
     DIR gets report.html, report.md, report.json, the tables as CSV and the figures as PNG, and
     frames.jsonl with the record of every frame.

@@ -39,14 +39,15 @@ from lidar_perception.types import InputError
 @click.option("--street", "kind", type=click.Choice(list(KINDS)), help="Streets of this kind only. "
               "Default: all, as often as in KITTI.")
 @click.option("--people", type=click.FloatRange(0), default=1.0, show_default=True,
-              help="How many times as many pedestrians and cyclists as in KITTI.")
+              help="Pedestrians and cyclists, as a multiple of KITTI's.")
 @click.option("--streets-of", type=click.IntRange(1), metavar="N",
-              help="Change to the next street after N scans. Default: 1 for kitti, 20 s of "
+              help="Scans of each street. Default: 1 for kitti, 20 s of "
                    "driving for the others.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes that write the folders of a data "
               "set. Default: one for each core.")
-@click.option("--resume", is_flag=True, help="Resume a data set that was not finished.")
-@click.option("--force", is_flag=True, help="Replace what was simulated into --out before.")
+@click.option("--resume", is_flag=True, help="Resume an unfinished data set; needs identical "
+              "settings.")
+@click.option("--force", is_flag=True, help="Replace an earlier simulated data set in --out.")
 @click.option("--compare", "real", type=click.Path(path_type=Path), metavar="PATH",
               help="Compare with the labelled scans of a data set or bag; nothing is made.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
@@ -59,7 +60,7 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
              png: Path | None) -> None:
     """Write labelled scans of simulated streets as a bag or data set, or measure how real they are.
 
-    A data set that was stopped is marked by a file INCOMPLETE; --resume finishes it.
+    A file INCOMPLETE marks an unfinished data set; --resume resumes it.
 
     \b
     Examples:
@@ -76,7 +77,7 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
     if json_file or png:
         raise click.UsageError("--json and --png go with --compare")
     if resume and force:
-        raise click.UsageError("--resume resumes, --force starts again: give one of them")
+        raise click.UsageError("--resume resumes, --force starts over: give one of them")
     sensor = sensor_named(sensor_name)
     plan = Plan(layout, sensor, seed, frames,
                 streets_of or (1 if layout == "kitti" else longest_drive(sensor)), streets)
@@ -95,7 +96,7 @@ def _bag(out: Path, plan: Plan, force: bool) -> None:
     try:
         count = write_bag(out, track(scans, "simulating", plan.frames), force=force)
     except OSError as error:
-        raise click.ClickException(f"cannot write {out}: {error.strerror}; what is done lies in "
+        raise click.ClickException(f"cannot write {out}: {error.strerror}; finished scans are in "
                                    f"{out}.incomplete") from None
     console.print(f"{out}: {count} scans", soft_wrap=True)
 
@@ -119,7 +120,8 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
     except InputError as error:
         if not begun:
             raise
-        raise click.ClickException(f"{error}; what is done stays, --resume continues") from None
+        raise click.ClickException(f"{error}; finished frames are kept, resume with "
+                                   "--resume") from None
     console.print(f"{out} is complete: there is nothing to do" if complete else
                   f"{out}: {plan.frames} scans" + (f", {plan.frames - len(missing)} of them from "
                                                    "before" if resume else ""), soft_wrap=True)

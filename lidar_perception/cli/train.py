@@ -37,16 +37,16 @@ SCENES_AND_RUN = (
                  help="Folder for best.safetensors, last.safetensors, logs and the state."),
     click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one."),
     click.option("--init", type=click.Path(path_type=Path), metavar="FILE",
-                 help="Begin with the weights of this checkpoint, as far as they fit."),
+                 help="Start from the weights of this checkpoint, as far as they fit."),
     click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N."),
     click.option("--jobs", type=click.IntRange(0), default=2, show_default=True,
-                 help="Processes that prepare scenes; 0: none but this one. The result is the "
+                 help="Processes that prepare scenes; 0: only this one. The result is the "
                  "same."),
 )
 
 
 def scene_options(command):
-    """What every network is told of its scenes and of the run."""
+    """The options of scenes and runs that all networks share."""
     for option in reversed(SCENES_AND_RUN):
         command = option(command)
     return command
@@ -65,8 +65,8 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
                  jobs: int, params: PointPillarsTraining) -> None:
     """PointPillars and EG-PointPillars, on labelled frames, simulated streets, or both.
 
-    The best weights so far, by AP on what is validated on, lie in OUT/best.safetensors. Ctrl-C
-    saves and stops; --resume continues, also after a kill. Several GPUs: torchrun.
+    OUT/best.safetensors holds the weights with the best validation AP so far. Ctrl-C saves and
+    stops; --resume resumes, also after a kill. Several GPUs: torchrun.
 
     \b
     Examples:
@@ -120,7 +120,7 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
 @train.command()
 @scene_options
 @click.option("--ablation", is_flag=True, help="Train every row of the paper's ablation, each into "
-              "a folder in --out, and show them side by side.")
+              "a folder in --out, and compare them.")
 @parameter_options(PointNetTraining())
 def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
              val_split: Path | None, out: Path, resume: bool, init: Path | None, device: str,
@@ -212,7 +212,7 @@ def tell(progress: Progress, batches: Batches, out: Path) -> None:
         console.print(f"{out / 'best.safetensors'}: score {progress.best:.2f} at step "
                       f"{progress.best_step}", soft_wrap=True)
     if progress.stopped:
-        console.print(f"stopped at step {progress.step}; --resume continues", soft_wrap=True)
+        console.print(f"stopped at step {progress.step}; --resume resumes it", soft_wrap=True)
         sys.exit(130)
 
 

@@ -1,5 +1,5 @@
-"""The folder of a run: frames.jsonl holds what was asked for and then a record a line, so that a
-run that was stopped, at whatever moment, goes on where it was."""
+"""The folder of a run: frames.jsonl holds its settings and then one record a line, so that a run
+that was stopped at any moment resumes where it stopped."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lidar_perception.types import InputError
 NAME = "frames.jsonl"
 # All that a run and its report write.
 OURS = (NAME, "report.html", "report.md", "report.json", "tables/*.csv", "figures/*.png")
-SYNC_S = 1.0  # at most so much is lost when the machine stops
+SYNC_S = 1.0  # at most this much is lost when the machine stops
 
 
 class Journal:
@@ -39,8 +39,8 @@ class Journal:
             if monotonic() - self._synced > SYNC_S:
                 self.sync()
         except OSError as error:
-            raise InputError(f"cannot write {self.path}: {error.strerror}; what is done stays, the "
-                             "same command goes on") from None
+            raise InputError(f"cannot write {self.path}: {error.strerror}; finished frames are "
+                             "kept, the same command resumes the run") from None
 
     def sync(self) -> None:
         os.fsync(self._stream.fileno())
@@ -58,7 +58,7 @@ def journal(folder: Path, plan: dict[str, Any], *, force: bool = False) -> Itera
     are not in it, so that they are tried again.
 
     InputError if the folder holds a run of another plan, or something else, unless force, which
-    begins anew; or if another process writes there.
+    starts over; or if another process writes there.
     """
     with locked(folder):
         path = folder / NAME

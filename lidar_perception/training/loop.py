@@ -1,7 +1,7 @@
 """The training loop of every network of the package.
 
 A network brings a Task; the loop brings one-cycle AdamW, mixed precision, gradient clipping, the
-average of the weights, validation, logs, and a state on disk from which a killed run goes on.
+average of the weights, validation, logs, and a state on disk from which a killed run resumes.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def may_begin(out: Path, resume: bool) -> Path:
     """The state's path in out. InputError if there is one, and resume is not asked for."""
     path = out / STATE
     if path.exists() and not resume:
-        raise InputError(f"{out} holds a training run already; give --resume to go on with it, or "
+        raise InputError(f"{out} holds a training run already; give --resume to resume it, or "
                          "another --out")
     return path
 

@@ -19,27 +19,27 @@ class LoopParams(Params):
                        high=10**9)
     epochs: float = param(80.0, "Passes over the data, if steps is 0.", low=0.001, high=1e5)
     batch: int = param(4, "Scenes of a step, on each device.", low=1, high=4096)
-    lr: float = param(0.003, "Greatest learning rate.", low=1e-9, high=10.0)
+    lr: float = param(0.003, "Highest learning rate.", low=1e-9, high=10.0)
     warm_share: float = param(0.4, "Share of the steps in which the learning rate rises; it falls "
-                              "in the others.", low=0.01, high=0.99)
+                              "in the rest.", low=0.01, high=0.99)
     weight_decay: float = param(0.01, "Weight decay of AdamW.", low=0.0, high=1.0)
-    clip: float = param(10.0, "Longest gradient; longer ones are shortened. 0 leaves them.",
+    clip: float = param(10.0, "Largest norm of the gradient; larger ones are clipped. 0: none.",
                         low=0.0, high=1e6)
-    ema: float = param(0.999, "Share of the averaged weights that a step keeps; the average is "
-                       "what is validated and saved. 0: the weights themselves.", low=0.0,
+    ema: float = param(0.999, "Decay of the moving average of the weights, which is validated "
+                       "and saved. 0: the weights themselves.", low=0.0,
                        high=0.999999)
     amp: str = param("auto", "Number format of the forward pass. auto: on CUDA bf16 where the "
                      "device has it, else fp16; on the CPU float32. bf16 on the CPU is about twice "
                      "as fast where it has instructions for it.",
                      choices=("auto", "bf16", "fp16", "off"))
-    validate_epochs: float = param(5.0, "Validate after so many epochs, if validate_steps is 0.",
+    validate_epochs: float = param(5.0, "Epochs between validations, if validate_steps is 0.",
                                    low=0.001, high=1e5)
-    validate_steps: int = param(0, "Validate after so many steps.", low=0, high=10**9)
-    save_steps: int = param(200, "Save what a resumed run needs after so many steps.", low=1,
-                            high=10**9)
-    log_steps: int = param(10, "Log the losses of every so manieth step.", low=1, high=10**6)
-    most_skipped: int = param(50, "Give up after so many steps in a row whose loss or gradient is "
-                              "not finite.", low=1, high=10**6)
+    validate_steps: int = param(0, "Steps between validations.", low=0, high=10**9)
+    save_steps: int = param(200, "Steps between saves of the state that a resumed run needs.",
+                            low=1, high=10**9)
+    log_steps: int = param(10, "Steps between logged losses.", low=1, high=10**6)
+    most_skipped: int = param(50, "Give up after this many consecutive steps whose loss or "
+                              "gradient is not finite.", low=1, high=10**6)
     seed: int = param(0, "Seed of the weights, the order of the scenes and their augmentation.",
                       low=0, high=2**31 - 1)
 
@@ -60,47 +60,47 @@ class LoopParams(Params):
 class NoiseParams(Params):
     """How far off the ranges are."""
 
-    beam_noise: float = param(0.08, "The ranges of each beam are off by up to about this; standard "
-                              "deviation.", unit="m", low=0.0, high=1.0)
-    range_noise: float = param(0.08, "Likewise the range of each point.", unit="m", low=0.0,
-                               high=1.0)
+    beam_noise: float = param(0.08, "Error of the ranges that all points of a beam share; standard "
+                              "deviation, at most.", unit="m", low=0.0, high=1.0)
+    range_noise: float = param(0.08, "Error of the range of each point, likewise.", unit="m",
+                               low=0.0, high=1.0)
 
 
 @dataclass(frozen=True)
 class AugmentParams(NoiseParams):
     """How scenes are changed. 0 switches a change off."""
 
-    crowded: float = param(0.7, "Chance that a scene gets objects of other scenes. The rest "
-                           "stay as empty as streets are.", low=0.0, high=1.0)
-    cars: int = param(10, "Cars of other scenes are put in until there are so many where "
-                      "the network looks.", low=0, high=100)
+    crowded: float = param(0.7, "Probability that objects of other scenes are pasted into a scene. "
+                           "The rest stay as they are.", low=0.0, high=1.0)
+    cars: int = param(10, "Cars of other scenes are pasted in until there are so many in the "
+                      "network's range.", low=0, high=100)
     pedestrians: int = param(8, "Likewise pedestrians.", low=0, high=100)
     cyclists: int = param(8, "Likewise cyclists.", low=0, high=100)
-    things: int = param(12, "So many things that stand like a person and are none, such as posts, "
-                        "are put in likewise, as what is not to be found.", low=0, high=100)
-    things_stretch: float = param(0.5, "They are made wider or thinner, higher or lower, by "
+    things: int = param(12, "So many objects that resemble a standing person, such as posts, are "
+                        "pasted in as background.", low=0, high=100)
+    things_stretch: float = param(0.5, "They are stretched or shrunk, in width and height, by "
                                   "factors up to exp(this).", low=0.0, high=3.0)
     things_intensity: float = param(0.8, "Their intensities are multiplied by up to exp(this), or "
                                     "divided.", low=0.0, high=3.0)
-    things_shine: float = param(0.25, "Chance that a part of one shines, as signs and reflectors "
-                                "do.", low=0.0, high=1.0)
-    database_scans: int = param(2000, "Those objects come from so many scenes, at most.", low=0,
+    things_shine: float = param(0.25, "Probability that a part of one is retroreflective, as "
+                                "signs are.", low=0.0, high=1.0)
+    database_scans: int = param(2000, "Pasted objects come from at most so many scenes.", low=0,
                                 high=10**6)
     object_turn: float = param(0.157, "Each object is turned by up to this.", unit="rad", low=0.0,
                                high=3.1416)
     object_shift: float = param(0.25, "Each object is shifted along x and y; standard deviation.",
                                 unit="m", low=0.0, high=5.0)
-    flip: float = param(0.5, "Chance that left and right are swapped.", low=0.0, high=1.0)
+    flip: float = param(0.5, "Probability that left and right are swapped.", low=0.0, high=1.0)
     turn: float = param(0.785, "The scene is turned about the sensor by up to this; one that is "
-                        "labelled all around by anything, unless this is 0.", unit="rad", low=0.0,
+                        "labelled all around by any angle, unless this is 0.", unit="rad", low=0.0,
                         high=3.1416)
-    scale: float = param(0.05, "The scene grows or shrinks by up to this share.", low=0.0, high=0.5)
-    dropout: float = param(0.3, "Up to this share of the points is left out.", low=0.0, high=0.99)
+    scale: float = param(0.05, "The scene is scaled by up to this share.", low=0.0, high=0.5)
+    dropout: float = param(0.3, "Up to this share of the points is dropped.", low=0.0, high=0.99)
     intensity: float = param(0.15, "Intensities are multiplied by 1 plus or minus up to this, and "
                              "raised or lowered by up to half of it; 0 stays 0.", low=0.0, high=1.0)
     height: float = param(0.1, "The sensor is raised or lowered by up to this.", unit="m", low=0.0,
                           high=2.0)
-    tilt: float = param(0.01, "The ground rises or falls ahead, and to the side, by up to this.",
+    tilt: float = param(0.01, "The ground is tilted ahead, and to the side, by up to this.",
                         unit="m/m", low=0.0, high=0.3)
 
 
@@ -109,40 +109,40 @@ class DataParams(Params):
     """Which scenes."""
 
     scans: int = param(4000, "Simulated scans of an epoch.", low=1, high=10**7)
-    street_scans: int = param(4, "Of each street so many are taken, spread over a drive of 20 s.",
+    street_scans: int = param(4, "Scans taken of each street, spread over a drive of 20 s.",
                               low=1, high=100)
     val_scans: int = param(200, "Simulated scans of a validation, of other streets.", low=1,
                            high=10**6)
     sensor: str = param("hdl64e", "Sensor of the simulated scans: the name of a preset, or "
                         "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE. It is mounted at 1.73 m.")
-    people: float = param(3.0, "How many times as many pedestrians and cyclists as in KITTI the "
-                          "streets to train on have.", low=0.0, high=100.0)
-    val_people: float = param(1.0, "Likewise the streets to validate on.", low=0.0, high=100.0)
-    cache: str = param("", "Folder for simulated scans, which take half a second to make. Empty: "
-                       "none.")
-    cache_gb: float = param(20.0, "Nothing more is put there from this size on.", unit="GB",
+    people: float = param(3.0, "Pedestrians and cyclists on the streets trained on, as a multiple "
+                          "of KITTI's.", low=0.0, high=100.0)
+    val_people: float = param(1.0, "Likewise on the streets validated on.", low=0.0, high=100.0)
+    cache: str = param("", "Folder that keeps simulated scans, which take about a second to make. "
+                       "Empty: none.")
+    cache_gb: float = param(20.0, "Size up to which scans are added to the cache.", unit="GB",
                             low=0.0, high=1e6)
-    val_share: float = param(PAPER_SHARE, "Share of the KITTI frames to validate on, drawn by the "
-                             "seed, where neither --val nor --split is given.", low=0.0,
+    val_share: float = param(PAPER_SHARE, "Share of the frames held out for validation, drawn by "
+                             "the seed, where neither --val nor --split is given.", low=0.0,
                              high=0.9)
-    view: bool = param(True, "Use the points in KITTI's image only, as its labels end there.")
-    min_points: int = param(5, "An object, or a cluster, with fewer points is not learned "
-                              "from.", low=1, high=1000)
+    view: bool = param(True, "Use only the points in KITTI's image, since its labels end there.")
+    min_points: int = param(5, "Objects, and clusters, with fewer points are left out of the "
+                              "loss.", low=1, high=1000)
 
 
 @dataclass(frozen=True)
 class PointPillarsTraining(LoopParams):
-    """Everything that train pointpillars can be told."""
+    """All settings of train pointpillars."""
 
     version: str = param("v4", "EG-PointPillars version; v0 is PointPillars.",
                          choices=("v0", "v1", "v2", "v3", "v4"))
     size: str = param("compact", "full: the paper's network, for a GPU. compact: for two CPU "
                       "cores.", choices=("full", "compact"))
-    ahead: float = param(0.0, "Train on what lies up to so far ahead only, which is quicker; the "
-                         "weights are those of the whole range all the same. 0: all of it.",
+    ahead: float = param(0.0, "Train only on what lies up to this far ahead, which is quicker; the "
+                         "weights still cover the whole range. 0: all of it.",
                          unit="m", low=0.0, high=1000.0)
     aside: float = param(0.0, "Likewise to each side.", unit="m", low=0.0, high=1000.0)
-    score: str = param("bev", "What the best weights are best at: bev, the mean AP from above at "
+    score: str = param("bev", "Score that chooses the best weights: bev, the mean AP from above at "
                        "the overlaps 0.5 / 0.25 / 0.25, or map, the mean AP in space at 0.7 / 0.5 "
                        "/ 0.5; both moderate, R40.", choices=("bev", "map"))
     augment: AugmentParams = AugmentParams()
@@ -151,30 +151,32 @@ class PointPillarsTraining(LoopParams):
 
 @dataclass(frozen=True)
 class ClusterAugmentParams(NoiseParams):
-    """Which clusters of a scene are learned from, and how they are changed. 0 switches a change
+    """Which clusters of a scene are trained on, and how they are changed. 0 switches a change
     off."""
 
-    objects: int = param(24, "Clusters of each class taken of a scene, at most.", low=1, high=1000)
-    background: int = param(40, "Clusters of background, at most.", low=0, high=10_000)
-    box_shift: float = param(0.15, "Points around an object are cut at its box, moved by about "
-                             "this; standard deviation.", unit="m", low=0.0, high=2.0)
+    objects: int = param(24, "Clusters of each class taken from a scene, at most.", low=1,
+                         high=1000)
+    background: int = param(40, "Background clusters taken from a scene, at most.", low=0,
+                            high=10_000)
+    box_shift: float = param(0.15, "Points around an object are cut by its box, shifted by this; "
+                             "standard deviation.", unit="m", low=0.0, high=2.0)
     farther: float = param(1.5, "Some clusters are moved away, to up to 1 plus this times their "
-                           "range, and lose points as they would.", low=0.0, high=10.0)
-    dropout: float = param(0.9, "Of half the clusters up to this share of the points is left out.",
+                           "range, and thinned accordingly.", low=0.0, high=10.0)
+    dropout: float = param(0.9, "Half of the clusters lose up to this share of their points.",
                            low=0.0, high=0.99)
-    scale: float = param(0.05, "Clusters grow or shrink by up to this share.", low=0.0, high=0.5)
-    flip: float = param(0.5, "Chance that left and right are swapped.", low=0.0, high=1.0)
+    scale: float = param(0.05, "Clusters are scaled by up to this share.", low=0.0, high=0.5)
+    flip: float = param(0.5, "Probability that left and right are swapped.", low=0.0, high=1.0)
     intensity: float = param(0.2, "Intensities are multiplied by 1 plus or minus up to this.",
                              low=0.0, high=1.0)
-    shine: float = param(0.1, "Chance that a part of a cluster of background shines, as signs and "
-                         "reflectors do.", low=0.0, high=1.0)
+    shine: float = param(0.1, "Probability that a part of a background cluster is retroreflective, "
+                         "as signs are.", low=0.0, high=1.0)
     height: float = param(0.15, "The ground is taken to be higher or lower by up to this, and by "
                           "half of it for each cluster by itself.", unit="m", low=0.0, high=2.0)
 
 
 @dataclass(frozen=True)
 class PointNetTraining(LoopParams):
-    """Everything that train pointnet can be told."""
+    """All settings of train pointnet."""
 
     network: str = param("improved", "improved: paper C's. pointnet, pointnet2: plain PointNet and "
                          "PointNet++ (single-scale grouping), to compare with. The others are rows "

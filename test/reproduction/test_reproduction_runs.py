@@ -214,7 +214,7 @@ def test_a_full_disk_is_one_line_and_the_rest_goes_on_later(few, tmp_path, monke
     with monkeypatch.context() as patch:
         patch.setattr(journal, "SYNC_S", -1.0)
         patch.setattr(journal.Journal, "sync", full)
-        with pytest.raises(InputError, match=r"No space left.*the same command goes on"):
+        with pytest.raises(InputError, match=r"No space left.*the same command resumes"):
             runner.run(SMALL, few, tmp_path / "out")
     assert len(runner.run(SMALL, few, tmp_path / "out")) == 5
 
