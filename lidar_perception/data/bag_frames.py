@@ -32,7 +32,7 @@ def open_recording(path: Path, *, points: str = POINTS, scans: bool = True) -> R
     """Frames of the clouds on the topic `points`. InputError if there is none."""
     with Bag(path) as bag:
         bag.require(points)
-        topics = set(bag.topics)
+        topics = {topic for topic, count in bag.counts.items() if count}
         frames = BagFrames(path, points, bag.topics[points], bag.counts[points])
     has = frozenset(what for what, needed in BESIDE.items() if needed <= topics)
     return Recording(path, f"rosbag2 bag, clouds on {points}", frames, has)
