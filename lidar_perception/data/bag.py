@@ -10,8 +10,10 @@ from typing import Any
 
 import yaml
 from mcap.writer import CompressionType, Writer
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import Reader
 
+from lidar_perception.data.mcap_index import check_index
+from lidar_perception.runs.files import short
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode, encode, typestore
 
@@ -119,7 +121,9 @@ def _full_qos(qos: dict) -> dict:
 
 
 class Bag:
-    """A bag open for reading; a context manager. topics maps name to type."""
+    """A bag open for reading; a context manager. topics maps name to type, counts to the number of
+    messages. InputError where it is damaged: checksums and counts are compared, so that what is
+    read is what was written, in as far as the writer left checksums."""
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
@@ -127,11 +131,20 @@ class Bag:
         try:
             self.reader = Reader(source)
             self.reader.open()
-        except (ReaderError, OSError, AssertionError, ValueError, TypeError, KeyError) as error:
+        except Exception as error:  # rosbags lets through what damaged sizes lead to
+            raise InputError(_unreadable(source, error)) from None
+        try:
+            for storage in getattr(self.reader.storage, "storages", [self.reader.storage]):
+                if storage.path.suffix == ".mcap":
+                    check_index(storage.path)
+        except Exception as error:
+            self.reader.close()
             raise InputError(_unreadable(source, error)) from None
         self.connections = list(self.reader.connections)
         self.topics = {c.topic: c.msgtype for c in self.connections}
-        self.counts = {c.topic: c.msgcount for c in self.connections}
+        self.counts = dict.fromkeys(self.topics, 0)
+        for connection in self.connections:
+            self.counts[connection.topic] += connection.msgcount
 
     def __enter__(self) -> Bag:
         return self
@@ -159,15 +172,23 @@ class Bag:
 
     def raw(self, topics: Iterable[str] | None = None, start_ns: int | None = None,
             stop_ns: int | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """(topic, time, CDR bytes) in order of time; all topics by default."""
+        """(topic, time, CDR bytes) in order of time; all topics by default. InputError where the
+        bag is damaged, at the end if other numbers of messages were read than it says."""
         wanted = [c for c in self.connections if topics is None or c.topic in topics]
         if not wanted:
             return
+        found = dict.fromkeys((c.topic for c in wanted), 0)
         try:
             for connection, stamp, data in self.reader.messages(wanted, start_ns, stop_ns):
+                found[connection.topic] += 1
                 yield connection.topic, stamp, data
         except Exception as error:  # rosbags lets through what zstd, struct and SQLite raise
             raise InputError(_unreadable(self.path, error)) from None
+        if (start_ns is None or start_ns <= self.start_ns) and stop_ns is None:
+            for topic, count in found.items():
+                if count != self.counts[topic]:
+                    raise InputError(_unreadable(self.path, ValueError(
+                        f"it says {self.counts[topic]} messages on {topic} and holds {count}")))
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         """(topic, time, message) of rosbags' classes."""
@@ -194,6 +215,6 @@ def _storage(path: Path) -> Path:
 
 
 def _unreadable(path: Path, error: Exception) -> str:
-    reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+    reason = short(error).rstrip(".")
     return (f"the bag {path} is truncated or damaged ({reason}); "
             "'mcap recover' may save what it holds")

@@ -93,7 +93,7 @@ def test_a_click_is_finite_and_near(axis, value):
     xyz, labels, boxes = clicked_scene()
     click = np.array([6, 0.2, -1.0])
     click[axis] = value
-    with pytest.raises(InputError, match="no finite number|nearest cluster is inf"):
+    with pytest.raises(InputError, match=r"no finite number|nearest cluster is inf"):
         seed_from_click(click, xyz, labels, boxes, 2.0)
 
 
