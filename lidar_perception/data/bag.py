@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,10 @@ import yaml
 from mcap.writer import CompressionType, Writer
 from rosbags.rosbag2 import Reader
 
-from lidar_perception.data.mcap_index import check_index
+from lidar_perception.data.mcap_index import NO_INDEX, check_index
+from lidar_perception.data.record_file import RecordFile
 from lidar_perception.runs.files import short
+from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode, encode, typestore
 
@@ -40,32 +43,45 @@ def _yaml(content: Any) -> str:
 class BagWriter:
     """Writes a rosbag2 folder with one MCAP file: zstd chunks, checksums, metadata.yaml.
 
-    A context manager. The folder appears under its name once it is complete; after an exception
-    what was written so far is closed properly and left as NAME.incomplete.
+    A context manager, of one process at a time. The folder appears under its name once it is
+    complete; after an exception what was written so far is closed properly and left as
+    NAME.incomplete. InputError where the disk is full: NAME.incomplete then holds the messages that
+    found room.
     """
 
     def __init__(self, path: str | Path, *, force: bool = False):
-        self.path = Path(path)
-        if self.path.exists() and not force:
-            raise InputError(f"{self.path} exists already; give another name or --force")
-        if self.path.exists() and not (self.path / "metadata.yaml").is_file():
-            raise InputError(f"{self.path} is no bag, so it is not replaced; give another name")
+        self.path, self.force = Path(path), force
         self.partial = self.path.with_name(self.path.name + ".incomplete")
         self.channels: dict[str, int] = {}
         self.topics: list[dict] = []
         self.times: list[int] = []
+        self._may_write()
+
+    def _may_write(self) -> None:
+        if self.path.exists() and not self.force:
+            raise InputError(f"{self.path} exists already; give another name or --force")
+        if self.path.exists() and not (self.path / "metadata.yaml").is_file():
+            raise InputError(f"{self.path} is no bag, so it is not replaced; give another name")
 
     def __enter__(self) -> BagWriter:
-        try:
-            if self.partial.exists():
-                shutil.rmtree(self.partial)
-            self.partial.mkdir(parents=True)
-            self.file = open(self.partial / f"{self.path.name}.mcap", "wb")
-        except OSError as error:
-            raise InputError(f"cannot write the bag {self.path}: {error}") from None
-        self.mcap = Writer(self.file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self.mcap.start(profile="ros2", library="lidar_perception")
+        with ExitStack() as stack, self._named():
+            stack.enter_context(locked(self.partial))
+            self._may_write()  # another process may just have written it
+            for old in self.partial.iterdir():
+                shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
+            self.file = stack.enter_context(RecordFile(self.partial / f"{self.path.name}.mcap"))
+            self.mcap = Writer(self.file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+            self.mcap.start(profile="ros2", library="lidar_perception")
+            self.open = stack.pop_all()
         return self
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise InputError(f"cannot write the bag {self.path}: {error.strerror or error}; what "
+                             f"could be written is in {self.partial}") from None
 
     def add_topic(self, topic: str, type_name: str, qos: dict = SENSOR_QOS) -> None:
         definition, _ = typestore().generate_msgdef(type_name, ros_version=2)
@@ -84,11 +100,28 @@ class BagWriter:
         """Append a message: an object of bag_message, or CDR bytes as they are."""
         channel = self.channels[topic]
         raw = message if isinstance(message, bytes) else encode(message)
-        self.mcap.add_message(channel, stamp_ns, raw, stamp_ns)
+        with self._named():
+            self.mcap.add_message(channel, stamp_ns, raw, stamp_ns)
         self.topics[list(self.channels).index(topic)]["message_count"] += 1
         self.times.append(stamp_ns)
 
     def __exit__(self, kind, error, trace) -> None:
+        with self.open, self._named():
+            try:
+                self._finish()
+            except OSError:
+                # As mcap has it, a file may end without an index; so may a bag without metadata.
+                self.file.close_with(NO_INDEX)
+                (self.partial / "metadata.yaml").unlink(missing_ok=True)
+                if kind is None:
+                    raise
+                return  # the error that there is says why
+            if kind is None:
+                if self.path.exists():
+                    shutil.rmtree(self.path)
+                self.partial.rename(self.path)
+
+    def _finish(self) -> None:
         start = min(self.times, default=0)
         count = sum(t["message_count"] for t in self.topics)
         span = {"starting_time": {"nanoseconds_since_epoch": start},
@@ -101,17 +134,11 @@ class BagWriter:
                 "ros_distro": "jazzy"}
         self.mcap.add_metadata("rosbag2", {"serialized_metadata": _yaml(info)})
         self.mcap.finish()
-        with self.file:
-            self.file.flush()
-            os.fsync(self.file.fileno())
+        self.file.sync()
         with open(self.partial / "metadata.yaml", "w") as stream:
             stream.write(_yaml({"rosbag2_bagfile_information": info}))
             stream.flush()
             os.fsync(stream.fileno())
-        if kind is None:
-            if self.path.exists():
-                shutil.rmtree(self.path)
-            self.partial.rename(self.path)
 
 
 def _full_qos(qos: dict) -> dict:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
 import struct
 
+import numpy as np
 import pytest
 from bag_samples import message_bytes, same_cloud, scans
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
-from samples import header, scene, write
+from samples import STAMP, header, scene, write
 
+from lidar_perception.data import bag as bag_module
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.recording import open_recording
-from lidar_perception.data.to_bag import write_bag
+from lidar_perception.data.to_bag import Scan, write_bag
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message, typestore
 from lidar_perception.wire.topics import POINTS
@@ -62,8 +65,61 @@ def test_an_exception_leaves_the_old_bag_and_an_incomplete_one_that_can_be_read(
 
 def test_a_place_that_cannot_hold_a_bag_is_named(tmp_path):
     write(tmp_path / "file", b"")
-    with pytest.raises(InputError, match=r"cannot write the bag .*file/bag"):
+    with pytest.raises(InputError, match=r"cannot make the folder .*file/bag"):
         write_bag(tmp_path / "file/bag", scans(1))
+
+
+@pytest.fixture
+def room():
+    """room(bytes): no file may grow larger; a write beyond fails as it does on a full disk."""
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, hard))
+
+
+def test_on_a_full_disk_what_found_room_can_be_read(tmp_path, monkeypatch, room):
+    """Wherever it gets full: in a chunk, in the index, in metadata.yaml."""
+    monkeypatch.setattr(bag_module, "CHUNK_BYTES", 20_000)
+    rng = np.random.default_rng(0)
+    drive = [Scan(rng.random((1000, 4), np.float32), STAMP + i) for i in range(5)]
+    write_bag(tmp_path / "all", drive)
+    whole = message_bytes(tmp_path / "all")
+    size = (tmp_path / "all/all.mcap").stat().st_size
+    read = []
+    for full in [*range(10_000, size, 6007), *range(size - 400, size, 7)]:
+        room(full)
+        with pytest.raises(InputError, match=r"cannot write the bag .*bag\.incomplete") as error:
+            write_bag(tmp_path / "bag", drive)
+        room(resource.RLIM_INFINITY)
+        assert "\n" not in str(error.value) and not (tmp_path / "bag").exists()
+        rows = message_bytes(tmp_path / "bag.incomplete")
+        assert rows == whole[:len(rows)]
+        read.append(len(rows))
+    assert read[0] == 0 and read[-1] == len(whole) and read == sorted(read)
+    write_bag(tmp_path / "bag", drive)
+    assert message_bytes(tmp_path / "bag") == whole
+
+
+def test_a_second_writer_of_the_same_bag_leaves_the_first_alone(tmp_path):
+    path, first = tmp_path / "bag", scans(2)
+
+    def slow():
+        yield first[0]
+        for force in (False, True):
+            with pytest.raises(InputError, match="another process is writing"):
+                write_bag(path, scans(1), force=force)
+        yield first[1]
+
+    write_bag(path, slow())
+    assert open_recording(bag=path).count == 2
+
+
+def test_a_bag_that_came_while_waiting_to_write_is_kept(tmp_path):
+    late = BagWriter(tmp_path / "bag")
+    write_bag(tmp_path / "bag", scans(2))
+    with pytest.raises(InputError, match="exists already"), late:
+        pass
+    assert open_recording(bag=tmp_path / "bag").count == 2
 
 
 def test_a_folder_without_metadata_is_read_by_its_one_file(written, tmp_path):
