@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.camera import Calibration, Camera
+from lidar_perception.groups import renumbered
 from lidar_perception.types import (
     CLASSES,
     Detections,
@@ -82,6 +83,14 @@ def column(msg: Any, name: str, places: np.ndarray) -> np.ndarray | None:
     it holds more than one number a point."""
     points = to_array(msg)
     return _single(points, name).take(places) if name in (points.dtype.names or ()) else None
+
+
+def cluster_column(msg: Any, places: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """labels (N,) int32 of the points at places (N,), 0 none and 1..K, from the column cluster_id
+    of whatever clustering, and numbers (K,) int64, the ids there (see groups.renumbered); None
+    where the cloud has no such column. InputError if it holds no ids."""
+    ids = column(msg, "cluster_id", places)
+    return None if ids is None else renumbered(ids)
 
 
 def _single(points: np.ndarray, name: str) -> np.ndarray:
