@@ -3,6 +3,7 @@ may have written."""
 
 from __future__ import annotations
 
+import errno
 import os
 from contextlib import suppress
 from pathlib import Path
@@ -57,6 +58,19 @@ def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
         with suppress(OSError):
             temporary.unlink()
         raise InputError(f"cannot write {path}: {error.strerror}") from None
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder, with those above it, if it is not there. InputError where that cannot be, or
+    nothing can be written into it."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        if not os.access(path, os.W_OK | os.X_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except FileExistsError:
+        raise InputError(f"{path} is a file; give the name of a folder") from None
+    except OSError as error:
+        raise InputError(f"cannot write into the folder {path}: {error.strerror}") from None
 
 
 def remove_temporaries(folder: Path) -> None:
