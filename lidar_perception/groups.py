@@ -54,9 +54,12 @@ def group_points(xyz: np.ndarray, labels: np.ndarray,
 
 def renumbered(ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """labels (N,) int32, 0 none and 1..K without a gap, of ids (N,) from anywhere, and numbers (K,)
-    int64: the id of each, ascending. 0, what is below, and what is not finite is none. InputError
-    for fractions, and beyond what a float64 holds exactly."""
+    int64: the id of each, ascending. 0, what is below, and what is not finite is none; so is
+    2^32 - 1 as uint32, the -1 of those who mean noise. InputError for fractions, and beyond what a
+    float64 holds exactly."""
     ids = np.asarray(ids)
+    if ids.dtype.kind == "u" and ids.dtype.itemsize == 4:
+        ids = np.where(ids == 2**32 - 1, 0, ids)
     if ids.dtype.kind == "f":
         ids = np.where(np.isfinite(ids) & (ids > 0), ids, 0).astype(np.float64)
         if not (ids == np.floor(ids)).all() or ids.max(initial=0) > 2.0**53:
