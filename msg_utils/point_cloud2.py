@@ -10,6 +10,7 @@ import numpy as np
 # sensor_msgs/PointField datatypes
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 CODES = {kind: code for code, kind in DATATYPES.items()}
+MAX_STEP = 2**20  # bytes a point; NumPy's own limit is 2**31
 
 
 class CloudError(ValueError):
@@ -20,8 +21,11 @@ def dtype_of(msg: Any) -> np.dtype:
     """The structured dtype of a cloud's points, itemsize = point_step, in the cloud's byte order.
 
     Fields without a name are padding. CloudError for an unknown datatype, a field that reaches
-    past point_step, or a name that comes twice.
+    past point_step, a name that comes twice, or a point_step above MAX_STEP.
     """
+    if msg.point_step > MAX_STEP:
+        raise CloudError(f"point_step = {msg.point_step} is more than {MAX_STEP} bytes a point; "
+                         "the message is broken")
     order = ">" if msg.is_bigendian else "<"
     names, formats, offsets = [], [], []
     for f in msg.fields:
@@ -165,4 +169,4 @@ def _cloud(header: Any, make: Any, fields: list, data: np.ndarray, *, height: in
            point_step: int, is_bigendian: bool, is_dense: bool) -> Any:
     return make("sensor_msgs/msg/PointCloud2", header=header, height=height, width=width,
                 fields=fields, is_bigendian=is_bigendian, point_step=point_step,
-                row_step=width * point_step, data=data, is_dense=is_dense)
+                row_step=width * point_step if data.size else 0, data=data, is_dense=is_dense)

@@ -40,7 +40,7 @@ def segment(frame: LidarFrame, camera: Camera | None = None,
     t4 = perf_counter()
     ms = dict(view=t1 - t0, ground=t2 - t1, clustering=t3 - t2, boxes=t4 - t3)
     return Segmented(places, seen.xyz, ground, cluster_ids, boxes,
-                     {k: v * 1e3 for k, v in ms.items()})
+                     ms={k: v * 1e3 for k, v in ms.items()})
 
 
 def find_candidates(frame: LidarFrame, seed: SeedSource, camera: Camera | None = None,
@@ -54,6 +54,10 @@ def find_candidates(frame: LidarFrame, seed: SeedSource, camera: Camera | None =
 
 def refined(segmented: Segmented, seed: SeedSource,
             params: PipelineParams = PipelineParams()) -> Candidates:
-    """The candidates among a frame's clusters. InputError where there is no seed."""
+    """The candidates among a frame's clusters, by the numbers that the cloud gives these.
+    InputError where there is no seed."""
     found = refine(segmented.xyz, segmented.cluster_ids, segmented.boxes, seed(segmented), params)
-    return replace(found, ms={**segmented.ms, **found.ms})
+    clusters = found.clusters
+    if segmented.numbers is not None:
+        clusters = segmented.numbers[clusters - 1]
+    return replace(found, clusters=clusters, ms={**segmented.ms, **found.ms})

@@ -38,8 +38,8 @@ def automatic_seed(template: Seed, params: PipelineParams) -> SeedSource:
         clusters = np.arange(1, len(s.boxes) + 1)
         likely = confidence(shape_features(*group_points(s.xyz, s.cluster_ids, clusters), s.boxes,
                                            params))
-        likely[np.bincount(s.cluster_ids, minlength=len(s.boxes) + 1)[1:] < MIN_POINTS] = 0.0
-        if likely.max(initial=0.0) < params.seed.min_confidence:
+        likely[np.bincount(s.cluster_ids, minlength=len(s.boxes) + 1)[1:] < MIN_POINTS] = -1.0
+        if likely.max(initial=-1.0) < params.seed.min_confidence:  # which may be 0
             return template
         best = int(likely.argmax())
         return seed_from_points(s.xyz[s.cluster_ids == best + 1], s.boxes[best])

@@ -12,11 +12,12 @@ import numpy as np
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.silhouette import silhouettes, to_pixels
 from lidar_perception.geometry import points_in_box
-from lidar_perception.runs.files import write_text
-from lidar_perception.types import InputError
+from lidar_perception.runs.files import read_text, short, write_text
+from lidar_perception.types import MAX_RANGE, InputError
 
 MIN_POINTS = 10  # a thinner seed has no shape to compare with; DBSCAN's min_samples likewise
 DIGITS = 4  # of a metre, in a template
+MAX_BYTES = 10**7  # of a template: some 200,000 points
 
 
 @dataclass(frozen=True)
@@ -67,12 +68,16 @@ def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray
 def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray,
                     radius: float) -> Seed:
     """Seed of the cluster whose points (labels 1..K, ground-snapped boxes (K, 7)) come nearest to
-    click (3,). InputError where none is within radius."""
+    click (3,). InputError where none is within radius, or the click is not finite."""
+    click = np.asarray(click, np.float64)
+    if not np.isfinite(click).all():
+        raise InputError("the clicked point has a coordinate that is no finite number; click again")
     clustered = np.flatnonzero(labels)
     if len(clustered) == 0:
         raise InputError("a point was clicked but the cloud has no clusters")
-    distance = np.linalg.norm(xyz[clustered] - np.asarray(click, np.float32), axis=1)
-    if distance.min() > radius:
+    with np.errstate(over="ignore"):
+        distance = np.linalg.norm(xyz[clustered] - click.astype(np.float32), axis=1)
+    if not distance.min() <= radius:
         raise InputError(f"nearest cluster is {distance.min():.1f} m from the clicked point; "
                          f"click within {radius:g} m of a pedestrian")
     label = labels[clustered[distance.argmin()]]
@@ -93,16 +98,17 @@ def load_seed(path: str | Path = "") -> Seed:
     pedestrian). InputError names the file and what is wrong with it."""
     source = Path(path) if path else files("lidar_perception.candidates") / "pedestrian.json"
     try:
-        content = json.loads(source.read_text())
-        xyz = np.array(content["points_m"], np.float32)
+        content = json.loads(read_text(source, MAX_BYTES) if path else source.read_text())
+        with np.errstate(over="ignore"):  # beyond float32 is inf
+            xyz = np.array(content["points_m"], np.float32)
         floor, height = float(content["floor_m"]), float(content["height_m"])
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the template {source}: {error}") from None
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{source} is not a template ({error!r}); make one with "
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{source} is not a template ({short(error)}); make one with "
                          "'lidar-perception seed'") from None
-    if (xyz.ndim != 2 or xyz.shape[1] != 3 or len(xyz) < MIN_POINTS or not 0 < height < np.inf
-            or not np.isfinite(xyz).all() or not np.isfinite(floor)):
+    if (xyz.ndim != 2 or xyz.shape[1] != 3 or len(xyz) < MIN_POINTS or not 0 < height <= MAX_RANGE
+            or not (np.abs(xyz) <= MAX_RANGE).all() or not abs(floor) <= MAX_RANGE):
         raise InputError(f"{source}: a template has {MIN_POINTS} points_m or more of x, y, z, and "
                          "height_m above 0; make one with 'lidar-perception seed'")
     return Seed(xyz, floor, height)

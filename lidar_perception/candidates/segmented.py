@@ -20,7 +20,7 @@ class Segmented:
 
     places (M,) int64 their rows in the frame, xyz (M, 3) float32, ground (M,) bool, cluster_ids
     (M,) int32 with 0 = none, boxes (K, 7) float32 of clusters 1..K down to the ground plane;
-    ms per step.
+    numbers (K,) int64: what the cloud calls these clusters, None for 1..K; ms per step.
     """
 
     places: np.ndarray
@@ -28,6 +28,7 @@ class Segmented:
     ground: np.ndarray
     cluster_ids: np.ndarray
     boxes: np.ndarray
+    numbers: np.ndarray | None = None
     ms: dict[str, float] = field(default_factory=dict)
 
 

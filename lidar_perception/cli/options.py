@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,10 @@ import yaml
 
 from lidar_perception.candidates.configurations import CONFIGURATIONS
 from lidar_perception.param_fields import flatten, new_name, parameter_fields, with_values
+from lidar_perception.runs.files import read_text, short
 from lidar_perception.types import InputError
+
+MAX_BYTES, MAX_NAMES = 10**6, 10_000  # of a parameter file; aliases in YAML make many of few bytes
 
 
 class NumberList(click.ParamType):
@@ -81,10 +85,9 @@ def read_config(path: Path, params: Any) -> dict[str, Any]:
         return {name: value for name, value in CONFIGURATIONS[str(path)].items()
                 if name in parameter_fields(params)}
     try:
-        content = yaml.safe_load(path.read_text())
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise InputError(f"cannot read the parameter file {path}: "
-                         f"{str(error).splitlines()[0]}") from None
+        content = yaml.safe_load(read_text(path, MAX_BYTES))
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        raise InputError(f"cannot read the parameter file {path}: {short(error)}") from None
     if not isinstance(content, dict | None):
         raise InputError(f"{path} is no parameter file; see config/ for the form")
     known, values = parameter_fields(params), {}
@@ -92,17 +95,33 @@ def read_config(path: Path, params: Any) -> dict[str, Any]:
         if not (isinstance(section, dict)
                 and isinstance(section.get("ros__parameters", ()), dict | None)):
             raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for the form")
-        for name, value in _dotted(section["ros__parameters"] or {}):
+        names = islice(_dotted(section.get("ros__parameters") or {}), MAX_NAMES + 1)
+        for count, (name, value) in enumerate(names):
+            if count == MAX_NAMES:
+                raise InputError(f"{path}: '{node}' has more than {MAX_NAMES} parameters")
+            if not isinstance(name, str):
+                raise InputError(f"{path}: {name!r} is no name of a parameter; put it into quotes")
             if name in known:
                 values[name] = value
             elif (new := new_name(name)) in known:
                 raise InputError(f"{path}: '{name}' is called '{new}' now; rename it")
+            elif any(k.startswith(f"{name}.") or name.startswith(f"{k}.") for k in known):
+                raise InputError(f"{path}: '{name}' is {_wrong_level(name, known)}")
     return values
 
 
-def _dotted(section: dict, prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _wrong_level(name: str, known: Iterable[str]) -> str:
+    inner = [k for k in known if k.startswith(f"{name}.")]
+    return (f"a group, not a value; it holds {', '.join(inner)}" if inner else
+            "below a parameter that holds no others")
+
+
+def _dotted(section: dict, prefix: str = "") -> Iterator[tuple[Any, Any]]:
+    """(dotted name, value); the name as it is where it is no text."""
     for key, value in section.items():
-        if isinstance(value, dict):
+        if not isinstance(key, str):
+            yield key, value
+        elif isinstance(value, dict):
             yield from _dotted(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value

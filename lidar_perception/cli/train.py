@@ -141,8 +141,10 @@ def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
     """
     from lidar_perception.detectors.devices import chosen_device
     from lidar_perception.detectors.pointnet.config import ABLATIONS
+    from lidar_perception.runs.files import make_folder
     from lidar_perception.training.ranks import joined, rank
     from lidar_perception.training.sources import training_scenes
+    make_folder(out)  # or say that it cannot be, before the data are prepared
     scenes = training_scenes(data, val, split, val_split, params.data, params.seed)
     with joined(chosen_device(device)) as place:
         for name in ABLATIONS if ablation else (params.network,):

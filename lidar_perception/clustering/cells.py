@@ -25,6 +25,79 @@ def cells_of(xyz: np.ndarray, reach: float) -> Cells:
     return Cells(reach, order, in_order(xyz, order), rest[0], *_ranges(*rest))
 
 
+def around(cells: Cells) -> float:
+    """How many points lie in the cells around a point, in the mean."""
+    return float(np.diff(cells.start) @ cells.size) / len(cells.order)
+
+
+# Of each cell the points that stand for all of it: xyz (3, S) float64, start (C + 1,) and weight
+# (C,), how many each stands for.
+Sample = namedtuple("Sample", "xyz start weight")
+
+
+def sample_of(cells: Cells, work: int) -> Sample:
+    """So many points of each cell, at least one, that all around all points are at most `work`, as
+    far as halves go. Chosen by their coordinates, as by chance: the order of the points, and what
+    else there is in the cloud, makes no difference."""
+    sizes = np.diff(cells.start)
+    most = int(sizes.max())
+    while most > 1 and _work(cells, np.minimum(sizes, most)) > work:
+        most //= 2
+    kept = np.minimum(sizes, most)
+    start = np.concatenate([[0], np.cumsum(kept)])
+    bits = cells.xyz.astype(np.float32).view(np.uint32).astype(np.uint64)
+    return Sample(_chosen(cells, _mixed(bits), start), start, sizes / kept)
+
+
+def _mixed(bits: np.ndarray) -> np.ndarray:
+    """(N,) uint64 from (3, N): nearly a random number for each of different columns (splitmix)."""
+    mixed = bits[0] << np.uint64(32) | bits[1]
+    for more in (bits[2], np.uint64(0)):
+        mixed = (mixed ^ mixed >> np.uint64(30)) * np.uint64(0xBF58476D1CE4E5B9)
+        mixed = (mixed ^ mixed >> np.uint64(27)) * np.uint64(0x94D049BB133111EB) + more
+    return mixed ^ mixed >> np.uint64(31)
+
+
+@njit(cache=True, nogil=True)
+def _work(cells, kept):
+    """Distances from all points to the kept ones (C,) of the cells around them."""
+    before, total = np.zeros(len(kept) + 1), 0.0
+    for a in range(len(kept)):
+        before[a + 1] = before[a] + kept[a]
+    for a in range(len(kept)):
+        for k in range(cells.ranges[a]):
+            total += (cells.start[a + 1] - cells.start[a]) * (before[cells.high[a, k]]
+                                                              - before[cells.low[a, k]])
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _chosen(cells, keys, start):
+    out = np.empty((3, start[-1]))
+    for a in range(len(start) - 1):
+        first = cells.start[a]
+        rows = np.argsort(keys[first:cells.start[a + 1]], kind="mergesort")
+        kept = start[a + 1] - start[a]
+        for k in range(kept):  # each so many-th: of places where many coincide as many as elsewhere
+            out[:, start[a] + k] = cells.xyz[:, first + rows[k * len(rows) // kept]]
+    return out
+
+
+@njit(cache=True, nogil=True)
+def gather_sample(cells, sample, a):
+    """near (3, M) and weight (M,): the sample of the cells around cell a."""
+    size = 0
+    for k in range(cells.ranges[a]):
+        size += sample.start[cells.high[a, k]] - sample.start[cells.low[a, k]]
+    near, weight, put = np.empty((3, size)), np.empty(size), 0
+    for k in range(cells.ranges[a]):
+        for b in range(cells.low[a, k], cells.high[a, k]):
+            for j in range(sample.start[b], sample.start[b + 1]):
+                near[:, put], weight[put] = sample.xyz[:, j], sample.weight[b]
+                put += 1
+    return near, weight
+
+
 @njit(cache=True, nogil=True)
 def _ranges(start, cell_z, column_start, neighbours):
     columns, half = neighbours.shape
@@ -72,11 +145,15 @@ def gather(cells, a, out):
 
 
 @njit(cache=True, nogil=True)
-def crowded(cells, reach2, enough):
+def crowded(cells, reach2, enough, work=np.inf):
     """(N,) bool, cell by cell: at least `enough` points lie within reach, itself included. reach2
-    (N,): the square of each point's own, at most that of the cells."""
+    (N,): the square of each point's own, at most that of the cells. And how much is left of the
+    work, a number of distances; once it is below 0, the rest is not looked at."""
     leads, near = np.zeros(len(reach2), np.bool_), np.empty((3, cells.size.max()))
     for a in range(len(cells.size)):
+        if work < 0:
+            break
+        work -= cells.size[a]
         gather(cells, a, near)
         for i in range(cells.start[a], cells.start[a + 1]):
             px, py, pz = cells.xyz[0, i], cells.xyz[1, i], cells.xyz[2, i]
@@ -87,5 +164,6 @@ def crowded(cells, reach2, enough):
                     one = 1 if dx * dx + dy * dy + dz * dz <= reach2[i] else 0
                     found += one
                 begin += BLOCK
+            work -= begin
             leads[i] = found >= enough
-    return leads
+    return leads, work

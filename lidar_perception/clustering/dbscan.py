@@ -11,11 +11,11 @@ import numpy as np
 from numba import njit
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from lidar_perception.clustering.dense import dbscan_by_cells
 from lidar_perception.clustering.growing import dbscan_by_growing
 from lidar_perception.clustering.params import DbscanParams
+from lidar_perception.clustering.tree import touching, tree_of
 from lidar_perception.geometry import horizontal_range
 
 
@@ -73,7 +73,7 @@ def _joined(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray,
     """labels (N,) with clusters joined across neighbouring bands, numbered anew in order; bands
     hold the places of their points."""
     count = int(labels.max(initial=0))
-    pairs = [np.zeros((0, 2), np.int32)]
+    pairs = [np.zeros((0, 2), np.int64)]
     clustered = [places[labels[places] > 0] for places in bands]
     for inner, outer, reach in zip(clustered, clustered[1:], map(min, eps, eps[1:])):
         if len(inner) and len(outer):
@@ -87,13 +87,18 @@ def _joined(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray,
 
 def _touching(xyz: np.ndarray, labels: np.ndarray, inner: np.ndarray, outer: np.ndarray,
               reach: float) -> np.ndarray:
-    """(P, 2) labels of pairs of points, one of each band, within reach of each other."""
+    """(P, 2) labels that connect what pairs of points connect, one of each band, within reach of
+    each other; P is less than the number of labels."""
     inner_range, outer_range = (horizontal_range(xyz[side]) for side in (inner, outer))
     inner = inner[inner_range >= outer_range.min() - reach]
     outer = outer[outer_range <= inner_range.max() + reach]
-    trees = [cKDTree(xyz[side].astype(np.float64)) for side in (inner, outer)]
-    found = trees[0].sparse_distance_matrix(trees[1], reach, output_type="coo_matrix")
-    return np.stack([labels[inner[found.row]], labels[outer[found.col]]], axis=1)
+    if len(inner) == 0 or len(outer) == 0:
+        return np.zeros((0, 2), np.int64)
+    rows = np.concatenate([inner, outer])
+    tree = tree_of(xyz[rows])
+    side = (tree.order >= len(inner)).astype(np.int64)
+    known, label = np.unique(labels[rows[tree.order]], return_inverse=True)
+    return known[touching(tree, label, side, reach * reach)[0]]
 
 
 def dbscan(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray:

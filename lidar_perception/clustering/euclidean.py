@@ -15,7 +15,10 @@ The equations are missing from the text of the paper; this is our reading of wha
   tested as they are before merging, and chains merge.
 
 So the clusters do not depend on the order of the points. No pairs are stored: memory grows with
-the number of points only; time grows with the number of points in a neighbourhood too.
+the number of points only. Where the grid takes more than PATIENCE distances a point, because it
+is crowded with points out of reach of each other, a tree finds the same. Only the local threshold
+has to look at every pair: it is exact up to WORK distances a cloud, twice what the densest scan
+known takes; of denser clouds it takes a sample of each cell, the same of the same points.
 """
 
 from __future__ import annotations
@@ -23,35 +26,53 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from lidar_perception.clustering.cells import cells_of, crowded, gather
-from lidar_perception.clustering.grid import number_clusters, root
+from lidar_perception.clustering.cells import (
+    around,
+    cells_of,
+    crowded,
+    gather,
+    gather_sample,
+    sample_of,
+)
+from lidar_perception.clustering.grid import number_clusters
 from lidar_perception.clustering.params import EuclideanParams
+from lidar_perception.clustering.tree import connected, nearest, nearest_leaders, tree_of
+from lidar_perception.clustering.tree import crowded as count_crowded
 
 SAMPLE, SIDES = 64, 5  # the first cells are 5 medians of a sample's nearest distances wide
 BUDGET = 20_000_000    # distances that are rather computed than to sort points into larger cells
+PATIENCE = 2_000       # distances a point, beyond which a tree finds the rest
+WORK = 2**32           # distances for local thresholds
 
 
-def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams()) -> np.ndarray:
+def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
+              patience: int = PATIENCE, work: int = WORK) -> np.ndarray:
     """(N,) int32 clusters of finite points (N, 3) float32, metres: 0 none, 1..K by their first
-    point; N may be 0. Distances are computed in float64."""
+    point; N may be 0. Distances are computed in float64. patience and work: see PATIENCE, WORK."""
     n = len(xyz)
     if n == 0:
         return np.zeros(0, np.int32)
     xyz = np.ascontiguousarray(xyz, np.float32)
     if params.threshold == "global":
-        mean, cells = _mean_nearest(xyz)
+        mean, cells = _mean_nearest(xyz, patience)
         reach = np.full(n, np.float32(params.alpha * mean), np.float64)
     elif params.threshold == "fixed":
         cells, reach = cells_of(xyz, params.distance), np.full(n, params.distance)
     else:
         cells, reach = cells_of(xyz, params.radius), np.empty(n)
-        reach[cells.order] = np.float32(params.alpha * _means(cells, params.radius ** 2))
+        means = (_means(cells, params.radius ** 2) if around(cells) * n <= work else
+                 _means_of_sample(cells, sample_of(cells, work), params.radius ** 2))
+        reach[cells.order] = np.float32(params.alpha * means)
     if reach.max() > cells.reach:
         cells = cells_of(xyz, reach.max())
+    component, enough = np.empty(n, np.int32), params.beta * np.log(n)
     reach2 = reach[cells.order] ** 2
-    leads = crowded(cells, reach2, params.beta * np.log(n))
-    component = np.empty(n, np.int32)
-    component[cells.order] = _components(cells, np.stack([*cells.xyz, reach2], axis=1), leads)
+    leads, left = crowded(cells, reach2, enough, patience * n)
+    component[cells.order], left = _components(cells, np.stack([*cells.xyz, reach2], axis=1), leads,
+                                               left)
+    if left < 0:
+        tree = tree_of(xyz)
+        component[tree.order] = _components_by_tree(tree, reach[tree.order] ** 2, enough)
     size = np.bincount(component + 1)  # the first is of none
     kept = (component >= 0) & (size[component + 1] >= params.min_size)
     parent, places = np.arange(len(size), dtype=np.int32), np.arange(n)
@@ -62,7 +83,7 @@ def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams()) -> n
     return labels.astype(np.int32)
 
 
-def _mean_nearest(xyz):
+def _mean_nearest(xyz, patience):
     """Mean distance to the nearest other point, 0 for one point; and cells. Points with none
     within reach of the cells wait for larger ones."""
     n, columns = len(xyz), xyz.T.astype(np.float64, order="C")
@@ -72,7 +93,10 @@ def _mean_nearest(xyz):
     first = cells = cells_of(xyz, max(SIDES * float(np.sqrt(np.median(sample))), 1e-3))
     squared = np.full(n, np.inf)
     while True:
-        _search(cells, squared)
+        if _search(cells, squared, patience * n) < 0:
+            tree = tree_of(xyz)
+            squared[tree.order] = nearest(tree)[0]
+            return np.sqrt(squared).mean(), first
         waiting = np.flatnonzero(squared > cells.reach ** 2)
         squared[waiting] = np.inf  # what was found may not be the nearest
         if len(waiting) * n <= BUDGET:
@@ -100,17 +124,21 @@ def _nearest(points, size, i):
 
 
 @njit(cache=True, nogil=True)
-def _search(cells, squared):
+def _search(cells, squared, work):
     near = np.empty((3, cells.size.max()))
     for a in range(len(cells.size)):
         empty = True
         for i in range(cells.start[a], cells.start[a + 1]):
             if squared[cells.order[i]] == np.inf:
+                work -= cells.size[a]
+                if work < 0:
+                    return work
                 if empty:
                     gather(cells, a, near)
                     empty = False
                 own = i - cells.start[cells.low[a, 0]]
                 squared[cells.order[i]] = _nearest(near, cells.size[a], own)
+    return work
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "nsz"})
@@ -138,6 +166,33 @@ def _means(cells, radius2):
     return means
 
 
+@njit(cache=True, nogil=True, fastmath={"reassoc", "nsz"})
+def _means_of_sample(cells, sample, radius2):
+    """As _means, from a sample of each cell whose points stand for all of it."""
+    means = np.zeros(len(cells.order))
+    for a in range(len(cells.size)):
+        near, weight = gather_sample(cells, sample, a)
+        for i in range(cells.start[a], cells.start[a + 1]):
+            px, py, pz = cells.xyz[0, i], cells.xyz[1, i], cells.xyz[2, i]
+            total, count = 0.0, 0.0
+            for j in range(len(weight)):
+                dx, dy, dz = px - near[0, j], py - near[1, j], pz - near[2, j]
+                squared = dx * dx + dy * dy + dz * dz
+                inside = squared <= radius2
+                total += weight[j] * np.sqrt(squared) if inside else 0.0
+                count += weight[j] if inside else 0.0
+            means[i] = total / max(count - 1.0, 1.0)
+    return means
+
+
+def _components_by_tree(tree, reach2, enough):
+    """As _components, in the order of the tree."""
+    leads = count_crowded(tree, reach2, enough)[0]
+    component = connected(tree, reach2, leads, 0.0)[0]
+    leader = nearest_leaders(tree, reach2, leads)[0]
+    return np.where(leader >= 0, component[leader], component)
+
+
 @njit(cache=True, nogil=True)
 def _squared(p, q):
     dx, dy, dz = p[0] - q[0], p[1] - q[1], p[2] - q[2]
@@ -145,9 +200,10 @@ def _squared(p, q):
 
 
 @njit(cache=True, nogil=True)
-def _components(cells, points, leads):
+def _components(cells, points, leads, work):
     """(N,) connected set of each of points (N, 4), x y z and the square of the threshold; -1 for
-    none. items are the points of each cell: leaders not yet found, found ones, followers."""
+    none; and how much is left of the work, as crowded does. items are the points of each cell:
+    leaders not yet found, found ones, followers."""
     n, start, left = len(points), cells.start, cells.start[1:].copy()
     cell, items, stack = np.empty(n, np.int32), np.arange(n), np.empty(n, np.int64)
     for a in range(len(left)):
@@ -164,11 +220,14 @@ def _components(cells, points, leads):
             stack[0], waiting = items[left[seed]], 1
             component[stack[0]] = count
             while waiting:
+                if work < 0:
+                    return component, work
                 waiting -= 1
                 i = stack[waiting]
                 p, a = points[i], cell[i]
                 for k in range(cells.ranges[a]):
                     for b in range(cells.low[a, k], cells.high[a, k]):
+                        work -= left[b] - start[b] + start[b + 1] - followers[b]
                         for m in range(left[b] - 1, start[b] - 1, -1):
                             j = items[m]
                             if _squared(p, points[j]) <= max(p[3], points[j, 3]):
@@ -187,12 +246,26 @@ def _components(cells, points, leads):
     for i in range(n):
         if leader[i] >= 0:
             component[i] = component[leader[i]]
-    return component
+    return component, work
+
+
+def _merged(xyz, labels, gamma):
+    """Union-find forest of the labels after Eq. 9."""
+    centre, diameter = _centres(xyz, labels)
+    parent = np.arange(len(centre), dtype=np.int32)
+    if len(centre) > 2:
+        tree = tree_of(centre[1:])
+        every = np.ones(len(tree.order), bool)
+        joined = connected(tree, diameter[1:][tree.order], every, gamma)[0]
+        component = np.empty(len(joined), np.int64)
+        component[tree.order] = joined
+        parent[1:] = np.unique(component, return_index=True)[1][component] + 1
+    return parent
 
 
 @njit(cache=True, nogil=True)
-def _merged(xyz, labels, gamma):
-    """Union-find forest of the labels after Eq. 9."""
+def _centres(xyz, labels):
+    """(K + 1, 3) means and (K + 1,) diagonals of the boxes of clusters 1..K, and of no cluster."""
     count = labels.max() + 1
     size, centre, diameter = np.zeros(count), np.zeros((count, 3)), np.zeros(count)
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
@@ -202,12 +275,7 @@ def _merged(xyz, labels, gamma):
             c, v = (labels[i], axis), np.float64(xyz[i, axis])
             centre[c] += v
             low[c], high[c] = min(low[c], v), max(high[c], v)
-    parent = np.arange(count).astype(np.int32)
     for a in range(1, count):
         centre[a] /= size[a]
         diameter[a] = np.sqrt(_squared(low[a], high[a]))
-        for b in range(1, a):
-            if np.sqrt(_squared(centre[a], centre[b])) < gamma * (diameter[a] + diameter[b]) / 2:
-                one, other = root(parent, a), root(parent, b)
-                parent[max(one, other)] = min(one, other)
-    return parent
+    return centre, diameter

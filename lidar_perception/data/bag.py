@@ -5,13 +5,18 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
 from mcap.writer import CompressionType, Writer
-from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2 import Reader
 
+from lidar_perception.data.mcap_index import NO_INDEX, check_index
+from lidar_perception.data.record_file import RecordFile
+from lidar_perception.runs.files import short
+from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode, encode, typestore
 
@@ -38,32 +43,45 @@ def _yaml(content: Any) -> str:
 class BagWriter:
     """Writes a rosbag2 folder with one MCAP file: zstd chunks, checksums, metadata.yaml.
 
-    A context manager. The folder appears under its name once it is complete; after an exception
-    what was written so far is closed properly and left as NAME.incomplete.
+    A context manager, of one process at a time. The folder appears under its name once it is
+    complete; after an exception what was written so far is closed properly and left as
+    NAME.incomplete. InputError where the disk is full: NAME.incomplete then holds the messages that
+    found room.
     """
 
     def __init__(self, path: str | Path, *, force: bool = False):
-        self.path = Path(path)
-        if self.path.exists() and not force:
-            raise InputError(f"{self.path} exists already; give another name or --force")
-        if self.path.exists() and not (self.path / "metadata.yaml").is_file():
-            raise InputError(f"{self.path} is no bag, so it is not replaced; give another name")
+        self.path, self.force = Path(path), force
         self.partial = self.path.with_name(self.path.name + ".incomplete")
         self.channels: dict[str, int] = {}
         self.topics: list[dict] = []
         self.times: list[int] = []
+        self._may_write()
+
+    def _may_write(self) -> None:
+        if self.path.exists() and not self.force:
+            raise InputError(f"{self.path} exists already; give another name or --force")
+        if self.path.exists() and not (self.path / "metadata.yaml").is_file():
+            raise InputError(f"{self.path} is no bag, so it is not replaced; give another name")
 
     def __enter__(self) -> BagWriter:
-        try:
-            if self.partial.exists():
-                shutil.rmtree(self.partial)
-            self.partial.mkdir(parents=True)
-            self.file = open(self.partial / f"{self.path.name}.mcap", "wb")
-        except OSError as error:
-            raise InputError(f"cannot write the bag {self.path}: {error}") from None
-        self.mcap = Writer(self.file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
-        self.mcap.start(profile="ros2", library="lidar_perception")
+        with ExitStack() as stack, self._named():
+            stack.enter_context(locked(self.partial))
+            self._may_write()  # another process may just have written it
+            for old in self.partial.iterdir():
+                shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
+            self.file = stack.enter_context(RecordFile(self.partial / f"{self.path.name}.mcap"))
+            self.mcap = Writer(self.file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+            self.mcap.start(profile="ros2", library="lidar_perception")
+            self.open = stack.pop_all()
         return self
+
+    @contextmanager
+    def _named(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise InputError(f"cannot write the bag {self.path}: {error.strerror or error}; what "
+                             f"could be written is in {self.partial}") from None
 
     def add_topic(self, topic: str, type_name: str, qos: dict = SENSOR_QOS) -> None:
         definition, _ = typestore().generate_msgdef(type_name, ros_version=2)
@@ -82,11 +100,28 @@ class BagWriter:
         """Append a message: an object of bag_message, or CDR bytes as they are."""
         channel = self.channels[topic]
         raw = message if isinstance(message, bytes) else encode(message)
-        self.mcap.add_message(channel, stamp_ns, raw, stamp_ns)
+        with self._named():
+            self.mcap.add_message(channel, stamp_ns, raw, stamp_ns)
         self.topics[list(self.channels).index(topic)]["message_count"] += 1
         self.times.append(stamp_ns)
 
     def __exit__(self, kind, error, trace) -> None:
+        with self.open, self._named():
+            try:
+                self._finish()
+            except OSError:
+                # As mcap has it, a file may end without an index; so may a bag without metadata.
+                self.file.close_with(NO_INDEX)
+                (self.partial / "metadata.yaml").unlink(missing_ok=True)
+                if kind is None:
+                    raise
+                return  # the error that there is says why
+            if kind is None:
+                if self.path.exists():
+                    shutil.rmtree(self.path)
+                self.partial.rename(self.path)
+
+    def _finish(self) -> None:
         start = min(self.times, default=0)
         count = sum(t["message_count"] for t in self.topics)
         span = {"starting_time": {"nanoseconds_since_epoch": start},
@@ -99,17 +134,11 @@ class BagWriter:
                 "ros_distro": "jazzy"}
         self.mcap.add_metadata("rosbag2", {"serialized_metadata": _yaml(info)})
         self.mcap.finish()
-        with self.file:
-            self.file.flush()
-            os.fsync(self.file.fileno())
+        self.file.sync()
         with open(self.partial / "metadata.yaml", "w") as stream:
             stream.write(_yaml({"rosbag2_bagfile_information": info}))
             stream.flush()
             os.fsync(stream.fileno())
-        if kind is None:
-            if self.path.exists():
-                shutil.rmtree(self.path)
-            self.partial.rename(self.path)
 
 
 def _full_qos(qos: dict) -> dict:
@@ -119,7 +148,9 @@ def _full_qos(qos: dict) -> dict:
 
 
 class Bag:
-    """A bag open for reading; a context manager. topics maps name to type."""
+    """A bag open for reading; a context manager. topics maps name to type, counts to the number of
+    messages. InputError where it is damaged: checksums and counts are compared, so that what is
+    read is what was written, in as far as the writer left checksums."""
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
@@ -127,11 +158,20 @@ class Bag:
         try:
             self.reader = Reader(source)
             self.reader.open()
-        except (ReaderError, OSError, AssertionError, ValueError, TypeError, KeyError) as error:
+        except Exception as error:  # rosbags lets through what damaged sizes lead to
+            raise InputError(_unreadable(source, error)) from None
+        try:
+            for storage in getattr(self.reader.storage, "storages", [self.reader.storage]):
+                if storage.path.suffix == ".mcap":
+                    check_index(storage.path)
+        except Exception as error:
+            self.reader.close()
             raise InputError(_unreadable(source, error)) from None
         self.connections = list(self.reader.connections)
         self.topics = {c.topic: c.msgtype for c in self.connections}
-        self.counts = {c.topic: c.msgcount for c in self.connections}
+        self.counts = dict.fromkeys(self.topics, 0)
+        for connection in self.connections:
+            self.counts[connection.topic] += connection.msgcount
 
     def __enter__(self) -> Bag:
         return self
@@ -159,15 +199,23 @@ class Bag:
 
     def raw(self, topics: Iterable[str] | None = None, start_ns: int | None = None,
             stop_ns: int | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """(topic, time, CDR bytes) in order of time; all topics by default."""
+        """(topic, time, CDR bytes) in order of time; all topics by default. InputError where the
+        bag is damaged, at the end if other numbers of messages were read than it says."""
         wanted = [c for c in self.connections if topics is None or c.topic in topics]
         if not wanted:
             return
+        found = dict.fromkeys((c.topic for c in wanted), 0)
         try:
             for connection, stamp, data in self.reader.messages(wanted, start_ns, stop_ns):
+                found[connection.topic] += 1
                 yield connection.topic, stamp, data
         except Exception as error:  # rosbags lets through what zstd, struct and SQLite raise
             raise InputError(_unreadable(self.path, error)) from None
+        if (start_ns is None or start_ns <= self.start_ns) and stop_ns is None:
+            for topic, count in found.items():
+                if count != self.counts[topic]:
+                    raise InputError(_unreadable(self.path, ValueError(
+                        f"it says {self.counts[topic]} messages on {topic} and holds {count}")))
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         """(topic, time, message) of rosbags' classes."""
@@ -194,6 +242,6 @@ def _storage(path: Path) -> Path:
 
 
 def _unreadable(path: Path, error: Exception) -> str:
-    reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(".")
+    reason = short(error).rstrip(".")
     return (f"the bag {path} is truncated or damaged ({reason}); "
             "'mcap recover' may save what it holds")

@@ -81,5 +81,5 @@ class BagRecorder(LidarNode):
         self.thread.join()
         try:
             self.writer.__exit__(type(self.failure) if self.failure else None, self.failure, None)
-        except OSError as error:  # still full: the part stays as it is, for 'mcap recover'
+        except (InputError, OSError) as error:  # the part stays as it is
             self.get_logger().error(f"{self.writer.partial} is not complete: {error}")

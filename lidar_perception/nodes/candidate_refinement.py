@@ -15,7 +15,7 @@ from lidar_perception.nodes.outputs import CandidateOutputs
 from lidar_perception.nodes.runtime import CLOUD, LidarNode
 from lidar_perception.params import RefinementNodeParams
 from lidar_perception.types import InputError
-from lidar_perception.wire.messages import column, to_frame
+from lidar_perception.wire.messages import cluster_column, column, to_frame
 from msg_utils.stamps import to_ns
 
 __all__ = ["CandidateRefinement", "warm_up"]
@@ -33,13 +33,13 @@ class CandidateRefinement(LidarNode):
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, places = to_frame(msg)
-            ground, ids = column(msg, "ground", places), column(msg, "cluster_id", places)
-            if ids is None:
+            ground, clusters = column(msg, "ground", places), cluster_column(msg, places)
+            if clusters is None:
                 raise InputError("the cloud has no column 'cluster_id'; remap ~/input/points to "
                                  "the clustering's output")
-            ids = ids.astype(np.int32)
+            ids, numbers = clusters
             ground = np.zeros(len(ids), bool) if ground is None else ground > 0
             segmented = Segmented(places, frame.xyz, ground, ids,
                                   grounded_boxes(frame.xyz, ground, ids,
-                                                 self.params.boxes.shape))
+                                                 self.params.boxes.shape), numbers)
             self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params))

@@ -7,15 +7,13 @@ import traceback
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
-
 from lidar_perception.detectors.contract import Found
 from lidar_perception.nodes.main import one_at_a_time
 from lidar_perception.nodes.outputs import DetectionOutputs
 from lidar_perception.nodes.runtime import CLOUD, ERROR, OK, WARN, LidarNode
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.types import InputError, LidarFrame
-from lidar_perception.wire.messages import column, to_frame
+from lidar_perception.wire.messages import cluster_column, column, to_frame
 from msg_utils.stamps import to_ns
 
 
@@ -92,12 +90,10 @@ class DetectorNode(LidarNode):
             return
         with self.frame(to_ns(msg.header.stamp)):
             frame, places = to_frame(msg, self.params.input.intensity_max)
-            ground, ids = column(msg, "ground", places), column(msg, "cluster_id", places)
-            with np.errstate(invalid="ignore"):  # NaN in a column of floats is no cluster
-                ids = None if ids is None else ids.astype(np.int32)
+            ground, clusters = column(msg, "ground", places), cluster_column(msg, places)
             self.detector.params = self.params
             found = self.detector(frame, ground=None if ground is None else ground > 0,
-                                  cluster_ids=ids)
+                                  cluster_ids=None if clusters is None else clusters[0])
             self.outputs.publish(msg.header, found.detections, found.ms)
         self._diagnose(frame, found)
 

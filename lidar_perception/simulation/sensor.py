@@ -9,12 +9,15 @@ import numpy as np
 
 from lidar_perception.types import SENSOR_HEIGHT, InputError
 
+MAX_RAYS = 5_000_000  # in a turn; the densest sensors have 0.5 million. Each takes some 100 bytes
+
 
 @dataclass(frozen=True)
 class Sensor:
     """A LiDAR that turns about its z axis; angles in radians, lengths in metres.
 
-    InputError for what cannot be: no beams, a height that is not positive, max_range <= min_range.
+    InputError for what cannot be: no beams, a height that is not positive, max_range <= min_range,
+    more than MAX_RAYS rays in a turn.
     """
 
     elevations: tuple[float, ...]  # one per beam, descending; ring 0 is the highest
@@ -50,6 +53,8 @@ class Sensor:
                 (not np.isfinite([*self.fade, *np.ravel(self.blocked)]).all(),
                  "fade and blocked must be finite"),
                 (not 0 < self.azimuth_step <= np.pi / 2, "azimuth_step must be in 0 .. pi / 2"),
+                (len(up) * 2 * np.pi > MAX_RAYS * self.azimuth_step,
+                 f"a turn must have at most {MAX_RAYS} rays; give a larger step or fewer beams"),
                 (not 0 < self.height < np.inf, "height must be positive"),
                 (not 0 <= self.min_range < self.max_range < np.inf,
                  "max_range must exceed min_range, which must not be negative"),
@@ -139,6 +144,8 @@ def generic(beams: int, lowest: float, highest: float, azimuth_step: float, rate
             **fields: float) -> Sensor:
     """A sensor of evenly spaced beams; angles in degrees, rate in turns per second, and any other
     field of Sensor by name. InputError for impossible values."""
+    if beams > MAX_RAYS:  # before there is a list of them
+        raise InputError(f"impossible sensor: {beams} beams must be {MAX_RAYS} at most")
     if beams > 1 and not lowest < highest:
         raise InputError(f"impossible sensor: lowest {lowest} must be below highest {highest}")
     return Sensor(tuple(np.radians(np.linspace(highest, lowest, max(beams, 0))).tolist()),
@@ -222,7 +229,7 @@ def sensor_named(name: str) -> Sensor:
         try:
             beams, *numbers = map(float, name.removeprefix("generic:").split(","))
             return generic(int(beams), *numbers)
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(f"sensor {name!r} must be {GENERIC}, such as "

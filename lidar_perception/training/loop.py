@@ -18,7 +18,7 @@ from typing import Any
 
 import torch
 
-from lidar_perception.runs.files import remove_temporaries, write_bytes
+from lidar_perception.runs.files import make_folder, remove_temporaries, write_bytes
 from lidar_perception.runs.terminal import errors, progress
 from lidar_perception.training.log import Log
 from lidar_perception.training.params import LoopParams
@@ -83,8 +83,10 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
 
 
 def may_begin(out: Path, resume: bool) -> Path:
-    """The state's path in out. InputError if there is one, and resume is not asked for."""
+    """The state's path in out. InputError if there is one, and resume is not asked for; or if out
+    cannot be a folder that is written into, before hours are spent on the data."""
     path = out / STATE
+    make_folder(out)
     if path.exists() and not resume:
         raise InputError(f"{out} holds a training run already; give --resume to resume it, or "
                          "another --out")

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.camera import Calibration, Camera
+from lidar_perception.groups import renumbered
 from lidar_perception.types import (
     CLASSES,
     Detections,
@@ -35,7 +36,7 @@ def to_frame(msg: Any, intensity_max: float | None = None) -> tuple[LidarFrame, 
         points = to_array(msg)
         places = None
         if "in_view" in (points.dtype.names or ()):
-            places = np.flatnonzero(points["in_view"])
+            places = np.flatnonzero(_single(points, "in_view"))
             points = points.take(places)
         coordinates = xyz(points)
         intensity = None if intensity_max is None else _intensity(points, intensity_max)
@@ -82,11 +83,22 @@ def column(msg: Any, name: str, places: np.ndarray) -> np.ndarray | None:
     """(N,) values of a field at places (N,); None where the cloud has no such field. InputError if
     it holds more than one number a point."""
     points = to_array(msg)
-    if name not in (points.dtype.names or ()):
-        return None
+    return _single(points, name).take(places) if name in (points.dtype.names or ()) else None
+
+
+def cluster_column(msg: Any, places: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """labels (N,) int32 of the points at places (N,), 0 none and 1..K, from the column cluster_id
+    of whatever clustering, and numbers (K,) int64, the ids there (see groups.renumbered); None
+    where the cloud has no such column. InputError if it holds no ids."""
+    ids = column(msg, "cluster_id", places)
+    return None if ids is None else renumbered(ids)
+
+
+def _single(points: np.ndarray, name: str) -> np.ndarray:
+    """(N,) values of a field with one number a point; InputError if it has more."""
     if points.dtype[name].shape:
         raise InputError(f"field '{name}' has count > 1; a single number is needed")
-    return points[name].take(places)
+    return points[name]
 
 
 def calibration_of(info: Any, transform: Any) -> Calibration:

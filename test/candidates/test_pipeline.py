@@ -9,9 +9,15 @@ from candidate_samples import boxes_at, floor, person, scene
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import STEPS, PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates, segment
-from lidar_perception.candidates.seed_sources import clicked_seed, fixed_seed, truth_seed
+from lidar_perception.candidates.seed_sources import (
+    automatic_seed,
+    clicked_seed,
+    fixed_seed,
+    truth_seed,
+)
 from lidar_perception.candidates.seeds import seed_from_points
 from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.param_fields import with_values
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.params import ViewParams
 
@@ -89,3 +95,14 @@ def test_ground_points_belong_to_no_cluster_and_ids_count_the_boxes():
     s = segment(LidarFrame(scene()))
     assert not (s.ground & (s.cluster_ids > 0)).any()
     assert np.unique(s.cluster_ids).tolist() == list(range(len(s.boxes) + 1))
+
+
+@pytest.mark.parametrize("xyz", [np.zeros((0, 3)), floor(), person(6, 0, count=9)],
+                         ids=["empty", "only ground", "nine points"])
+@pytest.mark.parametrize("least", [0.0, 0.5])
+def test_the_automatic_seed_is_the_template_where_no_cluster_can_be_one(xyz, least):
+    params = with_values(PipelineParams(), {"seed.min_confidence": least,
+                                            "clustering.dbscan.min_samples": 3})
+    given = seed_from_points(person(7, 2).astype(np.float32), boxes_at([[7, 2]])[0])
+    assert automatic_seed(given, params)(segment(LidarFrame(xyz.astype(np.float32)),
+                                                 params=params)) is given

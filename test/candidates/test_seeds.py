@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -86,6 +87,16 @@ def test_seed_from_click_needs_a_cluster_within_the_radius():
         seed_from_click(edge, xyz, np.zeros_like(labels), boxes[:0], 2.0)
 
 
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300])
+def test_a_click_is_finite_and_near(axis, value):
+    xyz, labels, boxes = clicked_scene()
+    click = np.array([6, 0.2, -1.0])
+    click[axis] = value
+    with pytest.raises(InputError, match=r"no finite number|nearest cluster is inf"):
+        seed_from_click(click, xyz, labels, boxes, 2.0)
+
+
 @few
 @given(seeds, st.integers(1, 30_000), st.integers(10, 300))
 def test_load_seed_is_the_inverse_of_save_seed(tmp_path_factory, seed, tenth_mm, count):
@@ -114,12 +125,24 @@ def changed(**values):
     changed(points_m=7), changed(points_m=[]), changed(points_m=POINTS[:9]),
     changed(points_m=[[1.0, 2.0]] * 10), changed(points_m=[*POINTS, [1.0]]),
     changed(points_m=[*POINTS, [1.0, 2.0, "x"]]), changed(points_m=[*POINTS, [1, 2, float("nan")]]),
-])
+    changed(points_m=[*POINTS, [10**400, 0, 0]]), changed(height_m=10**400),
+    changed(floor_m=10**400), changed(points_m=[*POINTS, [1e300, 0, 0]]),
+    changed(points_m=[*POINTS, [1e30, 0, 0]]), changed(height_m=1e30), changed(floor_m=-1e30),
+    changed(height_m="9" * 5000), "9" * 5000,
+    "[" * 100_000, '{"points_m": ' + "[" * 100_000, " " * 10_000_001,
+], ids=lambda text: text[-30:])
 def test_a_bad_template_is_an_input_error_that_names_the_file(tmp_path, text):
     path = tmp_path / "bad.json"
     path.write_text(text)
-    with pytest.raises(InputError, match=r"bad\.json"):
+    with pytest.raises(InputError, match=r"bad\.json") as error:
         load_seed(path)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 1000
+
+
+def test_a_pipe_is_no_template_and_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe.json")
+    with pytest.raises(InputError, match=r"pipe\.json is no file"):
+        load_seed(tmp_path / "pipe.json")
 
 
 def test_a_template_that_cannot_be_read_is_an_input_error_that_names_it(tmp_path):

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import click
 import pytest
@@ -13,9 +15,12 @@ from click.testing import CliRunner
 from samples import LABELS, WALKER, object_folder, walker_label, write
 
 from lidar_perception.candidates.configurations import PAPER
+from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.cli.main import COMMANDS, cli
+from lidar_perception.cli.options import read_config
 from lidar_perception.data.bag import Bag
 from lidar_perception.param_fields import parameter_fields
+from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS, TRUTH
 
 STAGES = ("stage1", "stage2", "final")
@@ -200,6 +205,33 @@ def test_a_config_says_the_same_as_flags_and_flags_win(bag, tmp_path):
         evaluate(tmp_path, "--bag", bag))
 
 
+@pytest.mark.parametrize("section, words", [
+    ("stm: 5", "'stm' is a group, not a value; it holds stm.threshold"),
+    ("stm: {threshold: {of: 5}}", "'stm.threshold.of' is below a parameter"),
+    ("5: 6", "5 is no name of a parameter"), ("{stm: {on: 1}}", "True is no name of a parameter"),
+    ("[" * 100_000, "cannot read the parameter file"), ("a: 2001-99-99", "cannot read the param"),
+    ("\n    ".join(["a0: &a0 {x: 1}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}"
+                                        for i in range(40)]), "more than 10000 parameters"),
+], ids=range(7))
+def test_a_parameter_file_says_nothing_that_is_passed_over(tmp_path, section, words):
+    file = write(tmp_path / "p.yaml", f"/**:\n  ros__parameters:\n    {section}\n")
+    with pytest.raises(InputError) as error:
+        read_config(file, PipelineParams())
+    assert words in str(error.value) and "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("file", sorted(Path(__file__).parents[2].glob("config/*.yaml")),
+                         ids=lambda path: path.name)
+def test_our_parameter_files_are_read_whatever_the_command(file):
+    read_config(file, PipelineParams())
+
+
+def test_a_pipe_is_no_parameter_file_and_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="is no file"):
+        read_config(tmp_path / "pipe", PipelineParams())
+
+
 def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
     root = object_folder(tmp_path / "kitti", walker_label(), count=3)
     write(root / "training/velodyne/000001.bin", b"123")
@@ -218,7 +250,7 @@ BAD_INPUTS = {
     "out is a file": (["convert", "kitti", "{kitti}", "--out", "{kitti}/training/calib/000000.txt",
                        "--force"], "is no bag"),
     "out under a file": (["convert", "kitti", "{kitti}", "--out",
-                          "{kitti}/training/calib/000000.txt/o"], "cannot write"),
+                          "{kitti}/training/calib/000000.txt/o"], "cannot make the folder"),
     "out of range": (["evaluate", "candidates", "--bag", "{bag}", "--ground-cloth-resolution",
                       "99"], "ground.cloth.resolution = 99.0 is outside 0.1 .. 10.0"),
     "lengths": (["evaluate", "candidates", "--bag", "{bag}", "--clustering-dbscan-eps", "0.1"],

@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
+import struct
 
+import numpy as np
 import pytest
 from bag_samples import message_bytes, same_cloud, scans
 from mcap.reader import make_reader
-from samples import header, scene, write
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from samples import STAMP, header, scene, write
 
+from lidar_perception.data import bag as bag_module
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.recording import open_recording
-from lidar_perception.data.to_bag import write_bag
+from lidar_perception.data.to_bag import Scan, write_bag
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import bag_message, typestore
 from lidar_perception.wire.topics import POINTS
 from msg_utils.point_cloud2 import from_array
 
@@ -60,8 +65,61 @@ def test_an_exception_leaves_the_old_bag_and_an_incomplete_one_that_can_be_read(
 
 def test_a_place_that_cannot_hold_a_bag_is_named(tmp_path):
     write(tmp_path / "file", b"")
-    with pytest.raises(InputError, match=r"cannot write the bag .*file/bag"):
+    with pytest.raises(InputError, match=r"cannot make the folder .*file/bag"):
         write_bag(tmp_path / "file/bag", scans(1))
+
+
+@pytest.fixture
+def room():
+    """room(bytes): no file may grow larger; a write beyond fails as it does on a full disk."""
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, hard))
+
+
+def test_on_a_full_disk_what_found_room_can_be_read(tmp_path, monkeypatch, room):
+    """Wherever it gets full: in a chunk, in the index, in metadata.yaml."""
+    monkeypatch.setattr(bag_module, "CHUNK_BYTES", 20_000)
+    rng = np.random.default_rng(0)
+    drive = [Scan(rng.random((1000, 4), np.float32), STAMP + i) for i in range(5)]
+    write_bag(tmp_path / "all", drive)
+    whole = message_bytes(tmp_path / "all")
+    size = (tmp_path / "all/all.mcap").stat().st_size
+    read = []
+    for full in [*range(10_000, size, 6007), *range(size - 400, size, 7)]:
+        room(full)
+        with pytest.raises(InputError, match=r"cannot write the bag .*bag\.incomplete") as error:
+            write_bag(tmp_path / "bag", drive)
+        room(resource.RLIM_INFINITY)
+        assert "\n" not in str(error.value) and not (tmp_path / "bag").exists()
+        rows = message_bytes(tmp_path / "bag.incomplete")
+        assert rows == whole[:len(rows)]
+        read.append(len(rows))
+    assert read[0] == 0 and read[-1] == len(whole) and read == sorted(read)
+    write_bag(tmp_path / "bag", drive)
+    assert message_bytes(tmp_path / "bag") == whole
+
+
+def test_a_second_writer_of_the_same_bag_leaves_the_first_alone(tmp_path):
+    path, first = tmp_path / "bag", scans(2)
+
+    def slow():
+        yield first[0]
+        for force in (False, True):
+            with pytest.raises(InputError, match="another process is writing"):
+                write_bag(path, scans(1), force=force)
+        yield first[1]
+
+    write_bag(path, slow())
+    assert open_recording(bag=path).count == 2
+
+
+def test_a_bag_that_came_while_waiting_to_write_is_kept(tmp_path):
+    late = BagWriter(tmp_path / "bag")
+    write_bag(tmp_path / "bag", scans(2))
+    with pytest.raises(InputError, match="exists already"), late:
+        pass
+    assert open_recording(bag=tmp_path / "bag").count == 2
 
 
 def test_a_folder_without_metadata_is_read_by_its_one_file(written, tmp_path):
@@ -123,6 +181,69 @@ def test_a_byte_that_flipped_is_never_a_traceback(written, tmp_path):
             damaged += 1
             assert "\n" not in str(error)
     assert damaged > 40
+
+
+def read_or_named(path):
+    """The messages, or None where the bag says in one line that it is damaged."""
+    try:
+        with Bag(path) as bag:
+            rows = list(bag.raw())
+            assert {t: sum(row[0] == t for row in rows) for t in bag.topics} == bag.counts
+        return rows
+    except InputError as error:
+        assert "truncated or damaged" in str(error) and "\n" not in str(error)
+        return None
+
+
+DAMAGES = {
+    "deleted": lambda raw, at: raw[:at] + raw[at + 1:],
+    "inserted": lambda raw, at: raw[:at] + b"\x91" + raw[at:],
+    "flipped": lambda raw, at: raw[:at] + bytes([raw[at] ^ 1 << at % 8]) + raw[at + 1:],
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_a_damaged_byte_never_changes_what_is_read_without_a_word(written, tmp_path, damage):
+    """In the data and in the index, from which readers take where the messages are."""
+    raw, before = (written / "drive.mcap").read_bytes(), message_bytes(written)
+    path, named = tmp_path / "drive.mcap", 0
+    places = [*range(8, len(raw), len(raw) // 40), *range(len(raw) - 4000, len(raw), 23)]
+    for at in places:
+        path.write_bytes(damage(raw, at))
+        rows = read_or_named(path)
+        assert rows in (None, before)
+        named += rows is None
+    assert named > 0.8 * len(places)
+
+
+def test_an_index_without_a_checksum_is_compared_with_the_data(written, tmp_path):
+    with Writer(tmp_path / "plain", version=9, storage_plugin=StoragePlugin.MCAP) as bag, \
+            Reader(written) as reader:
+        copies = {c.topic: bag.add_connection(c.topic, c.msgtype, typestore=typestore())
+                  for c in reader.connections}
+        for connection, stamp, data in reader.messages():
+            bag.write(copies[connection.topic], stamp, data)
+    source = tmp_path / "plain/plain.mcap"
+    raw = source.read_bytes()
+    with open(source, "rb") as stream:
+        index = make_reader(stream).get_summary().chunk_indexes[0]
+    at = raw.index(struct.pack("<QQQQ", index.message_start_time, index.message_end_time,
+                               index.chunk_start_offset, index.chunk_length))
+    assert read_or_named(source) == message_bytes(written)
+    path = tmp_path / "drive.mcap"
+    for byte in range(at, at + 32):
+        path.write_bytes(DAMAGES["flipped"](raw, byte))
+        assert read_or_named(path) is None
+
+
+def test_a_chunk_that_says_it_unpacks_to_terabytes_is_not_unpacked(written, tmp_path):
+    raw = bytearray((written / "drive.mcap").read_bytes())
+    with open(written / "drive.mcap", "rb") as stream:
+        at = make_reader(stream).get_summary().chunk_indexes[0].chunk_start_offset
+    raw[at + 9 + 16:at + 9 + 24] = struct.pack("<Q", 2**41)
+    (tmp_path / "drive.mcap").write_bytes(raw)
+    with pytest.raises(InputError, match="unpack to 2199023255552 bytes"):
+        Bag(tmp_path / "drive.mcap")
 
 
 def test_a_bag_without_clouds_says_what_it_has(tmp_path):

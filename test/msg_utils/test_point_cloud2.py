@@ -272,3 +272,23 @@ def test_what_point_cloud2_cannot_say_is_refused(make, dtype):
 def test_rows_of_different_length_are_refused(make):
     with pytest.raises(ValueError, match="5 points do not make 2 rows"):
         from_array(np.zeros(5, XYZ), header(make), make, height=2)
+
+
+@each_make
+@pytest.mark.parametrize("height, width", [(1, 0), (0, 1), (0, 2**32 - 1), (1, 1)])
+def test_a_point_step_beyond_all_reason_is_named_with_points_and_without(make, height, width):
+    fields = [field(make, name, 4 * i) for i, name in enumerate("xyz")]
+    msg = message(make, fields, np.zeros(12, np.uint8), height=height, width=width,
+                  point_step=2**32 - 1, row_step=0)
+    for read in (to_array, lambda m: add_columns(m, make, ground=np.zeros(0, "u1"))):
+        with pytest.raises(CloudError, match="point_step = 4294967295"):
+            read(msg)
+
+
+@each_make
+def test_a_cloud_of_no_rows_gets_columns_whatever_its_width(make):
+    fields = [field(make, name, 4 * i) for i, name in enumerate("xyz")]
+    msg = message(make, fields, np.zeros(0, np.uint8), height=0, width=2**32 - 1, point_step=12,
+                  row_step=0)
+    more = add_columns(msg, make, ground=np.zeros(0, "u1"))
+    assert (more.row_step, more.width, len(to_array(more))) == (0, 2**32 - 1, 0)

@@ -204,7 +204,10 @@ def test_a_generic_sensor_can_be_named():
     assert sensor_named("generic:32,-25,15,0.2,10") == generic(32, -25.0, 15.0, 0.2, 10.0)
 
 
-@pytest.mark.parametrize("name", ["generic:", "generic:32", "generic:a,b,c,d,e",
+@pytest.mark.parametrize("name", ["generic:", "generic:32", "generic:64,-24,2,1e-9,10",
+                                  "generic:64,-24,2,1e-320,10", "generic:1e12,-24,2,0.2,10",
+                                  "generic:inf,-24,2,0.2,10", "generic:1000000,-24,2,1,10",
+                                  "generic:a,b,c,d,e",
                                   "generic:32,-25,15,0.2,10,3", "generic:32,15,-25,0.2,10",
                                   "generic:0,-25,15,0.2,10", "generic:nan,-25,15,0.2,10"])
 def test_a_generic_sensor_that_cannot_be_is_refused_in_one_line(name):

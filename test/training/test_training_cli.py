@@ -146,3 +146,14 @@ def test_the_papers_share_is_held_out_and_every_number_has_a_flag():
     for group in PointPillarsTraining, DataParams:
         for f in dataclasses.fields(group):
             assert "--" in said and f.name.replace("_", "-") in said
+
+
+def test_an_out_that_is_a_file_fails_before_any_data_is_made(tmp_path, monkeypatch):
+    def never(*_):
+        raise AssertionError("data was prepared")
+    monkeypatch.setattr("lidar_perception.training.sources.training_scenes", never)
+    file = write(tmp_path / "out", b"")
+    for out in (file, file / "below"):
+        for kind in ("pointpillars", "pointnet"):
+            result = CliRunner().invoke(cli, ["train", kind, "--data", "sim", "--out", str(out)])
+            assert isinstance(result.exception, InputError) and str(out) in str(result.exception)

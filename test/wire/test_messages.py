@@ -9,7 +9,14 @@ from samples import CALIBRATION, each_make, header
 from lidar_perception.camera import Calibration, Camera
 from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import bag_message, decode, encode
-from lidar_perception.wire.messages import camera_info, camera_of, detection_markers, extrinsics
+from lidar_perception.wire.messages import (
+    camera_info,
+    camera_of,
+    column,
+    detection_markers,
+    extrinsics,
+    to_frame,
+)
 from msg_utils.messages import message_class, ros_message
 from msg_utils.point_cloud2 import from_array
 
@@ -103,3 +110,12 @@ def test_bytes_that_are_no_message_are_an_input_error():
     for size in range(0, len(raw), 7):
         with pytest.raises(InputError, match=f"^{size} bytes are no visualization_msgs"):
             decode(raw[:size], "visualization_msgs/msg/MarkerArray")
+
+
+@each_make
+@pytest.mark.parametrize("name", ["in_view", "ground", "cluster_id"])
+def test_a_column_with_more_than_one_number_a_point_is_named(make, name):
+    kind = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), (name, "<u4", 2)]
+    msg = from_array(np.ones(3, kind), header(make), make)
+    with pytest.raises(InputError, match=f"'{name}' has count > 1"):
+        column(msg, name, to_frame(msg)[1])

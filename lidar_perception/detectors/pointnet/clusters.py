@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
+from lidar_perception.groups import groups_of
 from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
 
 NEAR = (3.0, 6.0, 12.0)  # m: so far around a cluster the ground is looked for
@@ -80,18 +81,12 @@ def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, min_points: int = 1,
     """The clusters of a frame of N points, with numbers (N,) int, 0 and below for none, that have
     enough points, by their numbers. Without an intensity it is 0. ground (N,) bool: the points
     that say how high the ground is under each; None for a flat one."""
-    ids = np.asarray(cluster_ids)
-    order = np.argsort(ids, kind="stable")
-    order = order[np.searchsorted(ids[order], 1):]
-    known, sizes = np.unique(ids[order], return_counts=True)
-    kept = sizes >= min_points
-    order = order[np.repeat(kept, sizes)]
-    points = np.zeros((len(order), 4), np.float32)
-    points[:, :3] = frame.xyz[order]
+    groups = groups_of(np.asarray(cluster_ids), min_points)
+    points = np.zeros((len(groups.rows), 4), np.float32)
+    points[:, :3] = frame.xyz[groups.rows]
     if frame.intensity is not None:
-        points[:, 3] = frame.intensity[order]
-    first = np.concatenate([[0], np.cumsum(sizes[kept])]).astype(np.int64)
-    found = Clusters(points, first, known[kept].astype(np.int64))
+        points[:, 3] = frame.intensity[groups.rows]
+    found = Clusters(points, groups.start, groups.numbers)
     return found if ground is None else found.on(frame.xyz.compress(ground, axis=0))
 
 
