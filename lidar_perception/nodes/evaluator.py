@@ -35,7 +35,8 @@ class Evaluator(LidarNode):
             node, what = topic.split("/")[1], topic.rsplit("/", 1)[1]
             name = node if what == "processing_time_ms" else what.removesuffix("_ms")
             self.input(topic, "std_msgs/msg/Float64",
-                       lambda m, n=name: self.result.add_times({n: m.data}), RELIABLE)
+                       lambda m, n=name: self.result.add_times({n: m.data}), RELIABLE,
+                       private=False)
         self.create_timer(WRITE_PERIOD, self.write)
 
     def _add(self, kind: str, msg: Any) -> None:

@@ -40,7 +40,8 @@ class CameraInput:
                    LATCHED)
         if importlib.util.find_spec("tf2_msgs"):
             node.input(TF_STATIC, "tf2_msgs/msg/TFMessage",
-                       lambda m: [*map(self._on_transform, m.transforms)], LATCHED)
+                       lambda m: [*map(self._on_transform, m.transforms)], LATCHED,
+                       private=False)
 
     def _on_info(self, msg: Any) -> None:
         self.info = msg
@@ -122,7 +123,8 @@ class SeedInput:
         self.loaded: tuple[str, Seed] | None = None
         self.paired = Paired(self._deliver_with_truth)
         node.input("ground_truth", MARKERS, self._on_truth, RELIABLE)
-        node.input(CLICK, "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE)
+        node.input(CLICK, "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE,
+                   private=False)
 
     @property
     def params(self) -> SeedParams:

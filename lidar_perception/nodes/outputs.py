@@ -18,13 +18,19 @@ from lidar_perception.wire.messages import detection_markers
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys, to_marker_array
 from msg_utils.messages import message_class, ros_message
-from msg_utils.stamps import header_message, to_ns
+from msg_utils.stamps import SECOND, header_message, to_ns
+
+
+def lifetime_ns(node: LidarNode) -> int:
+    """How long the node's markers stay without newer ones; 0 for ever."""
+    return int(node.robot.output.marker_lifetime * SECOND)
 
 
 class ClusterBoxes:
     """~/output/boxes, made only while somebody subscribes."""
 
     def __init__(self, node: LidarNode):
+        self.node = node
         self.publisher = node.output("boxes", MARKERS)
         self.shown: Any = ()
 
@@ -33,6 +39,7 @@ class ClusterBoxes:
             found = boxes()
             markers = to_marker_array(found, ["cluster"] * len(found), header=header,
                                       make=bag_message, previous=self.shown,
+                                      lifetime_ns=lifetime_ns(self.node),
                                       extras=_size_classes(found))
             self.shown = marker_keys(markers)
             self.publisher.publish(encode(markers))
@@ -48,11 +55,12 @@ class DetectionMarkers:
     """A topic with detections as markers."""
 
     def __init__(self, node: LidarNode, topic: str):
-        self.publisher = node.output(topic, MARKERS)
+        self.node, self.publisher = node, node.output(topic, MARKERS)
         self.shown: Any = ()
 
     def publish(self, header: Any, detections: Detections) -> None:
-        message = detection_markers(detections, header, bag_message, self.shown)
+        message = detection_markers(detections, header, bag_message, self.shown,
+                                    lifetime_ns(self.node))
         self.shown = marker_keys(message)
         self.publisher.publish(encode(message))
 

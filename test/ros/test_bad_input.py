@@ -96,7 +96,7 @@ def test_no_method_dies_of_a_strange_cloud(values, processes, peer, good_cloud):
     """The wheels behind some methods end the process on NaN, outliers or nothing at all."""
     node = "perception" if "clustering.method" in values else "ground_segmentation"
     processes.start(node, {"~/input/points": "/in", "~/output/points": "/out"}, {
-        **RELIABLE_IN, **values})
+        **RELIABLE_IN, "input.queue": 5, **values})
     talker, received = peer.talker("/in", CLOUD), peer.listen("/out", CLOUD)
     rng = np.random.default_rng(0)
     xyz = xyz_of(good_cloud)
