@@ -118,8 +118,9 @@ class PlayerParams(Params):
     clock_hz: float = param(0.0, "Publish the bag's time on /clock this often; 0 does not.",
                             unit="Hz", low=0.0, high=1000.0, fixed=True)
     wait_for: tuple[str, ...] = param(
-        ("/points",), "Topics that must have a subscriber before the first message, or several: "
-        "TOPIC:=COUNT. Topics of other nodes may be named too.", fixed=True)
+        str, "Topics that must have a subscriber before the first message, or several: "
+        "TOPIC:=COUNT. Topics of other nodes may be named too. Empty: the bag's clouds.",
+        fixed=True)
     wait_timeout: float = param(10.0, "Play without subscribers after this time; 0 does not wait.",
                                 unit="s", low=0.0, high=3600.0, fixed=True)
 

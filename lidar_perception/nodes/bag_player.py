@@ -12,6 +12,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from lidar_perception.data.bag import Bag
+from lidar_perception.nodes.graph import cloud_topics
 from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
 from lidar_perception.params import PlayerParams
 from lidar_perception.types import InputError
@@ -91,7 +92,8 @@ class BagPlayer(LidarNode):
         self._wait_until_delivered()
 
     def _wait_for_subscribers(self) -> None:
-        rules = [rule.partition(":=") for rule in self.params.wait_for]
+        own = [self.names[t] for t in cloud_topics(self.bag.topics) if t in self.names]
+        rules = [rule.partition(":=") for rule in self.params.wait_for or own]
         wanted = {name: int(count or 1) for name, _, count in rules}
         give_up = monotonic() + self.params.wait_timeout
         while not self.stop.done():
@@ -106,7 +108,8 @@ class BagPlayer(LidarNode):
 
     def _subscribers(self, topic: str) -> int:
         """Of a topic that is played, those that are matched; else those that are known of."""
-        played = [p for t, p in self.publishers_by_topic.items() if self.names[t] == topic]
+        resolved = self.resolve_topic_name(topic)
+        played = [p for p in self.publishers_by_topic.values() if p.topic_name == resolved]
         return (played[0].get_subscription_count() if played
                 else self.count_subscribers(topic))
 

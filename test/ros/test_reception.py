@@ -13,11 +13,13 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from test_bad_input import CLOUD, cloud
+from test_bad_input import CLOUD, MARKERS, cloud
 
+from lidar_perception.nodes.graph import STAGES
 from lidar_perception.nodes.main import PROFILE_VARIABLES
 from lidar_perception.nodes.reception import RATE_OF, SHARE_OF, Arrivals
 from lidar_perception.wire.codec import encode
+from msg_utils.stamps import to_ns
 
 NODE, OK, WARN, ERROR, STALE = "ground_segmentation", 0, 1, 2, 3
 KITTI = 130_000  # points of a cloud: 2 MB
@@ -113,6 +115,33 @@ def test_two_nodes_of_one_name_say_so(processes, peer, tmp_path):
         others.start("clustering", {}, {})
         peer.wait(lambda: "another node is called /clustering" in peer.message_of("clustering")
                   and ord(peer.diagnostics["clustering"].level) == WARN, "a warning")
+
+
+def test_two_sensors_in_namespaces(processes, peer):
+    """The same graph twice: no topic is shared, and the diagnostics tell which sensor it is."""
+    seeds = {"seed.source": "click"}
+    for side in ("left", "right"):
+        for node, remap in STAGES.items():
+            processes.start(node, remap, seeds, namespace=side)
+    talkers = {side: peer.talker(f"/{side}/points", CLOUD) for side in ("left", "right")}
+    found = {side: peer.listen(f"/{side}/candidate_refinement/output/detections", MARKERS)
+             for side in talkers}
+    click = peer.talker("/right/clicked_point", "geometry_msgs/msg/PointStamped")
+    peer.wait(click.get_subscription_count, "the clicked points of one")
+    street = np.random.default_rng(0).uniform(-20, 20, (5000, 3)) * [1, 1, 1e-3] - [0, 0, 1.73]
+    for i, (side, talker) in enumerate(talkers.items()):
+        stamp = 5 * 10**9 * (i + 1)
+        peer.send(talker, cloud(street, stamp), lambda s=side: found[s], f"the result of {side}")
+        assert {to_ns(m.markers[0].header.stamp) for m in found[side]} == {stamp}
+        assert found[side][0].markers[0].lifetime.sec == 2  # and then a dead node's boxes go
+    assert all(peer.diagnostics[f"{side}/{node}"].hardware_id in (side, f"{side}/lidar")
+               for side in talkers for node in STAGES)
+    peer.wait(lambda: all(peer.diagnostics[f"{side}/clustering"].hardware_id == f"{side}/lidar"
+                          for side in talkers), "the sensors' frames")
+    names = {name for name, _ in peer.node.get_topic_names_and_types()}
+    ours = {t for t in names if not t.startswith(("/left/", "/right/"))}
+    assert ours <= {"/diagnostics", "/parameter_events", "/rosout", "/tf_static", "/clock"}
+    processes.check()
 
 
 def infos(numbers, period=10**8):
