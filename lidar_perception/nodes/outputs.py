@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -37,18 +37,20 @@ class ClusterBoxes:
     def publish(self, header: Any, boxes: Callable[[], np.ndarray]) -> None:
         if self.publisher.get_subscription_count():
             found = boxes()
+            ids = range(1, len(found) + 1)  # as in the column cluster_id
             markers = to_marker_array(found, ["cluster"] * len(found), header=header,
-                                      make=bag_message, previous=self.shown,
+                                      make=bag_message, ids=ids, previous=self.shown,
                                       lifetime_ns=lifetime_ns(self.node),
-                                      extras=_size_classes(found))
+                                      extras=_texts(found, ids))
             self.shown = marker_keys(markers)
             self.publisher.publish(encode(markers))
 
 
-def _size_classes(boxes: np.ndarray) -> list[dict]:
-    """What each box could be by its length and width alone, for the text of its marker."""
-    ids = class_by_diagonal(boxes)
-    return [{"size_class": CLASSES[i]} if i >= 0 else {} for i in ids]
+def _texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
+    """For the text of each box's marker: its id, and what it could be by its length and width
+    alone."""
+    return [{"id": i, **({"size_class": CLASSES[c]} if c >= 0 else {})}
+            for i, c in zip(ids, class_by_diagonal(boxes), strict=True)]
 
 
 class DetectionMarkers:

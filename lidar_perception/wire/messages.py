@@ -150,10 +150,12 @@ def to_detections(objects: MarkedObjects) -> Detections:
 
 def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
                       lifetime_ns: int = 0) -> Any:
-    """MarkerArray of detections; previous and lifetime_ns as in to_marker_array."""
+    """MarkerArray of detections, with their ids in the text too; previous and lifetime_ns as in
+    to_marker_array."""
     labels = [CLASSES[i] for i in detections.class_ids]
     return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
-                           previous=previous, lifetime_ns=lifetime_ns)
+                           extras=[{"id": i} for i in range(len(detections))], previous=previous,
+                           lifetime_ns=lifetime_ns)
 
 
 def _class_ids(labels: list[str]) -> list[int]:
