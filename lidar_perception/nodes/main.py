@@ -13,6 +13,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+from lidar_perception.runs.threads import wait_asleep
+
 if TYPE_CHECKING:
     from lidar_perception.nodes.stopping import Stop
 
@@ -112,7 +114,7 @@ def run(name: str, arguments: list[str]) -> int:
     # other's way.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # for torch, which takes more than one
+    wait_asleep()  # torch's, which takes more than one
     use_large_shared_memory()
     from lidar_perception.nodes.stopping import Stop
     stop = Stop(STOP_SIGNALS)
