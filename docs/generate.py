@@ -17,7 +17,8 @@ from lidar_perception.candidates.configurations import BEST_VALUES
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
 from lidar_perception.detectors.pointpillars.params import DetectorParams
-from lidar_perception.param_fields import flatten, parameter_fields
+from lidar_perception.nodes.main import node_parameters
+from lidar_perception.param_fields import flatten
 
 CONFIG = Path(__file__).parents[1] / "config"
 BEST, POINTPILLARS, POINTNET = (CONFIG / f"{name}.param.yaml"
@@ -57,7 +58,7 @@ CANDIDATES_OUT = [
 ALWAYS_OUT = [
     ("~/debug/processing_time_ms", STRING_TIMES, "Time of the work on one cloud."),
     ("/diagnostics", "diagnostic_msgs/DiagnosticArray", "Once a second and at every change: state, "
-     "reason, counts, lost messages, subscribers of the outputs."),
+     "reason, counts, rate, lost and dropped clouds, subscribers of the outputs."),
 ]
 COLUMNS = "columns `ground` (uint8, 1 = ground) and `in_view` (uint8, 1 = processed)"
 
@@ -165,7 +166,7 @@ def page(name: str) -> str:
             lines += [f"## {title}", "", "| name | type | |", "|---|---|---|",
                       *(f"| `{a}` | {b} | {c} |" for a, b, c in rows), ""]
     lines += ["## Parameters", "", "| name | default | range | |", "|---|---|---|---|"]
-    for key, f in parameter_fields(node["params"]).items():
+    for key, f in node_parameters(name).items():
         lines.append(f"| `{key}` | {_default(f)} | {_range(f)} | {f.metadata['doc']}"
                      + (" Fixed at start." if f.metadata["fixed"] else "") + " |")
     return "\n".join(lines) + "\n"

@@ -1,15 +1,15 @@
-"""The candidate pipeline on a live or replayed cloud.
+"""Pedestrian candidates on a live or replayed cloud;
+a case of detectors.launch.py.
 
     ros2 launch lidar_perception perception.launch.py points:=/velodyne_points
 """
 
 from pathlib import Path
 
-from lidar_perception.nodes.graph import SINGLE, STAGES
 from lidar_perception.nodes.launching import graph_launch
 
-CONFIG = Path(__file__).resolve().parents[1] / "config" / "perception.param.yaml"
+CONFIGS = Path(__file__).resolve().parents[1] / "config"
 
 
 def generate_launch_description():
-    return graph_launch(STAGES, SINGLE, CONFIG, "All stages in one process.")
+    return graph_launch(CONFIGS, "candidates")

@@ -1,15 +1,15 @@
-"""Cars, pedestrians and cyclists among the clusters of a live or replayed cloud, by PointNet.
+"""Cars, pedestrians and cyclists among the clusters of a cloud, by PointNet;
+a case of detectors.launch.py.
 
     ros2 launch lidar_perception pointnet.launch.py points:=/velodyne_points
 """
 
 from pathlib import Path
 
-from lidar_perception.nodes.graph import POINTNET, SINGLE_POINTNET
-from lidar_perception.nodes.launching import detector_launch
+from lidar_perception.nodes.launching import graph_launch
 
-CONFIG = Path(__file__).resolve().parents[1] / "config" / "pointnet.param.yaml"
+CONFIGS = Path(__file__).resolve().parents[1] / "config"
 
 
 def generate_launch_description():
-    return detector_launch(POINTNET, SINGLE_POINTNET, CONFIG, "pointnet")
+    return graph_launch(CONFIGS, "pointnet")

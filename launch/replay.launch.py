@@ -20,25 +20,47 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
-from lidar_perception.nodes.graph import evaluation, wait_for
+from lidar_perception.data.bag import Bag
+from lidar_perception.nodes.graph import (
+    chosen_clouds,
+    cloud_topics,
+    evaluation,
+    relative,
+    result_topics,
+    wait_for,
+)
+from lidar_perception.wire.topics import POINTS, TF_STATIC
 
 HERE = Path(__file__).resolve().parent
 CONFIG = HERE.parent / "config" / "replay.param.yaml"
+GLOBAL = {TF_STATIC, "/tf", "/clock", "/diagnostics"}
 SECONDS_FOR_THE_LAST_FRAME = 1.0
 
 
 def replay(context):
     value = {k: context.perform_substitution(LaunchConfiguration(k))
-             for k in ("bag", "rate", "loop", "scores", "config", "single", "use_sim_time",
-                       "log_level")}
+             for k in ("bag", "rate", "loop", "scores", "points", "config", "single",
+                       "real_time", "use_sim_time", "log_level")}
+    single = value["single"] == "true"
+    with Bag(value["bag"]) as bag:
+        clouds = chosen_clouds(value["bag"], bag.topics, value["points"])
+        played = [t for t in bag.topics if t == clouds or t not in cloud_topics(bag.topics)]
     sim_time = {"use_sim_time": value["use_sim_time"] == "true"}
     log_level = ["--log-level", value["log_level"]]
-    remap, scoring = evaluation(value["scores"], value["single"] == "true")
+    remap, scoring = evaluation(value["scores"], single)
+    # launch knows no type of an empty list
+    follow = {} if value["real_time"] == "true" else {
+        "follow": [relative(result_topics(single)["final"])]}
     player = Node(
         package="lidar_perception", executable="bag_player", name="bag_player", output="screen",
         parameters=[value["config"], {"bag": value["bag"], "rate": float(value["rate"]),
                                       "loop": value["loop"] == "true",
-                                      "wait_for": wait_for(value["single"] == "true")}],
+                                      "topics": played,
+                                      **follow,
+                                      "wait_for": wait_for(single)}],
+        # Relative, so that they go into a namespace if this file is included in one.
+        remappings=[(t, relative(POINTS if t == clouds else t)) for t in played
+                    if t not in GLOBAL],
         ros_arguments=log_level)
     evaluator = Node(
         package="lidar_perception", executable="evaluator", name="evaluator", output="screen",
@@ -53,10 +75,12 @@ def replay(context):
 def generate_launch_description():
     pipeline = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(HERE / "perception.launch.py")),
-        launch_arguments={k: LaunchConfiguration(k) for k in (
-            "config", "single", "use_sim_time", "log_level")}.items())
+        launch_arguments={"points": relative(POINTS), **{k: LaunchConfiguration(k) for k in (
+            "config", "single", "use_sim_time", "log_level")}}.items())
     return LaunchDescription([
         DeclareLaunchArgument("bag", description="Folder of the bag."),
+        DeclareLaunchArgument("points", default_value="", description="The bag's topic of clouds; "
+                              "empty: the only one it has."),
         DeclareLaunchArgument("rate", default_value="1.0", description="Speed of the replay."),
         DeclareLaunchArgument("loop", default_value="false", choices=["true", "false"],
                               description="Start again at the end."),
@@ -64,9 +88,12 @@ def generate_launch_description():
         DeclareLaunchArgument("config", default_value=str(CONFIG), description="Parameter file."),
         DeclareLaunchArgument("single", default_value="false", choices=["true", "false"],
                               description="All stages in one process."),
+        DeclareLaunchArgument("real_time", default_value="false", choices=["true", "false"],
+                              description="Play as a sensor sends; false: a cloud is sent when "
+                              "those before have their result."),
         DeclareLaunchArgument("use_sim_time", default_value="true", choices=["true", "false"],
                               description="Take the time from /clock."),
         DeclareLaunchArgument("log_level", default_value="info", description="debug, info, ..."),
+        OpaqueFunction(function=replay),  # first, as the other sets `points` to its own
         pipeline,
-        OpaqueFunction(function=replay),
     ])

@@ -23,6 +23,55 @@ from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import Params, param
 from lidar_perception.wire.params import InputParams, ViewParams
 
+
+@dataclass(frozen=True)
+class ReceptionParams(Params):
+    """How a node takes its clouds, and from when on it says that something is wrong with them."""
+
+    reliability: str = param(
+        "auto", "auto: reliable where every publisher of the topic offers it, else best_effort. "
+        "qos_overrides.TOPIC.subscription.reliability stands above this.",
+        choices=("auto", "reliable", "best_effort"))
+    queue: int = param(1, "Clouds that wait while one is worked on; older ones are dropped, and "
+                          "counted. 1: the newest wins.", low=1, high=1000)
+    rate: float = param(0.0, "Clouds a second that the sensor sends; 0 takes what the first 21 "
+                        "say.", unit="Hz", low=0.0, high=1000.0)
+    min_rate: float = param(0.7, "WARN below this share of the rate.", low=0.0, high=1.0)
+    error_after: float = param(2.0, "ERROR when no cloud has come for this time.", unit="s",
+                               low=0.1, high=1e6)
+    stale_after: float = param(10.0, "STALE when no cloud has come for this time.", unit="s",
+                               low=0.1, high=1e6)
+    max_lost: float = param(0.02, "WARN when more than this share of the last 100 clouds was lost "
+                            "on the way.", low=0.0, high=1.0)
+    max_dropped: float = param(
+        0.5, "WARN when more than this share of the last 100 clouds was dropped because a newer "
+        "one came before its turn.", low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class MarkerParams(Params):
+    """Boxes for RViz and Foxglove."""
+
+    marker_lifetime: float = param(2.0, "Markers go away when no newer ones have come for this "
+                                   "time, as of a node that has died; 0 keeps them for ever.",
+                                   unit="s", low=0.0, high=1e6)
+
+
+@dataclass(frozen=True)
+class CloudNodeParams:
+    """What a node that takes clouds has besides the numbers of its algorithm."""
+
+    input: ReceptionParams = ReceptionParams()
+
+
+@dataclass(frozen=True)
+class BoxNodeParams:
+    """What a node that makes boxes of clouds has besides the numbers of its algorithm."""
+
+    input: ReceptionParams = ReceptionParams()
+    output: MarkerParams = MarkerParams()
+
+
 # Each node declares the groups of its own stages, under the same names.
 
 
@@ -69,8 +118,18 @@ class PlayerParams(Params):
     clock_hz: float = param(0.0, "Publish the bag's time on /clock this often; 0 does not.",
                             unit="Hz", low=0.0, high=1000.0, fixed=True)
     wait_for: tuple[str, ...] = param(
-        ("/points",), "Topics that must have a subscriber before the first message, or several: "
-        "TOPIC:=COUNT. Topics of other nodes may be named too.", fixed=True)
+        str, "Topics that must have a subscriber before the first message, or several: "
+        "TOPIC:=COUNT. Topics of other nodes may be named too. Empty: the bag's clouds.",
+        fixed=True)
+    follow: tuple[str, ...] = param(
+        str, "Topics of detections (MarkerArray): the next cloud is sent when those before have "
+        "their answer on each, so that none is lost; the bag's time stands still meanwhile. Empty "
+        "plays in real time, as a sensor sends.", fixed=True)
+    ahead: int = param(1, "Clouds without an answer at a time, with `follow`. The nodes must have "
+                          "an `input.queue` as long, or they drop some.", low=1, high=1000,
+                       fixed=True)
+    follow_timeout: float = param(10.0, "Go on without an answer after this time, and count it.",
+                                  unit="s", low=0.1, high=3600.0, fixed=True)
     wait_timeout: float = param(10.0, "Play without subscribers after this time; 0 does not wait.",
                                 unit="s", low=0.0, high=3600.0, fixed=True)
 

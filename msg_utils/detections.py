@@ -13,7 +13,8 @@ from msg_utils.stamps import to_ns
 
 def to_detection_array(boxes: np.ndarray, labels: Sequence[str], scores: Sequence[float], *,
                        header: Any, make: Any) -> Any:
-    """Detection3DArray of boxes (K, 7) [x y z l w h yaw], one hypothesis each."""
+    """Detection3DArray of boxes (K, 7) [x y z l w h yaw], one hypothesis each; ids are 0..K-1, as
+    those of the markers. The covariances are all zero: "unknown", as sensor_msgs/Imu has it."""
     detections = []
     for i, (box, label, score) in enumerate(zip(np.asarray(boxes, float).reshape(-1, 7), labels,
                                                 scores, strict=True)):

@@ -130,8 +130,8 @@ def point_fields(dtype: np.dtype, make: Any) -> list:
 def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
     """The same cloud with further fields, each (height * width,) of a PointField datatype.
 
-    Every old field keeps its bytes; a field that exists already with the same datatype is
-    overwritten. Shape, density and byte order stay as they are.
+    Every old field keeps its bytes; a new one lies at a multiple of its size. A field that exists
+    already with the same datatype is overwritten. Shape, density and byte order stay as they are.
     """
     old = to_array(msg)
     order = ">" if msg.is_bigendian else "<"
@@ -146,6 +146,7 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
             places[name] = (known.offset, kind)
             continue
         fields = [f for f in fields if f.name != name]
+        offset = -(-offset // kind.itemsize) * kind.itemsize  # as C structs have it
         fields.append(make("sensor_msgs/msg/PointField", name=name, offset=offset, datatype=code,
                            count=1))
         places[name] = (offset, kind)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from lidar_perception.nodes.main import NODES, help_text
+from lidar_perception.nodes.main import NODES, help_text, node_parameters
 from lidar_perception.param_fields import parameter_fields
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -25,7 +25,8 @@ def generate():
 @pytest.mark.parametrize("name", NODES)
 def test_help_of_a_node_names_every_parameter(generate, name):
     text = help_text(name)
-    assert all(f"  {key} (" in text for key in parameter_fields(generate.NODES[name]["params"]))
+    assert all(f"  {key} (" in text for key in node_parameters(name))
+    assert parameter_fields(generate.NODES[name]["params"]).keys() <= node_parameters(name).keys()
 
 
 def test_every_node_has_a_page_and_a_place_in_setup(generate):

@@ -64,7 +64,9 @@ def cli() -> None:
 
 
 def main() -> None:
+    from lidar_perception.runs.threads import wait_asleep
     from lidar_perception.types import InputError
+    wait_asleep()
     try:
         cli(prog_name="lidar-perception")
     except InputError as error:

@@ -12,6 +12,8 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from lidar_perception.data.bag import Bag
+from lidar_perception.nodes.graph import cloud_topics
+from lidar_perception.nodes.pacing import Pace
 from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
 from lidar_perception.params import PlayerParams
 from lidar_perception.types import InputError
@@ -45,6 +47,7 @@ class BagPlayer(LidarNode):
         self.step_topic = max(self.publishers_by_topic, key=lambda t: (
             "PointCloud2" in self.bag.topics[t], self.bag.counts[t]))
         self.now_ns, self.anchor = self.start_ns, monotonic()
+        self.pace = Pace(self, self.params.follow, self.params.ahead, self.params.follow_timeout)
         self.clock = self.params.clock_hz and self.create_publisher(Clock, "/clock", RELIABLE)
         self.next_clock = 0.0
         for name, action in (("pause", self._pause), ("resume", self._resume),
@@ -70,7 +73,8 @@ class BagPlayer(LidarNode):
     def _publisher(self, topic: str) -> Any:
         kind = self.bag.topics[topic]
         try:
-            return self.output(self.names[topic], kind, _qos(self.bag.qos(topic)))
+            return self.output(self.names[topic], kind,
+                               _qos(self.bag.qos(topic), lossless=bool(self.params.follow)))
         except (ModuleNotFoundError, AttributeError):
             self.get_logger().warning(f"{topic} is not played: {kind} is not installed here")
             return None
@@ -87,32 +91,37 @@ class BagPlayer(LidarNode):
             self._play_once()
             if not self.params.loop:
                 break
+        self._count_pace()
         self.report(OK, "the bag is played")
         self._wait_until_delivered()
 
     def _wait_for_subscribers(self) -> None:
-        rules = [rule.partition(":=") for rule in self.params.wait_for]
+        own = [self.names[t] for t in cloud_topics(self.bag.topics) if t in self.names]
+        rules = [rule.partition(":=") for rule in self.params.wait_for or own]
         wanted = {name: int(count or 1) for name, _, count in rules}
         give_up = monotonic() + self.params.wait_timeout
         while not self.stop.done():
             missing = [t for t, count in wanted.items() if self._subscribers(t) < count]
+            missing += [t for t in self.params.follow if not self.count_publishers(t)]
             if not missing:
                 return
             if monotonic() > give_up:
-                self.report(WARN, f"too few subscribers of {', '.join(missing)} after "
-                            f"{self.params.wait_timeout:g} s; playing anyway")
+                self.report(WARN, f"too few subscribers of {', '.join(missing)} (or publishers, of "
+                            f"what is followed) after {self.params.wait_timeout:g} s; playing "
+                            "anyway")
                 return
             self.serve(timeout_sec=0.02)
 
     def _subscribers(self, topic: str) -> int:
         """Of a topic that is played, those that are matched; else those that are known of."""
-        played = [p for t, p in self.publishers_by_topic.items() if self.names[t] == topic]
+        resolved = self.resolve_topic_name(topic)
+        played = [p for p in self.publishers_by_topic.values() if p.topic_name == resolved]
         return (played[0].get_subscription_count() if played
                 else self.count_subscribers(topic))
 
     def _wait_until_delivered(self) -> None:
         from rclpy.duration import Duration
-        for publisher in self.publishers_by_topic.values():
+        for publisher in (*self.publishers_by_topic.values(), self._diagnostics):
             if not self.stop.done():
                 publisher.wait_for_all_acked(Duration(seconds=2))
 
@@ -123,9 +132,26 @@ class BagPlayer(LidarNode):
                                                self.stop_ns):
             if not self._wait_until(stamp, topic):
                 return
+            if topic == self.step_topic:
+                self._follow(data)
             self.publishers_by_topic[topic].publish(data)
             self.counts["frames"] += topic == self.step_topic
             self.last_stamp_ns = stamp
+
+    def _follow(self, cloud: bytes) -> None:
+        """Wait until the graph keeps up; the bag's time stands still meanwhile."""
+        if self.params.follow:
+            self._advance()
+            self.pace.room(lambda: self.serve(timeout_sec=0.05), self.stop.done)
+            self.pace.sent(cloud)
+            self.anchor = monotonic()
+            self._count_pace()
+
+    def _count_pace(self) -> None:
+        if self.params.follow:
+            played = max((self.now_ns - self.start_ns) / SECOND / self.params.rate, 1e-9)
+            self.counts.update(unanswered=self.pace.unanswered, held_s=f"{self.pace.held:.2f}",
+                               slower=f"{(played + self.pace.held) / played:.2f}")
 
     def _publish_latched(self) -> None:
         """The last message of each latched topic before the start, so that none is missed."""
@@ -194,14 +220,14 @@ def _done(response: Any, message: str, success: bool = True) -> Any:
     return response
 
 
-def _qos(profiles: list) -> QoSProfile:
-    """The recorded profile; what it leaves open is reliable and volatile."""
+def _qos(profiles: list, lossless: bool) -> QoSProfile:
+    """The recorded profile; what it leaves open is reliable and volatile. lossless: reliable."""
     if not profiles:
         return RELIABLE
     recorded = profiles[0]
+    best_effort = recorded.reliability.name == "BEST_EFFORT" and not lossless
     return QoSProfile(
         depth=max(recorded.depth, 10),
-        reliability=ReliabilityPolicy.BEST_EFFORT if recorded.reliability.name == "BEST_EFFORT"
-        else ReliabilityPolicy.RELIABLE,
+        reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL
         if recorded.durability.name == "TRANSIENT_LOCAL" else DurabilityPolicy.VOLATILE)

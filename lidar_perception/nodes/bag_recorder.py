@@ -55,8 +55,10 @@ class BagRecorder(LidarNode):
                             LATCHED_QOS if latched else SENSOR_QOS))
             self._subscribe(topic, message_class(types[topic][0]),
                             LATCHED if latched else RELIABLE if reliable else SENSOR_DATA)
-        self.report(*((WARN, f"waiting for {', '.join(self.waiting)}") if self.waiting
-                      else (OK, "recording")))
+        if self.waiting:
+            self.report(WARN, f"waiting for {', '.join(self.waiting)}", expected=True)
+        else:
+            self.report(OK, "recording")
 
     def _subscribe(self, topic: str, kind: type, qos: QoSProfile) -> None:
         def received(data: bytes) -> None:

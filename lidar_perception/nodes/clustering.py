@@ -11,7 +11,7 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.nodes.outputs import ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN, LidarNode
-from lidar_perception.params import ClusteringNodeParams
+from lidar_perception.params import BoxNodeParams, ClusteringNodeParams
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import column, spread, to_frame
 from msg_utils.point_cloud2 import add_columns
@@ -25,7 +25,7 @@ class Clustering(LidarNode):
     Boxes are made only while somebody subscribes."""
 
     def __init__(self, **options: Any):
-        super().__init__("clustering", ClusteringNodeParams(), **options)
+        super().__init__("clustering", ClusteringNodeParams(), BoxNodeParams(), **options)
         self.points = self.output("points", CLOUD)
         self.boxes = ClusterBoxes(self)
         self.input("points", CLOUD, self.on_points)

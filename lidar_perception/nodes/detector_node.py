@@ -12,6 +12,7 @@ from lidar_perception.nodes.main import one_at_a_time
 from lidar_perception.nodes.outputs import DetectionOutputs
 from lidar_perception.nodes.runtime import CLOUD, ERROR, OK, WARN, LidarNode
 from lidar_perception.nodes.sensor_check import SensorCheck
+from lidar_perception.params import BoxNodeParams
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.messages import cluster_column, column, to_frame
 from msg_utils.stamps import to_ns
@@ -28,10 +29,10 @@ class DetectorNode(LidarNode):
     group: ClassVar[str]  # of the parameters, a NetworkParams
 
     def __init__(self, name: str, params: Any, steps: tuple[str, ...], **options: Any):
-        super().__init__(name, params, **options)
+        super().__init__(name, params, BoxNodeParams(), **options)
         self.sensor = SensorCheck(self)
         self.outputs = DetectionOutputs(self, steps)
-        self.report(WARN, "loading the network")
+        self.report(WARN, "loading the network", expected=True)
         self.detector = self._loaded()
         self.input("points", CLOUD, self.on_points)
 
@@ -61,7 +62,8 @@ class DetectorNode(LidarNode):
         config = detector.config
         self.counts.update(network=f"{self.name_of(config)}, {' '.join(config.classes)}",
                            device=str(detector.device))
-        self.report(WARN, detector.fallback or "waiting for input")
+        self.report(WARN, detector.fallback or "waiting for input",
+                    expected=not detector.fallback)
         return detector
 
     def _load(self) -> Any:

@@ -32,10 +32,11 @@ class Evaluator(LidarNode):
         for stage in self.params.stages:
             self.input(stage, MARKERS, lambda m, s=stage: self._add(s, m), RELIABLE)
         for topic in self.params.timing:
-            node, what = topic.split("/")[1], topic.rsplit("/", 1)[1]
+            *_, node, _, what = topic.split("/")  # .../NODE/debug/WHAT
             name = node if what == "processing_time_ms" else what.removesuffix("_ms")
             self.input(topic, "std_msgs/msg/Float64",
-                       lambda m, n=name: self.result.update_times({n: m.data}), RELIABLE)
+                       lambda m, n=name: self.result.update_times({n: m.data}), RELIABLE,
+                       private=False)
         self.create_timer(WRITE_PERIOD, self.write)
 
     def _add(self, kind: str, msg: Any) -> None:

@@ -8,7 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -19,30 +19,60 @@ from lidar_perception.candidates.params import STEPS
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
 
-CAMERA = {"~/input/camera_info": CAMERA_INFO, "~/input/extrinsics": EXTRINSICS}
+Graph = Mapping[str, Mapping[str, str]]  # node -> remapping of its topics
 
-# Node -> remapping of its topics. One process a stage ...
-STAGES = {
-    "ground_segmentation": {"~/input/points": POINTS, **CAMERA},
-    "clustering": {"~/input/points": "/ground_segmentation/output/points"},
-    "candidate_refinement": {"~/input/points": "/clustering/output/points",
-                             "~/input/ground_truth": TRUTH},
+
+def relative(topic: str) -> str:
+    """A name that goes along when its node is put into a namespace."""
+    return topic.lstrip("/")
+
+
+CAMERA = {"~/input/camera_info": relative(CAMERA_INFO), "~/input/extrinsics": relative(EXTRINSICS)}
+TRUTH_IN = {"~/input/ground_truth": relative(TRUTH)}
+CLOUDS = {"~/input/points": relative(POINTS)}
+CLUSTERED = {"~/input/points": "clustering/output/points"}
+
+# Ground and clusters, once for all detectors ...
+EXPERTS = {
+    "ground_segmentation": {**CLOUDS, **CAMERA},
+    "clustering": {"~/input/points": "ground_segmentation/output/points"},
 }
-# ... or all stages in one process.
-SINGLE = {"perception": {"~/input/points": POINTS, "~/input/ground_truth": TRUTH, **CAMERA}}
+# ... and those behind them: one process a stage, or alone, as each finds both itself.
+BEHIND = {
+    "candidates": {"candidate_refinement": {**CLUSTERED, **TRUTH_IN}},
+    "pointpillars": {"pointpillars_detector": CLUSTERED},
+    "pointnet": {"pointnet_detector": CLUSTERED},
+}
+ALONE = {
+    "candidates": {"perception": {**CLOUDS, **TRUTH_IN, **CAMERA}},
+    "pointpillars": {"pointpillars_detector": CLOUDS},
+    "pointnet": {"pointnet_detector": CLOUDS},
+}
 
-# Cars, pedestrians and cyclists: a network behind the nodes that find ground and clusters ...
-EXPERTS = {node: STAGES[node] for node in ("ground_segmentation", "clustering")}
-CLUSTERED = {"~/input/points": "/clustering/output/points"}
-POINTPILLARS = {**EXPERTS, "pointpillars_detector": CLUSTERED}
-POINTNET = {**EXPERTS, "pointnet_detector": CLUSTERED}
-# ... or alone, as it finds both itself.
-SINGLE_POINTPILLARS = {"pointpillars_detector": {"~/input/points": POINTS}}
-SINGLE_POINTNET = {"pointnet_detector": {"~/input/points": POINTS}}
+
+def graph_of(detectors: Sequence[str], single: bool = False) -> dict[str, Mapping[str, str]]:
+    """The nodes of one or several detectors, each started once. InputError for an unknown one."""
+    for name in detectors:
+        if name not in BEHIND:
+            raise InputError(f"detectors: '{name}' is none of {', '.join(BEHIND)}")
+    parts = [(ALONE if single else BEHIND)[name] for name in detectors]
+    return {k: v for part in ([] if single else [EXPERTS]) + parts for k, v in part.items()}
+
+
+def prefixed(graph: Graph, prefix: str) -> dict[str, dict[str, str]]:
+    """The same graph with prefix before the names of its nodes, and of the topics between them."""
+    def renamed(topic: str) -> str:
+        return prefix + topic if topic.partition("/")[0] in graph else topic
+    return {prefix + node: {a: renamed(b) for a, b in remap.items()}
+            for node, remap in graph.items()}
+
+
+STAGES, SINGLE = graph_of(["candidates"]), graph_of(["candidates"], single=True)
+POINTPILLARS, POINTNET = graph_of(["pointpillars"]), graph_of(["pointnet"])
 
 
 def result_topics(single: bool = False) -> dict[str, str]:
-    """Stage -> topic of its detections."""
+    """Stage -> topic of its detections, without a namespace."""
     node = "perception" if single else "candidate_refinement"
     return {"stage1": f"/{node}/debug/stage1", "stage2": f"/{node}/debug/stage2",
             "final": f"/{node}/output/detections"}
@@ -63,13 +93,15 @@ def timing_topics(single: bool = False) -> list[str]:
 def evaluation(file: Path | str, single: bool = False) -> tuple[dict[str, str], dict[str, Any]]:
     """Remapping and parameters of an evaluator of all stages."""
     topics = result_topics(single)
-    remap = {"~/input/ground_truth": TRUTH, **{f"~/input/{k}": v for k, v in topics.items()}}
-    return remap, {"stages": list(topics), "timing": timing_topics(single), "file": str(file)}
+    remap = TRUTH_IN | {f"~/input/{k}": relative(v) for k, v in topics.items()}
+    return remap, {"stages": list(topics), "timing": [*map(relative, timing_topics(single))],
+                   "file": str(file)}
 
 
-def outputs_in_use(graph: Mapping[str, Mapping[str, str]]) -> dict[str, set[str]]:
-    """Node -> those of its topics that another node of the graph listens to."""
-    heard = {topic for remap in graph.values() for topic in remap.values()}
+def outputs_in_use(graph: Graph) -> dict[str, set[str]]:
+    """Node -> those of its topics that another node of the graph listens to, without a
+    namespace."""
+    heard = {f"/{relative(topic)}" for remap in graph.values() for topic in remap.values()}
     return {node: {t for t in heard if t.startswith(f"/{node}/")} for node in graph}
 
 
@@ -78,7 +110,24 @@ def wait_for(single: bool = False, points: int = 1, truth: int = 2) -> list[str]
     evaluator), and one of each topic between the nodes."""
     graph = SINGLE if single else STAGES
     between = sorted(set().union(*outputs_in_use(graph).values()))
-    return [f"{POINTS}:={points}", f"{TRUTH}:={truth}", *between, result_topics(single)["final"]]
+    topics = [f"{POINTS}:={points}", f"{TRUTH}:={truth}", *between, result_topics(single)["final"]]
+    return [*map(relative, topics)]
+
+
+def cloud_topics(types: Mapping[str, str]) -> list[str]:
+    """The topics with clouds, of topic -> type."""
+    return [topic for topic, kind in types.items() if kind.endswith("/PointCloud2")]
+
+
+def chosen_clouds(bag: str, types: Mapping[str, str], wanted: str = "") -> str:
+    """The topic of a bag with clouds: the wanted one, or with '' the only one. InputError names
+    those that there are."""
+    clouds = cloud_topics(types)
+    if wanted in clouds or (not wanted and len(clouds) == 1):
+        return wanted or clouds[0]
+    has = f"it has {', '.join(clouds)}" if clouds else "it has none at all"
+    raise InputError(f"{bag} has no cloud on {wanted}; {has}" if wanted else
+                     f"{bag}: give the topic of the clouds with points:=TOPIC; {has}")
 
 
 def private_domain() -> int:
@@ -110,14 +159,18 @@ class Processes:
         self.logs.mkdir(parents=True, exist_ok=True)
         return self
 
-    def start(self, node: str, remap: Mapping[str, str], params: Mapping[str, Any]) -> None:
+    def start(self, node: str, remap: Mapping[str, str], params: Mapping[str, Any],
+              namespace: str = "") -> None:
+        """Start an executable; in a namespace it is called NAMESPACE.NODE here."""
         values = {k: list(v) if isinstance(v, tuple) else v for k, v in params.items()}
         values = {k: v for k, v in values.items() if v != []}  # an empty list has no type in YAML
-        file = self.logs / f"{node}.param.yaml"
+        name = f"{namespace}.{node}" if namespace else node
+        file = self.logs / f"{name}.param.yaml"
         file.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}))
-        remapping = [word for rule in remap.items() for word in ("-r", ":=".join(rule))]
-        with open(self.logs / f"{node}.log", "w") as log:
-            self.running[node] = subprocess.Popen(
+        rules = {**remap, **({"__ns": f"/{namespace}"} if namespace else {})}
+        remapping = [word for rule in rules.items() for word in ("-r", ":=".join(rule))]
+        with open(self.logs / f"{name}.log", "w") as log:
+            self.running[name] = subprocess.Popen(
                 [sys.executable, "-m", "lidar_perception.nodes.main", node, "--ros-args",
                  "--params-file", str(file), *remapping],
                 env=self.environment, stdin=subprocess.DEVNULL, stdout=log,

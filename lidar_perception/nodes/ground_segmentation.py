@@ -11,7 +11,7 @@ from lidar_perception.ground.threshold import fit_plane, inlier_share
 from lidar_perception.nodes.inputs import CameraInput
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN, LidarNode
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.params import GroundNodeParams
+from lidar_perception.params import CloudNodeParams, GroundNodeParams
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import spread
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
@@ -25,7 +25,7 @@ class GroundSegmentation(LidarNode):
     only while somebody subscribes."""
 
     def __init__(self, **options: Any):
-        super().__init__("ground_segmentation", GroundNodeParams(), **options)
+        super().__init__("ground_segmentation", GroundNodeParams(), CloudNodeParams(), **options)
         self.camera = CameraInput(self)
         self.sensor = SensorCheck(self)
         self.points = self.output("points", CLOUD)

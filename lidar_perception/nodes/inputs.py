@@ -19,6 +19,7 @@ from lidar_perception.candidates.seed_sources import (
 )
 from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.candidates.segmented import Segmented
+from lidar_perception.nodes.graph import relative
 from lidar_perception.nodes.runtime import JUMP_NS, LATCHED, MARKERS, RELIABLE, LidarNode
 from lidar_perception.types import PEDESTRIAN, InputError
 from lidar_perception.wire.messages import camera_of, to_truth
@@ -40,7 +41,8 @@ class CameraInput:
                    LATCHED)
         if importlib.util.find_spec("tf2_msgs"):
             node.input(TF_STATIC, "tf2_msgs/msg/TFMessage",
-                       lambda m: [*map(self._on_transform, m.transforms)], LATCHED)
+                       lambda m: [*map(self._on_transform, m.transforms)], LATCHED,
+                       private=False)
 
     def _on_info(self, msg: Any) -> None:
         self.info = msg
@@ -122,7 +124,8 @@ class SeedInput:
         self.loaded: tuple[str, Seed] | None = None
         self.paired = Paired(self._deliver_with_truth)
         node.input("ground_truth", MARKERS, self._on_truth, RELIABLE)
-        node.input(CLICK, "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE)
+        node.input(relative(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE,
+                   private=False)
 
     @property
     def params(self) -> SeedParams:
@@ -156,8 +159,8 @@ class SeedInput:
 
     def _from_click(self, frame_id: str, segmented: Segmented) -> Seed:
         if self.click is None:
-            raise InputError(f"no seed yet: click a pedestrian (a PointStamped on {CLICK}, as RViz "
-                             "and Foxglove publish it)")
+            raise InputError("no seed yet: click a pedestrian (a PointStamped on "
+                             f"{relative(CLICK)}, as RViz and Foxglove publish it)")
         if self.clicked is None:
             if self.click.header.frame_id not in ("", frame_id):
                 raise InputError(f"the clicked point is in frame '{self.click.header.frame_id}' "

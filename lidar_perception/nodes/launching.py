@@ -1,8 +1,7 @@
-"""What the launch files of a graph share: their arguments, and one process for each node."""
+"""What the launch files share: their arguments, and one process for each node."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,52 +10,93 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
+from lidar_perception.nodes.graph import BEHIND, graph_of, prefixed, relative
+from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS
 
-Graph = Mapping[str, Mapping[str, str]]  # node -> remapping of its topics, see graph.py
+CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet"}
+NETWORKS = ("pointpillars", "pointnet")  # as their groups of parameters
+
+SWITCHES = dict(default_value="false", choices=["true", "false"])
+ARGUMENTS = {
+    "namespace": dict(default_value="", description="Of all nodes and topics, for one of several "
+                      "sensors; /diagnostics, /tf and /clock stay outside."),
+    "name_prefix": dict(default_value="", description="Before the name of each node."),
+    "points": dict(default_value=relative(POINTS), description="The cloud's topic."),
+    "reliability": dict(default_value="", description="auto, reliable or best_effort, for the "
+                        "parameter input.reliability; empty: that of the parameter file."),
+    "config": dict(default_value="", description="Parameter file of all nodes; empty: "
+                   "config/*.param.yaml of each detector, and of the first for ground and "
+                   "clusters."),
+    "weights": dict(default_value="", description="Checkpoint of the network, with several "
+                    "networks NAME=FILE,NAME=FILE; empty: that of the parameter file, or the one "
+                    "that comes with the package."),
+    "device": dict(default_value="", description="auto, cpu, cuda, cuda:N of the networks; empty: "
+                   "that of the parameter file."),
+    "single": dict(**SWITCHES, description="Each detector in one process, which finds ground and "
+                   "clusters itself."),
+    "use_sim_time": dict(**SWITCHES, description="Take the time from /clock."),
+    "log_level": dict(default_value="info", description="debug, info, ..."),
+}
 
 
-def graph_launch(graph: Graph, single: Graph, config: Path, single_means: str,
-                 parameters: Mapping[str, tuple[str, str]] | None = None) -> LaunchDescription:
-    """The nodes of a graph, or with single:=true of the other one, with the parameters of a file.
-
-    parameters: launch argument -> name of a parameter that it sets where it is not empty, and
-    what it is.
-    """
-    parameters = parameters or {}
+def graph_launch(config_folder: Path, detectors: str) -> LaunchDescription:
+    """Ground and clusters, once, and the detectors behind them: a list with commas, the default of
+    the argument `detectors`. ARGUMENTS are the others."""
 
     def nodes(context: Any) -> list[Node]:
-        value = {k: context.perform_substitution(LaunchConfiguration(k))
-                 for k in ("points", *parameters, "config", "single", "use_sim_time", "log_level")}
-        given = {name: value[k] for k, (name, _) in parameters.items() if value[k]}
-        given["use_sim_time"] = value["use_sim_time"] == "true"
-        return [Node(
-            package="lidar_perception", executable=name, name=name, output="screen",
-            parameters=[value["config"], given],
-            remappings=[(a, value["points"] if b == POINTS else b) for a, b in remap.items()],
-            ros_arguments=["--log-level", value["log_level"]],
-        ) for name, remap in (single if value["single"] == "true" else graph).items()]
+        return started({k: context.perform_substitution(LaunchConfiguration(k))
+                        for k in ("detectors", *ARGUMENTS)}, config_folder)
 
     return LaunchDescription([
-        DeclareLaunchArgument("points", default_value=POINTS, description="The cloud's topic."),
-        *(DeclareLaunchArgument(k, default_value="", description=what)
-          for k, (_, what) in parameters.items()),
-        DeclareLaunchArgument("config", default_value=str(config), description="Parameter file."),
-        DeclareLaunchArgument("single", default_value="false", choices=["true", "false"],
-                              description=single_means),
-        DeclareLaunchArgument("use_sim_time", default_value="false", choices=["true", "false"],
-                              description="Take the time from /clock."),
-        DeclareLaunchArgument("log_level", default_value="info", description="debug, info, ..."),
+        DeclareLaunchArgument("detectors", default_value=detectors,
+                              description=f"One or several of {','.join(BEHIND)}."),
+        *(DeclareLaunchArgument(name, **what) for name, what in ARGUMENTS.items()),
         OpaqueFunction(function=nodes),
     ])
 
 
-def detector_launch(graph: Graph, single: Graph, config: Path, group: str) -> LaunchDescription:
-    """The graph of a detector whose network has this group of parameters."""
-    return graph_launch(
-        graph, single, config,
-        "The detector alone, which then finds ground and clusters itself.",
-        {"weights": (f"{group}.weights", "Checkpoint; empty: that of the parameter file, or the "
-                     "one that comes with the package."),
-         "device": (f"{group}.device", "auto, cpu, cuda, cuda:N; empty: that of the parameter "
-                    "file.")})
+def started(value: dict[str, str], config_folder: Path) -> list[Node]:
+    """The nodes that the values of the arguments ask for."""
+    detectors = [name.strip() for name in value["detectors"].split(",") if name.strip()]
+    if not detectors:
+        raise InputError(f"detectors is empty; give one or several of {','.join(BEHIND)}")
+    single, prefix = value["single"] == "true", value["name_prefix"]
+    graph = prefixed(graph_of(detectors, single), prefix)
+    owner = {prefix + node: name for name in reversed(detectors)
+             for node in graph_of([name], single)}
+    return [Node(
+        package="lidar_perception", executable=node.removeprefix(prefix), name=node,
+        namespace=value["namespace"] or None, output="screen",
+        parameters=[value["config"] or str(config_folder / f"{CONFIGS[owner[node]]}.param.yaml"),
+                    _given(value, owner[node], detectors)],
+        remappings=[(a, value["points"] if b == relative(POINTS) else b)
+                    for a, b in remap.items()],
+        ros_arguments=["--log-level", value["log_level"]],
+    ) for node, remap in graph.items()]
+
+
+def _given(value: dict[str, str], detector: str, detectors: list[str]) -> dict[str, Any]:
+    """Parameters that arguments set."""
+    given: dict[str, Any] = {"use_sim_time": value["use_sim_time"] == "true"}
+    if value["reliability"]:
+        given["input.reliability"] = value["reliability"]
+    if detector in NETWORKS:
+        weights = _weights(value["weights"], [d for d in detectors if d in NETWORKS])
+        for name, chosen in (("weights", weights.get(detector)), ("device", value["device"])):
+            if chosen:
+                given[f"{detector}.{name}"] = chosen
+    return given
+
+
+def _weights(text: str, networks: list[str]) -> dict[str, str]:
+    """Network -> file, of FILE or NAME=FILE,NAME=FILE."""
+    if not text:
+        return {}
+    if len(networks) == 1 and not text.startswith(f"{networks[0]}="):
+        return {networks[0]: text}
+    pairs = dict(part.partition("=")[::2] for part in text.split(","))
+    if unknown := [name for name in pairs if name not in networks]:
+        raise InputError(f"weights: '{unknown[0]}' is none of {', '.join(networks)}; with several "
+                         "networks give NAME=FILE,NAME=FILE")
+    return pairs

@@ -11,7 +11,9 @@ import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from lidar_perception.runs.threads import wait_asleep
 
 if TYPE_CHECKING:
     from lidar_perception.nodes.stopping import Stop
@@ -29,36 +31,40 @@ NODES = {  # executable -> class; the module has the executable's name
 }
 
 
+BOXES = "params.BoxNodeParams"
 PARAMS = {  # executable -> its parameters
-    "bag_player": "params.PlayerParams",
-    "bag_recorder": "params.RecorderParams",
-    "ground_segmentation": "params.GroundNodeParams",
-    "clustering": "params.ClusteringNodeParams",
-    "candidate_refinement": "params.RefinementNodeParams",
-    "evaluator": "params.EvaluatorParams",
-    "perception": "candidates.params.PipelineParams",
-    "pointpillars_detector": "detectors.pointpillars.params.DetectorParams",
-    "pointnet_detector": "detectors.pointnet.params.PointNetDetectorParams",
+    "bag_player": ("params.PlayerParams",),
+    "bag_recorder": ("params.RecorderParams",),
+    "ground_segmentation": ("params.GroundNodeParams", "params.CloudNodeParams"),
+    "clustering": ("params.ClusteringNodeParams", BOXES),
+    "candidate_refinement": ("params.RefinementNodeParams", BOXES),
+    "evaluator": ("params.EvaluatorParams",),
+    "perception": ("candidates.params.PipelineParams", BOXES),
+    "pointpillars_detector": ("detectors.pointpillars.params.DetectorParams", BOXES),
+    "pointnet_detector": ("detectors.pointnet.params.PointNetDetectorParams", BOXES),
 }
+
+
+def node_parameters(name: str) -> dict[str, Any]:
+    """Name of each parameter of a node -> its dataclass field, with the node's default."""
+    from lidar_perception.param_fields import parameter_fields
+    found: dict[str, Any] = {}
+    for path in PARAMS[name]:
+        module, _, params = path.rpartition(".")
+        made = getattr(importlib.import_module(f"lidar_perception.{module}"), params)()
+        found |= parameter_fields(made)
+    return found
 
 
 def help_text(name: str) -> str:
     """What --help prints: how to start the node, and its parameters."""
-    from lidar_perception.param_fields import parameter_fields
-    module, _, params = PARAMS[name].rpartition(".")
-    params = getattr(importlib.import_module(f"lidar_perception.{module}"), params)
     lines = [f"Usage: {name} --ros-args [-p PARAMETER:=VALUE] [-r FROM:=TO] [--params-file YAML]",
              "", "Parameters:"]
-    for key, f in parameter_fields(params()).items():
+    for key, f in node_parameters(name).items():
         default = list(f.default) if isinstance(f.default, tuple) else f.default
         unit = f" {f.metadata['unit']}" if f.metadata["unit"] else ""
         lines += [f"  {key} (default {default!r}{unit})", f"      {f.metadata['doc']}"]
     return "\n".join(lines)
-
-
-def main() -> int:
-    """Entry point of all executables: the node is named by the program's own name."""
-    return run(Path(sys.argv[0]).name.removesuffix(".exe"), sys.argv)
 
 
 STOP_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
@@ -108,7 +114,7 @@ def run(name: str, arguments: list[str]) -> int:
     # other's way.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # for torch, which takes more than one
+    wait_asleep()  # torch's, which takes more than one
     use_large_shared_memory()
     from lidar_perception.nodes.stopping import Stop
     stop = Stop(STOP_SIGNALS)

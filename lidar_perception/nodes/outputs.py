@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,41 +18,51 @@ from lidar_perception.wire.messages import detection_markers
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys, to_marker_array
 from msg_utils.messages import message_class, ros_message
-from msg_utils.stamps import header_message, to_ns
+from msg_utils.stamps import SECOND, header_message, to_ns
+
+
+def lifetime_ns(node: LidarNode) -> int:
+    """How long the node's markers stay without newer ones; 0 for ever."""
+    return int(node.robot.output.marker_lifetime * SECOND)
 
 
 class ClusterBoxes:
     """~/output/boxes, made only while somebody subscribes."""
 
     def __init__(self, node: LidarNode):
+        self.node = node
         self.publisher = node.output("boxes", MARKERS)
         self.shown: Any = ()
 
     def publish(self, header: Any, boxes: Callable[[], np.ndarray]) -> None:
         if self.publisher.get_subscription_count():
             found = boxes()
+            ids = range(1, len(found) + 1)  # as in the column cluster_id
             markers = to_marker_array(found, ["cluster"] * len(found), header=header,
-                                      make=bag_message, previous=self.shown,
-                                      extras=_size_classes(found))
+                                      make=bag_message, ids=ids, previous=self.shown,
+                                      lifetime_ns=lifetime_ns(self.node),
+                                      extras=_texts(found, ids))
             self.shown = marker_keys(markers)
             self.publisher.publish(encode(markers))
 
 
-def _size_classes(boxes: np.ndarray) -> list[dict]:
-    """What each box could be by its length and width alone, for the text of its marker."""
-    ids = class_by_diagonal(boxes)
-    return [{"size_class": CLASSES[i]} if i >= 0 else {} for i in ids]
+def _texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
+    """For the text of each box's marker: its id, and what it could be by its length and width
+    alone."""
+    return [{"id": i, **({"size_class": CLASSES[c]} if c >= 0 else {})}
+            for i, c in zip(ids, class_by_diagonal(boxes), strict=True)]
 
 
 class DetectionMarkers:
     """A topic with detections as markers."""
 
     def __init__(self, node: LidarNode, topic: str):
-        self.publisher = node.output(topic, MARKERS)
+        self.node, self.publisher = node, node.output(topic, MARKERS)
         self.shown: Any = ()
 
     def publish(self, header: Any, detections: Detections) -> None:
-        message = detection_markers(detections, header, bag_message, self.shown)
+        message = detection_markers(detections, header, bag_message, self.shown,
+                                    lifetime_ns(self.node))
         self.shown = marker_keys(message)
         self.publisher.publish(encode(message))
 

@@ -13,6 +13,7 @@ from lidar_perception.nodes.inputs import CameraInput, SeedInput
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, LidarNode
 from lidar_perception.nodes.sensor_check import SensorCheck
+from lidar_perception.params import BoxNodeParams
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import spread
 from msg_utils.point_cloud2 import add_columns
@@ -26,7 +27,7 @@ class Perception(LidarNode):
     between them. ~/output/points and ~/output/boxes are made only while somebody subscribes."""
 
     def __init__(self, **options: Any):
-        super().__init__("perception", PipelineParams(), **options)
+        super().__init__("perception", PipelineParams(), BoxNodeParams(), **options)
         self.camera = CameraInput(self)
         self.sensor = SensorCheck(self)
         self.outputs = CandidateOutputs(self, STEPS)

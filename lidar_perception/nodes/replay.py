@@ -25,13 +25,18 @@ from lidar_perception.types import InputError
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, TRUTH
 
 START_TIMEOUT = 180.0   # seconds for all nodes to compile, come up and find each other
+AHEAD = 2               # clouds at a time, so that one stage works while another does
 SILENCE_TIMEOUT = 10.0  # seconds without a result after the last cloud
 
 
 def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate: float = 1.0,
-           single: bool = False, record: bool = True) -> dict:
+           single: bool = False, record: bool = True, real_time: bool = False) -> dict:
     """Scores of a bag with `clouds` clouds, and how the run went: results, latency_ms (from the
-    cloud's arrival in this process to its candidates'), memory_mb (proportional set size).
+    cloud's arrival in this process to its candidates'), memory_mb (proportional set size), slower
+    (how many times slower than asked for it was).
+
+    A cloud is sent when those before have their candidates, so that none is lost on a slow
+    machine; with real_time they come as from a sensor, whatever becomes of them.
 
     Leaves logs and, with record, the result bag in out. The nodes run on a private domain.
     """
@@ -45,7 +50,7 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
     recorded = [cloud_topic(single), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
     with Processes(out / "logs", domain) as processes, Watch(domain, topics["final"]) as watch:
         for node, remap in graph.items():
-            processes.start(node, remap, flatten(params))
+            processes.start(node, remap, {**flatten(params), "input.queue": AHEAD})
         processes.start("evaluator", evaluator_remap, evaluator_params)
         if record:
             processes.start("bag_recorder", {}, {"bag": str((out / "result").resolve()),
@@ -61,7 +66,9 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
         # The watch hears the clouds too, and the recorder the labels.
         rules = wait_for(single, points=2, truth=2 + record)
         processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
-                                           "wait_for": rules})
+                                           "wait_for": rules,
+                                           "follow": [] if real_time else [topics["final"]],
+                                           "ahead": AHEAD})
         with progress() as bar:
             task = bar.add_task("replaying", total=clouds)
             before = -1
@@ -87,4 +94,5 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
     return {**json.loads(scores.read_text()), "clouds": clouds, "results": watch.frames,
             "latency_ms": {"median": median(latencies),
                            "p95": latencies[int(0.95 * (len(latencies) - 1))]},
+            "slower": float(watch.value_of("bag_player", "slower") or 1.0),
             "memory_mb": sum(memory.values()), "memory_mb_by_node": memory}

@@ -5,18 +5,13 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable
 from contextlib import contextmanager
-from time import perf_counter
+from time import monotonic, perf_counter
 from typing import Any
 
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import (
-    FloatingPointRange,
-    IntegerRange,
-    ParameterDescriptor,
-    SetParametersResult,
-)
+from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import Executor
@@ -27,7 +22,9 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.task import Future
 from std_msgs.msg import Float64
 
-from lidar_perception.param_fields import flatten, new_name, parameter_fields, with_values
+from lidar_perception.nodes.declared import as_declared, declare
+from lidar_perception.nodes.reception import Problem, Reception
+from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message, decode, encode, typestore
 from msg_utils.messages import message_class
@@ -41,68 +38,68 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 JUMP_NS = 10**9  # stamps that go back by more than this are a bag that starts again
-TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE,
-         str: Parameter.Type.STRING}
-LISTS = {int: Parameter.Type.INTEGER_ARRAY, float: Parameter.Type.DOUBLE_ARRAY,
-         str: Parameter.Type.STRING_ARRAY}
+LOG_PERIOD = 60.0  # seconds before the same problem is logged again
 
 
 class LidarNode(Node):
     """A node whose callbacks never end it: bad input becomes a diagnostic.
 
     params is a dataclass of params.py; its fields are declared as ROS parameters, and a change at
-    run time goes through the same checks.
+    run time goes through the same checks. So is robot, what the node has besides its algorithm's
+    numbers: CloudNodeParams or BoxNodeParams where it takes clouds.
     """
 
-    def __init__(self, name: str, params: Any, **options: Any):
+    def __init__(self, name: str, params: Any, robot: Any = None, **options: Any):
         super().__init__(name, **options)
-        self.params = self._declare(params)
+        self.params = declare(self, params)
+        self.robot = robot and declare(self, robot)
+        self.add_pre_set_parameters_callback(self._before_set)
         self.add_on_set_parameters_callback(self._on_set)
         self.stop = Future()  # done when the node shall end; set from any thread
         self.state = (WARN, "waiting for input")
         self.counts: dict[str, Any] = {"frames": 0, "lost": 0}
         self.last_stamp_ns = 0
         self.times: list[float] = []
+        self.frame_id = ""  # of the last cloud
         self._outputs: list[Any] = []
+        self._receptions: list[Reception] = []
+        self._present: set[str] = set()  # kinds of problems
+        self._logged: dict[str, float] = {}  # kind of problem -> when it was logged
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         self._processing_time = self.create_publisher(Float64, "~/debug/processing_time_ms",
                                                       RELIABLE)
-        self.create_timer(1.0, self.publish_diagnostics, clock=Clock(
+        self.create_timer(1.0, self._tick, clock=Clock(
             clock_type=ClockType.STEADY_TIME))
 
-    def _declare(self, params: Any) -> Any:
-        declared = {}
-        for name in self._parameter_overrides:
-            if (new := new_name(name)) in parameter_fields(params):
-                raise InputError(f"parameter '{name}' is called '{new}' now; rename it")
-        for name, f in parameter_fields(params).items():
-            kind = LISTS[f.metadata["item"]] if isinstance(f.default, tuple) else TYPES[
-                type(f.default)]
-            value = list(f.default) if isinstance(f.default, tuple) else f.default
-            # An empty list has no type of its own; declared by type it is "not set".
-            declared[name] = self.declare_parameter(name, kind if value == [] else value,
-                                                    _descriptor(f, kind)).value
-        return with_values(params, {k: v for k, v in declared.items() if v is not None})
+    def _before_set(self, changes: list[Parameter]) -> list[Parameter]:
+        return [as_declared(c, self.get_parameter(c.name).type_)
+                if self.has_parameter(c.name) else c for c in changes]
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
-        known = flatten(self.params)
         try:
-            self.params = with_values(
-                self.params, {c.name: c.value for c in changes if c.name in known})
+            own, robot = (group and with_values(
+                group, {c.name: c.value for c in changes if c.name in flatten(group)})
+                for group in (self.params, self.robot))
         except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
+        self.params, self.robot = own, robot
         return SetParametersResult(successful=True)
 
-    def input(self, topic: str, type_name: str, callback: Callable, qos: QoSProfile = SENSOR_DATA):
-        """Subscribe to ~/input/TOPIC (or an absolute name). callback gets rosbags' class of the
-        message, the one that offline code reads from bags: it views the received bytes, where
-        rclpy's own class copies them several times."""
-        name = topic if topic.startswith("/") else f"~/input/{topic}"
+    def input(self, topic: str, type_name: str, callback: Callable,
+              qos: QoSProfile | None = None, private: bool = True) -> None:
+        """Subscribe to ~/input/TOPIC, or with private=False to the name as it is. callback gets
+        rosbags' class of the message, the one that offline code reads from bags: it views the
+        received bytes, where rclpy's own class copies them several times. Without qos the topic
+        is received as reception.py does."""
+        name = f"~/input/{topic}" if private else topic
         _warm_up_type(type_name)
 
         def guarded(data: bytes) -> None:
             try:
-                callback(decode(data, type_name))
+                msg = decode(data, type_name)
+                if type_name == CLOUD:
+                    self.frame_id = msg.header.frame_id
+                callback(msg)
             except InputError as error:
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {error}")
             except Exception as error:
@@ -113,7 +110,11 @@ class LidarNode(Node):
         def lost(event: Any) -> None:
             self.counts["lost"] += event.total_count_change
 
-        return self.create_subscription(
+        if qos is None:
+            self._receptions.append(Reception(self, message_class(type_name), name, guarded,
+                                              lambda: self.robot.input))
+            return
+        self.create_subscription(
             message_class(type_name), name, guarded, qos, raw=True,
             event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
             qos_overriding_options=QoSOverridingOptions.with_default_policies())
@@ -129,23 +130,30 @@ class LidarNode(Node):
         self._outputs.append(publisher)
         return publisher
 
-    def report(self, level: bytes, message: str) -> None:
-        """Set the diagnostic state; a change is logged and published at once."""
+    def report(self, level: bytes, message: str, expected: bool = False) -> None:
+        """Set the diagnostic state; a change is logged and published at once. What is expected,
+        such as that a node waits at its start, is no warning in the log."""
         if (level, message) != self.state:
             self.state = (level, message)
-            if level == OK:  # one line a level: rclpy ties the level to the place of the call
-                self.get_logger().info(message)
-            elif level == WARN:
-                self.get_logger().warning(message)
-            else:
-                self.get_logger().error(message)
+            self._log(OK if expected else level, message)
             self.publish_diagnostics()
+
+    def _log(self, level: bytes, message: str) -> None:
+        if level == OK:  # one line a level: rclpy ties the level to the place of the call
+            self.get_logger().info(message)
+        elif level == WARN:
+            self.get_logger().warning(message)
+        else:
+            self.get_logger().error(message)
 
     @contextmanager
     def frame(self, stamp_ns: int):
         """Around the work on one cloud: counts it, times it, notices that time went back."""
         if stamp_ns < self.last_stamp_ns - JUMP_NS:
-            self.get_logger().info("time went back; what waited from before is dropped")
+            self.counts["time_went_back"] = self.counts.get("time_went_back", 0) + 1
+            self.get_logger().info("time went back, as of a bag that starts again; what waited "
+                                   "from before is dropped (said once, counted in /diagnostics)",
+                                   once=True)
         self.last_stamp_ns = stamp_ns
         begin = perf_counter()
         yield
@@ -155,19 +163,51 @@ class LidarNode(Node):
         self.counts["frames"] += 1
 
     def publish_diagnostics(self) -> None:
+        """The state, and what is wrong with the inputs and with the node's name."""
         level, message = self.state
         values = dict(self.counts, last_stamp_ns=self.last_stamp_ns)
+        for reception in self._receptions:
+            values.update(reception.values())
         if self.times:
             values["processing_ms_median"] = f"{np.median(self.times):.1f}"
         for publisher in self._outputs:
             values[f"subscribers of {publisher.topic_name}"] = publisher.get_subscription_count()
+        if problems := self._problems():
+            level = max(level, *(p[1] for p in problems))
+            message = f"{'; '.join(p[2] for p in problems)} (state: {message})"
         status = DiagnosticStatus(level=level, name=self.get_fully_qualified_name().lstrip("/"),
-                                  message=message, hardware_id="lidar_perception",
+                                  message=message, hardware_id=self._hardware_id(),
                                   values=[KeyValue(key=k, value=str(v)) for k, v in values.items()])
         array = DiagnosticArray(status=[status])
         array.header.stamp = self.get_clock().now().to_msg()
         if rclpy.ok(context=self.context):
             self._diagnostics.publish(array)
+
+    def _problems(self) -> list[Problem]:
+        """Each is logged when it comes up, at most once in LOG_PERIOD."""
+        found = [p for reception in self._receptions for p in reception.problems()]
+        name, namespace = self.get_name(), self.get_namespace()
+        if self.get_node_names_and_namespaces().count((name, namespace)) > 1:
+            found.append(("name", WARN, f"another node is called {self.get_fully_qualified_name()} "
+                          "too, so topics and parameters of both are mixed; end one, or give it "
+                          "another namespace"))
+        now, before = monotonic(), self._present
+        self._present = {kind for kind, _, _ in found}
+        for kind, level, message in found:
+            if kind not in before and now - self._logged.get(kind, -LOG_PERIOD) >= LOG_PERIOD:
+                self._logged[kind] = now
+                self._log(level, message)
+        return found
+
+    def _hardware_id(self) -> str:
+        """The sensor, as its clouds and the namespace name it; tells two sensors apart."""
+        parts = self.get_namespace().strip("/"), self.frame_id
+        return "/".join(filter(None, parts)) or "lidar_perception"
+
+    def _tick(self) -> None:
+        for reception in self._receptions:
+            reception.adapt()  # where the middleware has no events that say so
+        self.publish_diagnostics()
 
     def spin(self, executor: Executor) -> None:
         """Work until stop is done."""
@@ -181,22 +221,3 @@ def _warm_up_type(type_name: str) -> None:
     """rosbags writes its code for a type on first use: do that before the first message."""
     if type_name in typestore().fielddefs:
         decode(encode(bag_message(type_name)), type_name)
-
-
-def _descriptor(f: Any, kind: Parameter.Type) -> ParameterDescriptor:
-    limits = f.metadata
-    unit = f" [{limits['unit']}]" if limits["unit"] else ""
-    choices = f"one of {', '.join(limits['choices'])}" if limits["choices"] else ""
-    descriptor = ParameterDescriptor(description=limits["doc"] + unit, read_only=limits["fixed"],
-                                     type=kind.value, additional_constraints=choices)
-    low, high = limits["low"], limits["high"]
-    if low is not None or high is not None:
-        if kind == Parameter.Type.DOUBLE:
-            descriptor.floating_point_range = [FloatingPointRange(
-                from_value=float(-1e300 if low is None else low),
-                to_value=float(1e300 if high is None else high), step=0.0)]
-        elif kind == Parameter.Type.INTEGER:
-            descriptor.integer_range = [IntegerRange(
-                from_value=-2**62 if low is None else low,
-                to_value=2**62 if high is None else high, step=0)]
-    return descriptor

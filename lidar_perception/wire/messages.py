@@ -170,11 +170,14 @@ def to_detections(objects: MarkedObjects) -> Detections:
                          objects.scores)
 
 
-def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = ()) -> Any:
-    """MarkerArray of detections; previous as in to_marker_array."""
+def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
+                      lifetime_ns: int = 0) -> Any:
+    """MarkerArray of detections, with their ids in the text too; previous and lifetime_ns as in
+    to_marker_array."""
     labels = [CLASSES[i] for i in detections.class_ids]
     return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
-                           previous=previous)
+                           extras=[{"id": i} for i in range(len(detections))], previous=previous,
+                           lifetime_ns=lifetime_ns)
 
 
 def _class_ids(labels: list[str]) -> list[int]:

@@ -9,4 +9,4 @@ TF_STATIC = "/tf_static"
 CLICK = "/clicked_point"           # what RViz and Foxglove publish
 
 LIDAR_FRAME = "velodyne"
-CAMERA_FRAME = "camera"
+CAMERA_FRAME = "camera_optical"    # z forward; REP-103

@@ -9,13 +9,13 @@ import struct
 import numpy as np
 import pytest
 from bag_samples import message_bytes, same_cloud, scans
+from lidar_perception.data.recording import open_recording
 from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from samples import STAMP, header, scene, write
 
 from lidar_perception.data import bag as bag_module
 from lidar_perception.data.bag import Bag, BagWriter
-from lidar_perception.data.recording import open_recording
 from lidar_perception.data.to_bag import Scan, write_bag
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message, typestore

@@ -203,6 +203,8 @@ def test_from_detection_array_inverts_to_detection_array(vision_make, rows):
                              [r[2] for r in rows], header=header(vision_make), make=vision_make)
     for read in (msg, codec.decode(codec.encode(msg), "vision_msgs/msg/Detection3DArray")):
         got = from_detection_array(read)
+        assert [d.id for d in read.detections] == [str(i) for i in range(len(rows))]
+        assert not any(np.any(r.pose.covariance) for d in read.detections for r in d.results)
         assert same_boxes(got.boxes, [r[0] for r in rows])
         assert got.labels == [r[1] for r in rows]
         assert got.scores.tolist() == [r[2] for r in rows]

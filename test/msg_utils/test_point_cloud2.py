@@ -175,6 +175,7 @@ def test_add_columns_keeps_every_old_byte_and_field(make, cloud, height, pad):
     assert (new.height, new.width) == (old.height, old.width)
     assert (new.is_bigendian, new.is_dense) == (old.is_bigendian, old.is_dense)
     assert new.header == old.header
+    assert all(f.offset % {4: 2, 7: 4}[f.datatype] == 0 for f in new.fields[-2:])
 
 
 @each_make

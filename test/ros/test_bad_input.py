@@ -96,7 +96,7 @@ def test_no_method_dies_of_a_strange_cloud(values, processes, peer, good_cloud):
     """The wheels behind some methods end the process on NaN, outliers or nothing at all."""
     node = "perception" if "clustering.method" in values else "ground_segmentation"
     processes.start(node, {"~/input/points": "/in", "~/output/points": "/out"}, {
-        **RELIABLE_IN, **values})
+        **RELIABLE_IN, "input.queue": 5, **values})
     talker, received = peer.talker("/in", CLOUD), peer.listen("/out", CLOUD)
     rng = np.random.default_rng(0)
     xyz = xyz_of(good_cloud)
@@ -182,6 +182,7 @@ def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
         processes, peer, good_cloud, drive_bag):
     """view.enabled without CameraInfo; then without a seed; then with a clicked pedestrian."""
     from lidar_perception.data.recording import open_recording
+
     from lidar_perception.scoring.centres.report import pedestrians
     processes.start("perception", {"~/input/points": "/in", "~/output/detections": "/found"},
                     {"view.enabled": True, "seed.source": "click"})

@@ -9,14 +9,8 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from lidar_perception.nodes.graph import (
-    POINTNET,
-    POINTPILLARS,
-    SINGLE,
-    SINGLE_POINTNET,
-    SINGLE_POINTPILLARS,
-    STAGES,
-)
+from lidar_perception.nodes.graph import graph_of
+from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = "lidar_perception.nodes.launching"
@@ -63,26 +57,64 @@ def launched(monkeypatch):
     return load
 
 
-@pytest.mark.parametrize("name, graph, single", [
-    ("perception", STAGES, SINGLE), ("pointpillars", POINTPILLARS, SINGLE_POINTPILLARS),
-    ("pointnet", POINTNET, SINGLE_POINTNET)])
-def test_a_launch_file_starts_its_graph_or_one_process(name, graph, single, launched):
-    arguments, nodes = launched(name)
-    config = str(ROOT / "config" / f"{name}.param.yaml")
-    assert arguments["config"] == config and Path(config).is_file()
-    started = nodes(points="/cloud", use_sim_time="true", log_level="debug")
-    assert list(started) == list(graph) and list(nodes(single="true")) == list(single)
+FILES = {"perception": "candidates", "pointpillars": "pointpillars", "pointnet": "pointnet",
+         "detectors": "candidates,pointpillars,pointnet"}
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched):
+    _, nodes = launched(name)
+    detectors = FILES[name].split(",")
+    config = str(ROOT / "config" / f"{'perception' if name == 'detectors' else name}.param.yaml")
+    started = nodes(points="/cloud", use_sim_time="true", log_level="debug", reliability="reliable")
+    assert list(started) == list(graph_of(detectors))
+    assert list(nodes(single="true")) == list(graph_of(detectors, single=True))
     assert ("~/input/points", "/cloud") in started["ground_segmentation"].remappings
-    assert ("~/input/points", "/ground_segmentation/output/points") in (
+    assert ("~/input/points", "ground_segmentation/output/points") in (
         started["clustering"].remappings)
     for node in started.values():
-        assert node.parameters[0] == config and node.parameters[1] == {"use_sim_time": True}
+        assert Path(node.parameters[0]).is_file() and node.namespace is None
+        assert node.parameters[1] == {"use_sim_time": True, "input.reliability": "reliable"}
         assert node.ros_arguments == ["--log-level", "debug"]
+        if not node.name.endswith("_detector"):
+            assert node.parameters[0] == config
+    assert nodes(config="mine.yaml")["clustering"].parameters[0] == "mine.yaml"
 
 
-@pytest.mark.parametrize("name, group", [("pointpillars", "detection"), ("pointnet", "pointnet")])
-def test_weights_and_device_of_a_detector_are_arguments(name, group, launched):
-    _, nodes = launched(name)
-    given = nodes(weights="w.safetensors", device="cpu")[f"{name}_detector"].parameters[1]
-    assert given == {f"{group}.weights": "w.safetensors", f"{group}.device": "cpu",
-                     "use_sim_time": False}
+def test_every_detector_has_its_numbers_and_the_first_those_of_ground_and_clusters(launched):
+    _, nodes = launched("detectors")
+    started = nodes(detectors="pointnet,pointpillars")
+    files = {name: Path(node.parameters[0]).name.split(".")[0] for name, node in started.items()}
+    assert files == {"ground_segmentation": "pointnet", "clustering": "pointnet",
+                     "pointnet_detector": "pointnet", "pointpillars_detector": "pointpillars"}
+
+
+def test_a_second_sensor_has_names_of_its_own(launched):
+    _, nodes = launched("detectors")
+    for node in nodes(namespace="left").values():
+        assert node.namespace == "left"
+        assert not any(topic.startswith("/") for _, topic in node.remappings)
+    started = nodes(name_prefix="left_", detectors="pointnet")
+    assert [n.name for n in started.values()] == ["left_" + n for n in started]
+    assert started["clustering"].remappings == [
+        ("~/input/points", "left_ground_segmentation/output/points")]
+    assert ("~/input/points", "points") in started["ground_segmentation"].remappings
+
+
+@pytest.mark.parametrize("name", ["pointpillars", "pointnet"])
+def test_weights_and_device_of_a_detector_are_arguments(name, launched):
+    expected = {f"{name}.weights": "w.safetensors", f"{name}.device": "cpu",
+                "use_sim_time": False}
+    for file, weights in (name, "w.safetensors"), ("detectors", f"{name}=w.safetensors"):
+        _, nodes = launched(file)
+        assert nodes(weights=weights, device="cpu")[f"{name}_detector"].parameters[1] == expected
+
+
+@pytest.mark.parametrize("given, words", [
+    ({"detectors": "candidates,dream"}, "'dream' is none of candidates, pointpillars, pointnet"),
+    ({"detectors": ""}, "detectors is empty"),
+    ({"weights": "w.safetensors"}, "NAME=FILE"), ({"weights": "v5=w"}, "'v5' is none of"),
+])
+def test_what_cannot_be_started_is_refused_by_name(given, words, launched):
+    with pytest.raises(InputError, match=words):
+        launched("detectors")[1](**given)

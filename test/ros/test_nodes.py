@@ -120,6 +120,7 @@ def test_markers_that_go_away_are_deleted_and_time_that_jumps_back_is_noticed(
     peer.send(talker, msg, lambda: received, "boxes")
     full = from_marker_array(received[-1])
     assert len(full) > 20
+    assert full.ids.tolist() == [text["id"] for text in full.extras] == [*range(1, 1 + len(full))]
     near = bag_message(CLOUD, **{f: getattr(msg, f) for f in (
         "fields", "point_step", "is_bigendian", "data", "is_dense")}, height=1, width=0)
     near.header = bag_message("std_msgs/msg/Header", frame_id="velodyne",

@@ -17,15 +17,16 @@ from lidar_perception.wire.messages import (
     extrinsics,
     to_frame,
 )
+from lidar_perception.wire.topics import CAMERA_FRAME
 from msg_utils.messages import message_class, ros_message
 from msg_utils.point_cloud2 import from_array
 
 
 @each_make
 def test_the_camera_is_the_same_from_either_direction_of_the_transform(make):
-    info = camera_info(CALIBRATION, header(make, frame_id="camera"), make)
+    info = camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
     forth = extrinsics(CALIBRATION, header(make), make)
-    back = extrinsics(CALIBRATION, header(make, frame_id="camera"), make)
+    back = extrinsics(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
     back.child_frame_id = "velodyne"
     inverse = np.linalg.inv(CALIBRATION.lidar_to_camera)
     turned = Calibration(CALIBRATION.intrinsics, inverse, 1, 1).pose
@@ -41,14 +42,14 @@ def test_the_camera_is_the_same_from_either_direction_of_the_transform(make):
 @each_make
 @pytest.mark.parametrize("change, words", [
     (lambda info, tf: setattr(info.header, "frame_id", "rear"),
-     "'rear' but the transform links 'velodyne' and 'camera'"),
+     "'rear' but the transform links 'velodyne' and 'camera_optical'"),
     (lambda info, tf: setattr(info, "width", 0), "no image size"),
     (lambda info, tf: setattr(info, "p", np.zeros(12)), "no projection matrix"),
     (lambda info, tf: setattr(tf.transform.rotation, "w", 5.0), "no unit quaternion"),
     (lambda info, tf: setattr(tf.transform.rotation, "w", float("nan")), "no unit quaternion"),
 ])
 def test_a_camera_that_cannot_be_used_is_an_input_error(make, change, words):
-    info = camera_info(CALIBRATION, header(make, frame_id="camera"), make)
+    info = camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)
     transform = extrinsics(CALIBRATION, header(make), make)
     change(info, transform)
     with pytest.raises(InputError, match=words):

@@ -1,0 +1,32 @@
+"""Two sensors, each with a graph of its own in a namespace.
+
+    ros2 launch lidar_perception two_lidars.launch.py left:=/lidar_left/points \
+        right:=/lidar_right/points detectors:=pointpillars
+"""
+
+from pathlib import Path
+
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
+
+from launch import LaunchDescription
+
+GRAPH = Path(__file__).resolve().parent / "detectors.launch.py"
+SIDES = ("left", "right")
+SHARED = {"detectors": "candidates", "single": "false", "use_sim_time": "false",
+          "log_level": "info"}
+
+
+def generate_launch_description():
+    return LaunchDescription([
+        *(DeclareLaunchArgument(side, default_value="points", description="Topic of the cloud, in "
+                                f"the namespace {side} unless it starts with /.")
+          for side in SIDES),
+        *(DeclareLaunchArgument(name, default_value=value, description="See detectors.launch.py.")
+          for name, value in SHARED.items()),
+        *(IncludeLaunchDescription(PythonLaunchDescriptionSource(str(GRAPH)), launch_arguments={
+            "namespace": side, "points": LaunchConfiguration(side),
+            **{name: LaunchConfiguration(name) for name in SHARED}}.items())
+          for side in SIDES),
+    ])

@@ -1,0 +1,216 @@
+"""How clouds come in: as reliably as they are offered, newest first, every one accounted for."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from importlib.resources import files
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+from lidar_perception.params import ReceptionParams
+
+WARN, ERROR, STALE = DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
+BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE
+DEPTH = 5
+SHARE_OF = 100        # clouds sent, of which the lost and the dropped are counted
+LEARNED_FROM = 20     # intervals between clouds; their median is what is expected
+RATE_OF = 10          # intervals, of which the present rate is the mean
+PROFILE = files("lidar_perception.nodes") / "fastdds.xml"
+
+Problem = tuple[str, bytes, str]  # kind, level, message
+
+
+class Arrivals:
+    """What became of the clouds that were sent: sent = taken + dropped + lost.
+
+    Publishers number their messages (publication_sequence_number). A gap is what was lost on the
+    way, or, where the queue was full, what a newer cloud has pushed out of it.
+    """
+
+    def __init__(self, depth: int):
+        self.depth = depth
+        self.sent = self.dropped = self.lost = 0
+        self.sequence: int | None = None  # of the last cloud
+        self.window: deque[tuple[int, int, int]] = deque([(0, 0, 0)], SHARE_OF + 1)
+        self.stamps: deque[tuple[int, int]] = deque(maxlen=LEARNED_FROM + 1)  # sent, ns
+        self.learned: float | None = None  # Hz
+
+    def add(self, infos: list[dict], dropped: int, one_publisher: bool = True) -> None:
+        """Messages that were waiting together, oldest first; dropped is how many were not taken
+        for that. Numbers of more than one publisher tell nothing."""
+        full = len(infos) >= self.depth
+        for i, info in enumerate(infos):
+            number, gap = info["publication_sequence_number"], 0
+            if one_publisher and number and self.sequence is not None and number > self.sequence:
+                gap = number - self.sequence - 1
+            self.sequence = number or None
+            if full and i == 0:
+                self.dropped += gap
+            else:
+                self.lost += gap
+            self.sent += 1 + gap
+            self.stamps.append((self.sent, info["source_timestamp"]))
+        self.dropped += dropped
+        self.window.append((self.sent, self.lost, self.dropped))
+        if self.learned is None and len(self.stamps) > LEARNED_FROM:
+            intervals = np.diff(np.array(self.stamps, float), axis=0)
+            period = np.median(intervals[:, 1] / intervals[:, 0])
+            self.learned = 1e9 / period if period > 0 else None
+
+    def recent(self) -> tuple[int, int, int]:
+        """Of the last SHARE_OF sent, or of more where one gap was longer: how many that are, how
+        many were lost, how many dropped."""
+        now = self.window[-1]
+        before = next((w for w in reversed(self.window) if now[0] - w[0] >= SHARE_OF),
+                      self.window[0])
+        sent, lost, dropped = (a - b for a, b in zip(now, before))
+        return sent, lost, dropped
+
+    def rate(self) -> float | None:
+        """Clouds a second that are sent now; None while too few have come."""
+        if len(self.stamps) <= RATE_OF:
+            return None
+        (n0, t0), (n1, t1) = self.stamps[-1 - RATE_OF], self.stamps[-1]
+        return 1e9 * (n1 - n0) / (t1 - t0) if t1 > t0 else None
+
+
+class Reception:
+    """A subscription of clouds. deliver gets the newest ones that are waiting (as many as the
+    parameter input.queue says), as bytes, one at a time.
+
+    It is RELIABLE where all publishers offer that, as of an ordinary driver's 2 MB a best-effort
+    subscriber gets less than half; a BEST_EFFORT publisher, also one that comes later, makes it
+    BEST_EFFORT, as else nothing at all would come from it. qos_overrides stand above that.
+    """
+
+    def __init__(self, node: Node, kind: type, name: str, deliver: Callable[[bytes], None],
+                 params: Callable[[], ReceptionParams]):
+        self.node, self.kind, self.deliver, self.params = node, kind, deliver, params
+        self.topic = node.resolve_topic_name(name)
+        self.fixed = (f"qos_overrides.{self.topic}.subscription.reliability"
+                      in node._parameter_overrides)
+        self.reliability = BEST_EFFORT if params().reliability == "best_effort" else RELIABLE
+        self.waiting: deque[bytes] = deque()
+        self.go_on = node.create_guard_condition(self._deliver_one)
+        self.look_again = node.create_guard_condition(self.adapt)
+        self.last_time: float | None = None  # monotonic, of the last cloud
+        self.subscription = self._subscribe()
+        self.arrivals = Arrivals(self.subscription.qos_profile.depth)
+        self.adapt()
+
+    def _subscribe(self) -> Any:
+        kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH]
+        look = SubscriptionEventCallbacks(matched=lambda _: self.look_again.trigger(),
+                                          incompatible_qos=lambda _: self.look_again.trigger())
+        return self.node.create_subscription(
+            self.kind, self.topic, self._received,
+            QoSProfile(depth=DEPTH, reliability=self.reliability), raw=True, event_callbacks=look,
+            qos_overriding_options=QoSOverridingOptions(
+                [*kinds, QoSPolicyKind.RELIABILITY] if self.fixed else kinds))
+
+    def publishers(self) -> list[Any]:
+        """What is known of those that publish the topic."""
+        return self.node.get_publishers_info_by_topic(self.topic)
+
+    def adapt(self) -> None:
+        """Subscribe again if the publishers offer something else than before."""
+        wanted = self.params().reliability
+        offered = {info.qos_profile.reliability for info in self.publishers()}
+        if wanted == "auto" and offered:
+            chosen = RELIABLE if offered == {RELIABLE} else BEST_EFFORT
+        else:
+            chosen = {"reliable": RELIABLE, "best_effort": BEST_EFFORT}.get(
+                wanted, self.reliability)
+        if self.fixed or chosen == self.reliability:
+            return
+        self.reliability = chosen
+        self.node.destroy_subscription(self.subscription)
+        self.subscription = self._subscribe()
+        self.node.get_logger().info(f"{self.topic} is received {self._how()} now")
+
+    def _how(self) -> str:
+        return self.subscription.qos_profile.reliability.name.lower().replace("_", " ")
+
+    def _received(self, data: bytes, info: dict) -> None:
+        """Take all that wait at the middleware, where nobody counts what is pushed out."""
+        infos, handle = [info], self.subscription.handle
+        self.waiting.append(data)
+        with handle:
+            while taken := handle.take_message(self.kind, True):
+                self.waiting.append(taken[0])
+                infos.append(taken[1])
+        dropped = max(0, len(self.waiting) - self.params().queue)
+        for _ in range(dropped):
+            self.waiting.popleft()
+        self.arrivals.add(infos, dropped, one_publisher=len(self.publishers()) < 2)
+        self._deliver_one()
+
+    def _deliver_one(self) -> None:
+        if not self.waiting:
+            return
+        try:
+            self.deliver(self.waiting.popleft())
+        finally:
+            self.last_time = monotonic()  # the work on a cloud is no silence
+            if self.waiting:
+                self.go_on.trigger()
+
+    def values(self) -> dict[str, Any]:
+        """For the diagnostics."""
+        rate, learned = self.arrivals.rate(), self.params().rate or self.arrivals.learned
+        return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped,
+                "reliability": self._how(),
+                **({"rate_hz": f"{rate:.1f}"} if rate else {}),
+                **({"expected_rate_hz": f"{learned:.1f}"} if learned else {})}
+
+    def problems(self) -> list[Problem]:
+        """What is wrong with the topic now, each with its remedy."""
+        found, params = [], self.params()
+        publishers = self.publishers()
+        if len(publishers) > 1:
+            names = ", ".join(sorted(_name(p) for p in publishers))
+            found.append(("publishers", WARN, f"{len(publishers)} publishers on {self.topic} "
+                          f"({names}): their clouds are mixed; remap all but one"))
+        silent = monotonic() - (self.last_time or monotonic())
+        if silent > params.error_after:
+            stale = silent > params.stale_after
+            limit = params.stale_after if stale else params.error_after
+            return [*found, ("stale" if stale else "silent", STALE if stale else ERROR,
+                             f"no cloud on {self.topic} for more than {limit:g} s: is the sensor "
+                             "running, and connected?")]
+        expected, rate = params.rate or self.arrivals.learned, self.arrivals.rate()
+        if expected and rate and rate < params.min_rate * expected:
+            found.append(("rate", WARN, f"{rate:.1f} clouds a second on {self.topic} where "
+                          f"{expected:.1f} are expected (input.rate): is the sensor overloaded?"))
+        sent, lost, dropped = self.arrivals.recent()
+        enough = max(sent, SHARE_OF)  # one of the first two clouds is no half of them
+        if lost > params.max_lost * enough:
+            found.append(("lost", WARN, f"{lost} of the last {sent} clouds on {self.topic} were "
+                          f"lost on the way; {self._remedy(publishers)}"))
+        if dropped > params.max_dropped * enough:
+            found.append(("dropped", WARN, f"{dropped} of the last {sent} clouds on {self.topic} "
+                          "were dropped, as newer ones came before their turn: the work on one "
+                          "takes too long for this machine"))
+        return found
+
+    def _remedy(self, publishers: list[Any]) -> str:
+        offered = {p.qos_profile.reliability for p in publishers}
+        if BEST_EFFORT in offered:
+            return (f"let {_name(publishers[0])} publish reliable, or start it with "
+                    f"FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}")
+        if self.subscription.qos_profile.reliability == BEST_EFFORT:
+            return "receive it reliable: input.reliability auto, and no qos_overrides"
+        return ("raise the depth of the publisher's queue; between machines also net.core.rmem_max "
+                "(sysctl)")
+
+
+def _name(endpoint: Any) -> str:
+    return f"{endpoint.node_namespace.rstrip('/')}/{endpoint.node_name}"

@@ -1,0 +1,99 @@
+"""A replay that loses nothing: when the next cloud may be sent, whatever the graph answers."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from lidar_perception.nodes import pacing
+from lidar_perception.nodes.graph import chosen_clouds
+from lidar_perception.runs.threads import WAIT_ASLEEP
+from lidar_perception.types import InputError
+
+
+def stamp(number):
+    return number.to_bytes(8, "little")
+
+
+def pace_of(topics, ahead, timeout=10.0):
+    return pacing.Pace(SimpleNamespace(create_subscription=lambda *_, **__: None), topics, ahead,
+                       timeout)
+
+
+def test_never_more_clouds_ahead_than_allowed_and_each_is_accounted_for():
+    """With answers that come late, twice, or not at all."""
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        topics, ahead = ["/a", "/b"][:rng.integers(1, 3)], int(rng.integers(1, 4))
+        pace, answers = pace_of(topics, ahead), 0
+
+        def serve(pace=pace, topics=topics):
+            nonlocal answers
+            number, topic = int(rng.integers(0, 40)), str(rng.choice(topics))
+            before = len(pace.waiting)
+            pace.answered(stamp(number), topic)
+            assert len(pace.waiting) <= before
+            answers += 1
+
+        for number in range(40):
+            pace.room(serve, lambda: False)
+            assert len(pace.waiting) < ahead
+            pace.sent(b"\0" * 4 + stamp(number))
+            assert list(pace.waiting)[-1] == stamp(number)
+        assert answers and pace.unanswered <= 40 * len(topics)
+
+
+def test_an_answer_in_time_is_none_missed_and_a_later_one_says_that_none_will_come():
+    pace = pace_of(["/a"], 2)
+    for number in range(3):
+        pace.sent(b"\0" * 4 + stamp(number))
+    pace.answered(stamp(0), "/a")
+    assert pace.unanswered == 0 and list(pace.waiting) == [stamp(1), stamp(2)]
+    pace.answered(stamp(2), "/a")
+    assert pace.unanswered == 1 and not pace.waiting
+
+
+def test_a_graph_that_never_answers_is_waited_for_once_and_then_briefly(monkeypatch):
+    now = 0.0
+    monkeypatch.setattr(pacing, "monotonic", lambda: now)
+
+    def serve():
+        nonlocal now
+        now += 0.25
+
+    pace = pace_of(["/a"], 1, timeout=8.0)
+    for number in range(5):
+        pace.room(serve, lambda: False)
+        pace.sent(b"\0" * 4 + stamp(number))
+    assert pace.unanswered == 4 and 8 + 3 < pace.held <= 8 + 3 + 4 * 0.25
+
+
+def test_the_clouds_of_a_bag_are_found_or_those_it_has_are_named():
+    cloud = "sensor_msgs/msg/PointCloud2"
+    assert chosen_clouds("bag", {"/velodyne": cloud, "/note": "std_msgs/msg/String"}) == "/velodyne"
+    for types, wanted, words in [
+            ({"/a": cloud, "/b": cloud}, "", "points:=TOPIC; it has /a, /b"),
+            ({"/a": cloud}, "/points", "bag has no cloud on /points; it has /a"),
+            ({"/note": "std_msgs/msg/String"}, "", "it has none at all")]:
+        with pytest.raises(InputError, match=words):
+            chosen_clouds("bag", types, wanted)
+
+
+@pytest.mark.parametrize("own", [{}, {"OMP_WAIT_POLICY": "active"}], ids=["ours", "the user's"])
+def test_threads_wait_asleep_unless_the_user_says_otherwise(own):
+    """The command sets it before torch is loaded, which reads it then."""
+    program = ("import atexit, os, sys; sys.argv[1:] = ['--version']; "
+               f"atexit.register(lambda: print([os.environ.get(k) for k in {list(WAIT_ASLEEP)}], "
+               "'torch' in sys.modules)); from lidar_perception.cli.main import main; main()")
+    environment = {k: v for k, v in os.environ.items() if k not in WAIT_ASLEEP} | own
+    said = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True,
+                          text=True).stdout.splitlines()[-1]
+    expected = own or WAIT_ASLEEP
+    assert said == f"{[expected.get(k) for k in WAIT_ASLEEP]} False"

@@ -1,0 +1,194 @@
+"""What a node makes of other people's drivers: nothing is lost unsaid, and silence is said."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from test_bad_input import CLOUD, MARKERS, cloud
+
+from lidar_perception.nodes.graph import STAGES
+from lidar_perception.nodes.main import PROFILE_VARIABLES
+from lidar_perception.nodes.reception import RATE_OF, SHARE_OF, Arrivals
+from lidar_perception.wire.codec import encode
+from msg_utils.stamps import to_ns
+
+NODE, OK, WARN, ERROR, STALE = "ground_segmentation", 0, 1, 2, 3
+KITTI = 130_000  # points of a cloud: 2 MB
+
+
+@contextmanager
+def driver(peer, reliability, count, points=KITTI, first=1, hz=10):
+    """A process without a Fast DDS profile, until it has sent."""
+    environment = {k: v for k, v in os.environ.items() if k not in PROFILE_VARIABLES}
+    process = subprocess.Popen(
+        [sys.executable, Path(__file__).with_name("driver.py"), "/in", reliability,
+         *map(str, (count, hz, points, first))], env=environment, text=True,
+        stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    os.set_blocking(process.stdout.fileno(), False)
+    try:
+        peer.wait(lambda: process.stdout.readline() == "sent\n", "the driver")
+        yield
+    finally:
+        process.communicate("\n", timeout=20)
+    assert process.returncode == 0
+
+
+def test_an_ordinary_driver(processes, peer):
+    """RELIABLE loses nothing; BEST_EFFORT, which comes later, is received too, and what it loses
+    is counted and said with a remedy; the end of it is an ERROR, then STALE, then forgotten."""
+    def value(key):
+        return int(peer.value_of(NODE, key) or 0)
+
+    def level():
+        return ord(peer.diagnostics[NODE].level)
+
+    def done():
+        return value("frames") + value("dropped")
+
+    processes.start(NODE, {"~/input/points": "/in"}, {"input.error_after": 1, "input.stale_after":
+                                                      3, "input.max_lost": 0})
+    with driver(peer, "reliable", 30):
+        peer.wait(lambda: done() == 30, "all clouds of a reliable driver")
+    assert value("lost") == 0 and peer.value_of(NODE, "reliability") == "reliable"
+    assert peer.diagnostics[NODE].hardware_id == "driver_lidar"
+    peer.wait(lambda: level() == ERROR and "no cloud on /in for more than 1 s"
+              in peer.message_of(NODE), "the silence")
+    peer.wait(lambda: level() == STALE and "more than 3 s" in peer.message_of(NODE), "it is stale")
+
+    before = value("frames")
+    with driver(peer, "best_effort", 30, first=100):
+        peer.wait(lambda: value("last_stamp_ns") >= 120 * 10**9 or value("lost"), "clouds")
+        assert peer.value_of(NODE, "reliability") == "best effort"
+    peer.wait(lambda: "no cloud" in peer.message_of(NODE), "the end")
+    assert value("frames") > before and done() + value("lost") <= 60
+    if value("lost"):
+        log = (processes.logs / f"{NODE}.log").read_text()
+        assert log.count("were lost on the way; let /driver publish reliable") == 1
+    peer.set_parameter(f"/{NODE}", "input.error_after", 1000)
+    peer.set_parameter(f"/{NODE}", "input.stale_after", 1000)
+    peer.wait(lambda: "no cloud" not in peer.message_of(NODE), "no limit")
+
+    with driver(peer, "reliable", 3, points=2000, first=200):
+        peer.wait(lambda: value("last_stamp_ns") == 202 * 10**9, "a reliable one again")
+        assert peer.value_of(NODE, "reliability") == "reliable"
+    processes.check()
+
+
+def test_the_newest_cloud_wins_and_the_others_are_counted(processes, peer):
+    """A burst while a node works on a large cloud; a second publisher is said."""
+    processes.start(NODE, {"~/input/points": "/in"}, {"ground.method": "patchwork"})
+    talker, rng = peer.talker("/in", CLOUD), np.random.default_rng(0)
+    large, *small = (encode(cloud(rng.uniform(-50, 50, (n, 3)) * [1, 1, 0.05], stamp))
+                     for stamp, n in enumerate([1_000_000, *[2000] * 40], start=2))
+    peer.wait(talker.get_subscription_count, "the node")
+    talker.publish(encode(cloud(np.ones((9, 3)), 1)))
+    peer.wait(lambda: peer.value_of(NODE, "frames") == "1", "the first cloud")
+    for data in (large, *small):
+        talker.publish(data)
+    peer.wait(lambda: peer.value_of(NODE, "last_stamp_ns") == "42", "the newest")
+
+    def accounted():
+        return [int(peer.value_of(NODE, key)) for key in ("frames", "dropped", "lost")]
+
+    peer.wait(lambda: sum(accounted()) == 42, "an account of every cloud")
+    assert accounted()[0] < 30
+    other = peer.talker("/in", CLOUD)
+    peer.wait(lambda: "2 publishers on /in (/peer, /peer)" in peer.message_of(NODE), "a warning")
+    peer.node.destroy_publisher(other)
+    peer.wait(lambda: "publishers" not in peer.message_of(NODE), "no warning")
+
+
+def test_two_nodes_of_one_name_say_so(processes, peer, tmp_path):
+    from lidar_perception.nodes.graph import Processes
+    processes.start("clustering", {}, {})
+    peer.wait(lambda: peer.message_of("clustering") == "waiting for input", "the first")
+    with Processes(tmp_path / "second", int(os.environ["ROS_DOMAIN_ID"])) as others:
+        others.start("clustering", {}, {})
+        peer.wait(lambda: "another node is called /clustering" in peer.message_of("clustering")
+                  and ord(peer.diagnostics["clustering"].level) == WARN, "a warning")
+
+
+def test_two_sensors_in_namespaces(processes, peer):
+    """The same graph twice: no topic is shared, and the diagnostics tell which sensor it is."""
+    seeds = {"seed.source": "click"}
+    for side in ("left", "right"):
+        for node, remap in STAGES.items():
+            processes.start(node, remap, seeds, namespace=side)
+    talkers = {side: peer.talker(f"/{side}/points", CLOUD) for side in ("left", "right")}
+    found = {side: peer.listen(f"/{side}/candidate_refinement/output/detections", MARKERS)
+             for side in talkers}
+    click = peer.talker("/right/clicked_point", "geometry_msgs/msg/PointStamped")
+    peer.wait(click.get_subscription_count, "the clicked points of one")
+    street = np.random.default_rng(0).uniform(-20, 20, (5000, 3)) * [1, 1, 1e-3] - [0, 0, 1.73]
+    for i, (side, talker) in enumerate(talkers.items()):
+        stamp = 5 * 10**9 * (i + 1)
+        peer.send(talker, cloud(street, stamp), lambda s=side: found[s], f"the result of {side}")
+        assert {to_ns(m.markers[0].header.stamp) for m in found[side]} == {stamp}
+        assert found[side][0].markers[0].lifetime.sec == 2  # and then a dead node's boxes go
+    assert all(peer.diagnostics[f"{side}/{node}"].hardware_id in (side, f"{side}/lidar")
+               for side in talkers for node in STAGES)
+    peer.wait(lambda: all(peer.diagnostics[f"{side}/clustering"].hardware_id == f"{side}/lidar"
+                          for side in talkers), "the sensors' frames")
+    names = {name for name, _ in peer.node.get_topic_names_and_types()}
+    ours = {t for t in names if not t.startswith(("/left/", "/right/"))}
+    assert ours <= {"/diagnostics", "/parameter_events", "/rosout", "/tf_static", "/clock"}
+    processes.check()
+
+
+def infos(numbers, period=10**8):
+    return [{"publication_sequence_number": n, "source_timestamp": n * period} for n in numbers]
+
+
+def test_every_cloud_is_accounted_for():
+    """Whatever is lost, waits or is pushed out: sent = taken + dropped + lost."""
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        arrivals, taken, number, sizes = Arrivals(5), 0, 0, []
+        while number < 300:
+            steps = rng.choice([1, 1, 1, 2, 9], rng.integers(1, 7))
+            numbers = number + np.cumsum(steps)
+            number = int(numbers[-1])
+            arrivals.add(infos(numbers.tolist()), len(numbers) - 1)
+            taken += 1
+            sizes.append(steps[0] - 1)
+        first = sizes[0]  # nobody knows how many came before the first
+        assert arrivals.sent == number - first == taken + arrivals.dropped + arrivals.lost
+        sent, lost, dropped = arrivals.recent()
+        assert 0 <= lost + dropped < sent and sent >= SHARE_OF
+        assert arrivals.learned == pytest.approx(10) and arrivals.rate() == pytest.approx(10)
+
+
+def test_what_a_full_queue_has_pushed_out_was_not_lost_on_the_way():
+    arrivals = Arrivals(5)
+    arrivals.add(infos([1]), 0)
+    arrivals.add(infos([8, 9, 10, 11, 12]), 4)
+    assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (0, 10, 12)
+    arrivals.add(infos([15, 16]), 1)
+    assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (2, 11, 16)
+
+
+def test_a_driver_that_starts_again_or_a_second_one_has_lost_nothing():
+    arrivals = Arrivals(5)
+    for number in (7, 8, 1, 2):
+        arrivals.add(infos([number]), 0)
+    arrivals.add(infos([90]), 0, one_publisher=False)
+    assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (0, 0, 5)
+
+
+def test_a_sensor_that_slows_down_is_seen_by_its_own_clock():
+    arrivals = Arrivals(5)
+    for number in range(1, 30):
+        arrivals.add(infos([number]), 0)
+    for info in infos(range(30, 30 + RATE_OF)):
+        info["source_timestamp"] = 29 * 10**8 + (info["publication_sequence_number"] - 29) * 10**9
+        arrivals.add([info], 0)
+    assert arrivals.learned == pytest.approx(10) and arrivals.rate() == pytest.approx(1)
