@@ -116,7 +116,7 @@ def test_the_summary_shows_the_scores_beside_the_papers(whole):
 def test_a_study_runs_by_its_name(few, tmp_path, monkeypatch):
     monkeypatch.setitem(STUDIES, "points", "reproduction_samples:SMALL")
     out = tmp_path / "out"
-    text = command("stm-cpa", "--study", "points", "--kitti", few, "--out", out, "--jobs", 1)
+    text = command("stm-cpa", "--study", "points", "--data", few, "--out", out, "--jobs", 1)
     assert "skipped 1: three is not liked" in text
     expected = [len(frame.cloud()) for frame in open_kitti(few)]
     rows = list(csv.DictReader((out / "tables/points.csv").open()))
@@ -127,7 +127,7 @@ def test_a_study_runs_by_its_name(few, tmp_path, monkeypatch):
     (["--study", "luck"], "'luck' is no study"), (["other"], "'other'"), (["--jobs", "0"], "0 is"),
     (["--limit", "0"], "0 is"), (["--jobs", "2", "--dask", "a:1"], "give one of them")])
 def test_what_cannot_be_asked_for_is_named(tmp_path, arguments, words):
-    result = CliRunner().invoke(cli, ["reproduce", "--kitti", str(tmp_path), "--out",
+    result = CliRunner().invoke(cli, ["reproduce", "--data", str(tmp_path), "--out",
                                       str(tmp_path / "out"), *arguments])
     assert result.exit_code == 2 and words in result.output
     assert not (tmp_path / "out").exists()

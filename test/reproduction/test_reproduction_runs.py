@@ -90,7 +90,7 @@ def test_without_distributed_the_extra_is_named(few, tmp_path, monkeypatch):
 def test_a_killed_run_leaves_no_process_and_goes_on_where_it_was(crowds, whole, tmp_path):
     out = tmp_path / "out"
     process = subprocess.Popen(
-        [sys.executable, "-m", "lidar_perception.cli.main", "reproduce", "--kitti", str(crowds),
+        [sys.executable, "-m", "lidar_perception.cli.main", "reproduce", "--data", str(crowds),
          "--out", str(out), "--jobs", "2"], cwd=ROOT, start_new_session=True, text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE)
     while len(lines_of(out)) < 4:
@@ -110,7 +110,7 @@ def test_a_killed_run_leaves_no_process_and_goes_on_where_it_was(crowds, whole, 
     assert "Traceback" not in process.communicate()[1]
     kept = lines_of(out)
     assert 4 <= len(kept) < COUNT and not (out / "report.html").exists()
-    command("--kitti", crowds, "--out", out, "--jobs", 1)
+    command("--data", crowds, "--out", out, "--jobs", 1)
     assert untimed(out) == untimed(whole)
     assert content(out) == content(whole)
     assert set(kept[:4]) <= set(lines_of(out))  # with their times: they were not measured again
@@ -282,9 +282,9 @@ def test_broken_frames_are_skipped_by_name_and_the_others_are_as_before(crowds, 
 def test_a_folder_without_scans_or_pedestrians_is_an_error(tmp_path):
     for argument, words in ((tmp_path / "none", "is not a folder"), (tmp_path, "no KITTI scans")):
         with pytest.raises(InputError, match=words):
-            command("--kitti", argument, "--out", tmp_path / "out")
+            command("--data", argument, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
     nobody = object_folder(tmp_path / "nobody", "")
     with pytest.raises(InputError, match=r"no frame could be measured.*no Pedestrian"):
-        command("--kitti", nobody, "--out", tmp_path / "out", "--jobs", 1)
+        command("--data", nobody, "--out", tmp_path / "out", "--jobs", 1)
     assert json.loads((tmp_path / "out/report.json").read_text())["skipped"] == 2
