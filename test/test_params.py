@@ -322,7 +322,7 @@ def test_an_old_name_of_others_parameters_is_nobodys(tmp_path):
     # The clustering node may share a file with a detector, whose old names it need not know.
     text = "detector: {ros__parameters: {detection.weights: a, pointnet.least_points: 3}}"
     assert config(tmp_path, text, PipelineParams()) == {}
-    with pytest.raises(ValueError, match="'detection.weights'; known are"):
+    with pytest.raises(ValueError, match=r"'detection\.weights'; known are"):
         with_values(PipelineParams(), {"detection.weights": "a"})
 
 
