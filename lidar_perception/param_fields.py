@@ -120,7 +120,7 @@ def with_values(params: Any, values: dict[str, Any]) -> Any:
     or wrong."""
     known = parameter_fields(params)
     if unknown := [name for name in values if name not in known]:
-        remedy = (f"it is {new} now" if (new := new_name(unknown[0]))
+        remedy = (f"it is {new} now" if (new := new_name(unknown[0])) in known
                   else f"known are {', '.join(known)}")
         raise ValueError(f"unknown parameter {unknown[0]!r}; {remedy}")
     return _replaced(params, values, "")

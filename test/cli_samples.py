@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 
 from click.testing import CliRunner
@@ -27,3 +28,12 @@ def evaluate_detection(tmp_path, *arguments):
                                       *map(str, arguments)], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return json.loads(path.read_text()), result.stdout
+
+
+def error_line(capsys) -> str:
+    """The one line on stderr that says what is wrong. Before it there may be what was opened, and
+    the empty line of a progress bar that ended."""
+    *before, line = capsys.readouterr().err.strip().splitlines()
+    assert line.startswith("Error: ")
+    assert all(re.search(r": .*, \d+ frames?\b", each) for each in before if each), before
+    return line

@@ -111,7 +111,7 @@ def whole(crowds, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("whole") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COLUMNS", "160")
-        write(out.parent / "said", command("--kitti", crowds, "--out", out, "--jobs", 1))
+        write(out.parent / "said", command("--data", crowds, "--out", out, "--jobs", 1))
     return out
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,6 +20,7 @@ from benchmark.rows import print_ground, print_measured, row, target_text, value
 from benchmark.timing import Clock, in_child, interleaved
 from lidar_perception.clustering.euclidean import euclidean
 from lidar_perception.clustering.params import EuclideanParams
+from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.types import LidarFrame
 
 SKLEARN = [p.name for p in peers.SKLEARN]
@@ -104,7 +104,8 @@ def test_peers_that_are_not_installed_are_said_to_be(nothing_installed, capsys):
 def test_ground_scores_do_without_the_libraries(nothing_installed, capsys):
     points = scene()
     semantic = np.where(points[:, 2] < -1.6, 40, 30).astype(np.uint16)
-    scan = SimpleNamespace(load=lambda: (LidarFrame(points[:, :3], points[:, 3]), semantic, None))
+    scan = Frame.of("a", LidarFrame(points[:, :3], points[:, 3]),
+                    point_truth=lambda: PointTruth(semantic, np.zeros_like(semantic)))
     content = ground.measure_labelled([scan], 1)
     print_ground(json.loads(json.dumps(content)))
     assert capsys.readouterr().out.count("not installed") == 2 * len(content["protocols"])
@@ -142,7 +143,7 @@ def test_the_command_writes_what_it_measured(nothing_installed, tmp_path):
     pytest.importorskip("cv2")
     from benchmark.__main__ import main
     root, out = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "b.json"
-    done = CliRunner().invoke(main, ["--kitti", str(root), "--json", str(out), "--repeat", "1",
+    done = CliRunner().invoke(main, ["--data", str(root), "--json", str(out), "--repeat", "1",
                                      "--frames", "2", "--no-graph"], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     content = json.loads(out.read_text())

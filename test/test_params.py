@@ -300,3 +300,48 @@ def test_a_config_that_cannot_be_read_is_named(tmp_path):
     for name in ("missing.yaml", "binary.yaml", "."):
         with pytest.raises(InputError, match="cannot read the parameter file"):
             read_config(tmp_path / name, PipelineParams())
+
+
+RENAMED = [("detection.weights", "pointpillars.weights", "''", DetectorParams),
+           ("detection.scores.car", "pointpillars.scores.car", "0.5", DetectorParams),
+           ("seed.least_confidence", "seed.min_confidence", "0.5", PipelineParams),
+           ("pointnet.least_points", "pointnet.min_points", "7", PointNetDetectorParams),
+           ("data.least_points", "data.min_points", "7", PointPillarsTraining)]
+each_renamed = pytest.mark.parametrize("old, new, value, kind", RENAMED)
+
+
+@each_renamed
+def test_an_old_name_is_answered_with_the_new_one(old, new, value, kind, tmp_path):
+    assert new in parameter_fields(kind())
+    with pytest.raises(ValueError, match=f"unknown parameter '{old}'; it is {new} now$"):
+        with_values(kind(), {old: 1})
+    for text in f"{{{old}: {value}}}", f"{{{old.replace('.', ': {')}: {value}" + "}" * (
+            old.count(".") + 1):
+        with pytest.raises(InputError, match=f"'{old}' is called '{new}' now") as error:
+            config(tmp_path, f"node: {{ros__parameters: {text}}}", kind())
+        assert str(tmp_path) in str(error.value)
+
+
+def test_an_old_name_of_others_parameters_is_nobodys(tmp_path):
+    # The clustering node may share a file with a detector, whose old names it need not know.
+    text = "detector: {ros__parameters: {detection.weights: a, pointnet.least_points: 3}}"
+    assert config(tmp_path, text, PipelineParams()) == {}
+    with pytest.raises(ValueError, match=r"'detection\.weights'; known are"):
+        with_values(PipelineParams(), {"detection.weights": "a"})
+
+
+@each_renamed
+def test_a_node_answers_an_old_name_with_the_new_one(old, new, value, kind, domain):
+    rclpy = pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+    from rclpy.parameter import Parameter
+    from rclpy.signals import SignalHandlerOptions
+
+    from lidar_perception.nodes.runtime import LidarNode
+    context = rclpy.context.Context()
+    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    given = Parameter(old, value=flatten(kind())[new])
+    try:
+        with pytest.raises(InputError, match=f"'{old}' is called '{new}' now"):
+            LidarNode("old", kind(), context=context, parameter_overrides=[given])
+    finally:
+        rclpy.try_shutdown(context=context)

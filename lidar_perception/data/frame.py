@@ -116,4 +116,4 @@ class Recording:
         if unknown := [name for name in names if name not in by_name]:
             raise InputError(f"{self.path} has no frame {unknown[0]} ({len(unknown)} such); its "
                              f"first is {next(iter(by_name), 'none')}")
-        return replace(self, frames=[by_name[name] for name in names])
+        return replace(self, frames=[by_name[name] for name in names], lost=())

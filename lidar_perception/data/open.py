@@ -36,6 +36,8 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
                          "the folder of KITTI (velodyne/ or training/velodyne/, or raw drives), "
                          "nuScenes (v1.0-*/ and samples/) or SemanticKITTI (sequences/00/)")
     recording = layout.open_recording(path, points=points, scans=scans)
+    if len(recording) == 0:
+        raise InputError(f"{path} ({recording.layout}) has no frame; record or download it again")
     recording = replace(recording, reopen=partial(open_recording, path, split=split, points=points,
                                                   scans=scans))
     return recording if split is None else _of_split(recording, Path(split))

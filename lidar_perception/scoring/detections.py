@@ -65,7 +65,10 @@ def _by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None
             if calibration is None:
                 raise RunError(f"{recording.path} ({recording.layout}) has no camera calibration, "
                                "which KITTI's result files need")
-            write_results(folder / f"{frame.name}.txt", result.detections, calibration)
+            try:
+                write_results(folder / f"{frame.name}.txt", result.detections, calibration)
+            except InputError as error:  # of the disk, or numbers that are not finite
+                raise RunError(str(error)) from None
         return result
     return measure
 

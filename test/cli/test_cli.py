@@ -10,7 +10,7 @@ from pathlib import Path
 
 import click
 import pytest
-from cli_samples import exit_of
+from cli_samples import error_line, exit_of
 from click.testing import CliRunner
 from samples import LABELS, WALKER, object_folder, walker_label, write
 
@@ -71,7 +71,7 @@ def kitti(tmp_path_factory):
 @pytest.fixture(scope="module")
 def bag(kitti, tmp_path_factory):
     path = tmp_path_factory.mktemp("bags") / "drive"
-    run("convert", "kitti", kitti, "--out", path)
+    run("convert", kitti, "--out", path)
     return path
 
 
@@ -111,7 +111,7 @@ def test_convert_makes_a_bag_of_every_scan(kitti, bag):
 
 
 def test_convert_takes_as_many_frames_as_asked_for(kitti, tmp_path):
-    text = run("convert", "kitti", kitti, "--out", tmp_path / "bag", "--frames", 1)
+    text = run("convert", kitti, "--out", tmp_path / "bag", "--limit", 1)
     assert "1 scans of 1" in text.replace("\n", "")
     with Bag(tmp_path / "bag") as opened:
         assert opened.counts[POINTS] == 1
@@ -120,7 +120,7 @@ def test_convert_takes_as_many_frames_as_asked_for(kitti, tmp_path):
 def test_convert_leaves_out_what_is_broken_and_says_so(tmp_path, monkeypatch, capsys):
     root = object_folder(tmp_path / "kitti", LABELS)
     broken = write(root / "training/velodyne/000000.bin", b"123")
-    assert exit_of(monkeypatch, "convert", "kitti", root, "--out", tmp_path / "bag") == 1
+    assert exit_of(monkeypatch, "convert", root, "--out", tmp_path / "bag") == 1
     text = capsys.readouterr().out.replace("\n", "")
     assert "1 scans of 2" in text and str(broken) in text
     with Bag(tmp_path / "bag") as opened:
@@ -128,7 +128,7 @@ def test_convert_leaves_out_what_is_broken_and_says_so(tmp_path, monkeypatch, ca
 
 
 def test_convert_replaces_a_bag_only_by_force(kitti, tmp_path, monkeypatch):
-    command = ("convert", "kitti", kitti, "--out", tmp_path / "bag", "--frames", 1)
+    command = ("convert", kitti, "--out", tmp_path / "bag", "--limit", 1)
     assert [exit_of(monkeypatch, *command), exit_of(monkeypatch, *command),
             exit_of(monkeypatch, *command, "--force")] == [0, 2, 0]
 
@@ -147,7 +147,7 @@ def test_info_shows_topics_types_counts_and_length(bag, monkeypatch):
 
 
 def test_the_scores_are_those_of_the_two_pedestrians(kitti, tmp_path):
-    content = evaluate(tmp_path, "--kitti", kitti)
+    content = evaluate(tmp_path, "--data", kitti)
     assert (content["frames"], content["ground_truth"], content["skipped"]) == (2, 2, [])
     assert content["ground_truth_by_range"] == {r: 2 if r == "0-15" else 0 for r in RANGES}
     for stage in STAGES:
@@ -165,12 +165,12 @@ def test_the_scores_are_those_of_the_two_pedestrians(kitti, tmp_path):
 
 
 def test_a_bag_has_the_scores_of_the_folder_it_was_made_of(kitti, bag, tmp_path):
-    assert scores(evaluate(tmp_path, "--bag", bag)) == scores(evaluate(tmp_path, "--kitti", kitti))
+    assert scores(evaluate(tmp_path, "--data", bag)) == scores(evaluate(tmp_path, "--data", kitti))
 
 
 def test_evaluate_prints_what_it_writes(bag, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    text = run("evaluate", "candidates", "--bag", bag, "--png", tmp_path / "a/picture.png")
+    text = run("evaluate", "candidates", "--data", bag, "--png", tmp_path / "a/picture.png")
     assert "2 pedestrians in 2 frames" in text
     assert (tmp_path / "a/picture.png").read_bytes().startswith(b"\x89PNG")
 
@@ -182,13 +182,13 @@ def test_evaluate_prints_what_it_writes(bag, tmp_path, monkeypatch):
     ("--no-view-enabled", "--ground-threshold-max-height", -10,
      "--clustering-dbscan-range-limits", "5,7")])
 def test_flags_reach_the_pipeline(bag, tmp_path, flags):
-    changed = scores(evaluate(tmp_path, "--bag", bag, *flags))
+    changed = scores(evaluate(tmp_path, "--data", bag, *flags))
     assert changed["ground_truth"] == 2
-    assert changed != scores(evaluate(tmp_path, "--bag", bag))
+    assert changed != scores(evaluate(tmp_path, "--data", bag))
 
 
 def test_without_core_points_there_are_no_candidates(bag, tmp_path):
-    content = evaluate(tmp_path, "--bag", bag, "--clustering-dbscan-min-samples", 100_000)
+    content = evaluate(tmp_path, "--data", bag, "--clustering-dbscan-min-samples", 100_000)
     for stage in STAGES:
         row = content[stage]["all"]
         assert (row["tp"], row["fp"], row["fn"], row["f1"]) == (0, 0, 2, 0)
@@ -199,10 +199,10 @@ def test_a_config_says_the_same_as_flags_and_flags_win(bag, tmp_path):
     flag = "--clustering-dbscan-min-samples"
     file = write(tmp_path / "p.yaml",
                  "/**:\n  ros__parameters:\n    clustering.dbscan.min_samples: 100000\n")
-    no_clusters = scores(evaluate(tmp_path, "--bag", bag, flag, 100_000))
-    assert scores(evaluate(tmp_path, "--bag", bag, "--config", file)) == no_clusters
-    assert scores(evaluate(tmp_path, "--bag", bag, "--config", file, flag, 10)) == scores(
-        evaluate(tmp_path, "--bag", bag))
+    no_clusters = scores(evaluate(tmp_path, "--data", bag, flag, 100_000))
+    assert scores(evaluate(tmp_path, "--data", bag, "--config", file)) == no_clusters
+    assert scores(evaluate(tmp_path, "--data", bag, "--config", file, flag, 10)) == scores(
+        evaluate(tmp_path, "--data", bag))
 
 
 @pytest.mark.parametrize("section, words", [
@@ -235,7 +235,7 @@ def test_a_pipe_is_no_parameter_file_and_is_not_waited_for(tmp_path):
 def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
     root = object_folder(tmp_path / "kitti", walker_label(), count=3)
     write(root / "training/velodyne/000001.bin", b"123")
-    content = evaluate(tmp_path, "--kitti", root)
+    content = evaluate(tmp_path, "--data", root)
     assert content["frames"] == 2
     line, = content["skipped"]
     assert "000001.bin" in line
@@ -244,24 +244,24 @@ def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
 BAD_INPUTS = {
     "missing bag": (["info", "{tmp}/none"], "there is no bag {tmp}/none"),
     "no bag": (["info", "{tmp}"], "{tmp} has no metadata.yaml"),
-    "missing kitti": (["convert", "kitti", "{tmp}/none", "--out", "{tmp}/o"], "{tmp}/none"),
-    "no kitti": (["convert", "kitti", "{tmp}", "--out", "{tmp}/o"], "no KITTI scans"),
-    "existing out": (["convert", "kitti", "{kitti}", "--out", "{bag}"], "exists already"),
-    "out is a file": (["convert", "kitti", "{kitti}", "--out", "{kitti}/training/calib/000000.txt",
+    "missing data": (["convert", "{tmp}/none", "--out", "{tmp}/o"], "there is no {tmp}/none"),
+    "no data": (["convert", "{tmp}", "--out", "{tmp}/o"], "{tmp} is no recording that can be read"),
+    "existing out": (["convert", "{kitti}", "--out", "{bag}"], "exists already"),
+    "out is a file": (["convert", "{kitti}", "--out", "{kitti}/training/calib/000000.txt",
                        "--force"], "is no bag"),
-    "out under a file": (["convert", "kitti", "{kitti}", "--out",
+    "out under a file": (["convert", "{kitti}", "--out",
                           "{kitti}/training/calib/000000.txt/o"], "cannot make the folder"),
-    "out of range": (["evaluate", "candidates", "--bag", "{bag}", "--ground-cloth-resolution",
+    "out of range": (["evaluate", "candidates", "--data", "{bag}", "--ground-cloth-resolution",
                       "99"], "ground.cloth.resolution = 99.0 is outside 0.1 .. 10.0"),
-    "lengths": (["evaluate", "candidates", "--bag", "{bag}", "--clustering-dbscan-eps", "0.1"],
+    "lengths": (["evaluate", "candidates", "--data", "{bag}", "--clustering-dbscan-eps", "0.1"],
                 "one more eps than range_limits"),
-    "missing config": (["evaluate", "candidates", "--bag", "{bag}", "--config", "{tmp}/none"],
+    "missing config": (["evaluate", "candidates", "--data", "{bag}", "--config", "{tmp}/none"],
                        "{tmp}/none"),
-    "missing template": (["evaluate", "candidates", "--bag", "{bag}", "--seed-source", "file",
+    "missing template": (["evaluate", "candidates", "--data", "{bag}", "--seed-source", "file",
                           "--seed-file", "{tmp}/none"], "{tmp}/none"),
-    "json under a file": (["evaluate", "candidates", "--bag", "{bag}", "--json",
+    "json under a file": (["evaluate", "candidates", "--data", "{bag}", "--json",
                            "{kitti}/training/calib/000000.txt/o"], "cannot write"),
-    "json is a folder": (["evaluate", "candidates", "--bag", "{bag}", "--json", "{tmp}"],
+    "json is a folder": (["evaluate", "candidates", "--data", "{bag}", "--json", "{tmp}"],
                          "cannot write {tmp}"),
 }
 
@@ -274,13 +274,12 @@ def test_bad_input_is_one_line_on_stderr_and_exit_code_2(case, kitti, bag, tmp_p
 
     arguments, words = BAD_INPUTS[case]
     assert exit_of(monkeypatch, *map(fill, arguments)) == 2
-    line, = capsys.readouterr().err.strip().splitlines()
-    assert line.startswith("Error: ") and fill(words) in line
+    assert fill(words) in error_line(capsys)
 
 
 def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch, capsys):
     root = object_folder(tmp_path / "kitti", "")
-    assert exit_of(monkeypatch, "evaluate", "candidates", "--kitti", root, "--json",
+    assert exit_of(monkeypatch, "evaluate", "candidates", "--data", root, "--json",
                    tmp_path / "s.json") == 2
     assert "no frame with a Pedestrian label" in capsys.readouterr().err
     assert json.loads((tmp_path / "s.json").read_text())["frames"] == 0
@@ -288,14 +287,14 @@ def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch,
 
 @pytest.mark.parametrize("arguments, words", [
     (["bogus"], "No such command 'bogus'"),
-    (["evaluate", "candidates"], "give either --kitti ROOT or --bag FILE"),
-    (["evaluate", "candidates", "--kitti", "a", "--bag", "b"], "give either"),
-    (["evaluate", "candidates", "--bag", "b", "--clustering-dbscan-min-samples", "few"], "'few'"),
-    (["evaluate", "candidates", "--bag", "b", "--clustering-dbscan-eps", "0.1,wide"],
+    (["evaluate", "candidates"], "Missing option '--data'"),
+    (["evaluate", "candidates", "--data", "a", "--jobs", "2", "--dask", "b"], "give one of them"),
+    (["evaluate", "candidates", "--data", "b", "--clustering-dbscan-min-samples", "few"], "'few'"),
+    (["evaluate", "candidates", "--data", "b", "--clustering-dbscan-eps", "0.1,wide"],
      "list of numbers"),
-    (["evaluate", "candidates", "--bag", "b", "--seed-source", "luck"], "'luck'"),
-    (["convert", "kitti", "a", "--out", "b", "--frames", "0"], "0 is not in the range"),
-    (["convert", "kitti", "a"], "--out"),
+    (["evaluate", "candidates", "--data", "b", "--seed-source", "luck"], "'luck'"),
+    (["convert", "a", "--out", "b", "--limit", "0"], "0 is not in the range"),
+    (["convert", "a"], "--out"),
     (["run", "bogus"], "'bogus'"),
 ])
 def test_a_command_that_cannot_be_used_is_exit_code_2(arguments, words, monkeypatch, capsys):
@@ -313,8 +312,8 @@ def test_the_process_ends_with_the_code(arguments, code, words, tmp_path):
 
 def test_real_scans_are_scored_alike_from_folder_and_bag(data, tmp_path):
     root = data / "kitti_object"
-    run("convert", "kitti", root, "--out", tmp_path / "bag", "--frames", 6)
-    content = evaluate(tmp_path, "--bag", tmp_path / "bag")
+    run("convert", root, "--out", tmp_path / "bag", "--limit", 6)
+    content = evaluate(tmp_path, "--data", tmp_path / "bag")
     labels = [path.read_text() for path in sorted(root.glob("training/label_2/*.txt"))[:6]]
     counts = [sum(line.startswith("Pedestrian ") for line in text.splitlines()) for text in labels]
     assert content["frames"] == sum(n > 0 for n in counts)

@@ -45,7 +45,8 @@ def judge():
 @pytest.fixture(scope="module")
 def found(judge):
     """What a low threshold leaves: the frame's segmentation and candidates."""
-    pipeline = RescoredCandidates(judge, RescoringParams(min_confidence=0.0), PIPELINE).pipeline
+    pipeline = RescoredCandidates(judge, SEED, None, RescoringParams(min_confidence=0.0),
+                                  PIPELINE).pipeline
     segmented, candidates = find_candidates(cloud(), SEED, None, pipeline)
     assert len(candidates.final) >= 4
     return segmented, candidates

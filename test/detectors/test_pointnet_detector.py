@@ -379,7 +379,7 @@ def test_one_function_opens_both(saved, tmp_path):
 def test_evaluation_runs_either_network(saved, tmp_path):
     kitti = object_folder(tmp_path / "kitti")
     for path in saved[:2]:
-        content, _ = evaluate(tmp_path, "--kitti", kitti, "--weights", path, "--device", "cpu")
+        content, _ = evaluate(tmp_path, "--data", kitti, "--weights", path, "--device", "cpu")
         assert content["frames"] == 2 and content["ms"] > 0 and not content["skipped"]
 
 

@@ -15,7 +15,7 @@ from detection_samples import eager, frame, lively, random_detector, same, tiny
 from lidar_perception.cli.main import cli
 from lidar_perception.detectors.checkpoint import Header, adopt, read_header, save_checkpoint
 from lidar_perception.detectors.pointpillars import weights_file as weights_module
-from lidar_perception.detectors.pointpillars.config import VERSIONS, network_config
+from lidar_perception.detectors.pointpillars.config import VERSIONS, NetworkConfig, network_config
 from lidar_perception.detectors.pointpillars.detector import (
     CPU,
     PointPillarsDetector,
@@ -58,7 +58,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
         torch.testing.assert_close(value, network.state_dict()[name], atol=1e-7,
                                    rtol=0 if value.ndim < 2 else 2**-10)
     found = load_detector(path, "cpu", eager())(frame())
-    assert len(found) and same(found, PointPillarsDetector(TorchNetwork(network), header, CPU,
+    assert len(found.detections) and same(found, PointPillarsDetector(TorchNetwork(network), header, CPU,
                                                eager())(frame()))
 
 
@@ -77,29 +77,29 @@ def test_a_network_begins_with_what_fits_of_another(saved):
     path, header, network = saved
     state = network.state_dict()
     same = make_network(header.config)
-    taken, count = adopt(same, path, Header)
+    taken, count = adopt(same, path, NetworkConfig)
     assert taken == count == len(state)
     assert all(torch.equal(value, state[name]) for name, value in same.state_dict().items())
     # without the branch of the map the first block has fewer inputs, of which it takes its own
     other = make_network(tiny("v1"))
-    taken, count = adopt(other, path, Header)
+    taken, count = adopt(other, path, NetworkConfig)
     assert taken == count
     first, old = (s["blocks.0.0.0.weight"] for s in (other.state_dict(), state))
     assert first.shape[1] < old.shape[1] and torch.equal(first, old[:, :first.shape[1]])
     # a new input, such as the number of the cluster, comes last and begins at 0
     numbered = make_network(tiny("v2"))
-    assert len(set(adopt(numbered, path, Header))) == 1
+    assert len(set(adopt(numbered, path, NetworkConfig))) == 1
     first, old = (s["pillar_net.linear.weight"] for s in (numbered.state_dict(), state))
     assert torch.equal(first[:, :-1], old) and not first[:, -1].any()
     # and another neck begins at random
     third = make_network(tiny("v0"))
     before = {name: value.clone() for name, value in third.state_dict().items()}
-    taken, count = adopt(third, path, Header)
+    taken, count = adopt(third, path, NetworkConfig)
     assert 0 < taken < count
     assert all(torch.equal(value, before[name]) for name, value in third.state_dict().items()
                if name.startswith("neck"))
     with pytest.raises(InputError, match="no layer"):
-        adopt(torch.nn.Linear(2, 3), path, Header)
+        adopt(torch.nn.Linear(2, 3), path, NetworkConfig)
 
 
 def test_files_that_are_no_checkpoints_are_refused(saved, tmp_path):
@@ -170,7 +170,7 @@ def test_an_exported_network_finds_the_same(version, changes, tmp_path):
     exported = load_detector(tmp_path / "n.onnx", "auto", eager(score=0.1))
     assert exported.header == header and isinstance(exported.network, OnnxNetwork)
     expected = PointPillarsDetector(TorchNetwork(network), header, CPU, eager(score=0.1))(frame())
-    assert len(expected) and same(exported(frame()), expected, 1e-4)
+    assert len(expected.detections) and same(exported(frame()), expected, 1e-4)
 
 
 @needs_onnx

@@ -15,7 +15,7 @@ from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.refine import STAGES, refine
 from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.data.kitti.folder import open_kitti
-from lidar_perception.data.recording import open_recording
+from lidar_perception.data.open import open_recording
 from lidar_perception.reproduction import runner
 from lidar_perception.reproduction.experiment import Cell
 from lidar_perception.reproduction.labelled import load_labelled, nearest_seed
@@ -36,7 +36,8 @@ from lidar_perception.scoring.centres.matching import (
     match_centres,
     range_bins,
 )
-from lidar_perception.scoring.centres.report import CandidateReport, evaluate
+from lidar_perception.scoring.centres.report import CandidateReport, by_pipeline
+from lidar_perception.scoring.run import fill
 from lidar_perception.types import InputError
 
 COUNT = 7
@@ -50,7 +51,7 @@ def kitti(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def records(kitti, tmp_path_factory):
-    return runner.run(STM_CPA, kitti, tmp_path_factory.mktemp("run") / "out")
+    return runner.run(STM_CPA, open_recording(kitti), tmp_path_factory.mktemp("run") / "out")
 
 
 @pytest.fixture(scope="module")
@@ -116,8 +117,7 @@ def test_hits_and_misses_are_the_truth_in_every_part_of_a_record(kitti, measured
 
 def test_the_stages_are_those_of_evaluate_candidates(kitti, measured):
     report = CandidateReport()
-    for _ in evaluate(open_recording(kitti=kitti), PAPER, report):
-        pass
+    fill(report, open_recording(kitti), by_pipeline(PAPER))
     assert report.frames == len(measured)
     for stage, score in report.scores.items():
         for key in ("tp", "fp", "fn"):

@@ -14,6 +14,7 @@ from reproduction_samples import SMALL, command, points_table
 
 from lidar_perception.cli.main import cli
 from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.reproduction import journal, runner
 from lidar_perception.reproduction.experiment import Cell, Experiment, Figure, Line, Panel, Table
 from lidar_perception.reproduction.figures import draw
@@ -75,7 +76,7 @@ def test_the_page_needs_no_other_file_and_says_what_was_run(whole, crowds):
 
 
 def test_text_is_escaped(few, tmp_path):
-    records = runner.run(SMALL, few, tmp_path / "out")
+    records = runner.run(SMALL, open_recording(few), tmp_path / "out")
     page = write_report(tmp_path / "out", SMALL, records, points_table(records),
                         {"folder": "<b>"}).read_text()
     for text in ("Small & <quick>", "<Points>", "Points | of <all>", "a <note>", "<b>"):
@@ -116,9 +117,9 @@ def test_the_summary_shows_the_scores_beside_the_papers(whole):
 def test_a_study_runs_by_its_name(few, tmp_path, monkeypatch):
     monkeypatch.setitem(STUDIES, "points", "reproduction_samples:SMALL")
     out = tmp_path / "out"
-    text = command("stm-cpa", "--study", "points", "--kitti", few, "--out", out, "--jobs", 1)
+    text = command("stm-cpa", "--study", "points", "--data", few, "--out", out, "--jobs", 1)
     assert "skipped 1: three is not liked" in text
-    expected = [len(frame.cloud()) for frame in open_kitti(few)]
+    expected = [len(frame.load()) for frame in open_kitti(few)]
     rows = list(csv.DictReader((out / "tables/points.csv").open()))
     assert [float(r["points"]) for r in rows] == np.delete(expected, 3).tolist()
 
@@ -127,7 +128,7 @@ def test_a_study_runs_by_its_name(few, tmp_path, monkeypatch):
     (["--study", "luck"], "'luck' is no study"), (["other"], "'other'"), (["--jobs", "0"], "0 is"),
     (["--limit", "0"], "0 is"), (["--jobs", "2", "--dask", "a:1"], "give one of them")])
 def test_what_cannot_be_asked_for_is_named(tmp_path, arguments, words):
-    result = CliRunner().invoke(cli, ["reproduce", "--kitti", str(tmp_path), "--out",
+    result = CliRunner().invoke(cli, ["reproduce", "--data", str(tmp_path), "--out",
                                       str(tmp_path / "out"), *arguments])
     assert result.exit_code == 2 and words in result.output
     assert not (tmp_path / "out").exists()

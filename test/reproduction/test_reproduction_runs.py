@@ -26,9 +26,11 @@ from reproduction_samples import (
 )
 from samples import object_folder, write
 
+from lidar_perception.data.open import open_recording
 from lidar_perception.reproduction import journal, runner
 from lidar_perception.reproduction.report import write_report
 from lidar_perception.reproduction.stm_cpa import STM_CPA
+from lidar_perception.scoring import run as scoring_run
 from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -59,7 +61,7 @@ def content(folder):
 
 
 def test_two_processes_measure_what_one_does(crowds, whole, tmp_path):
-    runner.run(STM_CPA, crowds, tmp_path / "out", jobs=2)
+    runner.run(STM_CPA, open_recording(crowds), tmp_path / "out", jobs=2)
     assert untimed(tmp_path / "out") == untimed(whole)
 
 
@@ -68,29 +70,29 @@ def test_a_cluster_of_two_workers_measures_what_one_process_does(crowds, whole, 
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
                                   dashboard_address=None) as cluster:
         address = cluster.scheduler_address
-        runner.run(STM_CPA, crowds, tmp_path / "out", dask=address)
+        runner.run(STM_CPA, open_recording(crowds), tmp_path / "out", dask=address)
         with pytest.raises(ZeroDivisionError):
-            runner.run(small(break_down), crowds, tmp_path / "broken", dask=address)
+            runner.run(small(break_down), open_recording(crowds), tmp_path / "broken", dask=address)
     assert untimed(tmp_path / "out") == untimed(whole)
 
 
 def test_a_cluster_that_is_not_there_is_named(few, tmp_path, monkeypatch):
     pytest.importorskip("distributed", reason="needs the extra [distributed]")
-    monkeypatch.setattr(runner, "CONNECT_S", 0.2)
+    monkeypatch.setattr(scoring_run, "CONNECT_S", 0.2)
     with pytest.raises(InputError, match="cannot reach a Dask scheduler"):
-        runner.run(SMALL, few, tmp_path / "out", dask="tcp://127.0.0.1:9")
+        runner.run(SMALL, open_recording(few), tmp_path / "out", dask="tcp://127.0.0.1:9")
 
 
 def test_without_distributed_the_extra_is_named(few, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"lidar_perception\[distributed\]"):
-        runner.run(SMALL, few, tmp_path / "out", dask="tcp://127.0.0.1:9")
+        runner.run(SMALL, open_recording(few), tmp_path / "out", dask="tcp://127.0.0.1:9")
 
 
 def test_a_killed_run_leaves_no_process_and_goes_on_where_it_was(crowds, whole, tmp_path):
     out = tmp_path / "out"
     process = subprocess.Popen(
-        [sys.executable, "-m", "lidar_perception.cli.main", "reproduce", "--kitti", str(crowds),
+        [sys.executable, "-m", "lidar_perception.cli.main", "reproduce", "--data", str(crowds),
          "--out", str(out), "--jobs", "2"], cwd=ROOT, start_new_session=True, text=True,
         env={**os.environ, "PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE)
     while len(lines_of(out)) < 4:
@@ -110,7 +112,7 @@ def test_a_killed_run_leaves_no_process_and_goes_on_where_it_was(crowds, whole, 
     assert "Traceback" not in process.communicate()[1]
     kept = lines_of(out)
     assert 4 <= len(kept) < COUNT and not (out / "report.html").exists()
-    command("--kitti", crowds, "--out", out, "--jobs", 1)
+    command("--data", crowds, "--out", out, "--jobs", 1)
     assert untimed(out) == untimed(whole)
     assert content(out) == content(whole)
     assert set(kept[:4]) <= set(lines_of(out))  # with their times: they were not measured again
@@ -118,16 +120,16 @@ def test_a_killed_run_leaves_no_process_and_goes_on_where_it_was(crowds, whole, 
 
 @pytest.mark.parametrize("cut", [1, 2, 40])
 def test_a_cut_last_line_is_dropped_and_its_frame_measured_again(few, tmp_path, cut):
-    expected = runner.run(SMALL, few, tmp_path / "out")
+    expected = runner.run(SMALL, open_recording(few), tmp_path / "out")
     path = tmp_path / "out" / journal.NAME
     bytes_before = path.read_bytes()
     path.write_bytes(bytes_before[:-cut])
-    assert runner.run(SMALL, few, tmp_path / "out") == expected
+    assert runner.run(SMALL, open_recording(few), tmp_path / "out") == expected
     assert path.read_bytes() == bytes_before
 
 
 def test_what_is_there_is_not_measured_again(few, tmp_path, monkeypatch):
-    expected = runner.run(SMALL, few, tmp_path / "out", limit=2)
+    expected = runner.run(SMALL, open_recording(few), tmp_path / "out", limit=2)
     assert [r["frame"] for r in expected] == ["000000", "000001"]
     asked = []
 
@@ -135,9 +137,9 @@ def test_what_is_there_is_not_measured_again(few, tmp_path, monkeypatch):
         asked.append(number)
         return count_points(frames, number)
 
-    assert runner.run(small(noted), few, tmp_path / "out")[:2] == expected
+    assert runner.run(small(noted), open_recording(few), tmp_path / "out")[:2] == expected
     assert asked == [2, 3, 4]
-    assert len(runner.run(small(noted), few, tmp_path / "out", limit=1)) == 1
+    assert len(runner.run(small(noted), open_recording(few), tmp_path / "out", limit=1)) == 1
     assert asked == [2, 3, 4]
     assert len(lines_of(tmp_path / "out")) == 1 + 4  # the plan, and what was not skipped
 
@@ -146,10 +148,12 @@ def test_a_frame_that_was_skipped_is_tried_again(few, tmp_path):
     scan = few / "training/velodyne/000001.bin"
     whole = scan.read_bytes()
     scan.write_bytes(whole[:100])
-    first = runner.run(SMALL, few, tmp_path / "out")
+    first = runner.run(SMALL, open_recording(few), tmp_path / "out")
     assert "000001.bin" in first[1]["skipped"] and "000001.bin" in first[2]["skipped"]
     scan.write_bytes(whole)
-    assert runner.run(SMALL, few, tmp_path / "out") == runner.run(SMALL, few, tmp_path / "again")
+    resumed, anew = (runner.run(SMALL, open_recording(few), tmp_path / name)
+                     for name in ("out", "again"))
+    assert resumed == anew
 
 
 # What is in the way
@@ -157,17 +161,17 @@ def test_a_frame_that_was_skipped_is_tried_again(few, tmp_path):
 
 def test_another_plan_is_an_error_that_names_what_differs(few, tmp_path):
     out = tmp_path / "out"
-    runner.run(small(limits=(1, 2), deep={"a": 1, "b": 2}), few, out)
+    runner.run(small(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(few), out)
     before = (out / journal.NAME).read_bytes()
     with pytest.raises(InputError, match=r"settings.deep.b 2, not 3; .*--force") as error:
-        runner.run(small(limits=(1, 2), deep={"a": 1, "b": 3}), few, out)
+        runner.run(small(limits=(1, 2), deep={"a": 1, "b": 3}), open_recording(few), out)
     assert "deep.a" not in str(error.value) and "limits" not in str(error.value)
     other = object_folder(tmp_path / "other", count=4)
-    with pytest.raises(InputError, match=r"kitti '.*few', not '.*other'; frames 5, not 4"):
-        runner.run(small(limits=(1, 2), deep={"a": 1, "b": 2}), other, out)
+    with pytest.raises(InputError, match=r"data '.*few', not '.*other'; frames 5, not 4"):
+        runner.run(small(limits=(1, 2), deep={"a": 1, "b": 2}), open_recording(other), out)
     assert (out / journal.NAME).read_bytes() == before
-    runner.run(SMALL, other, out, force=True)
-    assert len(runner.run(SMALL, other, out)) == 4
+    runner.run(SMALL, open_recording(other), out, force=True)
+    assert len(runner.run(SMALL, open_recording(other), out)) == 4
 
 
 def test_a_folder_of_something_else_is_left_alone(few, tmp_path):
@@ -175,19 +179,19 @@ def test_a_folder_of_something_else_is_left_alone(few, tmp_path):
     write(out / "letter.txt", "dear")
     write(out / "figures/photo.png", "me")
     with pytest.raises(InputError, match=f"{out} exists already.*--force"):
-        runner.run(SMALL, few, out)
+        runner.run(SMALL, open_recording(few), out)
     assert sorted(p.name for p in out.rglob("*.*")) == ["letter.txt", "photo.png"]
-    runner.run(SMALL, few, out, force=True)
+    runner.run(SMALL, open_recording(few), out, force=True)
     assert (out / "letter.txt").read_text() == "dear" and (out / "figures/photo.png").exists()
     with pytest.raises(InputError, match="is a file"):
-        runner.run(SMALL, few, out / "letter.txt")
+        runner.run(SMALL, open_recording(few), out / "letter.txt")
     with pytest.raises(InputError, match="cannot make the folder"):
-        runner.run(SMALL, few, out / "letter.txt/deeper")
+        runner.run(SMALL, open_recording(few), out / "letter.txt/deeper")
 
 
 def test_force_begins_anew_and_leaves_no_old_table(whole, few, tmp_path):
     shutil.copytree(whole, tmp_path / "out")
-    records = runner.run(SMALL, few, tmp_path / "out", force=True)
+    records = runner.run(SMALL, open_recording(few), tmp_path / "out", force=True)
     assert [p.name for p in (tmp_path / "out").rglob("*.*")] == [journal.NAME]
     write_report(tmp_path / "out", SMALL, records, points_table(records), {})
     assert [p.stem for p in (tmp_path / "out").rglob("*.csv")] == ["points"]
@@ -197,14 +201,14 @@ def test_force_begins_anew_and_leaves_no_old_table(whole, few, tmp_path):
 def test_a_journal_without_a_plan_is_not_gone_on_with(few, tmp_path, first):
     write(tmp_path / "out" / journal.NAME, first + "\n")
     with pytest.raises(InputError, match=r"cannot read .*--force"):
-        runner.run(SMALL, few, tmp_path / "out")
-    assert len(runner.run(SMALL, few, tmp_path / "out", force=True)) == 5
+        runner.run(SMALL, open_recording(few), tmp_path / "out")
+    assert len(runner.run(SMALL, open_recording(few), tmp_path / "out", force=True)) == 5
 
 
 def test_two_runs_do_not_write_one_folder(few, tmp_path):
     with (journal.journal(tmp_path / "out", {}) as _,
           pytest.raises(InputError, match="another process")):
-        runner.run(SMALL, few, tmp_path / "out", force=True)
+        runner.run(SMALL, open_recording(few), tmp_path / "out", force=True)
 
 
 def test_a_full_disk_is_one_line_and_the_rest_goes_on_later(few, tmp_path, monkeypatch):
@@ -215,14 +219,14 @@ def test_a_full_disk_is_one_line_and_the_rest_goes_on_later(few, tmp_path, monke
         patch.setattr(journal, "SYNC_S", -1.0)
         patch.setattr(journal.Journal, "sync", full)
         with pytest.raises(InputError, match=r"No space left.*the same command resumes"):
-            runner.run(SMALL, few, tmp_path / "out")
-    assert len(runner.run(SMALL, few, tmp_path / "out")) == 5
+            runner.run(SMALL, open_recording(few), tmp_path / "out")
+    assert len(runner.run(SMALL, open_recording(few), tmp_path / "out")) == 5
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_mistake_in_an_experiment_is_not_a_skipped_frame(few, tmp_path, jobs, capfd):
     with pytest.raises((ZeroDivisionError, InputError)) as error:
-        runner.run(small(break_down), few, tmp_path / "out", jobs=jobs)
+        runner.run(small(break_down), open_recording(few), tmp_path / "out", jobs=jobs)
     said = capfd.readouterr().err + "".join(getattr(error.value, "__notes__", []))
     assert "while frame 000002 was measured" in said
     assert '"000002"' not in "".join(lines_of(tmp_path / "out"))
@@ -230,12 +234,12 @@ def test_a_mistake_in_an_experiment_is_not_a_skipped_frame(few, tmp_path, jobs, 
 
 def test_a_record_that_is_no_json_is_a_mistake(few, tmp_path):
     with pytest.raises(ValueError, match="JSON"):
-        runner.run(small(not_json), few, tmp_path / "out")
+        runner.run(small(not_json), open_recording(few), tmp_path / "out")
 
 
 def test_a_process_that_is_killed_ends_the_run_with_a_reason(few, tmp_path):
     with pytest.raises(InputError, match=r"measured frames.*want of memory: try fewer --jobs"):
-        runner.run(small(end_the_process), few, tmp_path / "out", jobs=2)
+        runner.run(small(end_the_process), open_recording(few), tmp_path / "out", jobs=2)
 
 
 # Broken frames
@@ -264,7 +268,7 @@ def test_broken_frames_are_skipped_by_name_and_the_others_are_as_before(crowds, 
             path.unlink()
         else:
             path.write_bytes(change(path.read_bytes()))
-    records = {r["frame"]: r for r in runner.run(STM_CPA, root, tmp_path / "out")}
+    records = {r["frame"]: r for r in runner.run(STM_CPA, open_recording(root), tmp_path / "out")}
     assert len(records) == COUNT
     for name in BROKEN:
         frame = Path(name).stem
@@ -279,12 +283,23 @@ def test_broken_frames_are_skipped_by_name_and_the_others_are_as_before(crowds, 
     assert sum("skipped" not in r for r in records.values()) == COUNT - len(BROKEN) - 1
 
 
+def test_a_split_leaves_out_all_else(few, tmp_path):
+    (few / "training/velodyne/000004.bin").unlink()
+    split = write(tmp_path / "split.txt", "000002\n000000\n")
+    whole = open_recording(few)
+    assert [name for name, _ in whole.lost] == ["000004"]
+    records = runner.run(SMALL, open_recording(few, split=split), tmp_path / "out")
+    assert [(r["frame"], "skipped" in r) for r in records] == [("000002", False), ("000000", False)]
+    assert [r["frame"] for r in runner.run(SMALL, whole, tmp_path / "all")][-1] == "000004"
+
+
 def test_a_folder_without_scans_or_pedestrians_is_an_error(tmp_path):
-    for argument, words in ((tmp_path / "none", "is not a folder"), (tmp_path, "no KITTI scans")):
+    for argument, words in ((tmp_path / "none", "there is no "),
+                            (tmp_path, "is no recording that can be read")):
         with pytest.raises(InputError, match=words):
-            command("--kitti", argument, "--out", tmp_path / "out")
+            command("--data", argument, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
     nobody = object_folder(tmp_path / "nobody", "")
     with pytest.raises(InputError, match=r"no frame could be measured.*no Pedestrian"):
-        command("--kitti", nobody, "--out", tmp_path / "out", "--jobs", 1)
+        command("--data", nobody, "--out", tmp_path / "out", "--jobs", 1)
     assert json.loads((tmp_path / "out/report.json").read_text())["skipped"] == 2

@@ -8,20 +8,26 @@ import detection_samples
 import numpy as np
 import pointnet_samples
 import pytest
-from cli_samples import exit_of
+from cli_samples import error_line, exit_of
 from click.testing import CliRunner
 from kitti_samples import tracking_folder
 from samples import crowd_folder, object_folder, walker_label, write
 
 from lidar_perception.cli.main import cli
-from lidar_perception.data.kitti.folder import open_kitti
-from lidar_perception.detectors.pointnet import checkpoint as pointnet
+from lidar_perception.data.open import open_recording
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
+from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
-from lidar_perception.detectors.pointpillars import checkpoint as pointpillars
 from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
-from lidar_perception.scoring.comparison.outcomes import Contender, Outcome, compare, in_turn
+from lidar_perception.scoring.comparison.outcomes import (
+    ComparisonReport,
+    Contender,
+    by_contenders,
+    in_turn,
+)
 from lidar_perception.scoring.comparison.report import spread
 from lidar_perception.scoring.kitti.protocol import SCORED
+from lidar_perception.scoring.run import fill
 from lidar_perception.types import Detections, InputError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -44,11 +50,9 @@ def weights(tmp_path_factory):
     folder = tmp_path_factory.mktemp("weights")
     config = detection_samples.tiny()
     for name, seed in ("a", 0), ("b", 1):
-        pointpillars.save_checkpoint(folder / name, detection_samples.lively(config, seed),
-                                     pointpillars.Header(config))
+        save_checkpoint(folder / name, detection_samples.lively(config, seed), Header(config))
     config = pointnet_samples.small()
-    pointnet.save_checkpoint(folder / "c", pointnet_samples.lively(config),
-                             pointnet.Header(config))
+    save_checkpoint(folder / "c", pointnet_samples.lively(config), Header(config))
     return folder
 
 
@@ -60,11 +64,22 @@ def run(tmp_path, *arguments) -> tuple[dict, str]:
     return json.loads(path.read_text()), result.stdout
 
 
-def taken(root, *finds, frames=None) -> list[Outcome]:
-    outcomes = [Outcome(Contender(str(i), find)) for i, find in enumerate(finds)]
-    for _ in compare(frames or open_kitti(root), outcomes, []):
-        pass
-    return outcomes
+def taken(root, *detectors) -> dict:
+    """The report of detectors: functions of a frame to a detector, or None."""
+    contenders = [Contender(str(i), each) for i, each in enumerate(detectors)]
+    report = ComparisonReport(contenders)
+    fill(report, open_recording(root), by_contenders(lambda: contenders))
+    return report.compute()
+
+
+def saying(say):
+    """What gives a detector for each frame that says what say(frame) gives, Detections."""
+    return lambda frame: lambda scan: Found(say(frame))
+
+
+def right(frame, score=0.9) -> Detections:
+    truth = frame.truth()
+    return Detections.of(truth.boxes, truth.class_ids, score)
 
 
 def test_all_detectors_are_compared_and_what_is_missing_is_listed(bare, weights, tmp_path,
@@ -72,7 +87,7 @@ def test_all_detectors_are_compared_and_what_is_missing_is_listed(bare, weights,
     monkeypatch.setenv("COLUMNS", "100")
     root, png = crowd_folder(tmp_path / "kitti", 3), tmp_path / "pictures/compare.png"
     given = [word for name in "acb" for word in ("--weights", weights / name)]
-    content, text = run(tmp_path, "--kitti", root, *given, "--png", png, "--device", "cpu")
+    content, text = run(tmp_path, "--data", root, *given, "--png", png, "--device", "cpu")
     assert [*content["rows"]] == [
         *CANDIDATES, "PointPillars v0 compact", "PointNet", "PointPillars v0 compact #2",
         "STM-CPA + PointNet", "STM-CPA + PointNet, auto", "PP v0 compact + PointNet"]
@@ -98,8 +113,8 @@ def test_all_detectors_are_compared_and_what_is_missing_is_listed(bare, weights,
 
 
 def test_without_networks_the_candidates_are_compared_in_any_layout(bare, tmp_path):
-    content, _ = run(tmp_path, "--kitti", tracking_folder(tmp_path / "kitti"), "--frames", 2,
-                        "--png", tmp_path / "a.png")
+    content, _ = run(tmp_path, "--data", tracking_folder(tmp_path / "kitti"), "--limit", 2,
+                     "--png", tmp_path / "a.png")
     assert [*content["rows"]] == CANDIDATES and content["frames"] == 2
     reasons = {each["name"]: each["reason"] for each in content["missing"]}
     assert len(reasons) == 14 and "no PointNet" in reasons["STM-CPA + PointNet"]
@@ -110,19 +125,16 @@ def test_without_networks_the_candidates_are_compared_in_any_layout(bare, tmp_pa
 def test_a_detector_that_finds_everything_has_100_and_one_that_fails_goes_on(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=3)
 
-    def right(recorded):
-        return Detections.of(recorded.truth.boxes, recorded.truth.class_ids, 0.9)
-
-    def fails(recorded):
-        if recorded.name == "000001":
+    def fails(frame):
+        if frame.name == "000001":
             raise InputError("too dark")
-        return right(recorded)
+        return right(frame)
 
-    def broken(recorded):
-        return Detections.of(np.vstack([recorded.truth.boxes, np.full((1, 7), np.nan)]))
+    def broken(frame):
+        return Detections.of(np.vstack([frame.truth().boxes, np.full((1, 7), np.nan)]))
 
-    whole, failing, other, nan = (each.content() for each in taken(
-        root, right, fails, lambda recorded: None, broken))
+    whole, failing, other, nan = taken(root, saying(right), saying(fails), lambda frame: None,
+                                       saying(broken))["rows"].values()
     assert whole["ap"]["Pedestrian"]["3d"]["moderate"] == 100 == whole["mean_ap"]["3d"]
     assert whole["pedestrian_centres"]["operating"]["f1"] == 1 and whole["failed"] == []
     assert (failing["frames"], failing["failed"]) == (2, ["000001: too dark"])
@@ -136,10 +148,8 @@ def test_a_detector_that_finds_everything_has_100_and_one_that_fails_goes_on(tmp
 def test_pedestrians_count_from_the_operating_score_on(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=1)
 
-    def unsure(recorded):
-        return Detections.of(recorded.truth.boxes, recorded.truth.class_ids, 0.2)
-
-    row = taken(root, unsure)[0].content()["pedestrian_centres"]
+    row, = taken(root, saying(lambda frame: right(frame, 0.2)))["rows"].values()
+    row = row["pedestrian_centres"]
     assert (row["operating"]["tp"], row["best"]["tp"]) == (0, 1)
     assert row["best"]["score"] == pytest.approx(0.2)
 
@@ -152,8 +162,8 @@ def test_detectors_take_turns(tmp_path):
         for place in range(count):
             assert sorted(order[place] for order in orders) == sorted(2 * items)
     said = []
-    finds = [lambda recorded, i=i: said.append((recorded.name, i)) for i in range(3)]
-    taken(object_folder(tmp_path, walker_label(), count=3), *finds)
+    taken(object_folder(tmp_path, walker_label(), count=3),
+          *(lambda frame, i=i: said.append((frame.name, i)) for i in range(3)))
     first, *rest = (said[i:i + 3] for i in range(0, len(said), 3))
     assert first == rest[0] and len(rest) == 3  # the first frame once more before it counts
     assert [frame[0][1] for frame in rest] == [0, 1, 2]
@@ -162,14 +172,14 @@ def test_detectors_take_turns(tmp_path):
 def test_what_cannot_be_read_is_skipped(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=2)
     write(root / "training/velodyne/000000.bin", b"123")
-    outcomes, skipped = [Outcome(Contender("a", lambda recorded: Detections.none()))], []
-    assert len([*compare(open_kitti(root), outcomes, skipped)]) == 2
-    assert outcomes[0].content()["frames"] == 1 and "000000.bin" in skipped[0]
+    content = taken(root, saying(lambda frame: Detections.none()))
+    line, = content["skipped"]
+    assert content["frames"] == content["rows"]["0"]["frames"] == 1 and "000000.bin" in line
 
 
 def test_a_class_without_labels_is_left_out_of_the_mean(tmp_path):
     root = object_folder(tmp_path, walker_label(), count=1)
-    row = taken(root, lambda recorded: Detections.none())[0].content()
+    row, = taken(root, saying(lambda frame: Detections.none()))["rows"].values()
     assert row["mean_ap"] == dict.fromkeys(row["mean_ap"], 0.0)
     assert [row["ap"][name]["3d"]["moderate"] for name in SCORED] == [None, 0.0, None]
 
@@ -191,7 +201,7 @@ def test_names_in_the_figure_keep_their_distance():
 @pytest.mark.parametrize("case", ["labels", "weights", "folder"])
 def test_bad_input_is_one_line(case, bare, tmp_path, monkeypatch, capsys):
     root = object_folder(tmp_path / "kitti")
-    arguments = ["--kitti", root]
+    arguments = ["--data", root]
     if case == "labels":
         for path in (root / "training/label_2").iterdir():
             path.unlink()
@@ -200,7 +210,6 @@ def test_bad_input_is_one_line(case, bare, tmp_path, monkeypatch, capsys):
         arguments += ["--weights", tmp_path / "w"]
         expected = f"there is no checkpoint {tmp_path / 'w'}"
     else:
-        arguments, expected = ["--kitti", tmp_path / "none"], "none is not a folder"
+        arguments, expected = ["--data", tmp_path / "none"], f"there is no {tmp_path / 'none'}"
     assert exit_of(monkeypatch, "compare", *arguments) == 2
-    line, = capsys.readouterr().err.strip().splitlines()[-1:]
-    assert line.startswith("Error: ") and expected in line
+    assert expected in error_line(capsys)

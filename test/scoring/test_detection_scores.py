@@ -17,6 +17,7 @@ from lidar_perception.data.kitti.write import image_boxes
 from lidar_perception.scoring.average_precision import at_recall, averages, recall_thresholds
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.scores import CentreScores
+from lidar_perception.scoring.detections import Detected
 from lidar_perception.scoring.kitti.camera_objects import camera_objects
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED, Comparison, precision
 from lidar_perception.scoring.kitti.report import ROWS, DetectionReport, mean_3d
@@ -35,12 +36,12 @@ def report(frames, calibration=CALIBRATION):
     """frames: (label text, result text)."""
     total = DetectionReport()
     for truth, found in frames:
-        total.add("frame", labels(truth), labels(found), calibration)
+        total.update(Detected("frame", labels(truth), labels(found), calibration))
     return total
 
 
 def ap(frames):
-    return report(frames).content()["ap"]
+    return report(frames).compute()["ap"]
 
 
 def numbers(content):
@@ -206,8 +207,8 @@ def test_the_truth_scores_100_in_everything(seed):
         scores = rng.uniform(0, 1, len(truth))
         found = GroundTruth.of(truth.boxes, truth.class_ids,
                                [{**e, "score": s} for e, s in zip(truth.extras, scores)])
-        total.add("frame", truth, found, CALIBRATION)
-    content = total.content()
+        total.update(Detected("frame", truth, found, CALIBRATION))
+    content = total.compute()
     for name in SCORED:
         for row in ("image", "aos", "bev", "3d", "bev_relaxed", "3d_relaxed"):
             for level in DIFFICULTIES:
@@ -227,7 +228,7 @@ def test_the_order_of_detections_changes_nothing(seed):
                  for line in found.splitlines()]
         frames.append((truth, together(*lines)))
         shuffled.append((truth, together(*rng.permutation(lines))))
-    assert report(frames).content() == report(shuffled).content()
+    assert report(frames).compute() == report(shuffled).compute()
 
 
 def test_the_order_of_equal_scores_changes_nothing():
@@ -259,9 +260,9 @@ def test_frames_one_by_one_are_the_frames_together_and_empty_ones_change_nothing
 
 
 def test_without_objects_or_frames_there_is_no_figure():
-    content = report([]).content()
+    content = report([]).compute()
     assert content["frames"] == 0 and content["ap"] == {} and content["map_3d"] is None
-    content = report([("", car(score=0.5))]).content()
+    content = report([("", car(score=0.5))]).compute()
     assert mean_3d(content["ap"]) is None and content["ap"]["Car"]["3d"]["easy"] is None
     json.dumps(content, allow_nan=False)
 
@@ -281,11 +282,11 @@ def test_detections_are_projected_and_outside_the_image_they_do_not_count():
     found = Detections.of([ahead, behind, beside], CLASSES.index("Car"), [0.5, 0.9, 0.8])
     for boxes, expected in ((found, 100), (found[1:], 0)):
         total = DetectionReport()
-        total.add("frame", truth, boxes, CALIBRATION)
-        assert total.content()["ap"]["Car"]["bev"]["hard"]["r40"] == expected
+        total.update(Detected("frame", truth, boxes, CALIBRATION))
+        assert total.compute()["ap"]["Car"]["bev"]["hard"]["r40"] == expected
     total = DetectionReport()
-    total.add("frame", truth, found)  # no camera: everything around counts
-    rows = total.content()["ap"]["Car"]
+    total.update(Detected("frame", truth, found))  # no camera: everything around counts
+    rows = total.compute()["ap"]["Car"]
     assert rows["bev"]["hard"]["r40"] == pytest.approx(100 / 3) and "image" not in rows
 
 
@@ -293,7 +294,7 @@ def test_detections_are_projected_and_outside_the_image_they_do_not_count():
 def test_a_number_that_is_not_finite_is_an_error_that_names_the_frame(broken):
     found = Detections.of(**{"boxes": labels(car()).boxes, "class_ids": 0, "scores": 1, **broken})
     with pytest.raises(InputError, match=r"^000123: .*box 1 of 1 .*not finite"):
-        DetectionReport().add("000123", labels(car()), found, CALIBRATION)
+        DetectionReport().update(Detected("000123", labels(car()), found, CALIBRATION))
 
 
 @pytest.mark.parametrize("shift, taller, words", [
@@ -307,8 +308,8 @@ def test_boxes_that_are_right_from_above_but_not_in_space_are_noticed(shift, tal
     truth = labels(together(*(car(left=100 * i, x=5.0 * i - 10) for i in range(5))))
     found = Detections.of(truth.boxes + [0, 0, shift, 0, 0, taller, 0], 0, np.arange(5) / 5)
     for _ in range(10):
-        total.add("frame", truth, found, CALIBRATION)
-    content = total.content()
+        total.update(Detected("frame", truth, found, CALIBRATION))
+    content = total.compute()
     assert content["matched"]["Car"]["pairs"] == 50
     assert content["matched"]["Car"]["z_error_m"] == pytest.approx(shift, abs=0.01)
     assert content["ap"]["Car"]["bev"]["moderate"]["r40"] > 99
@@ -332,9 +333,9 @@ def test_the_best_score_is_the_best_of_all_scores(seed):
     for _ in range(6):
         truth, found = (np.column_stack([rng.uniform(-2, 2, (n, 3)), np.ones((n, 4))])
                         for n in rng.integers(1, 6, 2))
-        scores.add(truth, found, rng.integers(0, 3, len(found)) / 2)
+        scores.update(truth, found, rng.integers(0, 3, len(found)) / 2)
     assert scores.table(scores.best_score())["all"]["f1"] == pytest.approx(brute_best(scores))
-    row = scores.content()["of_all"]["all"]
+    row = scores.compute()["of_all"]["all"]
     assert row["tp"] == sum(len(match_centres(found, truth)[0])
                             for truth, found, _ in scores.frames)
 
@@ -342,8 +343,8 @@ def test_the_best_score_is_the_best_of_all_scores(seed):
 def test_detections_of_equal_score_are_kept_together():
     # From 0.9 on: 2 * 1 / (1 + 2). From 0.5 on: 2 * 2 / (5 + 2). The hit alone is no choice.
     scores, person, wrong = CentreScores(), np.array([[10.0, 0, 0, 1, 1, 1, 0]]), np.ones((3, 7))
-    scores.add(person, person, np.array([0.9]))
-    scores.add(person, np.concatenate([person, wrong]), np.full(4, 0.5))
+    scores.update(person, person, np.array([0.9]))
+    scores.update(person, np.concatenate([person, wrong]), np.full(4, 0.5))
     assert scores.best_score() == 0.9
 
 
@@ -354,9 +355,9 @@ def test_pedestrians_by_centre_distance_worked_out_by_hand():
                            [PEDESTRIAN] * 2)
     near, far, behind = (person + [dx, 0, 0, 0, 0, 0, 0] for dx in (0.9, 1.1, -30))
     found = Detections.of([near, far, behind], PEDESTRIAN, [0.8, 0.3, 0.9])
-    total.add("a", truth, found, CALIBRATION)
-    total.add("no pedestrian", GroundTruth.of([], []), found, CALIBRATION)
-    content = total.content()["pedestrian_centres"]
+    total.update(Detected("a", truth, found, CALIBRATION))
+    total.update(Detected("no pedestrian", GroundTruth.of([], []), found, CALIBRATION))
+    content = total.compute()["pedestrian_centres"]
     assert (content["frames"], content["ground_truth"]) == (1, 2)
     # near hits; far does not; what is behind the camera does not count: 2 * 1 / (2 + 2)
     assert content["of_all"]["all"]["f1"] == 0.5

@@ -7,15 +7,17 @@ import types
 
 import numpy as np
 import pytest
+from cli_samples import error_line, exit_of
 from cli_samples import evaluate_detection as evaluate
-from cli_samples import exit_of
 from samples import CALIBRATION, LABELS, object_folder, write
 
 from lidar_perception.data.kitti.folder import open_kitti
 from lidar_perception.data.kitti.results import read_results, write_results
+from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
 from lidar_perception.scoring.thinning import thinned
-from lidar_perception.types import CLASSES, Detections, InputError
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, InputError
 
 PERSON, CAR, REGION = LABELS.splitlines()
 WHOLE = CAR.replace("0.35 2", "0.00 0")
@@ -24,8 +26,7 @@ ROWS = ("image", "aos", "bev", "3d", "bev_relaxed", "3d_relaxed")
 
 def error_of(monkeypatch, capsys, *arguments):
     assert exit_of(monkeypatch, "evaluate", "detection", *arguments) == 2
-    line, = capsys.readouterr().err.strip().splitlines()
-    return line
+    return error_line(capsys)
 
 
 def cells(content):
@@ -57,12 +58,12 @@ def detector(monkeypatch):
     was asked."""
     made = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
 
-    def open_detector(path, device="auto", min_score=None):
-        made.asked.append((str(path), device))
+    def open_detector(path, device="auto", *, min_score=None, sensor_height=None):
+        made.asked.append((str(path), device, min_score, sensor_height))
 
         def detect(frame):
             made.scans.append(frame)
-            return made.find(frame)
+            return Found(made.find(frame))
         return detect
 
     module = types.ModuleType("lidar_perception.detectors.open")
@@ -78,7 +79,7 @@ def truth_of(kitti):
 
 def test_the_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    content, text = evaluate(tmp_path, "--kitti", kitti, "--results", found)
+    content, text = evaluate(tmp_path, "--data", kitti, "--results", found)
     assert content["frames"] == 2 and content["source"] == str(found)
     assert len(cells(content)) == 2 * len(ROWS) * len(DIFFICULTIES)
     assert {(c["objects"], c["r11"], c["r40"]) for c in cells(content).values()} == {(2, 100, 100)}
@@ -91,11 +92,11 @@ def test_the_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path,
 
 
 def test_scans_are_not_needed_for_result_files(kitti, found, tmp_path):
-    before, _ = evaluate(tmp_path, "--kitti", kitti, "--results", found)
+    before, _ = evaluate(tmp_path, "--data", kitti, "--results", found)
     for path in (kitti / "training/velodyne").iterdir():
         path.unlink()
     (kitti / "training/velodyne").rmdir()
-    after, _ = evaluate(tmp_path, "--kitti", kitti / "training", "--results", found)
+    after, _ = evaluate(tmp_path, "--data", kitti / "training", "--results", found)
     assert after == before
     with pytest.raises(InputError, match="no KITTI scans"):
         open_kitti(kitti)
@@ -103,9 +104,10 @@ def test_scans_are_not_needed_for_result_files(kitti, found, tmp_path):
 
 def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
     detector.find = lambda frame: truth_of(kitti)
-    content, text = evaluate(tmp_path, "--kitti", kitti, "--weights", "v4.safetensors",
+    content, text = evaluate(tmp_path, "--data", kitti, "--weights", "v4.safetensors",
                              "--device", "cpu")
-    assert detector.asked == [("v4.safetensors", "cpu")] and len(detector.scans) == 2
+    assert detector.asked == [("v4.safetensors", "cpu", MIN_SCORE, SENSOR_HEIGHT)]
+    assert len(detector.scans) == 2
     assert len(detector.scans[0]) == len(open_kitti(kitti)[0].load())
     assert content["ms"] >= 0 and "ms a frame" in text
     for (_, row, _), cell in cells(content).items():
@@ -117,7 +119,7 @@ def test_a_share_of_the_points_is_kept_and_always_the_same(kitti, detector, tmp_
     kept = {}
     for share in (1, 0.1, 0.1):
         detector.scans.clear()
-        content, _ = evaluate(tmp_path, "--kitti", kitti, "--weights", "w", "--keep", share)
+        content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--keep", share)
         assert content["keep"] == share
         points = [np.column_stack([scan.xyz, scan.intensity]) for scan in detector.scans]
         for now, before in zip(points, kept.get(share, points), strict=True):
@@ -147,10 +149,10 @@ def test_written_results_score_as_what_was_found(kitti, detector, tmp_path):
         truth_of(kitti).boxes + noise.normal(0, 0.02, 7), truth_of(kitti).class_ids,
         [0.123456, 3])
     out = tmp_path / "out/data"
-    direct, text = evaluate(tmp_path, "--kitti", kitti, "--weights", "w", "--write-results", out)
+    direct, text = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", out)
     assert "result files" in text and sorted(p.name for p in out.iterdir()) == [
         "000000.txt", "000001.txt"]
-    read, _ = evaluate(tmp_path, "--kitti", kitti, "--results", out)
+    read, _ = evaluate(tmp_path, "--data", kitti, "--results", out)
     for key, cell in cells(direct).items():
         assert cells(read)[key] == pytest.approx(cell, abs=1e-3)
 
@@ -180,19 +182,19 @@ def test_frames_without_labels_are_written_and_not_scored(kitti, detector, tmp_p
                                                           capsys):
     (kitti / "training/label_2/000001.txt").unlink()
     out = tmp_path / "out"
-    content, _ = evaluate(tmp_path, "--kitti", kitti, "--weights", "w", "--write-results", out)
+    content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", out)
     assert content["frames"] == 1 and (out / "000001.txt").exists()
     (kitti / "training/label_2/000000.txt").unlink()
-    content, _ = evaluate(tmp_path, "--kitti", kitti, "--weights", "w", "--write-results", out)
+    content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", out)
     assert content["frames"] == 0
-    line = error_of(monkeypatch, capsys, "--kitti", kitti, "--weights", "w")
+    line = error_of(monkeypatch, capsys, "--data", kitti, "--weights", "w")
     assert line == f"Error: {kitti}: no frame with labels"
 
 
 def test_a_scan_that_was_cut_is_skipped_and_one_that_is_refused_is_missed(kitti, detector,
                                                                          tmp_path):
     write(kitti / "training/velodyne/000001.bin", b"123")
-    content, text = evaluate(tmp_path, "--kitti", kitti, "--weights", "w")
+    content, text = evaluate(tmp_path, "--data", kitti, "--weights", "w")
     line, = content["skipped"]
     assert "000001.bin" in line and "was cut" in line and "skipped" in text
     assert content["frames"] == 1
@@ -200,7 +202,7 @@ def test_a_scan_that_was_cut_is_skipped_and_one_that_is_refused_is_missed(kitti,
     def refuse(frame):
         raise InputError("the cloud has no intensity")
     detector.find = refuse
-    content, _ = evaluate(tmp_path, "--kitti", kitti, "--weights", "w")
+    content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w")
     assert content["skipped"][0] == "000000: the cloud has no intensity"
     assert content["frames"] == 1 and content["ap"]["Car"]["3d"]["hard"]["r40"] == 0
 
@@ -208,7 +210,7 @@ def test_a_scan_that_was_cut_is_skipped_and_one_that_is_refused_is_missed(kitti,
 def test_a_split_says_which_frames_are_scored(kitti, found, tmp_path):
     (found / "000000.txt").unlink()
     split = write(tmp_path / "val.txt", "000001\n000001\n")
-    content, _ = evaluate(tmp_path, "--kitti", kitti, "--results", found, "--split", split)
+    content, _ = evaluate(tmp_path, "--data", kitti, "--results", found, "--split", split)
     assert content["frames"] == 1
 
 
@@ -226,19 +228,19 @@ BAD = {
 def test_a_bad_result_file_is_named_with_its_line(case, kitti, found, monkeypatch, capsys):
     content, words = BAD[case]
     write(found / "000000.txt", content)
-    line = error_of(monkeypatch, capsys, "--kitti", kitti, "--results", found)
+    line = error_of(monkeypatch, capsys, "--data", kitti, "--results", found)
     assert line.startswith("Error: ") and words in line and str(found) in line
 
 
 def test_what_is_missing_is_named(kitti, found, tmp_path, monkeypatch, capsys):
     def error(*arguments):
-        return error_of(monkeypatch, capsys, "--kitti", kitti, *arguments)
+        return error_of(monkeypatch, capsys, "--data", kitti, *arguments)
 
     assert "none is not a folder" in error("--results", tmp_path / "none")
-    assert "cannot read the frames" in error("--results", found, "--split", tmp_path / "none")
+    assert "cannot read the split" in error("--results", found, "--split", tmp_path / "none")
     split = write(tmp_path / "split.txt", "000001 000007 000008")
     line = error("--results", found, "--split", split)
-    assert "names the frame 000007 (2 such)" in line
+    assert "names 000007 (2 such)" in line and str(kitti) in line
     assert "names no frame" in error("--results", found, "--split", write(split, "\n"))
     (found / "000001.txt").unlink()
     assert f"no result file {found / '000001.txt'}" in error("--results", found)
@@ -248,12 +250,12 @@ def test_what_is_missing_is_named(kitti, found, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize("arguments, words", [
-    (["--kitti", "a"], "give either --results DIR or --weights FILE"),
-    (["--kitti", "a", "--results", "b", "--weights", "c"], "give either"),
-    (["--kitti", "a", "--results", "b", "--keep", "0.1"], "--keep thins the scans"),
-    (["--kitti", "a", "--weights", "b", "--keep", "1.1"], "1.1 is not in the range"),
-    (["--results", "b"], "--kitti"),
-    (["--kitti", "a", "--results", "b", "--write-results", "c"], "has its files already"),
+    (["--data", "a"], "give either --results DIR or --weights FILE"),
+    (["--data", "a", "--results", "b", "--weights", "c"], "give either"),
+    (["--data", "a", "--results", "b", "--keep", "0.1"], "--keep thins the scans"),
+    (["--data", "a", "--weights", "b", "--keep", "1.1"], "1.1 is not in the range"),
+    (["--results", "b"], "Missing option '--data'"),
+    (["--data", "a", "--results", "b", "--write-results", "c"], "has its files already"),
 ])
 def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):
     assert exit_of(monkeypatch, "evaluate", "detection", *arguments) == 2
@@ -269,7 +271,7 @@ def test_real_labels_as_their_own_results_score_100(data, tmp_path):
     root = data / "kitti_object"
     for path in root.glob("training/label_2/*.txt"):
         write(tmp_path / "found" / path.name, with_scores(path))
-    content, _ = evaluate(tmp_path, "--kitti", root, "--results", tmp_path / "found")
+    content, _ = evaluate(tmp_path, "--data", root, "--results", tmp_path / "found")
     found = cells(content)
     assert content["frames"] == 57 and len(found) == len(SCORED) * len(ROWS) * len(DIFFICULTIES)
     assert {(c["r11"], c["r40"]) for c in found.values()} == {(100, 100)}
@@ -287,7 +289,7 @@ def test_real_boxes_without_2d_boxes_are_projected_onto_the_labels(data, detecto
         truth = next(truths)
         return Detections.of(truth.boxes, truth.class_ids, np.linspace(1, 0.5, len(truth)))
     detector.find = find
-    content, _ = evaluate(tmp_path, "--kitti", data / "kitti_object", "--weights", "w")
+    content, _ = evaluate(tmp_path, "--data", data / "kitti_object", "--weights", "w")
     for (name, row, _), cell in cells(content).items():
         assert cell["r40"] > (80 if name == "Pedestrian" and row in ("image", "aos") else 99.99)
 
@@ -299,7 +301,7 @@ def test_real_tracks_are_scored_by_what_is_outside_the_image(data, tmp_path):
         truth = frame.truth()
         write_results(tmp_path / f"found/{frame.name}.txt",
                       Detections.of(truth.boxes, truth.class_ids), frame.calibration())
-    content, _ = evaluate(tmp_path, "--kitti", root, "--results", tmp_path / "found")
+    content, _ = evaluate(tmp_path, "--data", root, "--results", tmp_path / "found")
     assert content["frames"] == len(frames) == 30
     assert content["ap"]["Cyclist"]["3d"]["easy"]["r40"] == pytest.approx(100)
     levels = [content["ap"]["Car"]["3d"][level]["objects"] for level in DIFFICULTIES]

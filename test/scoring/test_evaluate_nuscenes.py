@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
 import json
 import types
 
+import detection_samples
 import numpy as np
 import nuscenes_folder as folder
+import pointnet_samples
 import pytest
-from cli_samples import exit_of
+from cli_samples import error_line, exit_of
 from click.testing import CliRunner
 
-from lidar_perception.cli import nuscenes as command
 from lidar_perception.cli.main import cli
 from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
 from lidar_perception.data.nuscenes.folder import open_nuscenes
@@ -23,6 +23,9 @@ from lidar_perception.data.nuscenes.results import (
     to_results,
     write_results,
 )
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
+from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.open import open_detector
 from lidar_perception.scoring.nuscenes.report import OURS
 from lidar_perception.types import CLASSES, Detections, InputError
 
@@ -50,10 +53,10 @@ def detector(monkeypatch):
     """A stand-in for the detector of a checkpoint."""
     made = types.SimpleNamespace(asked=[], find=lambda scan: Detections.none())
 
-    def detector_at(*arguments):
-        made.asked.append(arguments)
-        return lambda scan: made.find(scan)
-    monkeypatch.setattr(command, "detector_at", detector_at)
+    def opened(path, device, *, sensor_height):
+        made.asked.append((path, device, sensor_height))
+        return lambda scan: Found(made.find(scan))
+    monkeypatch.setattr("lidar_perception.detectors.open.open_detector", opened)
     return made
 
 
@@ -67,8 +70,7 @@ def evaluate(tmp_path, *arguments):
 
 def error_of(monkeypatch, capsys, *arguments):
     assert exit_of(monkeypatch, "evaluate", "nuscenes", *arguments) == 2
-    line, = capsys.readouterr().err.strip().splitlines()
-    return line
+    return error_line(capsys)
 
 
 def by_stamp(root):
@@ -79,7 +81,7 @@ def test_a_checkpoint_is_run_and_its_results_score_the_same(root, detector, tmp_
     monkeypatch.setenv("COLUMNS", "80")
     frames, out = by_stamp(root), tmp_path / "out/results.json"
     detector.find = lambda scan: detections(frames[scan.stamp_ns])
-    direct, text = evaluate(tmp_path, "--root", root, "--weights", "w.safetensors", "--device",
+    direct, text = evaluate(tmp_path, "--data", root, "--weights", "w.safetensors", "--device",
                             "cpu", "--write-results", out)
     (path, device, height), = detector.asked
     assert (str(path), device, height) == ("w.safetensors", "cpu", folder.SENSOR[2])
@@ -90,7 +92,7 @@ def test_a_checkpoint_is_run_and_its_results_score_the_same(root, detector, tmp_
                for n in NAMES if n not in OURS)
     assert direct["ours"]["ave"] == direct["ours"]["aae"] == 1
     assert direct["all"]["map"] == pytest.approx(0.3 * direct["ours"]["map"])
-    read, _ = evaluate(tmp_path, "--root", root, "--results", out)
+    read, _ = evaluate(tmp_path, "--data", root, "--results", out)
     assert {**read, "source": None, "ms": None} == {**direct, "source": None, "ms": None}
     for words in ("92.68", "83.45", "our three ", "all ten", "result file", "ms a frame"):
         assert words in text
@@ -100,8 +102,8 @@ def test_a_checkpoint_is_run_and_its_results_score_the_same(root, detector, tmp_
 def test_scenes_are_chosen_by_a_file(root, tmp_path):
     scenes, path = tmp_path / "val.txt", tmp_path / "r.json"
     scenes.write_text("scene-0916\nscene-0916\n")
-    write_results(path, {f.token: GlobalBoxes.none() for f in open_nuscenes(root)})
-    content, _ = evaluate(tmp_path, "--root", root, "--results", path, "--scenes", scenes)
+    write_results(path, {f.native.token: GlobalBoxes.none() for f in open_nuscenes(root)})
+    content, _ = evaluate(tmp_path, "--data", root, "--results", path, "--split", scenes)
     assert content["frames"] == 4 and content["all"]["map"] == content["all"]["nds"] == 0
 
 
@@ -114,11 +116,13 @@ def test_boxes_go_to_the_file_and_back(root, tmp_path):
         assert len(boxes) == len(found) - 1 and (np.diff(boxes.scores) <= 0).all()
         boxes.velocities[::2] = rng.normal(0, 1, (len(boxes[::2]), 2))
         boxes.attributes[::3] = 4
-        written[frame.token] = boxes
+        written[frame.native.token] = boxes
     write_results(tmp_path / "r.json", written)
-    for frame, read in zip(frames, read_results(tmp_path / "r.json", frames)):
-        for name, column in vars(written[frame.token]).items():
-            np.testing.assert_array_equal(getattr(read, name), column, err_msg=name)
+    read = read_results(tmp_path / "r.json", frames)
+    assert [*read] == [frame.name for frame in frames]
+    for frame in frames:
+        for name, column in vars(written[frame.native.token]).items():
+            np.testing.assert_array_equal(getattr(read[frame.name], name), column, err_msg=name)
 
 
 def test_only_the_best_boxes_of_a_frame_are_written(root):
@@ -142,12 +146,12 @@ def test_what_cannot_be_read_or_is_refused_is_told(root, detector, tmp_path):
         return detections(by_stamp(root)[scan.stamp_ns])
     detector.find = find
     out = tmp_path / "r.json"
-    content, text = evaluate(tmp_path, "--root", root, "--weights", "w", "--write-results", out)
+    content, text = evaluate(tmp_path, "--data", root, "--weights", "w", "--write-results", out)
     assert content["frames"] == 6 and len(content["skipped"]) == 3
     assert "cannot read the sweep" in content["skipped"][0] and "30 bytes" in content["skipped"][1]
     assert content["skipped"][2] == "scene-0103/02: too dark" and "skipped" in text
     results = json.loads(out.read_text())["results"]
-    assert results[frames[2].token] == [] and frames[0].token not in results
+    assert results[frames[2].native.token] == [] and frames[0].native.token not in results
 
 
 def test_a_version_without_labels_is_written_and_not_scored(tmp_path, detector, monkeypatch,
@@ -158,12 +162,15 @@ def test_a_version_without_labels_is_written_and_not_scored(tmp_path, detector, 
     folder.save(root, tables, "v1.0-test", sweeps=False)
     detector.find = lambda scan: Detections.of(np.ones((1, 7)), 0, 0.5)
     out = tmp_path / "r.json"
-    content, _ = evaluate(tmp_path, "--root", root, "--version", "v1.0-test", "--weights", "w",
+    content, _ = evaluate(tmp_path, "--data", root / "v1.0-test", "--weights", "w",
                           "--write-results", out)
     assert content["frames"] == 0 and content["all"] is None
     assert [len(rows) for rows in json.loads(out.read_text())["results"].values()] == [1] * 8
-    assert "no frame of v1.0-test with labels" in error_of(
-        monkeypatch, capsys, "--root", root, "--version", "v1.0-test", "--results", out)
+    assert content["version"] == "v1.0-test"
+    assert "v1.0-test: no frame with labels" in error_of(
+        monkeypatch, capsys, "--data", root / "v1.0-test", "--results", out)
+    line = error_of(monkeypatch, capsys, "--data", root, "--results", out)
+    assert "several versions" in line and str(root / "v1.0-test") in line
 
 
 @pytest.mark.parametrize("text, words", [
@@ -173,14 +180,14 @@ def test_files_that_are_no_results_are_named(root, tmp_path, monkeypatch, capsys
     path = tmp_path / "r.json"
     if text is not None:
         path.write_text(text)
-    assert words in error_of(monkeypatch, capsys, "--root", root, "--results", path)
+    assert words in error_of(monkeypatch, capsys, "--data", root, "--results", path)
 
 
 @pytest.mark.parametrize("arguments, words", [
-    (["--root", "a"], "give either --results JSON or --weights FILE"),
-    (["--root", "a", "--results", "b", "--weights", "c"], "give either"),
-    (["--results", "b"], "--root"),
-    (["--root", "a", "--results", "b", "--write-results", "c"], "such a file already"),
+    (["--data", "a"], "give either --results JSON or --weights FILE"),
+    (["--data", "a", "--results", "b", "--weights", "c"], "give either"),
+    (["--results", "b"], "Missing option '--data'"),
+    (["--data", "a", "--results", "b", "--write-results", "c"], "such a file already"),
 ])
 def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):
     assert exit_of(monkeypatch, "evaluate", "nuscenes", *arguments) == 2
@@ -189,23 +196,20 @@ def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):
 
 def test_scene_files_that_are_wrong_are_named(root, tmp_path, monkeypatch, capsys):
     def error(path):
-        return error_of(monkeypatch, capsys, "--root", root, "--weights", "w", "--scenes", path)
+        return error_of(monkeypatch, capsys, "--data", root, "--weights", "w", "--split", path)
     scenes = tmp_path / "scenes.txt"
-    assert "cannot read the scenes" in error(scenes)
+    assert "cannot read the split" in error(scenes)
     scenes.write_text("\n")
-    assert "names no scene" in error(scenes)
+    assert "names no frame" in error(scenes)
     scenes.write_text("scene-0103\nscene-9999\n")
-    assert "no scene scene-9999" in error(scenes)
+    assert "names scene-9999 (1 such)" in error(scenes)
 
 
-@pytest.mark.parametrize("samples, save", [
-    ("detection_samples", "lidar_perception.detectors.pointpillars.checkpoint"),
-    ("pointnet_samples", "lidar_perception.detectors.pointnet.checkpoint")])
-def test_the_detector_of_either_network_is_told_how_high_the_sensor_is(samples, save, tmp_path,
+@pytest.mark.parametrize("made, config", [(detection_samples, detection_samples.tiny()),
+                                          (pointnet_samples, pointnet_samples.small())])
+def test_the_detector_of_either_network_is_told_how_high_the_sensor_is(made, config, tmp_path,
                                                                       one_thread):
-    made, module = importlib.import_module(samples), importlib.import_module(save)
-    config = (made.tiny if samples.startswith("detection") else made.small)()
-    module.save_checkpoint(tmp_path / "w", made.lively(config), module.Header(config))
-    detector = command.detector_at(tmp_path / "w", "cpu", 1.84)
+    save_checkpoint(tmp_path / "w", made.lively(config), Header(config))
+    detector = open_detector(tmp_path / "w", "cpu", sensor_height=1.84)
     assert detector.config == config
     assert detector.params.ground.sensor_pose.height == 1.84

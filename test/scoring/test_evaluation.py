@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from itertools import permutations
+from pathlib import Path
+from types import NoneType
 
 import numpy as np
 import pytest
@@ -11,8 +13,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidar_perception.candidates.params import PipelineParams, SeedParams
+from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, match_centres, range_bins
-from lidar_perception.scoring.centres.report import CandidateReport, evaluate, pedestrians
+from lidar_perception.scoring.centres.report import (
+    CandidateReport,
+    CandidateResult,
+    by_pipeline,
+    pedestrians,
+)
+from lidar_perception.scoring.run import Skipped, fill, results
 from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, InputError, LidarFrame
 
 few = settings(max_examples=60, database=None)
@@ -90,7 +99,7 @@ def test_detections_with_nan_or_infinite_centres_match_nothing_and_count_as_fals
     i, j = match_centres(found, truth)
     assert (i.tolist(), j.tolist()) == ([1], [1])
     score = Score()
-    score.add(found, truth)
+    score.update(found, truth)
     everything = score.table()["all"]
     assert (everything["tp"], everything["fp"], everything["fn"]) == (1, 2, 1)
 
@@ -106,7 +115,7 @@ def test_hits_and_misses_add_up_to_the_truth_and_to_what_was_found(seed, frames)
         near = truth[rng.random(len(truth)) < 0.5]
         near = near + rng.normal(0, 0.5, near.shape)
         found = np.concatenate([some(rng, found_in_frame, 70.0), near]).astype(np.float32)
-        score.add(found, truth)
+        score.update(found, truth)
         truths.append(truth)
         found_count += len(found)
     table = score.table()
@@ -125,10 +134,10 @@ def test_hits_and_misses_add_up_to_the_truth_and_to_what_was_found(seed, frames)
 
 def test_a_case_by_hand():
     score = Score()
-    score.add(boxes([10.3, 0, 0], [20, 0, 0.5], [14.5, 14.5, 0], [61, 0, 0]),
+    score.update(boxes([10.3, 0, 0], [20, 0, 0.5], [14.5, 14.5, 0], [61, 0, 0]),
               boxes([10, 0, 0], [20, 0, 0], [40, 0, 0]))
-    score.add(np.zeros((0, 7), np.float32), boxes([5, 0, 0]))
-    score.add(boxes([0, -50, 0]).astype(np.float32), np.zeros((0, 7)))
+    score.update(np.zeros((0, 7), np.float32), boxes([5, 0, 0]))
+    score.update(boxes([0, -50, 0]).astype(np.float32), np.zeros((0, 7)))
     table = score.table()
     counts = {name: tuple(row[k] for k in ("tp", "fp", "fn")) for name, row in table.items()}
     assert counts == {"0-15": (1, 0, 1), "15-30": (1, 1, 0), "30-45": (0, 0, 1),
@@ -144,7 +153,7 @@ def test_a_case_by_hand():
 
 def test_a_hit_belongs_to_the_range_of_the_true_object():
     score = Score()
-    score.add(boxes([15.2, 0, 0]), boxes([14.8, 0, 0]))
+    score.update(boxes([15.2, 0, 0]), boxes([14.8, 0, 0]))
     assert score.table()["0-15"]["tp"] == 1 and score.table()["15-30"]["fp"] == 0
 
 
@@ -171,12 +180,12 @@ def scene_points():
     return np.concatenate([flat, figure]).astype(np.float32)
 
 
-class Item:
-    """What an evaluation reads of a recorded frame."""
+def frame(name, truth):
+    return Frame.of(name, LidarFrame(scene_points()), truth)
 
-    def __init__(self, name, truth):
-        self.name, self.truth, self.camera = name, truth, None
-        self.frame = LidarFrame(scene_points())
+
+def cut():
+    raise InputError("frame 3 is cut")
 
 
 def truth_of(*centres, label="Pedestrian"):
@@ -185,22 +194,25 @@ def truth_of(*centres, label="Pedestrian"):
     return GroundTruth.of(made, [CLASSES.index(label)] * len(made))
 
 
-def run(items, source="ground_truth"):
-    report = CandidateReport()
-    params = PipelineParams(seed=SeedParams(source=source))
-    results = list(evaluate(items, params, report))
-    assert len(results) == len(items)
-    return report.content(), results
+def run(frames, source="ground_truth"):
+    report, recording = CandidateReport(), Recording(Path("here"), "memory", frames)
+    start = by_pipeline(PipelineParams(seed=SeedParams(source=source)))
+    fill(report, recording, start)
+    found = [result for _, result in results(recording, start)]
+    assert len(found) == len(frames)
+    return report.compute(), found
 
 
 HERE = (7.05, 0, -0.82)
 
 
 def test_the_report_of_a_recording_is_json_and_counts_every_labelled_pedestrian():
-    items = [Item("both", truth_of(HERE, (25, 9, -0.8))), Item("car", truth_of(HERE, label="Car")),
-             Item("none", None), InputError("frame 3 is cut"), Item("again", truth_of(HERE))]
-    content, results = run(items)
-    assert [r is not None for r in results] == [True, False, False, False, True]
+    content, found = run([
+        frame("both", truth_of(HERE, (25, 9, -0.8))), frame("car", truth_of(HERE, label="Car")),
+        frame("none", None), Frame("cut", 0, cut, lambda: truth_of(HERE)),
+        frame("again", truth_of(HERE))])
+    assert [type(r) for r in found] == [CandidateResult, NoneType, NoneType, Skipped,
+                                        CandidateResult]
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     assert content["frames"] == 2 and content["ground_truth"] == 3
     assert content["ground_truth_by_range"] == {"0-15": 2, "15-30": 1, "30-45": 0, "45-60": 0,
@@ -214,8 +226,8 @@ def test_the_report_of_a_recording_is_json_and_counts_every_labelled_pedestrian(
 
 
 def test_a_frame_without_a_seed_counts_its_pedestrians_as_missed():
-    content, results = run([Item("far", truth_of((30, 10, -0.8)))])
-    assert results == [None]
+    content, (found,) = run([frame("far", truth_of((30, 10, -0.8)))])
+    assert found.problem and found.boxes and not any(map(len, found.boxes.values()))
     assert content["frames"] == 1 and content["final"]["all"]["fn"] == 1
     assert content["skipped"][0].startswith("far: ")
 
@@ -229,5 +241,5 @@ def test_an_empty_recording_has_an_empty_report():
 def test_only_pedestrians_count():
     mixed = GroundTruth.of(boxes([1, 0, 0], [2, 0, 0], [3, 0, 0]),
                            [PEDESTRIAN, CLASSES.index("Person_sitting"), CLASSES.index("Cyclist")])
-    np.testing.assert_array_equal(pedestrians(Item("", mixed)), boxes([1, 0, 0]))
-    assert pedestrians(Item("", None)).shape == (0, 7)
+    np.testing.assert_array_equal(pedestrians(mixed), boxes([1, 0, 0]))
+    assert pedestrians(None).shape == (0, 7)

@@ -22,7 +22,7 @@ from lidar_perception.scoring.nuscenes.protocol import (
     hit_errors,
     summary,
 )
-from lidar_perception.scoring.nuscenes.report import OURS, NuscenesReport
+from lidar_perception.scoring.nuscenes.report import OURS, NuscenesReport, key_frame
 from lidar_perception.types import InputError
 
 TABLES = folder.made_tables(seed=2, frames=4, objects=60)
@@ -161,9 +161,10 @@ def reported(root, results):
     path = root / "results.json"
     path.write_text(json.dumps({"meta": META, "results": results}))
     frames, report = open_nuscenes(root), NuscenesReport()
-    for frame, found in zip(frames, read_results(path, frames)):
-        report.add(frame, found)
-    return report.content()
+    boxes = read_results(path, frames)
+    for frame in frames:
+        report.update(key_frame(frame, boxes[frame.name]))
+    return report.compute()
 
 
 def close_to_reference(content, by_class, over):

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import DATA, needs_data, object_folder, walker_label, write
 
-from lidar_perception.cli.segmentation import segmentation
+from lidar_perception.cli.evaluate.segmentation import segmentation
 from lidar_perception.clustering.params import CLUSTERING_METHODS
 from lidar_perception.data.semantickitti import GROUND, MOVING, THINGS, open_semantic_kitti
 from lidar_perception.ground.params import GROUND_METHODS
@@ -23,6 +23,7 @@ from lidar_perception.scoring.points.segmentation import (
     ClusterReport,
     GroundReport,
     Objects,
+    ground_by_protocol,
     ground_counts,
     objects_in_boxes,
     objects_of_instances,
@@ -49,8 +50,9 @@ def objects(owner, region=None, near=None, counted=None, ranges=None):
 
 def report_of(cluster_ids, truth) -> dict:
     report = ClusterReport()
-    report.add(np.asarray(cluster_ids, np.int32), truth, 2.0)
-    return report.content()
+    score = score_clusters(np.asarray(cluster_ids, np.int32), truth)
+    report.update(truth.classes, truth.ranges, score, 2.0)
+    return report.compute()
 
 
 def some(seed):
@@ -240,12 +242,12 @@ def test_counts_and_ratios_of_ground_by_hand():
     assert ground_counts(found, ground, counted).tolist() == [2, 1, 1, 3]
     report = GroundReport()
     for _ in range(2):
-        report.add(found[:7], np.where(ground[:7], 40, 50), np.zeros(7), 3.0)
-    row = report.content()["protocols"]["without vegetation"]
+        report.update(ground_by_protocol(found[:7], np.where(ground[:7], 40, 50), np.zeros(7)), 3.0)
+    row = report.compute()["protocols"]["without vegetation"]
     assert [row[k] for k in ("tp", "fp", "fn", "tn")] == [4, 2, 2, 6]
     assert [row[k] for k in ("precision", "recall", "f1", "accuracy")] == pytest.approx(
         [2 / 3, 2 / 3, 2 / 3, 5 / 7])
-    assert report.content()["scans"] == 2 and report.content()["ms"] == 3.0
+    assert report.compute()["scans"] == 2 and report.compute()["ms"] == 3.0
 
 
 def semantic_folder(root, scans=("00/000000", "00/000001", "05/000000")):
@@ -270,7 +272,8 @@ def test_a_folder_is_read_in_order_without_unusable_returns(tmp_path):
     frames = open_semantic_kitti(tmp_path)
     assert [f.name for f in frames] == ["00/000000", "00/000001", "05/000000"]
     assert [f.name for f in open_semantic_kitti(tmp_path / "dataset")] == [f.name for f in frames]
-    frame, semantic, instance = frames[0].load()
+    frame, labels = frames[0].load(), frames[0].point_truth()
+    semantic, instance = labels.classes, labels.instances
     assert len(frame) == len(semantic) == len(instance) == 4400
     assert semantic.dtype == instance.dtype == np.uint16
     assert semantic[[0, 4000, 4200]].tolist() == [40, 10, 252]
@@ -291,12 +294,15 @@ def test_a_broken_folder_gives_one_line_with_a_remedy(tmp_path, root, file, cont
     with pytest.raises(InputError, match=text) as error:
         for frame in open_semantic_kitti(tmp_path / root):
             frame.load()
+            frame.point_truth()
     assert "\n" not in str(error.value) and re.search("give|expected|again", str(error.value))
 
 
 @needs_data
 def test_the_real_scan_has_a_label_for_every_point():
-    frame, semantic, instance = open_semantic_kitti(DATA / "semantickitti")[0].load()
+    first = open_semantic_kitti(DATA / "semantickitti")[0]
+    frame, labels = first.load(), first.point_truth()
+    semantic, instance = labels.classes, labels.instances
     assert len(frame) == len(semantic) == len(instance) > 100_000
     assert np.isin(semantic, GROUND).mean() > 0.4
     cars = np.bincount(instance[semantic == 10])
@@ -313,23 +319,24 @@ def test_the_command_scores_every_method_and_goes_on_after_a_broken_scan(tmp_pat
     write(root / "sequences/00/labels/000001.label", b"")
     kitti = object_folder(tmp_path / "kitti", walker_label() + "\n")
     path = tmp_path / "made/here/scores.json"
-    result = run("--semantic-kitti", root, "--kitti", kitti, "--json", path)
+    result = run("--data", root, "--data", kitti, "--json", path)
     assert result.exit_code == 0, result.output
     content = json.loads(path.read_text())
     assert len(content["skipped"]) == 1 and "skipped" in result.stdout
     assert list(content["ground"]) == list(GROUND_METHODS)
     assert {report["scans"] for report in content["ground"].values()} == {2}
-    assert set(content["clusters"]) == {"semantic_kitti", "kitti"}
+    assert set(content["clusters"]) == {"SemanticKITTI", "KITTI object data"}
     for reports in content["clusters"].values():
         assert list(reports) == list(CLUSTERING_METHODS)
-    cars, walkers = (content["clusters"][s]["dbscan"] for s in ("semantic_kitti", "kitti"))
+    cars, walkers = (content["clusters"][s]["dbscan"] for s in ("SemanticKITTI",
+                                                                    "KITTI object data"))
     assert (cars["objects"], cars["hits"], cars["precision"]) == (4, 4, 1)
     assert (walkers["objects"], walkers["frames"]) == (2, 2)
 
 
 def test_methods_and_frames_can_be_chosen(tmp_path):
     root, path, png = semantic_folder(tmp_path), tmp_path / "a.json", tmp_path / "made/a.png"
-    assert run("--semantic-kitti", root, "--methods", "threshold", "--limit", 1, "--json", path,
+    assert run("--data", root, "--methods", "threshold", "--limit", 1, "--json", path,
                "--png", png).exit_code == 0
     content = json.loads(path.read_text())
     assert list(content["ground"]) == ["threshold"] and content["clusters"] == {}
@@ -340,12 +347,13 @@ def test_methods_and_frames_can_be_chosen(tmp_path):
 
 def test_calls_that_cannot_be_answered_say_why(tmp_path):
     root = semantic_folder(tmp_path / "semantic", ["00/000000"])
-    for arguments, text in (([], "at least one of"),
-                            (["--semantic-kitti", root, "--methods", "magic"], "is no method"),
-                            (["--kitti", root, "--png", "a.png"], "--png draws"),
-                            (["--kitti", root, "--methods", "threshold"], "SemanticKITTI only")):
+    kitti = object_folder(tmp_path / "kitti")
+    for arguments, text in (([], "Missing option '--data'"),
+                            (["--data", root, "--methods", "magic"], "is no method"),
+                            (["--data", kitti, "--png", "a.png"], "--png draws"),
+                            (["--data", kitti, "--methods", "threshold"], "labelled points only")):
         result = run(*arguments)
         assert result.exit_code == 2 and text in result.output
     write(root / "sequences/00/labels/000000.label", b"")
     with pytest.raises(InputError, match="no frame with labels"):
-        raise run("--semantic-kitti", root).exception
+        raise run("--data", root).exception

@@ -1,0 +1,96 @@
+"""Every detector of the package is a value that fulfils the one contract."""
+
+from __future__ import annotations
+
+import inspect
+
+import detection_samples
+import numpy as np
+import pointnet_samples
+import pytest
+from detection_samples import same
+from samples import CALIBRATION, crowd
+
+from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
+from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
+from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
+from lidar_perception.scoring.comparison.contenders import contenders
+from lidar_perception.types import CLASSES, InputError, LidarFrame
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+NAMES = ["STM-CPA paper", "STM-CPA best", "STM-CPA best, auto", "PointPillars v0 compact",
+         "PointNet", "STM-CPA + PointNet", "STM-CPA + PointNet, auto", "PP v0 compact + PointNet"]
+each_name = pytest.mark.parametrize("name", NAMES)
+
+
+@pytest.fixture(scope="module")
+def frame():
+    cloud, truth = crowd(1)
+    return Frame.of("crowd", LidarFrame(cloud[:, :3].copy(), cloud[:, 3].copy()), truth,
+                    CALIBRATION)
+
+
+@pytest.fixture(scope="module")
+def detectors(frame, tmp_path_factory):
+    """name -> detector of every contender, whose networks are random."""
+    folder = tmp_path_factory.mktemp("weights")
+    for name, made, config in (("a", detection_samples, detection_samples.tiny()),
+                               ("b", pointnet_samples, pointnet_samples.small())):
+        save_checkpoint(folder / name, made.lively(config), Header(config))
+    with pytest.MonkeyPatch.context() as patch:
+        for module in pointpillars_weights, pointnet_weights:
+            patch.setattr(module, "WEIGHTS", folder / "none")
+        found, _ = contenders([folder / "a", folder / "b"], "cpu")
+    return {each.name: each.detector_of(frame) for each in found}
+
+
+def test_these_are_all(detectors):
+    assert list(detectors) == NAMES
+
+
+@each_name
+def test_it_says_what_it_can_detect_and_from_which_score_on(detectors, name):
+    detector = detectors[name]
+    assert detector.classes and set(detector.classes) <= set(CLASSES)
+    assert set(detector.min_scores) == set(detector.classes)
+    columns = inspect.signature(detector).parameters
+    assert [p.kind for p in columns.values()] == [inspect.Parameter.POSITIONAL_OR_KEYWORD,
+                                                  *[inspect.Parameter.KEYWORD_ONLY] * 2]
+    assert [*columns][1:] == ["ground", "cluster_ids"]
+
+
+@each_name
+def test_called_again_it_says_the_same_and_leaves_the_frame(detectors, frame, name):
+    scan = frame.load()
+    before = scan.xyz.copy(), scan.intensity.copy()
+    first, again = (detectors[name](scan) for _ in range(2))
+    assert isinstance(first, Found) and same(first, again)
+    assert (first.problem, first.best) == (again.problem, again.best)
+    assert first.ms.keys() == again.ms.keys()
+    assert {CLASSES[i] for i in first.detections.class_ids} <= set(detectors[name].classes)
+    np.testing.assert_array_equal(scan.xyz, before[0])
+    np.testing.assert_array_equal(scan.intensity, before[1])
+
+
+@each_name
+def test_another_threshold_makes_another_detector_and_leaves_this_one(detectors, frame, name):
+    detector, scan = detectors[name], frame.load()
+    before, scores = detector(scan), dict(detector.min_scores)
+    strict = detector.with_min_score(0.6)
+    assert type(strict) is type(detector) and strict.classes == detector.classes
+    assert set(strict.min_scores.values()) == {0.6}
+    assert (strict(scan).detections.scores >= np.float32(0.6)).all()
+    assert dict(detector.min_scores) == scores and same(detector(scan), before)
+    assert len(before.detections) > 0 or before.best
+
+
+@each_name
+def test_columns_of_another_length_are_refused_by_name(detectors, frame, name):
+    scan = frame.load()
+    for column, values in dict(ground=np.zeros(len(scan) - 1, bool),
+                               cluster_ids=np.zeros(len(scan) + 1, np.int32)).items():
+        with pytest.raises(InputError, match=rf"^{column} has {len(values)} values for {len(scan)} "
+                           "points$"):
+            detectors[name](scan, **{column: values})

@@ -1,0 +1,161 @@
+"""Laws of the one loop: whoever measures, the results are the same, in the order of the frames."""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass, field, replace
+
+import pytest
+from cli_samples import error_line, exit_of
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from samples import object_folder, walker_label, write
+
+from lidar_perception.data.open import open_recording
+from lidar_perception.scoring.detections import by_files
+from lidar_perception.scoring.run import RunError, Skipped, fill, in_order, results
+from lidar_perception.types import InputError
+
+COUNT = 5
+
+
+@dataclass
+class Names:
+    """A report of what came."""
+
+    names: list = field(default_factory=list)
+    skipped: list = field(default_factory=list)
+
+    def update(self, result):
+        self.names.append(result[0])
+
+    def compute(self):
+        return vars(self)
+
+
+def counting(recording):
+    """(name, points) of a frame; nothing of 000003, which has no labels."""
+    return lambda frame: frame.truth() and (frame.name, len(frame.load()))
+
+
+def ending(name, recording):
+    def measure(frame):
+        if frame.name == name:
+            raise RunError(f"cannot go on after {frame.name}")
+        return frame.name, 0
+    return measure
+
+
+@pytest.fixture
+def root(tmp_path):
+    """Five frames: the scan of 000001 was cut, 000003 has no labels."""
+    root = object_folder(tmp_path / "kitti", walker_label(), COUNT)
+    write(root / "training/velodyne/000001.bin", b"123")
+    (root / "training/label_2/000003.txt").unlink()
+    return root
+
+
+def test_in_many_processes_the_results_are_those_of_one_in_their_order(root):
+    recording = open_recording(root)
+    one, three = ([*results(recording, counting, jobs=jobs)] for jobs in (1, 3))
+    assert one == three and [type(r) for _, r in one] == [type(r) for _, r in three]
+    assert [i for i, _ in one] == [*range(COUNT)]
+    chosen = [1, 2, 4]
+    for jobs in 1, 3:
+        assert [*results(recording, counting, chosen, jobs=jobs)] == [one[i] for i in chosen]
+        assert [*results(recording, counting, [], jobs=jobs)] == []
+
+
+def test_processes_measure_the_frames_of_a_split(root, tmp_path):
+    split = write(tmp_path / "split.txt", "000004 000000 000002")
+    found = [[*results(open_recording(root, split=split), counting, jobs=jobs)] for jobs in (1, 2)]
+    assert found[0] == found[1]
+    assert [name for _, (name, _) in found[0]] == ["000004", "000000", "000002"]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_frame_that_cannot_be_read_is_skipped_by_name_and_the_others_go_on(root, jobs):
+    recording, report = open_recording(root), Names()
+    kinds = [type(result) for _, result in results(recording, counting, jobs=jobs)]
+    assert kinds == [tuple, Skipped, tuple, type(None), tuple]
+    fill(report, recording, counting, jobs=jobs)
+    line, = report.skipped
+    assert report.names == ["000000", "000002", "000004"]
+    assert "000001.bin" in line and "\n" not in line
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_error_of_the_run_ends_it_and_what_came_before_has_counted(root, jobs):
+    report = Names()
+    with pytest.raises(InputError, match=r"^cannot go on after 000002$"):
+        fill(report, open_recording(root), functools.partial(ending, "000002"), jobs=jobs)
+    assert report.skipped == [] and "000002" not in report.names
+    assert report.names == ["000000", "000001"][:len(report.names)]
+
+
+def test_a_command_whose_run_ends_says_so_in_one_line(root, tmp_path, monkeypatch, capsys):
+    (tmp_path / "found").mkdir()
+    for jobs in 1, 2:
+        assert exit_of(monkeypatch, "evaluate", "detection", "--data", root, "--results",
+                       tmp_path / "found", "--jobs", jobs) == 2
+        assert "no result file" in error_line(capsys)
+    with pytest.raises(RunError):
+        [*results(open_recording(root), by_files(tmp_path / "found"))]
+
+
+def test_a_mistake_is_no_skipped_frame_and_names_it(root):
+    def mistaken(recording):
+        return lambda frame: 1 // (frame.name != "000002")
+    with pytest.raises(ZeroDivisionError) as error:
+        [*results(open_recording(root), mistaken)]
+    assert error.value.__notes__ == ["while frame 000002 was measured"]
+
+
+@pytest.mark.parametrize("limit, expected", [
+    (None, ["000000", "000002", "000004"]), (1, ["000000"]), (3, ["000000", "000002"]),
+    (99, ["000000", "000002", "000004"])])
+def test_a_limit_is_of_frames_and_no_other_is_touched(root, limit, expected):
+    touched = []
+
+    def noting(recording):
+        measure = counting(recording)
+        return lambda frame: touched.append(frame.name) or measure(frame)
+    report = Names()
+    fill(report, open_recording(root), noting, limit=limit)
+    assert report.names == expected
+    assert touched == [f"00000{i}" for i in range(min(limit or COUNT, COUNT))]
+
+
+def test_start_is_called_once_and_each_frame_measured_once_when_it_is_asked_for(root):
+    called = []
+
+    def start(recording):
+        called.append("start")
+        return lambda frame: called.append(frame.name)
+    found = results(open_recording(root), start)
+    assert called == []
+    next(found)
+    assert called == ["start", "000000"]
+    assert len([*found]) == COUNT - 1 and len(called) == 1 + COUNT
+
+
+def test_a_recording_that_cannot_be_opened_again_is_measured_here(root):
+    recording = replace(open_recording(root), reopen=None)
+    assert len([*results(recording, counting)]) == COUNT
+
+
+@settings(max_examples=60, database=None)
+@given(st.sets(st.integers(0, 20)), st.randoms(use_true_random=False))
+def test_pairs_come_in_order_each_as_soon_as_it_can(numbers, random):
+    numbers = sorted(numbers)
+    sent, taken = random.sample(numbers, len(numbers)), []
+
+    def pairs():
+        for number in sent:
+            taken.append(number)
+            yield number, -number
+    for k, pair in enumerate(in_order(pairs(), numbers)):
+        assert pair == (numbers[k], -numbers[k])
+        needed = 1 + max(sent.index(number) for number in numbers[:k + 1])
+        assert taken == sent[:needed]  # no more than it needed
+    assert taken == sent
