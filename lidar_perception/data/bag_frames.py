@@ -52,7 +52,7 @@ class BagFrames(Sequence):
         return self.count
 
     def __iter__(self) -> Iterator[Frame]:
-        names = Counter()
+        names: Counter[int] = Counter()
         with Bag(self.path) as bag:
             for i, (_, time, data) in enumerate(bag.raw({self.points})):
                 stamp = _stamp(data, time)
@@ -72,7 +72,9 @@ class BagFrames(Sequence):
     def _index(self) -> list[tuple[int, int, int, int]]:
         """Of each cloud: time, clouds of the same time before it, stamp, clouds of the same stamp
         up to it."""
-        times, names, rows = Counter(), Counter(), []
+        times: Counter[int] = Counter()
+        names: Counter[int] = Counter()
+        rows = []
         with Bag(self.path) as bag:
             for _, time, data in bag.raw({self.points}):
                 stamp = _stamp(data, time)
@@ -90,7 +92,8 @@ class BagFrames(Sequence):
         """Labels by stamp, and calibrations and transforms by time: they are small, and may come
         after their cloud."""
         truth: dict[int, GroundTruth] = {}
-        infos, transforms = [], []
+        infos: list[tuple[int, Any]] = []
+        transforms: list[tuple[int, Any]] = []
         with Bag(self.path) as bag:
             wanted = {TRUTH, CAMERA_INFO, EXTRINSICS} & set(bag.topics)
             for topic, time, msg in bag.messages(wanted):

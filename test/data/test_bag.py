@@ -42,7 +42,8 @@ def test_a_recording_gives_back_the_scans(written):
 def test_clouds_are_in_the_bag_bit_by_bit_with_intensity(tmp_path):
     cloud = np.array([[1, 2, 3, 0.5], [np.nan, -0.0, np.inf, -1], [0, 0, 0, 0]], np.float32)
     write_bag(tmp_path / "bag", [
-        Frame.of(str(i), cloud_frame(part, STAMP + i)) for i, part in enumerate((cloud, cloud[:0]))])
+        Frame.of(str(i), cloud_frame(part, STAMP + i))
+        for i, part in enumerate((cloud, cloud[:0]))])
     with Bag(tmp_path / "bag") as bag:
         full, empty = [to_array(msg) for _, _, msg in bag.messages({POINTS})]
     assert full.dtype.names == ("x", "y", "z", "intensity") and len(empty) == 0

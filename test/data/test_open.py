@@ -100,7 +100,7 @@ def test_what_lies_there_is_recognised_said_and_read(tmp_path, monkeypatch, kind
         if what in has:
             recording.require(what, "evaluate")
         else:
-            with pytest.raises(InputError, match="has no .*, which evaluate needs") as error:
+            with pytest.raises(InputError, match=r"has no .*, which evaluate needs") as error:
                 recording.require(what, "evaluate")
             assert what.removeprefix("a ") in str(error.value) and said.split(",")[0] in str(
                 error.value)
@@ -272,7 +272,7 @@ def test_a_bag_made_of_a_recording_says_the_same(tmp_path, kind):
 def test_a_scan_that_cannot_be_read_is_left_out_of_a_bag_and_named(tmp_path):
     root = object_folder(tmp_path / "kitti", count=3)
     write(root / "training/velodyne/000001.bin", b"cut")
-    with pytest.raises(InputError, match="000001.bin"):
+    with pytest.raises(InputError, match=r"000001\.bin"):
         write_bag(tmp_path / "strict", open_recording(root))
     skipped = []
     assert write_bag(tmp_path / "bag", open_recording(root), skipped=skipped) == 2

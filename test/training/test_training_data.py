@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 import time
@@ -17,6 +18,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import WALKER, object_folder, walker_label, write
 
+from lidar_perception.data.frame import Frame
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED
@@ -38,7 +42,14 @@ from lidar_perception.training.pointpillars.task import (
 from lidar_perception.training.record import metrics_of
 from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes, random_split
 from lidar_perception.training.sources import names_of
-from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError
+from lidar_perception.types import (
+    CLASSES,
+    PEDESTRIAN,
+    Detections,
+    GroundTruth,
+    InputError,
+    LidarFrame,
+)
 
 few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -96,6 +107,31 @@ def test_kitti_scenes_end_with_the_image_unless_asked(tmp_path):
     assert (ahead.points[:, 0] > 0).all() and (all_of_it.points[:, 0] < 0).any()
     np.testing.assert_allclose(ahead.boxes[0], WALKER, atol=0.02)
     assert points_in_box(ahead.points[:, :3], ahead.boxes[0]).sum() > 300
+
+
+def test_a_bag_of_a_folder_has_its_scenes(tmp_path):
+    folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
+    write_bag(tmp_path / "bag", open_recording(folder))
+    of_bag = RecordedScenes(tmp_path / "bag", names_of(tmp_path / "bag"))
+    of_bag.scene(0)  # what it has opened stays here
+    for source in (of_bag, pickle.loads(pickle.dumps(of_bag))):
+        for i in range(2):
+            scene, expected = source.scene(i), RecordedScenes(folder, names_of(folder)).scene(i)
+            assert np.array_equal(scene.points, expected.points) and not scene.around
+            np.testing.assert_allclose(scene.boxes, expected.boxes, atol=1e-9)
+            assert np.array_equal(scene.class_ids, expected.class_ids)
+
+
+def test_without_a_camera_all_around_is_labelled_and_without_labels_nothing_is_learned(tmp_path):
+    frames = [Frame.of("0", LidarFrame(two_objects()[:, :3].copy()), GroundTruth.of([WALKER],
+                                                                                   [PEDESTRIAN]))]
+    write_bag(tmp_path / "bag", frames)
+    scene = RecordedScenes(tmp_path / "bag", names_of(tmp_path / "bag")).scene(0)
+    assert scene.around and np.array_equal(scene.points[:, :3], two_objects()[:, :3])
+    assert not scene.points[:, 3].any()  # no intensity
+    write_bag(tmp_path / "bare", [Frame.of("0", frames[0].load())])
+    with pytest.raises(InputError, match="has no labelled boxes, which train needs"):
+        names_of(tmp_path / "bare")
 
 
 def test_splits_name_their_frames(tmp_path):
