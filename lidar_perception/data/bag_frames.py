@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property, partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +41,9 @@ def open_recording(path: Path, *, points: str = POINTS, scans: bool = True) -> R
 
 
 class BagFrames(Sequence):
-    """The frames in order of time. Iterating reads the bag once; a frame by its number is looked
-    up in the bag's index, after one look through the bag for the times of all."""
+    """The frames in order of time. Iterating reads the bag once, and each frame holds its cloud; a
+    frame by its number reads it when it is asked for, found by its time after one look through the
+    bag for the times of all."""
 
     def __init__(self, path: Path, points: str, kind: str, count: int):
         self.path, self.points, self.kind, self.count = path, points, kind, count
@@ -49,9 +52,12 @@ class BagFrames(Sequence):
         return self.count
 
     def __iter__(self) -> Iterator[Frame]:
+        names: Counter[int] = Counter()
         with Bag(self.path) as bag:
             for i, (_, time, data) in enumerate(bag.raw({self.points})):
-                yield self._frame(i, time, data)
+                stamp = _stamp(data, time)
+                names[stamp] += 1
+                yield self._frame(i, time, stamp, names[stamp], lambda data=data: data)
 
     def __getitem__(self, i):
         if isinstance(i, slice):
@@ -59,23 +65,35 @@ class BagFrames(Sequence):
         if not -self.count <= i < self.count:
             raise IndexError(i)
         i %= self.count
-        time = self._times[i]
-        before = i - self._times.index(time)  # of the same time
-        with Bag(self.path) as bag:
-            same = [data for _, _, data in bag.raw({self.points}, time, time + 1)]
-        return self._frame(i, time, same[before])
+        time, before, stamp, which = self._index[i]
+        return self._frame(i, time, stamp, which, partial(self._read, time, before))
 
     @cached_property
-    def _times(self) -> list[int]:
+    def _index(self) -> list[tuple[int, int, int, int]]:
+        """Of each cloud: time, clouds of the same time before it, stamp, clouds of the same stamp
+        up to it."""
+        times: Counter[int] = Counter()
+        names: Counter[int] = Counter()
+        rows = []
         with Bag(self.path) as bag:
-            return [time for _, time, _ in bag.raw({self.points})]
+            for _, time, data in bag.raw({self.points}):
+                stamp = _stamp(data, time)
+                names[stamp] += 1
+                rows.append((time, times[time], stamp, names[stamp]))
+                times[time] += 1
+        return rows
+
+    def _read(self, time: int, before: int) -> bytes:
+        with Bag(self.path) as bag:
+            return next(islice(bag.raw({self.points}, time, time + 1), before, None))[2]
 
     @cached_property
     def _beside(self) -> tuple[dict[int, GroundTruth], list, list]:
         """Labels by stamp, and calibrations and transforms by time: they are small, and may come
         after their cloud."""
         truth: dict[int, GroundTruth] = {}
-        infos, transforms = [], []
+        infos: list[tuple[int, Any]] = []
+        transforms: list[tuple[int, Any]] = []
         with Bag(self.path) as bag:
             wanted = {TRUTH, CAMERA_INFO, EXTRINSICS} & set(bag.topics)
             for topic, time, msg in bag.messages(wanted):
@@ -86,19 +104,19 @@ class BagFrames(Sequence):
                     (infos if topic == CAMERA_INFO else transforms).append((time, msg))
         return truth, infos, transforms
 
-    def _frame(self, i: int, time: int, data: bytes) -> Frame:
-        stamp = _stamp(data)
-        return Frame(str(time if stamp is None else stamp), time if stamp is None else stamp,
-                     partial(self._load, time, data), partial(self._truth, stamp),
+    def _frame(self, i: int, time: int, stamp: int, which: int,
+               data: Callable[[], bytes]) -> Frame:
+        name = str(stamp) if which == 1 else f"{stamp}-{which}"  # recorders may not set the stamp
+        return Frame(name, stamp, partial(self._load, time, data), partial(self._truth, stamp),
                      calibration=partial(self._calibration, time), index=i)
 
-    def _load(self, time: int, data: bytes) -> LidarFrame:
+    def _load(self, time: int, data: Callable[[], bytes]) -> LidarFrame:
         try:
-            return to_frame(decode(data, self.kind), intensity_max=0.0)[0]
+            return to_frame(decode(data(), self.kind), intensity_max=0.0)[0]
         except InputError as error:
             raise InputError(f"{self.path}, topic {self.points} at {time} ns: {error}") from None
 
-    def _truth(self, stamp: int | None) -> GroundTruth | None:
+    def _truth(self, stamp: int) -> GroundTruth | None:
         return self._beside[0].get(stamp)
 
     def _calibration(self, time: int) -> Calibration | None:
@@ -107,10 +125,10 @@ class BagFrames(Sequence):
         return calibration_of(info, transform) if info and transform else None
 
 
-def _stamp(data: bytes) -> int | None:
-    """header.stamp of a serialised message; None if it is too short to have one."""
+def _stamp(data: bytes, time: int) -> int:
+    """header.stamp of a serialised message; its time if it is too short to have one."""
     if len(data) < 12:
-        return None
+        return time
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return seconds * SECOND + nanoseconds
 

@@ -112,8 +112,8 @@ class Recording:
 
     def chosen(self, names: Sequence[str]) -> Recording:
         """The frames of these names, in their order. InputError names what is not there."""
-        by_name = {frame.name: frame for frame in self.frames}
-        if unknown := [name for name in names if name not in by_name]:
+        numbers = {frame.name: i for i, frame in enumerate(self.frames)}
+        if unknown := [name for name in names if name not in numbers]:
             raise InputError(f"{self.path} has no frame {unknown[0]} ({len(unknown)} such); its "
-                             f"first is {next(iter(by_name), 'none')}")
-        return replace(self, frames=[by_name[name] for name in names], lost=())
+                             f"first is {next(iter(numbers), 'none')}")
+        return replace(self, frames=[self.frames[numbers[name]] for name in names], lost=())

@@ -49,13 +49,14 @@ def _of_split(recording: Recording, split: Path) -> Recording:
         names = split.read_text().split()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the split {split}: {error}") from None
-    first = recording.frames[0].name
+    sequences: dict[str, list[str]] = {}
+    frames: dict[str, None] = {}
+    for frame in recording:
+        frames[frame.name] = None
+        sequences.setdefault(frame.sequence, []).append(frame.name)
+    first = next(iter(frames), "none")
     if not names:
         raise InputError(f"{split} names no frame; it needs one a line, such as {first}")
-    frames = {frame.name: frame for frame in recording}
-    sequences: dict[str, list[str]] = {}
-    for name, frame in frames.items():
-        sequences.setdefault(frame.sequence, []).append(name)
     chosen: dict[str, None] = {}
     unknown: list[str] = []
     for name in names:

@@ -26,8 +26,10 @@ MOVING = {252: 10, 253: 31, 254: 30, 255: 32, 256: 16, 257: 13, 258: 18, 259: 20
 
 
 def recognises(path: Path) -> bool:
-    """Whether a SemanticKITTI folder lies there."""
-    return any((path / folder).is_dir() for folder in ("sequences", "dataset/sequences"))
+    """Whether a SemanticKITTI folder lies there, or its sequences/, or a sequence."""
+    return (any((path / folder).is_dir() for folder in ("sequences", "dataset/sequences"))
+            or any((sequence / "labels").is_dir() and (sequence / "velodyne").is_dir()
+                   for sequence in (path, *path.glob("*/"))))
 
 
 def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
@@ -40,13 +42,13 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
 
 def open_semantic_kitti(root: str | Path) -> list[Frame]:
     """The labelled scans of ROOT/sequences/NN or ROOT/dataset/sequences/NN, in order; only the
-    file lists are read. Sequences without a labels folder, as the test ones, are left out.
+    file lists are read. ROOT may also be sequences/ or one sequence. Sequences without a labels
+    folder, as the test ones, are left out.
     InputError says what is missing."""
     root = Path(root)
     if not root.is_dir():
         raise InputError(f"{root} is not a folder; give the folder of a SemanticKITTI download")
-    folder = root / "dataset" if (root / "dataset/sequences").is_dir() else root
-    scans = [(sequence, i, scan) for sequence in sorted(folder.glob("sequences/*/"))
+    scans = [(sequence, i, scan) for sequence in _sequences(root.absolute())
              for i, scan in enumerate(sorted(sequence.glob("velodyne/*.bin")))]
     if not scans:
         raise InputError(f"{root} has no SemanticKITTI scans: expected "
@@ -64,6 +66,13 @@ def open_semantic_kitti(root: str | Path) -> list[Frame]:
         raise InputError(f"{root} has scans but no labels: expected "
                          "sequences/00/labels/*.label; download the labels of SemanticKITTI too")
     return frames
+
+
+def _sequences(root: Path) -> list[Path]:
+    for folder in (root / "dataset/sequences", root / "sequences"):
+        if folder.is_dir():
+            return sorted(folder.glob("*/"))
+    return [root] if (root / "labels").is_dir() else sorted(root.glob("*/"))
 
 
 def _point_truth(scan: Path, path: Path) -> PointTruth:

@@ -55,7 +55,7 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
                 skipped.append(str(error))
                 continue
             header = header_message(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
-            if calibration is not None and calibration is not written:
+            if calibration is not None and not _same(calibration, written):
                 written = calibration
                 _write_calibration(bag, calibration, frame.stamp_ns, header)
             if truth is not None:
@@ -67,6 +67,11 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
             bag.write(POINTS, frame.stamp_ns, from_array(_points(scan), header, bag_message))
             count += 1
     return count
+
+
+def _same(calibration: Calibration, written: Calibration | None) -> bool:
+    return written is not None and all(
+        np.array_equal(a, b) for a, b in zip(vars(calibration).values(), vars(written).values()))
 
 
 def _points(scan: LidarFrame) -> np.ndarray:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import yaml
-from bag_samples import LATCHED, message_bytes, same_cloud, scans
+from bag_samples import LATCHED, cloud_frame, message_bytes, same_cloud, scans
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from samples import STAMP, png_header, scene, write
 
 from lidar_perception.data.bag import LATCHED_QOS, Bag, BagWriter
-from lidar_perception.data.recording import open_recording
-from lidar_perception.data.to_bag import Scan, write_bag
+from lidar_perception.data.frame import Frame
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
 from lidar_perception.types import GroundTruth
 from lidar_perception.wire.codec import typestore
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, IMAGE, POINTS, TRUTH
@@ -20,24 +21,29 @@ from msg_utils.point_cloud2 import to_array
 
 
 def test_a_recording_gives_back_the_scans(written):
-    recording = open_recording(bag=written)
-    assert recording.count == 3
-    for scan, read in zip(scans(), recording, strict=True):
-        assert same_cloud(scan.cloud, read.frame.xyz)
-        assert (read.frame.stamp_ns, read.frame.frame_id) == (scan.stamp_ns, "velodyne")
-        assert (read.truth is None) == (scan.truth is None)
-        if scan.truth is not None:
-            np.testing.assert_allclose(read.truth.boxes, scan.truth.boxes, atol=1e-12)
-            assert read.truth.labels == scan.truth.labels
-        np.testing.assert_allclose(read.camera.projection, scan.calibration.camera().projection,
-                                   atol=1e-9)
-        assert (read.camera.width, read.camera.height) == (scan.calibration.width,
-                                                           scan.calibration.height)
+    recording = open_recording(written)
+    assert len(recording) == 3
+    for i, (scan, read) in enumerate(zip(scans(), recording, strict=True)):
+        frame = read.load()
+        assert same_cloud(scene(i), frame.xyz)
+        assert np.array_equal(scan.load().intensity, frame.intensity)
+        assert (frame.stamp_ns, frame.frame_id) == (scan.stamp_ns, "velodyne")
+        assert (read.stamp_ns, read.name, read.index) == (scan.stamp_ns, str(scan.stamp_ns), i)
+        truth, expected = read.truth(), scan.truth()
+        assert (truth is None) == (expected is None)
+        if expected is not None:
+            np.testing.assert_allclose(truth.boxes, expected.boxes, atol=1e-12)
+            assert truth.labels == expected.labels
+        camera, expected = read.camera(), scan.camera()
+        np.testing.assert_allclose(camera.projection, expected.projection, atol=1e-9)
+        assert (camera.width, camera.height) == (expected.width, expected.height)
 
 
 def test_clouds_are_in_the_bag_bit_by_bit_with_intensity(tmp_path):
     cloud = np.array([[1, 2, 3, 0.5], [np.nan, -0.0, np.inf, -1], [0, 0, 0, 0]], np.float32)
-    write_bag(tmp_path / "bag", [Scan(cloud, STAMP), Scan(cloud[:0], STAMP + 1)])
+    write_bag(tmp_path / "bag", [
+        Frame.of(str(i), cloud_frame(part, STAMP + i))
+        for i, part in enumerate((cloud, cloud[:0]))])
     with Bag(tmp_path / "bag") as bag:
         full, empty = [to_array(msg) for _, _, msg in bag.messages({POINTS})]
     assert full.dtype.names == ("x", "y", "z", "intensity") and len(empty) == 0
@@ -45,22 +51,25 @@ def test_clouds_are_in_the_bag_bit_by_bit_with_intensity(tmp_path):
 
 
 def test_what_a_scan_lacks_is_not_in_the_bag(tmp_path):
-    write_bag(tmp_path / "bag", [Scan(scene(), STAMP)])
-    read, = open_recording(bag=tmp_path / "bag")
-    assert read.truth is None and read.camera is None
+    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
+    recording = open_recording(tmp_path / "bag")
+    read, = recording
+    assert read.truth() is None and read.camera() is None and read.pose() is None
     with Bag(tmp_path / "bag") as bag:
         assert {t for t, _, _ in bag.raw()} == {POINTS}
 
 
 def test_empty_labels_are_not_missing_labels(tmp_path):
-    write_bag(tmp_path / "bag", [Scan(scene(), STAMP, GroundTruth.of([], []))])
-    read, = open_recording(bag=tmp_path / "bag")
-    assert len(read.truth) == 0
+    write_bag(tmp_path / "bag", [
+        Frame.of("0", cloud_frame(scene(), STAMP), GroundTruth.of([], []))])
+    read, = open_recording(tmp_path / "bag")
+    assert len(read.truth()) == 0
 
 
 def test_images_are_in_the_bag_byte_by_byte(tmp_path):
     image = write(tmp_path / "image.png", png_header(3, 2) + b"pixels")
-    write_bag(tmp_path / "bag", [Scan(scene(), STAMP, image=image)])
+    write_bag(tmp_path / "bag", [
+        Frame.of("0", cloud_frame(scene(), STAMP), image=image)], images=True)
     with Bag(tmp_path / "bag") as bag:
         (_, stamp, msg), = bag.messages({IMAGE})
     assert (bytes(msg.data), msg.format, stamp) == (image.read_bytes(), "png", STAMP)
@@ -95,7 +104,8 @@ def test_mcap_reads_the_bag_and_its_checksums_hold(written):
 
 def test_chunks_are_zstd_and_hold_more_than_one_cloud(tmp_path):
     cloud = np.random.default_rng(0).random((60_000, 4), np.float32)
-    count = write_bag(tmp_path / "bag", (Scan(cloud, STAMP + i) for i in range(12)))
+    count = write_bag(tmp_path / "bag", (
+        Frame.of(str(i), cloud_frame(cloud, STAMP + i)) for i in range(12)))
     with open(tmp_path / "bag/bag.mcap", "rb") as stream:
         chunks = make_reader(stream).get_summary().chunk_indexes
     assert {c.compression for c in chunks} == {"zstd"}
@@ -133,7 +143,7 @@ def test_metadata_counts_what_is_in_the_file(written):
 
 def test_a_bag_without_messages_is_a_bag(tmp_path):
     assert write_bag(tmp_path / "bag", []) == 0
-    assert list(open_recording(bag=tmp_path / "bag")) == []
+    assert list(open_recording(tmp_path / "bag")) == []
 
 
 def test_bags_of_sqlite_are_read_alike(written, tmp_path):
@@ -143,11 +153,10 @@ def test_bags_of_sqlite_are_read_alike(written, tmp_path):
                   for c in reader.connections}
         for connection, stamp, data in reader.messages():
             bag.write(copies[connection.topic], stamp, data)
-    for a, b in zip(open_recording(bag=written), open_recording(bag=tmp_path / "sql"),
-                    strict=True):
-        assert same_cloud(a.frame.xyz, b.frame.xyz)
-        assert np.array_equal(a.camera.projection, b.camera.projection)
-        assert (a.truth is None) == (b.truth is None)
+    for a, b in zip(open_recording(written), open_recording(tmp_path / "sql"), strict=True):
+        assert same_cloud(a.load().xyz, b.load().xyz)
+        assert np.array_equal(a.camera().projection, b.camera().projection)
+        assert (a.truth() is None) == (b.truth() is None)
 
 
 def test_raw_takes_topics_and_a_window_of_time(written):
@@ -168,6 +177,6 @@ def test_labels_may_come_after_their_cloud(written, tmp_path):
         for topic, stamp, data in message_bytes(written):
             if topic in bag.channels:
                 bag.write(topic, stamp + (topic != POINTS) * 5 * 10**7, data)
-    read = list(open_recording(bag=tmp_path / "late"))
-    assert [r.truth is not None for r in read] == [True, False, True]
-    assert all(r.camera is not None for r in read)
+    read = list(open_recording(tmp_path / "late"))
+    assert [r.truth() is not None for r in read] == [True, False, True]
+    assert all(r.camera() is not None for r in read)

@@ -181,8 +181,7 @@ def test_clustering_and_refinement_name_the_missing_column(processes, peer, good
 def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
         processes, peer, good_cloud, drive_bag):
     """view.enabled without CameraInfo; then without a seed; then with a clicked pedestrian."""
-    from lidar_perception.data.recording import open_recording
-
+    from lidar_perception.data.open import open_recording
     from lidar_perception.scoring.centres.report import pedestrians
     processes.start("perception", {"~/input/points": "/in", "~/output/detections": "/found"},
                     {"view.enabled": True, "seed.source": "click"})
@@ -194,7 +193,7 @@ def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
               "no seed yet")
     assert len(from_marker_array(found[-1])) == 0
 
-    people = pedestrians(next(iter(open_recording(bag=drive_bag))))
+    people = pedestrians(next(iter(open_recording(drive_bag))).truth())
     nearest = people[np.argmin(np.hypot(people[:, 0], people[:, 1]))]
     click = peer.talker("/clicked_point", "geometry_msgs/msg/PointStamped")
     point = bag_message("geometry_msgs/msg/Point", x=nearest[0], y=nearest[1], z=nearest[2])

@@ -10,12 +10,18 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.data.bag import Bag
-from lidar_perception.data.recording import open_recording
+from lidar_perception.data.open import open_recording
 from lidar_perception.nodes.graph import cloud_topic, result_topics
 from lidar_perception.nodes.replay import replay
 from lidar_perception.param_fields import with_values
-from lidar_perception.scoring.centres.report import CandidateReport, evaluate
+from lidar_perception.scoring.centres.report import (
+    CandidateReport,
+    of_frame,
+    pedestrians,
+    seed_source,
+)
 from lidar_perception.wire.messages import column, to_detections, to_frame
 from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import from_marker_array
@@ -53,9 +59,14 @@ def run(setting, drive_bag, tmp_path_factory):
 @pytest.fixture(scope="module")
 def offline(setting, drive_bag):
     """Stamp -> what the offline pipeline finds; and its report."""
-    report = CandidateReport()
-    results = [r for r in evaluate(open_recording(bag=drive_bag), setting[1], report) if r]
-    return {r.frame.stamp_ns: (segmented, found) for r, segmented, found in results}, report
+    report, results, params = CandidateReport(), {}, setting[1]
+    for frame in open_recording(drive_bag):
+        people = pedestrians(frame.truth())
+        if len(people):
+            report.update(of_frame(frame, params))
+            results[frame.stamp_ns] = find_candidates(
+                frame.load(), seed_source(people, None, params), frame.camera(), params)
+    return results, report
 
 
 def test_no_frame_is_lost_between_the_processes(run):
@@ -100,7 +111,7 @@ def test_the_published_cloud_holds_all_fields_and_the_offline_columns(run, offli
 
 def test_the_evaluator_scores_as_the_offline_evaluation(run, offline):
     _, content, out = run
-    expected = json.loads(json.dumps(offline[1].content()))
+    expected = json.loads(json.dumps(offline[1].compute()))
     for key in ("frames", "ground_truth", "ground_truth_by_range", "stage1", "stage2", "final"):
         assert _rounded(content[key]) == _rounded(expected[key])
     assert json.loads((out / "logs" / "scores.json").read_text())["frames"] == expected["frames"]

@@ -52,10 +52,11 @@ def values(weights):
     return {k: v for k, v in flatten(params).items() if v != defaults[k]}
 
 
-def offline(weights, msg, *columns):
+def offline(weights, msg, cluster_ids=None):
     params = with_values(eager(), {"pointnet.threads": 1})
     detector = load_pointnet_detector(weights, "cpu", params)
-    return detector(to_frame(msg, params.input.intensity_max)[0], *columns)
+    scan = to_frame(msg, params.input.intensity_max)[0]
+    return detector(scan, cluster_ids=cluster_ids).detections
 
 
 def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, weights):

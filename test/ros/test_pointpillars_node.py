@@ -74,10 +74,11 @@ def received(messages, stamp):
     return next((m for m in map(from_marker_array, messages) if m.stamp_ns == stamp), None)
 
 
-def offline(weights, msg, params=None, *columns):
-    params = params or with_values(eager(), {"pointpillars.threads": 1})
+def offline(weights, msg, ground=None, cluster_ids=None):
+    params = with_values(eager(), {"pointpillars.threads": 1})
     detector = load_detector(weights, "cpu", params)
-    return detector(to_frame(msg, params.input.intensity_max)[0], *columns)
+    scan = to_frame(msg, params.input.intensity_max)[0]
+    return detector(scan, ground=ground, cluster_ids=cluster_ids).detections
 
 
 def assert_equal(objects, expected):
@@ -115,7 +116,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, 
     marked, places = points[-1], np.arange(len(scan))
     np.testing.assert_array_equal(column(marked, "ground", places) > 0, segmented.ground)
     np.testing.assert_array_equal(column(marked, "cluster_id", places), segmented.cluster_ids)
-    assert_equal(received(found, 1), offline(weights, message(1), None, *columns))
+    assert_equal(received(found, 1), offline(weights, message(1), *columns))
     assert received(found, 1).frame_id == "lidar"
 
     talker = peer.talker(between, CLOUD)
@@ -126,7 +127,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, 
     ids = cluster_obstacles(scan.xyz, nowhere > 0, DetectorParams().clustering)
     peer.send(talker, message(3, ground=nowhere, cluster_id=ids.astype(np.uint32)),
               lambda: received(found, 3), "detections of a cloud with columns")
-    other = offline(weights, message(3), None, nowhere, ids)
+    other = offline(weights, message(3), nowhere > 0, ids)
     assert_equal(received(found, 3), other)
     assert not np.array_equal(other.boxes, offline(weights, message(2)).boxes)
 
@@ -184,7 +185,7 @@ def test_thresholds_change_at_run_time_and_what_cannot_is_refused(processes, pee
 
     text, double = ParameterType.PARAMETER_STRING, ParameterType.PARAMETER_DOUBLE
     for name, value in ("weights", "other.safetensors"), ("device", "cuda"), ("version", "v0"):
-        refused = change(f"detection.{name}", type=text, string_value=value)
+        refused = change(f"pointpillars.{name}", type=text, string_value=value)
         assert not refused.successful and "read-only" in refused.reason
     refused = change("pointpillars.scores.car", type=double, double_value=1.5)
     assert not refused.successful and refused.reason

@@ -15,13 +15,14 @@ from samples import CALIBRATION, calibration_text, object_folder, scene, walker_
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.cli.main import cli
-from lidar_perception.data.recording import Recorded, open_recording
+from lidar_perception.data.frame import Frame
+from lidar_perception.data.open import open_recording
 from lidar_perception.simulation.realism.compare import (
     LEAST_SAMPLES,
     MOST_SCANS,
     compare,
+    evenly,
     factor_off,
-    labelled,
     measure,
     median_interval,
     ratio,
@@ -49,7 +50,7 @@ EXTENTS = [f"{name} {what}" for name in CLASSES for what in ("height", "length",
 LIGHT = [name for name in CURVES if "intensity" in name]
 
 
-def recorded(seed: int, points: int = 500) -> Recorded:
+def recorded(seed: int, points: int = 500) -> Frame:
     """A street all around, and objects full of points."""
     rng = np.random.default_rng(seed)
     reach, turn = rng.uniform(3, 70, 12000), rng.uniform(-np.pi, np.pi, 12000)
@@ -67,13 +68,23 @@ def recorded(seed: int, points: int = 500) -> Recorded:
     xyz = np.concatenate(parts).astype(np.float32)
     intensity = rng.beta(2, 4, len(xyz)).round(2).astype(np.float32)
     extras = [{"occluded": 0, "truncated": 0.0} for _ in boxes]
-    return Recorded(str(seed), LidarFrame(xyz, intensity), GroundTruth.of(boxes, ids, extras),
-                    CALIBRATION.camera())
+    return Frame.of(str(seed), LidarFrame(xyz, intensity), GroundTruth.of(boxes, ids, extras),
+                    CALIBRATION)
 
 
-def changed(change, count: int = SCANS) -> list[Recorded]:
+def with_scan(frame: Frame, scan: LidarFrame) -> Frame:
+    """The frame with other points."""
+    return Frame.of(frame.name, scan, frame.truth(), frame.calibration())
+
+
+def rows_of(frame: Frame) -> dict:
+    """The rows of its objects."""
+    return object_rows(frame.load(), frame.truth(), frame.camera())
+
+
+def changed(change, count: int = SCANS) -> list[Frame]:
     """The street's scans with every frame changed."""
-    return [replace(r, frame=change(r.frame, np.random.default_rng(100 + i)))
+    return [with_scan(r, change(r.load(), np.random.default_rng(100 + i)))
             for i, r in enumerate(map(recorded, range(count)))]
 
 
@@ -126,13 +137,13 @@ def test_the_order_of_the_points_does_not_matter():
 
 def test_counts_add_up():
     one = recorded(0)
-    rows = {name: row[0] for name, row in scan_rows(one.frame).items()}
-    assert rows["points"].sum() == rows["scan points"][0] == len(one.frame)
+    rows = {name: row[0] for name, row in scan_rows(one.load()).items()}
+    assert rows["points"].sum() == rows["scan points"][0] == len(one.load())
     assert ((rows["ground share"] >= 0) & (rows["ground share"] <= 1)
             | np.isnan(rows["ground share"])).all()
     assert (rows["person clusters"] <= rows["clusters"]).all()
     for name in LIGHT:
-        row = {**rows, **{k: v[0] for k, v in object_rows(one).items()}}[name]
+        row = {**rows, **{k: v[0] for k, v in rows_of(one).items()}}[name]
         assert row.sum() == pytest.approx(1.0) if "histogram" in name else (np.diff(row) >= 0).all()
 
 
@@ -151,9 +162,9 @@ def test_what_is_missing_on_the_simulated_side_is_wrong():
 
 
 def test_nothing_is_compared_with_nothing():
-    empty = Recorded("0", LidarFrame(np.zeros((0, 3), np.float32)), GroundTruth.of([], []),
-                     CALIBRATION.camera())
-    for scans in ([], [empty], [replace(empty, truth=None)]):
+    none = LidarFrame(np.zeros((0, 3), np.float32))
+    empty = Frame.of("0", none, GroundTruth.of([], []), CALIBRATION)
+    for scans in ([], [empty], [Frame.of("0", none, None, CALIBRATION)]):
         measured = measure(scans, PAPER)
         content = compare(measured, measured)
         assert (content["judged"], content["share"]) == (0, None)
@@ -161,7 +172,7 @@ def test_nothing_is_compared_with_nothing():
 
 
 def test_scans_without_intensity_or_camera_have_the_other_curves():
-    bare = [replace(r, camera=None, frame=replace(r.frame, intensity=None))
+    bare = [Frame.of(r.name, replace(r.load(), intensity=None), r.truth())
             for r in map(recorded, range(2))]
     measured = measure(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
     assert all((len(rows) == 0) == (name in LIGHT) for name, rows in measured.rows.items()
@@ -170,32 +181,33 @@ def test_scans_without_intensity_or_camera_have_the_other_curves():
 
 def test_a_scan_cropped_to_the_view_counts_for_its_objects_only():
     whole = recorded(0)
-    seen = np.flatnonzero(whole.camera.in_view(whole.frame.xyz))
-    cropped = replace(whole, frame=whole.frame.take(seen))
-    assert is_whole(whole.frame) and not is_whole(cropped.frame)
+    seen = np.flatnonzero(whole.camera().in_view(whole.load().xyz))
+    cropped = with_scan(whole, whole.load().take(seen))
+    assert is_whole(whole.load()) and not is_whole(cropped.load())
     measured = measure([cropped], PAPER)
     assert (measured.scans, measured.whole_scans) == (1, 0)
     assert all(not measured.rows[name] for name in ("points", "clusters", "ground intensity"))
-    expected = object_rows(whole)
+    expected = rows_of(whole)
     assert all(np.array_equal(rows, expected[name], equal_nan=True)
-               for name, rows in object_rows(cropped).items())
+               for name, rows in rows_of(cropped).items())
 
 
 def test_objects_at_the_border_of_the_image_do_not_count():
     one = recorded(0)
-    border = one.truth.boxes[:1].copy()
-    while one.camera.in_view(border[:, :3]).all():
+    border = one.truth().boxes[:1].copy()
+    while one.camera().in_view(border[:, :3]).all():
         border[0, 1] += 0.1
     border[0, 1] -= 0.2  # the centre is seen, a half is not
-    assert object_rows(replace(one, truth=GroundTruth.of(border, [0]))) == {}
+    assert object_rows(one.load(), GroundTruth.of(border, [0]), one.camera()) == {}
 
 
 @pytest.mark.parametrize("level", [1, 2, 3])
 def test_occluded_objects_count_for_all_points_only(level):
     one = recorded(0)
-    truth = replace(one.truth, extras=tuple({"occluded": level} for _ in one.truth.extras))
-    found = set(object_rows(replace(one, truth=truth)))
-    assert found == {name for name in object_rows(one)
+    truth = one.truth()
+    truth = replace(truth, extras=tuple({"occluded": level} for _ in truth.extras))
+    found = set(object_rows(one.load(), truth, one.camera()))
+    assert found == {name for name in rows_of(one)
                      if name.endswith("points of all") or "intensity" in name}
 
 
@@ -224,8 +236,8 @@ def test_the_interval_holds_the_median():
 
 def test_what_lies_among_uncertain_real_samples_is_plausible():
     def thinned(shares):
-        return measure([replace(r, frame=r.frame.take(np.flatnonzero(
-            np.random.default_rng(100).random(len(r.frame)) < share)))
+        return measure([with_scan(r, r.load().take(np.flatnonzero(
+            np.random.default_rng(100).random(len(r.load())) < share)))
             for r, share in zip(map(recorded, range(SCANS)), shares)], PAPER)
     content = compare(thinned(np.linspace(0.3, 1, SCANS)), thinned([0.9] * SCANS))
     points = judged(content, ["scan points", "Car points"])
@@ -259,7 +271,7 @@ def tracking_folder(root):
 @pytest.mark.parametrize("make", [lambda root: object_folder(root, walker_label(), 1),
                                   tracking_folder])
 def test_object_and_tracking_folders_are_read(tmp_path, make):
-    measured = measure(labelled(open_recording(kitti=make(tmp_path))), PAPER)
+    measured = measure(evenly(open_recording(make(tmp_path))), PAPER)
     assert measured.objects == {"Car": 0, "Pedestrian": 1, "Cyclist": 0}
     assert (measured.scans, measured.whole_scans, measured.skipped) == (1, 1, [])
 
@@ -269,27 +281,27 @@ def test_folders_without_labels_are_refused(tmp_path):
     for label in tmp_path.rglob("label_2/*.txt"):
         label.unlink()
     with pytest.raises(InputError, match="no labels"):
-        labelled(open_recording(kitti=tmp_path))
+        evenly(open_recording(tmp_path))
 
 
 def test_broken_scans_are_skipped_and_counted(tmp_path):
     scans = sorted(object_folder(tmp_path, walker_label(), 3).rglob("velodyne/*.bin"))
     write(scans[1], b"cut")
-    measured = measure(labelled(open_recording(kitti=tmp_path)), PAPER)
+    measured = measure(evenly(open_recording(tmp_path)), PAPER)
     assert measured.scans == 2 and len(measured.skipped) == 1
     assert compare(measured, measured)["real"]["skipped"] == measured.skipped
     for scan in scans:
         write(scan, b"cut")
     with pytest.raises(InputError, match=r"none of 3 scans can be read: .*000000.bin"):
-        measure(labelled(open_recording(kitti=tmp_path)), PAPER)
+        measure(evenly(open_recording(tmp_path)), PAPER)
 
 
 def test_of_a_large_folder_an_even_choice_is_compared(tmp_path):
-    recording = open_recording(kitti=object_folder(tmp_path, walker_label(), 1))
+    recording = open_recording(object_folder(tmp_path, walker_label(), 1))
     many = [replace(recording.frames[0], name=str(i)) for i in range(3 * MOST_SCANS)]
-    chosen = labelled(replace(recording, frames=many, count=len(many)))
-    numbers = [int(f.name) for f in chosen.frames]
-    assert chosen.count == len(numbers) == MOST_SCANS
+    chosen = evenly(replace(recording, frames=many))
+    numbers = [int(f.name) for f in chosen]
+    assert len(numbers) == MOST_SCANS
     assert (numbers[0], numbers[-1]) == (0, len(many) - 1) and set(np.diff(numbers)) <= {3, 4}
 
 
@@ -305,7 +317,7 @@ def test_the_command_compares(tmp_path):
 
 
 def test_real_scans_are_as_real_as_themselves(data):
-    scans = [r for r in open_recording(kitti=data / "kitti_object") if is_whole(r.frame)][:2]
+    scans = [r for r in open_recording(data / "kitti_object") if is_whole(r.load())][:2]
     first, second = (measure(scans, PAPER) for _ in range(2))
     content = compare(first, second)
     assert all(b["ratio"] in (1.0, None) for c in content["curves"].values() for b in c["bins"])

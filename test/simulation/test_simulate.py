@@ -208,7 +208,7 @@ def test_resume_names_every_difference(tmp_path, monkeypatch):
     (["--sensor", "hdl65"], "unknown sensor 'hdl65': must be one of hdl64e"),
     (["--format", "pcap"], "pcap"), (["--frames", "0"], "0 is not in the range"),
     (["--seed", "-1"], "-1 is not in the range"), (["--streets-of", "201"], "1 .. 200"),
-    (["--resume", "--force"], "one of them"), (["--format", "mcap", "--resume"], "convert kitti")])
+    (["--resume", "--force"], "one of them"), (["--format", "mcap", "--resume"], "with 'convert'")])
 def test_bad_arguments_are_named(tmp_path, options, said):
     arguments = ["--out", str(tmp_path / "set"), "--format", "kitti", *options]
     result = CliRunner().invoke(simulate, arguments)

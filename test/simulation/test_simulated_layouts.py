@@ -11,7 +11,7 @@ from simulate_samples import TINY, run
 from lidar_perception.data.kitti import write as write_kitti
 from lidar_perception.data.kitti.folder import open_kitti
 from lidar_perception.data.kitti.labels import read_object_labels, read_tracking_labels
-from lidar_perception.data.recording import open_recording
+from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import MOVING, THINGS, open_semantic_kitti
 from lidar_perception.geometry import box_corners, points_in_box, wrap_angle
 from lidar_perception.simulation.batch import training_scans
@@ -55,17 +55,18 @@ def test_columns_of_a_scan_fit_its_points():
 
 
 def test_object_layout_reads_back(made):
-    recording = open_recording(kitti=made / "kitti")
-    assert recording.count == 5
+    recording = open_recording(made / "kitti")
+    assert len(recording) == 5
     for number, recorded in enumerate(recording):
         scan = scan_at(3 + number // 2, number % 2, TINY)
         order = np.argsort(scan.ring, kind="stable")
         assert recorded.name == f"{number:06}"
-        assert np.array_equal(recorded.frame.xyz, scan.frame.xyz[order])
-        assert np.array_equal(recorded.frame.intensity, scan.frame.intensity[order])
-        assert np.allclose(recorded.camera.projection, FORWARD_CAMERA.camera().projection)
-        assert (recorded.camera.width, recorded.camera.height) == (1242, 375)
-        same_objects(recorded.truth, kitti_labels(scan.truth), 0.0051)
+        frame, camera = recorded.load(), recorded.camera()
+        assert np.array_equal(frame.xyz, scan.frame.xyz[order])
+        assert np.array_equal(frame.intensity, scan.frame.intensity[order])
+        assert np.allclose(camera.projection, FORWARD_CAMERA.camera().projection)
+        assert (camera.width, camera.height) == (1242, 375)
+        same_objects(recorded.truth(), kitti_labels(scan.truth), 0.0051)
 
 
 def test_what_is_hidden_or_nearly_so_is_not_labelled_but_marked():
@@ -83,11 +84,12 @@ def test_tracking_layout_reads_back(made):
     frames = open_kitti(made / "kitti-tracking")
     assert [f.name for f in frames] == ["0000/000000", "0000/000001", "0001/000000", "0001/000001",
                                         "0002/000000"]
-    for number, recorded in enumerate(open_recording(kitti=made / "kitti-tracking")):
+    for number, recorded in enumerate(open_recording(made / "kitti-tracking")):
         scan = scan_at(3 + number // 2, number % 2, TINY)
         expected = kitti_labels(scan.truth)
-        same_objects(recorded.truth, expected, 6e-7, truncation=0.26)
-        assert ([e["track_id"] for e in recorded.truth.extras]
+        truth = recorded.truth()
+        same_objects(truth, expected, 6e-7, truncation=0.26)
+        assert ([e["track_id"] for e in truth.extras]
                 == [e["track_id"] for e in expected.extras])
 
 
@@ -115,10 +117,11 @@ def test_semantickitti_layout_reads_back(made):
     for number, frame in enumerate(frames):
         scan = scan_at(3 + number // 2, number % 2, TINY)
         order = np.argsort(scan.ring, kind="stable")
-        read, semantic, instance = frame.load()
-        assert np.array_equal(read.xyz, scan.frame.xyz[order])
-        assert np.array_equal(semantic, scan.semantic[order])
-        assert np.array_equal(instance, scan.instance[order])
+        truth = frame.point_truth()
+        assert np.array_equal(frame.load().xyz, scan.frame.xyz[order])
+        assert np.array_equal(truth.classes, scan.semantic[order])
+        assert np.array_equal(truth.instances, scan.instance[order])
+        assert np.allclose(frame.pose(), scan.pose, atol=1e-9)  # inverts pose_line
     for sequence in range(2):
         folder = root / f"sequences/{sequence:02}"
         calibration = dict(line.split(": ") for line in
@@ -135,11 +138,11 @@ def test_semantickitti_layout_reads_back(made):
 def test_a_bag_goes_on_with_the_next_street(tmp_path):
     result = run(tmp_path / "bag", "mcap", 4, 1, "--streets-of", 2)
     assert result.exit_code == 0, result.output
-    recording = list(open_recording(bag=tmp_path / "bag"))
+    recording = list(open_recording(tmp_path / "bag"))
     for number, recorded in enumerate(recording):
         scan = scan_at(3 + number // 2, number % 2, TINY)
-        assert np.array_equal(recorded.frame.xyz, scan.frame.xyz)
-    stamps = [r.frame.stamp_ns for r in recording]
+        assert np.array_equal(recorded.load().xyz, scan.frame.xyz)
+    stamps = [r.load().stamp_ns for r in recording]
     assert np.diff(stamps).tolist() == [10**8, 101 * 10**8, 10**8]
 
 

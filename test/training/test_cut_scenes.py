@@ -10,6 +10,7 @@ import torch
 from pointnet_samples import SMALL, blobs
 from samples import CALIBRATION
 
+from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.config import pointnet_config
 from lidar_perception.detectors.pointnet.network import make_pointnet
@@ -18,6 +19,7 @@ from lidar_perception.geometry import points_in_box, wrap_angle
 from lidar_perception.scoring.points.clusters import (
     UNKNOWN,
     ClusterScores,
+    confusions,
     labelled,
     point_labels,
     uncared,
@@ -112,9 +114,10 @@ def test_scores_of_clusters_and_points_are_counted_by_hand(rng):
     labels = np.array([0, 0, 1, 3, 0])  # right, missed, right, wrong; too small to count
     numbers = np.array([1, 1, 2, 3, 0, 0])
     truth = np.array([0, 3, 0, 1, 1, UNKNOWN])
-    scores.add(clusters, labels, Predictions(found, found.argmax(1), np.zeros((5, 7))), truth,
-               numbers)
-    content = scores.content()
+    scores.update(confusions(clusters, labels, Predictions(found, found.argmax(1),
+                                                           np.zeros((5, 7))), truth, numbers,
+                             CONFIG.classes))
+    content = scores.compute()
     assert content["clusters"]["accuracy"] == 50.0
     assert content["clusters"]["object_accuracy"] == pytest.approx(200 / 3)
     car = content["clusters"]["by_class"]["Car"]
@@ -124,7 +127,7 @@ def test_scores_of_clusters_and_points_are_counted_by_hand(rng):
     assert (car["precision"], car["recall"], car["f1"], car["iou"]) == (
         50.0, 50.0, 50.0, pytest.approx(100 / 3))
     assert content["points"]["mean"]["recall"] == 50.0
-    empty = ClusterScores(CONFIG.classes).content()
+    empty = ClusterScores(CONFIG.classes).compute()
     assert empty["clusters"]["accuracy"] is None and empty["points"]["mean"]["iou"] is None
 
 
@@ -260,8 +263,8 @@ def test_validation_reads_every_scene_and_calibrates(rng):
                 raise InputError("broken.bin")
             return scene
 
-        def judged(self, i):
-            return "a", LidarFrame(np.zeros((0, 3), np.float32)), truth, CALIBRATION
+        def frame(self, i):
+            return Frame.of("a", LidarFrame(np.zeros((0, 3), np.float32)), truth, CALIBRATION)
 
     items = [JudgedScenes((Source(),), judged_clusters)[n] for n in range(2)]
     assert items[1].sample is None and items[1].skipped == ("broken.bin",)

@@ -126,7 +126,7 @@ def test_what_is_held_out_is_not_trained_on(tmp_path):
 
 
 @pytest.mark.parametrize("arguments, reason", [
-    (["--data", "nowhere"], "nowhere is not a folder"),
+    (["--data", "nowhere"], "there is no nowhere; give a bag or the folder of a data set"),
     (["--data", "sim", "--data-sensor", "lidar9000"], "lidar9000"),
     (["--data", "sim", "--device", "tpu"], "tpu"),
     (["--data", "sim", "--lr", "0"], "lr = 0"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 import time
@@ -17,6 +18,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import WALKER, object_folder, walker_label, write
 
+from lidar_perception.data.frame import Frame
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED
 from lidar_perception.geometry import points_in_box
@@ -29,14 +34,22 @@ from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pointpillars.task import (
     Preparation,
     Sample,
-    judged_scan,
+    frame_to_judge,
     make_loss,
-    score_detector,
     targets_of,
+    validation_report,
 )
 from lidar_perception.training.record import metrics_of
-from lidar_perception.training.scenes import KittiScenes, SimulatedScenes, kitti_names, random_split
-from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError
+from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes, random_split
+from lidar_perception.training.sources import names_of
+from lidar_perception.types import (
+    CLASSES,
+    PEDESTRIAN,
+    Detections,
+    GroundTruth,
+    InputError,
+    LidarFrame,
+)
 
 few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
@@ -65,7 +78,7 @@ def keep_all(scene, rng):
 
 def test_what_is_broken_is_named_skipped_and_counted(tmp_path, capsys):
     root = broken_folder(tmp_path)
-    stream = Stream((KittiScenes(root, kitti_names(root)),), keep_all)
+    stream = Stream((RecordedScenes(root, names_of(root)),), keep_all)
     batches = Batches(stream, 5)
     steps = batches(0)
     for _ in range(2):
@@ -75,7 +88,7 @@ def test_what_is_broken_is_named_skipped_and_counted(tmp_path, capsys):
     assert "000001.txt:1" in reasons[0] and "000003.bin" in reasons[1]
     assert capsys.readouterr().err.replace("\n", "").count("skipped:") == 2  # each said once
     assert len(list(RawScenes(stream).some(10, 0))) == 3
-    broken = Stream((KittiScenes(root, ("000001", "000003")),), keep_all)
+    broken = Stream((RecordedScenes(root, ("000001", "000003")),), keep_all)
     with pytest.raises(InputError, match="none of the 2 scenes"):
         broken[0]
 
@@ -84,28 +97,53 @@ def test_frames_without_labels_cannot_be_learned_from(tmp_path):
     root = object_folder(tmp_path, count=2)
     (root / "training/label_2/000001.txt").unlink()
     with pytest.raises(InputError, match=r"000001\.bin has no labels"):
-        KittiScenes(root, ("000001",)).scene(0)
+        RecordedScenes(root, ("000001",)).scene(0)
 
 
 def test_kitti_scenes_end_with_the_image_unless_asked(tmp_path):
     root = object_folder(tmp_path, walker_label() + "\n", 1)
-    ahead, all_of_it = (KittiScenes(root, ("000000",), view).scene(0) for view in (True, False))
+    ahead, all_of_it = (RecordedScenes(root, ("000000",), view).scene(0) for view in (True, False))
     assert 0 < len(ahead.points) < len(all_of_it.points)
     assert (ahead.points[:, 0] > 0).all() and (all_of_it.points[:, 0] < 0).any()
     np.testing.assert_allclose(ahead.boxes[0], WALKER, atol=0.02)
     assert points_in_box(ahead.points[:, :3], ahead.boxes[0]).sum() > 300
 
 
+def test_a_bag_of_a_folder_has_its_scenes(tmp_path):
+    folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
+    write_bag(tmp_path / "bag", open_recording(folder))
+    of_bag = RecordedScenes(tmp_path / "bag", names_of(tmp_path / "bag"))
+    of_bag.scene(0)  # what it has opened stays here
+    for source in (of_bag, pickle.loads(pickle.dumps(of_bag))):
+        for i in range(2):
+            scene, expected = source.scene(i), RecordedScenes(folder, names_of(folder)).scene(i)
+            assert np.array_equal(scene.points, expected.points) and not scene.around
+            np.testing.assert_allclose(scene.boxes, expected.boxes, atol=1e-9)
+            assert np.array_equal(scene.class_ids, expected.class_ids)
+
+
+def test_without_a_camera_all_around_is_labelled_and_without_labels_nothing_is_learned(tmp_path):
+    frames = [Frame.of("0", LidarFrame(two_objects()[:, :3].copy()), GroundTruth.of([WALKER],
+                                                                                   [PEDESTRIAN]))]
+    write_bag(tmp_path / "bag", frames)
+    scene = RecordedScenes(tmp_path / "bag", names_of(tmp_path / "bag")).scene(0)
+    assert scene.around and np.array_equal(scene.points[:, :3], two_objects()[:, :3])
+    assert not scene.points[:, 3].any()  # no intensity
+    write_bag(tmp_path / "bare", [Frame.of("0", frames[0].load())])
+    with pytest.raises(InputError, match="has no labelled boxes, which train needs"):
+        names_of(tmp_path / "bare")
+
+
 def test_splits_name_their_frames(tmp_path):
     root = object_folder(tmp_path, count=4)
     split = write(tmp_path / "train.txt", "000003\n000001\n")
-    assert kitti_names(root, split) == ("000003", "000001")
-    assert len(kitti_names(root)) == 4
+    assert names_of(root, split) == ("000003", "000001")
+    assert len(names_of(root)) == 4
     for text, reason in (("000009", "000009"), ("", "names no frame")):
         with pytest.raises(InputError, match=reason):
-            kitti_names(root, write(split, text))
+            names_of(root, write(split, text))
     with pytest.raises(InputError, match="cannot read the split"):
-        kitti_names(root, tmp_path / "missing.txt")
+        names_of(root, tmp_path / "missing.txt")
 
 
 @few
@@ -258,16 +296,16 @@ def test_a_scene_that_the_network_cannot_see_is_skipped():
 
 def test_a_perfect_detector_scores_and_a_blind_one_does_not(tmp_path):
     root = broken_folder(tmp_path)
-    scenes = JudgedScenes((KittiScenes(root, kitti_names(root)),), judged_scan)
-    right = score_detector(lambda frame: Detections.of([WALKER]), scenes)
-    blind = score_detector(lambda frame: Detections.none(), scenes)
-    assert right.content()["frames"] == 3 and len(right.skipped) == 2
+    scenes = JudgedScenes((RecordedScenes(root, names_of(root)),), frame_to_judge)
+    right = validation_report(lambda frame: Found(Detections.of([WALKER])), scenes)
+    blind = validation_report(lambda frame: Found(Detections.none()), scenes)
+    assert right.compute()["frames"] == 3 and len(right.skipped) == 2
     names = ("Car", "Pedestrian", "Cyclist")
     for score in "bev", "map":
-        metrics = metrics_of(right.content(), score, names)
+        metrics = metrics_of(right.compute(), score, names)
         assert metrics["score"] == metrics["Pedestrian_3d"] == 100.0
         assert np.isnan(metrics["Car_bev_relaxed"])
-        assert metrics_of(blind.content(), score, names)["score"] == 0.0
+        assert metrics_of(blind.compute(), score, names)["score"] == 0.0
 
 
 def test_samples_are_plain_arrays_that_other_processes_can_send():

@@ -87,7 +87,7 @@ def _open(root: Path, scans: bool) -> tuple[list[Frame], str, bool]:
             labelled = (folder / "label_02").is_dir() or (folder / "label_2").is_dir()
             break
     else:
-        frames, layout = _raw(root), "raw drives"
+        frames, layout = _raw(root.absolute()), "raw drives"
         labelled = any((frame.native / "tracklet_labels.xml").exists() for frame in frames)
     if not frames:
         raise InputError(f"{root} has no KITTI scans: expected training/velodyne/*.bin (object), "

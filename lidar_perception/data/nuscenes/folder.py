@@ -79,7 +79,7 @@ def recognises(path: Path) -> bool:
 def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
     """The key frames of ROOT, which has one version, or of ROOT/VERSION."""
     if (path / "sample_data.json").is_file():
-        root, version = path.parent, path.name
+        root, version = path.absolute().parent, path.absolute().name
     else:
         root, (version, *others) = path, _versions(path)
         if others:

@@ -16,6 +16,7 @@ import numpy as np
 
 from lidar_perception import __version__
 from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.geometry import points_in_box
@@ -53,8 +54,8 @@ class CutScenes:
     def __len__(self) -> int:
         return len(self.scenes)
 
-    def judged(self, i: int) -> Any:
-        """The scan that it is cut from, with what evaluation needs."""
+    def frame(self, i: int) -> Frame:
+        """The frame that it is cut from, to validate on."""
         return self.scenes.frame(i)
 
     def scene(self, i: int) -> CutScene:

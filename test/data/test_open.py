@@ -1,0 +1,315 @@
+"""One opener: what lies at a path is recognised and said, and split files choose from it."""
+
+from __future__ import annotations
+
+import shutil
+from itertools import pairwise
+
+import numpy as np
+import nuscenes_folder
+import pytest
+from bag_samples import cloud_frame, message_bytes, same_cloud, scans
+from kitti_samples import raw_folder, tracking_folder
+from samples import CALIBRATION, STAMP, object_folder, scene, write
+
+from lidar_perception.data.bag import Bag, BagWriter
+from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES, Frame
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.semantickitti import calibration_text, pose_line, write_scan
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.wire.topics import CAMERA_INFO, POINTS
+
+
+def drive(i):
+    """Pose of scan i of a sequence."""
+    turn, pose = 0.1 * i, np.eye(4)
+    pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    pose[:3, 3] = [2.0 * i, 0.3 * i, -0.1 * i]
+    return pose
+
+
+def semantic_folder(root):
+    """Two sequences; every point has labels of its own."""
+    for sequence, count in (("00", 2), ("08", 1)):
+        folder = root / "sequences" / sequence
+        for i in range(count):
+            cloud = scene(i)
+            write_scan(folder, i, cloud, np.arange(len(cloud)) % 260, np.arange(len(cloud)) % 7)
+        write(folder / "poses.txt", "".join(pose_line(drive(i), CALIBRATION)
+                                            for i in range(count)))
+        write(folder / "calib.txt", calibration_text(CALIBRATION))
+    return root
+
+
+def nuscenes_root(root):
+    return nuscenes_folder.save(root, nuscenes_folder.made_tables(frames=3, objects=6))
+
+
+def reduced_folder(root):
+    tracking_folder(root)
+    (root / "training/velodyne").rename(root / "training/velodyne_reduced")
+    return root
+
+
+def bag_folder(root):
+    write_bag(root, scans())
+    return root
+
+
+MADE = {  # name: (make, inner folders or files that say the same, what is said of it)
+    "object": (object_folder, ("", "training"), "KITTI object data, 2 frames", {BOXES, CAMERA}),
+    "tracking": (tracking_folder, ("", "training"), "KITTI tracking data, 5 frames",
+                 {BOXES, CAMERA}),
+    "reduced": (reduced_folder, ("", "training"), "KITTI tracking data, 5 frames",
+                {BOXES, CAMERA}),
+    "raw": (raw_folder, ("", "2011_09_26", "2011_09_26/2011_09_26_drive_0001_sync"),
+            "KITTI raw drives, 3 frames", {BOXES, CAMERA}),
+    "nuscenes": (nuscenes_root, ("", nuscenes_folder.VERSION), "nuScenes v1.0-mini, 6 frames",
+                 {BOXES, POSES}),
+    "semantickitti": (semantic_folder, ("", "sequences"), "SemanticKITTI, 3 frames",
+                      {POINT_LABELS, POSES}),
+    "bag": (bag_folder, ("", "bag.mcap"), "rosbag2 bag, clouds on /points, 3 frames",
+            {BOXES, CAMERA}),
+}
+each_recording = pytest.mark.parametrize("kind", MADE)
+
+
+@each_recording
+def test_what_lies_there_is_recognised_said_and_read(tmp_path, monkeypatch, kind):
+    make, inner, said, has = MADE[kind]
+    root = make(tmp_path / kind)
+    names = [frame.name for frame in open_recording(root)]
+    assert len(set(names)) == len(names)
+    for part in inner:
+        recording = open_recording(root / part)
+        assert str(recording) == ", ".join([f"{root / part}: {said}", *sorted(has)])
+        assert recording.has == has and [frame.name for frame in recording] == names
+        for frame, same in zip(recording, recording.reopen().frames, strict=True):
+            assert (frame.name, frame.stamp_ns) == (same.name, same.stamp_ns)
+            assert len(frame.load()) and np.array_equal(frame.load().xyz, same.load().xyz)
+            assert frame.load().stamp_ns == frame.stamp_ns
+            assert (frame.camera() is not None) == (CAMERA in has)
+            assert (frame.pose() is not None) == (POSES in has)
+            assert (frame.point_truth() is not None) == (POINT_LABELS in has)
+        assert any(frame.truth() is not None for frame in recording) == (BOXES in has)
+        if (root / part).is_dir():
+            monkeypatch.chdir(root / part)
+            assert [frame.name for frame in open_recording(".")] == names
+    for what in (BOXES, POINT_LABELS, CAMERA, POSES):
+        if what in has:
+            recording.require(what, "evaluate")
+        else:
+            with pytest.raises(InputError, match=r"has no .*, which evaluate needs") as error:
+                recording.require(what, "evaluate")
+            assert what.removeprefix("a ") in str(error.value) and said.split(",")[0] in str(
+                error.value)
+    for a, b in pairwise(recording):
+        assert a.stamp_ns < b.stamp_ns or a.sequence != b.sequence
+        assert a.index < b.index or a.sequence != b.sequence
+
+
+def test_one_sequence_of_semantickitti_is_a_recording(tmp_path):
+    root = semantic_folder(tmp_path)
+    assert [f.name for f in open_recording(root / "sequences/08")] == ["08/000000"]
+    (root / "sequences").rename(root / "inner")
+    (root / "dataset").mkdir()
+    (root / "inner").rename(root / "dataset/sequences")
+    assert len(open_recording(root)) == 3
+
+
+@pytest.mark.usefixtures("streets", "tiny_sensor")
+def test_what_simulate_wrote_is_recognised(made):
+    said = {str(open_recording(made / layout)).partition(": ")[2] for layout in (
+        "kitti", "kitti-tracking", "semantickitti")}
+    assert said == {"KITTI object data, 5 frames, a camera, labelled boxes",
+                    "KITTI tracking data, 5 frames, a camera, labelled boxes",
+                    "SemanticKITTI, 5 frames, labelled points, poses"}
+
+
+@pytest.mark.parametrize("make, words", [
+    (lambda p: p / "missing", "there is no .*missing; give a bag or the folder of a data set"),
+    (lambda p: p, "no recording that can be read: expected a rosbag2 bag, or the folder of KITTI"),
+    (lambda p: write(p / "notes.txt", b"text"), "no rosbag2 bag; give its folder"),
+    (lambda p: write(p / "training/velodyne/x", b"").parents[2], "has no KITTI scans: expected"),
+    (lambda p: write(p / "sequences/00/x", b"").parents[2], "no SemanticKITTI scans: expected"),
+    (lambda p: nuscenes_folder.save(nuscenes_root(p), nuscenes_folder.made_tables(), "v1.0-test",
+                                    False), "several versions; give one: .*v1.0-mini, .*v1.0-test"),
+])
+def test_what_is_no_recording_is_named_with_the_remedy(tmp_path, make, words):
+    with pytest.raises(InputError, match=words) as error:
+        open_recording(make(tmp_path))
+    assert "\n" not in str(error.value) and str(tmp_path) in str(error.value)
+
+
+def test_labels_without_a_scan_are_lost_and_named(tmp_path):
+    root = object_folder(tmp_path, count=3)
+    (root / "training/velodyne/000001.bin").unlink()
+    recording = open_recording(root)
+    assert [f.name for f in recording] == ["000000", "000002"]
+    (name, reason), = recording.lost
+    assert name == "000001" and "000001.txt has no scan; download it again" in reason
+    waiting = open_recording(root, scans=False)
+    assert len(waiting) == 3 and waiting.lost == ()
+
+
+# splits
+
+@each_recording
+def test_a_split_names_frames_in_its_order_each_once(tmp_path, kind):
+    root = MADE[kind][0](tmp_path / kind)
+    names = [frame.name for frame in open_recording(root)]
+    asked = [names[-1], names[0], names[-1]]
+    recording = open_recording(root, split=write(tmp_path / "split.txt", "\n".join(asked)))
+    assert [f.name for f in recording] == [f.name for f in recording.reopen()] == asked[:2]
+    assert len(recording.frames[0].load()) and str(recording).count("2 frames") == 1
+    whole = open_recording(root)
+    assert [f.name for f in whole.chosen(names[::-1])] == names[::-1]
+    with pytest.raises(InputError, match=rf"no frame x \(1 such\); its first is {names[0]}"):
+        whole.chosen([names[0], "x"])
+
+
+@pytest.mark.parametrize("kind, sequences", [
+    ("tracking", ("0007", "0000")), ("nuscenes", nuscenes_folder.SCENES[::-1]),
+    ("semantickitti", ("08", "00"))])
+def test_a_split_may_name_sequences(tmp_path, kind, sequences):
+    root = MADE[kind][0](tmp_path / kind)
+    frames = list(open_recording(root))
+    first, second = ([f.name for f in frames if f.sequence == name] for name in sequences)
+    for asked, expected in ((sequences[:1], first), (sequences, first + second),
+                            ((first[-1], *sequences), first[-1:] + first[:-1] + second)):
+        split = write(tmp_path / "split.txt", "\n".join(asked) + "\n")
+        assert [f.name for f in open_recording(root, split=split)] == expected
+
+
+def test_splits_that_are_wrong_are_named(tmp_path, written):
+    for root in (object_folder(tmp_path / "kitti"), written):
+        first = next(iter(open_recording(root))).name
+        for text, words in (("", f"names no frame; it needs one a line, such as {first}"),
+                            (f"{first}\nx\ny\n", rf"names x \(2 such\), .* first frame is {first}"),
+                            (b"\xff\xfe\x00", "cannot read the split")):
+            with pytest.raises(InputError, match=words) as error:
+                open_recording(root, split=write(tmp_path / "split.txt", text))
+            assert "\n" not in str(error.value) and "split.txt" in str(error.value)
+        with pytest.raises(InputError, match="cannot read the split"):
+            open_recording(root, split=tmp_path / "missing.txt")
+    assert write_bag(tmp_path / "empty", []) == 0
+    with pytest.raises(InputError, match="names x"):
+        open_recording(tmp_path / "empty", split=write(tmp_path / "split.txt", "x"))
+
+
+# bags
+
+def same_frames(a, b):
+    return (a.name, a.stamp_ns, a.index) == (b.name, b.stamp_ns, b.index) and np.array_equal(
+        a.load().xyz, b.load().xyz)
+
+
+def test_frames_of_a_bag_by_number_are_those_of_iterating(written, tmp_path):
+    clouds = [row for row in message_bytes(written) if row[0] == POINTS]
+    with BagWriter(tmp_path / "equal") as bag:  # three at the same time, two of the same stamp
+        bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+        bag.add_topic("/other", "sensor_msgs/msg/PointCloud2")
+        for i, time in ((2, 5), (0, 7), (1, 7), (0, 7), (2, 9)):
+            bag.write("/other", time, clouds[1][2])
+            bag.write(POINTS, time, clouds[i][2])
+    for path, count in ((written, 3), (tmp_path / "equal", 5)):
+        recording = open_recording(path)
+        frames = list(recording)
+        assert len(frames) == len(recording) == count == len({f.name for f in frames})
+        for i, frame in enumerate(frames):
+            assert same_frames(frame, recording.frames[i])
+            assert same_frames(frame, recording.frames[i - count])
+            assert (frame.truth() is None) == (recording.frames[i].truth() is None)
+        assert [f.name for f in recording.frames[1:]] == [f.name for f in frames[1:]]
+        for i in (count, -count - 1):
+            with pytest.raises(IndexError):
+                recording.frames[i]
+    assert [scene_of(f) for f in frames] == [2, 0, 1, 0, 2]
+
+
+def scene_of(frame):
+    return next(i for i in range(3) if same_cloud(scene(i), frame.load().xyz))
+
+
+def test_a_frame_of_a_bag_by_number_is_read_when_it_is_asked_for(written, tmp_path):
+    shutil.copytree(written, tmp_path / "bag")
+    frame = open_recording(tmp_path / "bag").frames[1]
+    shutil.rmtree(tmp_path / "bag")
+    with pytest.raises(InputError, match="there is no bag"):
+        frame.load()
+
+
+def test_a_bag_has_what_is_in_it_and_not_what_could_be(tmp_path):
+    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
+    assert open_recording(tmp_path / "bag").has == set()
+
+
+@each_recording
+def test_a_bag_made_of_a_recording_says_the_same(tmp_path, kind):
+    recording = open_recording(MADE[kind][0](tmp_path / kind))
+    assert write_bag(tmp_path / "made", recording) == len(recording)
+    bag = open_recording(tmp_path / "made")
+    assert bag.has == recording.has & {BOXES, CAMERA}
+    for frame, read in zip(recording, bag, strict=True):
+        expected, got = frame.load(), read.load()
+        assert np.array_equal(got.xyz, expected.xyz)
+        assert np.array_equal(got.intensity, expected.intensity)
+        assert got.stamp_ns == expected.stamp_ns
+        truth, again = frame.truth(), read.truth()
+        assert (truth is None) == (again is None)
+        if truth is not None:
+            np.testing.assert_allclose(again.boxes, truth.boxes, atol=1e-9)
+            assert again.labels == truth.labels and len(again.notes) == len(truth.notes)
+            for a, b in zip(again.extras, truth.extras, strict=True):
+                assert a.keys() == b.keys()
+                np.testing.assert_equal([a.get("track_id"), a.get("category")],
+                                        [b.get("track_id"), b.get("category")])
+    with Bag(tmp_path / "made") as opened:  # a calibration is written when it changes
+        assert opened.counts[CAMERA_INFO] == (CAMERA in recording.has) * (1 + (kind == "bag"))
+
+
+def test_a_scan_that_cannot_be_read_is_left_out_of_a_bag_and_named(tmp_path):
+    root = object_folder(tmp_path / "kitti", count=3)
+    write(root / "training/velodyne/000001.bin", b"cut")
+    with pytest.raises(InputError, match=r"000001\.bin"):
+        write_bag(tmp_path / "strict", open_recording(root))
+    skipped = []
+    assert write_bag(tmp_path / "bag", open_recording(root), skipped=skipped) == 2
+    assert len(skipped) == 1 and "000001.bin" in skipped[0]
+    assert [scene_of(f) for f in open_recording(tmp_path / "bag")] == [0, 2]
+
+
+# columns
+
+def test_unusable_returns_go_from_all_columns_alike(tmp_path):
+    xyz = scene().astype(np.float64)[:, :3]
+    intensity = np.arange(len(xyz), dtype=np.float32)
+    bad = {3: np.nan, 10: np.inf, 11: -np.inf, 20: 0.0, 21: 1e6}
+    for place, value in bad.items():
+        xyz[place] = value
+    kept = np.setdiff1d(np.arange(len(xyz)), list(bad))
+    before = xyz.copy(), intensity.copy()
+    frame = LidarFrame.of(xyz, intensity, 5, "velodyne")
+    assert np.array_equal(frame.xyz, xyz[kept].astype(np.float32))
+    assert np.array_equal(frame.intensity, kept) and (frame.stamp_ns, frame.frame_id) == (
+        5, "velodyne")
+    assert frame.xyz.dtype == np.float32 and frame.xyz.flags.c_contiguous
+    assert np.array_equal(before[0], xyz, equal_nan=True) and np.array_equal(before[1], intensity)
+    assert LidarFrame.of(xyz).intensity is None and len(LidarFrame.of(xyz[:0])) == 0
+    write_scan(tmp_path / "sequences/00", 0, np.column_stack([xyz, intensity]),
+               np.arange(len(xyz)), np.arange(len(xyz)))
+    read, = open_recording(tmp_path)
+    assert np.array_equal(read.load().intensity, read.point_truth().classes)
+    assert np.array_equal(read.point_truth().instances, kept)
+
+
+def test_poses_of_semantickitti_invert_pose_line(tmp_path):
+    for frame in open_recording(semantic_folder(tmp_path)):
+        np.testing.assert_allclose(frame.pose(), drive(frame.index), atol=1e-9)
+    (tmp_path / "sequences/00/poses.txt").write_text("1 0 0\n")
+    with pytest.raises(InputError, match=r"cannot read pose 0 of .*poses.txt .*download it again"):
+        open_recording(tmp_path).frames[0].pose()
+    (tmp_path / "sequences/08/calib.txt").write_text("")
+    with pytest.raises(InputError, match=r"calib.txt has no Tr"):
+        open_recording(tmp_path).frames[-1].pose()
