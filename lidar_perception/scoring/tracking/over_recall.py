@@ -49,7 +49,7 @@ class RecallPoint:
         return min(1.0, max(0.0, 1 - wrong / (self.recall * self.objects)))
 
 
-def over_recall(sequences: list[list[Pairs]]) -> dict[str, float]:
+def over_recall(sequences: list[list[Pairs]]) -> dict[str, float | None]:
     """sAMOTA, AMOTA, AMOTP, and best_MOTA with its threshold best_score, of sequences of frames in
     order (as pairs_of gives them); 0 without a track that matches, best_score then None."""
     means = [_mean_scores(frames) for frames in sequences]
