@@ -20,14 +20,16 @@ def costs(tracks: np.ndarray, spread: np.ndarray, kinds: np.ndarray, reach: np.n
     metres, the standard deviation of a predicted centre as it would be measured; kinds (N,),
     found_kinds (M,) places in KINDS; reach (N,) metres.
     """
-    apart = np.hypot(*(tracks[:, None, axis] - found[None, :, axis] for axis in (0, 1)))
+    dx, dy = (tracks[:, None, axis] - found[None, :, axis] for axis in (0, 1))
+    apart = np.sqrt(dx * dx + dy * dy)
     gate = np.minimum(np.maximum(params.sigmas * spread, reach), params.max_gate)[:, None]
     cost = (1.0 - params.overlap) * apart / gate
     if params.overlap > 0:
         cost += params.overlap * (1.0 - bev_iou(tracks, found))
     differ = kinds[:, None] != found_kinds[None, :]
-    on_foot_or_cycle = (kinds > 0)[:, None] & (found_kinds > 0)[None, :]
-    cost += params.other_kind * differ * np.where(on_foot_or_cycle, 0.5, 1.0)
+    if differ.any():
+        on_foot_or_cycle = (kinds > 0)[:, None] & (found_kinds > 0)[None, :]
+        cost += params.other_kind * differ * np.where(on_foot_or_cycle, 0.5, 1.0)
     return np.where((apart <= gate) & (cost <= MAX_COST), cost, FORBIDDEN)
 
 

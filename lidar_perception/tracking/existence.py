@@ -46,10 +46,11 @@ def effective_looks(looks: np.ndarray, views: np.ndarray, correlation: float) ->
 def real(total: np.ndarray, looks: np.ndarray, views: np.ndarray, moving: np.ndarray,
          params: ExistenceParams) -> np.ndarray:
     """(N,) log odds of being what is claimed: total (N,) evidence of looks (N,) in 1 + views (N,)
-    groups; moving (N,) probability of motion."""
+    groups; moving (N,) probability of motion, which speaks for an object as far as it is above a
+    half."""
     mean = total / np.maximum(looks, 1e-9)
     return (params.prior + mean * effective_looks(looks, views, params.correlation)
-            + params.moves * moving)
+            + params.moves * np.maximum(2.0 * moving - 1.0, 0.0))
 
 
 def absence(hits: np.ndarray, tries: np.ndarray, params: ExistenceParams) -> np.ndarray:

@@ -57,7 +57,7 @@ class NeutralParams(Params):
     """The score that says nothing for or against an object, by kind: what the detector gives to
     boxes that are right as often as wrong."""
 
-    vehicle: float = param(0.3, "Of vehicles.", low=0.001, high=0.999)
+    vehicle: float = param(0.35, "Of vehicles.", low=0.001, high=0.999)
     pedestrian: float = param(0.3, "Of pedestrians.", low=0.001, high=0.999)
     cyclist: float = param(0.3, "Of cyclists.", low=0.001, high=0.999)
 
@@ -68,20 +68,21 @@ class ExistenceParams(Params):
 
     neutral: NeutralParams = NeutralParams()
     gain: float = param(1.0, "Weight of a score's log odds.", low=0.0, high=10.0)
-    correlation: float = param(0.3, "Of the evidence of looks from the same place: n of them count "
+    correlation: float = param(0.8, "Of the evidence of looks from the same place: n of them count "
                                "as n / (1 + (n - 1) correlation).", low=0.0, high=1.0)
     new_view: float = param(0.35, "A change of the bearing under which it is seen (rad), or "
                             "of the logarithm of its range, that makes a look a new one.",
                             low=0.01, high=10.0)
-    memory: float = param(2.0, "Evidence fades with this time constant.", unit="s", low=0.05,
+    memory: float = param(1.0, "Evidence fades with this time constant.", unit="s", low=0.05,
                           high=1000.0)
-    prior: float = param(-0.5, "Log odds of a track before any evidence.", low=-10.0, high=10.0)
-    missed: float = param(-1.0, "Evidence of a look that found nothing.", low=-10.0, high=0.0)
-    moves: float = param(1.0, "Evidence of motion: posts do not walk.", low=0.0, high=10.0)
+    prior: float = param(0.0, "Log odds of a track before any evidence.", low=-10.0, high=10.0)
+    missed: float = param(-1.5, "Evidence of a look that found nothing.", low=-10.0, high=0.0)
+    moves: float = param(1.0, "Evidence of motion, where poses say what stands: posts do not "
+                         "walk.", low=0.0, high=10.0)
     seen: float = param(2.0, "What a hit adds to the log odds of being there still.", low=0.0,
                         high=10.0)
     max_present: float = param(3.0, "These log odds are no higher.", low=0.0, high=20.0)
-    max_absence: float = param(0.7, "One miss takes no more from them than this: what is hidden "
+    max_absence: float = param(0.4, "One miss takes no more from them than this: what is hidden "
                                "stays hidden for a while.", low=0.01, high=10.0)
     end: float = param(0.02, "A track ends when it is there with a lower probability.", low=0.0,
                        high=0.5)
@@ -91,7 +92,7 @@ class ExistenceParams(Params):
 class TrackingParams(Params):
     """Tracks from detections."""
 
-    vehicle: MotionParams = MotionParams()
+    vehicle: MotionParams = MotionParams(position=0.4)
     pedestrian: MotionParams = MotionParams(1.0, 0.0, 1.0, 1.0, 0.7, 0.15, 0.7, 0.7)
     cyclist: MotionParams = MotionParams(2.0, 0.3, 0.2, 4.0, 0.4, 0.2, 0.3, 1.2)
     association: AssociationParams = AssociationParams()

@@ -131,22 +131,23 @@ def born(first_id: int, boxes: np.ndarray, class_ids: np.ndarray, scores: np.nda
         np.full(count, HEIGHT_NOISE ** 2), boxes[:, 3:6].copy(), scores.copy(), votes,
         class_ids.astype(np.int32), existence.evidence(scores, kinds, own), ones, zeros,
         seen_from(means, sensor), np.full(count, own.seen / 2), ones.copy(), ones.copy(),
-        moving(means, covariances, params.moving_speed) * 0.0, zeros.copy(), zeros.copy())
+        moving(means, covariances, params.moving_speed), zeros.copy(), zeros.copy())
 
 
-def alive(states: States, params: TrackingParams) -> States:
+def alive(states: States, params: TrackingParams, fixed: bool) -> States:
     """Those that are still there; of tracks on top of each other the most probable one."""
     states = states.take(np.flatnonzero(
         existence.probability(states.present) >= params.existence.end))
-    rank = probabilities(states, params)
+    rank = probabilities(states, params, fixed)
     stays = suppressed(states.boxes(), rank, states.class_ids, params.overlap, across_classes=True)
     return states.take(np.sort(stays[:params.max_tracks]))
 
 
-def probabilities(states: States, params: TrackingParams) -> np.ndarray:
-    """(N,) of being what is claimed, and there."""
-    claim = existence.real(states.total, states.looks, states.views, states.moving,
-                           params.existence)
+def probabilities(states: States, params: TrackingParams, fixed: bool) -> np.ndarray:
+    """(N,) of being what is claimed, and there. fixed: whether the frame is one in which posts
+    stand; if not, motion says nothing."""
+    claim = existence.real(states.total, states.looks, states.views,
+                           states.moving if fixed else np.zeros(len(states)), params.existence)
     return existence.probability(claim) * existence.probability(states.present)
 
 

@@ -72,7 +72,7 @@ class Tracker:
         seen = np.zeros(len(states), bool)
         seen[i], seen[before:] = True, True
         hit = set(states.ids[seen].tolist())
-        kept = alive(states, self.params)
+        kept = alive(states, self.params, self._ego.known)
         self.born += len(start)
         self.ended += len(states) - len(kept)
         self._states = kept
@@ -153,7 +153,7 @@ class Tracker:
 def _in_sensor_frame(states: States, ego: Ego, seen: np.ndarray,
                      params: TrackingParams) -> Tracks:
     """Those that are to be reported."""
-    scores = probabilities(states, params)
+    scores = probabilities(states, params, ego.known)
     places = np.flatnonzero((scores >= params.report) & (
         seen | (probability(states.present) >= params.report_unseen)))
     chosen, back = states.take(places), np.linalg.inv(ego.pose)
