@@ -58,7 +58,8 @@ def hota(sequences):
         for number, alpha in enumerate(alphas):
             matches = {}
             for true, tracks, alike in frames:
-                def gain(a, b, true=true, tracks=tracks, alike=alike):
+                def gain(a, b, true=true, tracks=tracks, alike=alike, together=together,
+                         length=length, found=found):
                     c = together.get((true[a], tracks[b]), 0)
                     return alike[a, b] * c / (length[true[a]] + found[tracks[b]] - c)
                 for a, b in best_assignment(len(true), len(tracks), gain):

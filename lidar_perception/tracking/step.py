@@ -57,19 +57,22 @@ def matched(states: States, boxes: np.ndarray, class_ids: np.ndarray, scores: np
 
 
 def updated(states: States, i: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
-            scores: np.ndarray, sensor: np.ndarray, params: TrackingParams) -> States:
+            scores: np.ndarray, sensor: np.ndarray, params: TrackingParams,
+            fixed: bool) -> States:
     """The tracks after a frame in which those at i (P,) were hit by boxes (P, 7), and the others
-    missed; sensor (2,) its place."""
+    missed; sensor (2,) its place. fixed: whether the frame stands, so that wheels and feet go
+    forward in it; seen from a car, those of parked cars do not."""
     new = states.copy()
     kinds = KINDS[states.class_ids[i]]
     noise = np.column_stack([*[_by_kind(params, "position")[kinds]] * 2,
                              _by_kind(params, "heading")[kinds]])
     means, covariances = motion.update(states.means[i], states.covariances[i],
                                        boxes[:, [0, 1, 6]], noise)
-    means, covariances = motion.keep_to_heading(means, covariances,
-                                                _by_kind(params, "slip")[kinds])
-    new.means[i] = motion.facing_forward(means, BACKWARDS_BY_KIND[kinds])
-    new.covariances[i] = covariances
+    if fixed:
+        means, covariances = motion.keep_to_heading(means, covariances,
+                                                    _by_kind(params, "slip")[kinds])
+        means = motion.facing_forward(means, BACKWARDS_BY_KIND[kinds])
+    new.means[i], new.covariances[i] = means, covariances
     gain = states.height_variances[i] / (states.height_variances[i] + HEIGHT_NOISE ** 2)
     new.heights[i] += gain * (boxes[:, 2] - states.heights[i])
     new.height_variances[i] *= 1.0 - gain

@@ -61,7 +61,8 @@ class Tracker:
         states = predicted(self._states, seconds, self.params)
         i, j = matched(states, boxes, class_ids, scores, self.params)
         sensor = self._ego.pose[:2, 3]
-        states = updated(states, i, boxes[j], class_ids[j], scores[j], sensor, self.params)
+        states = updated(states, i, boxes[j], class_ids[j], scores[j], sensor, self.params,
+                         self._ego.known)
         free = np.ones(len(boxes), bool)
         free[j] = False
         start = np.flatnonzero(free & (scores >= self.params.association.strong))

@@ -123,7 +123,7 @@ def test_neighbour_classes_and_what_is_cut_off_neither_help_nor_harm():
 
 
 def test_a_track_in_a_dont_care_region_is_excused():
-    (truth, tracks), = drive(frames=1)
+    (_, tracks), = drive(frames=1)
     wide = GroundTruth.of([], [], [], [("DontCare", {
         "bbox": [0.0, 0.0, 1241.0, 374.0], "track_id": -1, "truncated": -1.0, "occluded": -1,
         "alpha": -10.0, "dimensions": [-1.0] * 3, "location": [-1000.0] * 3,
@@ -160,7 +160,7 @@ def test_result_files_come_back_as_they_were(tmp_path):
     write_tracking_results(path, frames, FORWARD_CAMERA)
     found = read_tracking_results(path, FORWARD_CAMERA.lidar_to_camera)
     assert " Person " in path.read_text()  # the tracking benchmark's name of Person_sitting
-    for number, ids, detections in frames:
+    for number, _, detections in frames:
         again = found[number]
         np.testing.assert_allclose(again.boxes, detections.boxes, atol=2e-6)
         assert again.class_ids.tolist() == detections.class_ids.tolist()

@@ -256,3 +256,13 @@ def test_the_assignment_makes_most_pairs_within_gates_and_forbids_the_rest():
     assert (cost[2] == FORBIDDEN).all() and (cost[:, 2] == FORBIDDEN).all()
     assert [p.tolist() for p in assigned(cost)] == [[0, 1], [1, 0]]
     assert len(assigned(np.zeros((0, 4)))[0]) == 0
+
+
+def test_odometry_says_how_a_simulated_drive_went():
+    pytest.importorskip("kiss_icp", reason="needs kiss-icp, the extra [odometry]")
+    from lidar_perception.simulation.drive import scans
+    from lidar_perception.tracking.ego import Odometry
+    odometry = Odometry()
+    for scan in scans(5, 6):
+        found = odometry(scan.frame.xyz)
+    assert usable(found) and np.linalg.norm(found[:3, 3] - scan.pose[:3, 3]) < 0.3
