@@ -266,3 +266,14 @@ def test_odometry_says_how_a_simulated_drive_went():
     for scan in scans(5, 6):
         found = odometry(scan.frame.xyz)
     assert usable(found) and np.linalg.norm(found[:3, 3] - scan.pose[:3, 3]) < 0.3
+
+
+def test_parked_cars_seen_from_a_turning_car_without_poses_keep_their_ids():
+    """They move sideways in the sensor's frame: nothing may tie their motion to their heading."""
+    parked = np.array([car(25, 4), car(32, -6, 0.1), car(40, 5)])
+    frames = [Detections.of(moved_boxes(parked, np.linalg.inv(pose(0.6 * i, 0.0, 0.02 * i))), CAR,
+                            0.9) for i in range(25)]
+    tracks = followed(frames)
+    assert {tuple(t.ids.tolist()) for t in tracks} == {(1, 2, 3)}
+    for t, found in zip(tracks[5:], frames[5:]):
+        np.testing.assert_allclose(t.detections.boxes[:, :2], found.boxes[:, :2], atol=0.3)
