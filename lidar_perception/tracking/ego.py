@@ -53,7 +53,7 @@ def next_ego(ego: Ego, pose: np.ndarray | None, seconds: float, max_gap: float) 
         since = seconds + ego.missing
         if not ego.known or since <= 0:
             return Ego(pose, ego.velocity, ego.rotation, 0.0, True)
-        start = ego.pose @ np.linalg.inv(_moved(ego, ego.missing)) if ego.missing else ego.pose
+        start = ego.pose @ np.linalg.inv(_moved(ego, min(ego.missing, max_gap)))
         step = np.linalg.inv(start) @ pose
         return Ego(pose, step[:3, 3] / since,
                    Rotation.from_matrix(step[:3, :3]).as_rotvec() / since, 0.0, True)

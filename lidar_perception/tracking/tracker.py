@@ -113,20 +113,18 @@ class Tracker:
         return seconds
 
     def _move_ego(self, pose: np.ndarray | None, seconds: float) -> None:
-        given = usable(pose)
-        if given and len(self._states) and (not self._ego.known
-                                            or jumped(self._ego, pose, seconds)):
-            stamp = self._stamp
-            known = self._ego.known
+        given = pose if usable(pose) else None
+        if given is not None and len(self._states) and (
+                not self._ego.known or jumped(self._ego, given, seconds)):
+            stamp, known = self._stamp, self._ego.known
             self.reset()
             self._stamp = stamp
             self.problem = ("the sensor's pose jumped: all tracks ended" if known else
                             "poses began: all tracks ended, and go on in the fixed frame")
-        if not given and (pose is not None or self._ego.known):
+        if given is None and (pose is not None or self._ego.known):
             self.problem = ("the pose is missing or not rigid: the sensor is taken to move on as "
                             "before")
-        self._ego = next_ego(self._ego, pose if given else None, seconds,
-                             self.params.max_ego_gap)
+        self._ego = next_ego(self._ego, given, seconds, self.params.max_ego_gap)
 
     def _usable(self, found: Detections) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Boxes (K, 7), class ids (K,), scores (K,), float64, the best max_detections."""

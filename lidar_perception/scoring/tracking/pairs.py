@@ -119,7 +119,7 @@ def image_iou(boxes: np.ndarray, others: np.ndarray, of_first: bool = False) -> 
 
 
 def _in_regions(boxes: np.ndarray, regions: np.ndarray) -> np.ndarray:
-    return (image_iou(boxes, regions, of_first=True) > IN_REGION + EPS).any(axis=1)
+    return np.any(image_iou(boxes, regions, of_first=True) > IN_REGION + EPS, axis=1)
 
 
 def without_ignored(pairs: Pairs) -> Pairs:
