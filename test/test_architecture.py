@@ -20,8 +20,8 @@ MAX_LINES = 400
 
 # From the ground up: a room imports only those before it, and itself.
 ROOMS = ("classes", "types", "param_fields", "geometry", "camera", "groups", "runs", "wire",
-         "data", "ground", "clustering", "candidates", "detectors", "scoring", "simulation",
-         "training", "reproduction", "params", "nodes", "cli")
+         "data", "ground", "clustering", "candidates", "detectors", "tracking", "scoring",
+         "simulation", "training", "reproduction", "params", "nodes", "cli")
 # What the files of a room may import besides the rooms below and the standard library.
 NUMBERS = ["numpy", "scipy", "numba"]
 STRANGERS = {
@@ -31,7 +31,7 @@ STRANGERS = {
     "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils"],
     "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,
     "detectors": [*NUMBERS, "torch", "safetensors", "onnx", "onnxruntime", "onnxscript"],
-    "params": [],
+    "tracking": ["numpy", "scipy", "kiss_icp"], "params": [],
 }
 
 

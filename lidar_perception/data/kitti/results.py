@@ -1,7 +1,9 @@
-"""Result files of KITTI's object benchmark: one a frame, a label line with a score a detection."""
+"""Result files of KITTI's object benchmark, one a frame, a label line with a score a detection; and
+of its tracking benchmark, one a sequence, with the frame's number and the track's id before it."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +12,16 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.kitti.labels import (
     format_label,
     parsed_lines,
+    read_tracking_labels,
     to_ground_truth,
     to_labels,
 )
-from lidar_perception.data.kitti.write import image_boxes
+from lidar_perception.data.kitti.write import TRACKING_NAMES, image_boxes
 from lidar_perception.runs.files import write_text
 from lidar_perception.types import Detections, GroundTruth, InputError
 
 DECIMALS = 4  # of a score, so that the order stays, and of metres, so that overlaps do
+TRACKING_DECIMALS = 6  # as in the labels of the tracking benchmark
 
 
 def read_results(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
@@ -45,3 +49,34 @@ def write_results(path: Path, detections: Detections, calibration: Calibration) 
     write_text(path, "".join(
         format_label({**label, "truncated": "-1", "occluded": -1}, DECIMALS) + "\n"
         for label in to_labels(found, calibration.lidar_to_camera)))
+
+
+def write_tracking_results(path: Path, frames: Iterable[tuple[int, np.ndarray, Detections]],
+                           calibration: Calibration) -> None:
+    """Write the result file of one sequence of the tracking benchmark: of each frame its number,
+    track ids (K,) int and the boxes. Other columns as in write_results. InputError where it cannot
+    be written."""
+    lines = []
+    for number, ids, detections in frames:
+        pixels = np.nan_to_num(image_boxes(detections.boxes, calibration)[0])
+        extras = [{"score": float(score), "bbox": box.tolist()}
+                  for score, box in zip(detections.scores, pixels)]
+        found = GroundTruth.of(detections.boxes, detections.class_ids, extras)
+        for track, label in zip(ids, to_labels(found, calibration.lidar_to_camera)):
+            name = TRACKING_NAMES.get(label["class"], label["class"])
+            line = format_label({**label, "class": name, "truncated": "-1", "occluded": -1},
+                                TRACKING_DECIMALS)
+            lines.append(f"{number} {int(track)} {line}\n")
+    write_text(path, "".join(lines))
+
+
+def read_tracking_results(path: Path, lidar_to_camera: np.ndarray) -> dict[int, GroundTruth]:
+    """Frame number -> tracks, track_id and score in extras, of a result file of the tracking
+    benchmark; frames without tracks are left out. InputError as of read_tracking_labels, and for a
+    line without a score."""
+    frames = read_tracking_labels(path, lidar_to_camera)
+    for number, tracks in frames.items():
+        if not all("score" in extra for extra in tracks.extras):
+            raise InputError(f"{path}: frame {number} has a track without a score as the 18th "
+                             "column")
+    return frames

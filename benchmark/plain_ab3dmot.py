@@ -1,0 +1,105 @@
+"""A plain reading of AB3DMOT (Weng et al., IROS 2020): the peer of lidar_perception.tracking.
+
+One Kalman filter with constant velocity a box, Hungarian assignment by the distance of centres,
+birth after 3 hits, death after 2 misses, classes apart; the numbers are its authors' own for KITTI
+(the covariances of their filter, gates of 6 m, 1 m for pedestrians). None of our code but the
+types.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from lidar_perception.types import CLASSES, Detections
+
+MIN_HITS, MAX_AGE = 3, 2
+GATES = {"Car": 6.0, "Pedestrian": 1.0, "Cyclist": 6.0}
+OTHER_GATE = 6.0
+
+# State: x y z yaw l w h and the change of x y z a frame.
+STEP = np.eye(10)
+STEP[:3, 7:] = np.eye(3)
+SEEN = np.eye(7, 10)
+FIRST = np.diag([10.0] * 7 + [10_000.0] * 3)
+DRIFT = np.diag([1.0] * 7 + [0.01] * 3)
+
+
+@dataclass
+class _Track:
+    number: int
+    state: np.ndarray
+    score: float
+    covariance: np.ndarray = field(default_factory=lambda: FIRST.copy())
+    hits: int = 1
+    age: int = 0
+
+    def predict(self) -> None:
+        self.state = STEP @ self.state
+        self.covariance = STEP @ self.covariance @ STEP.T + DRIFT
+        self.age += 1
+
+    def update(self, measured: np.ndarray, score: float) -> None:
+        turn = (measured[3] - self.state[3] + np.pi) % (2 * np.pi) - np.pi
+        if abs(turn) > np.pi / 2:  # the detector took the other end for the front
+            self.state[3] += np.pi
+            turn -= np.sign(turn) * np.pi
+        difference = measured - self.state[:7]
+        difference[3] = turn
+        gain = self.covariance @ SEEN.T @ np.linalg.inv(
+            SEEN @ self.covariance @ SEEN.T + np.eye(7))
+        self.state = self.state + gain @ difference
+        self.covariance = (np.eye(10) - gain @ SEEN) @ self.covariance
+        self.score, self.hits, self.age = score, self.hits + 1, 0
+
+
+class PlainAb3dmot:
+    """tracker(detections, pose) -> ids (K,), Detections; pose (4, 4) of the sensor or None."""
+
+    def __init__(self) -> None:
+        self.tracks: dict[int, list[_Track]] = {}
+        self.frames = 0
+        self.next = 1
+
+    def __call__(self, found: Detections, pose: np.ndarray | None = None
+                 ) -> tuple[np.ndarray, Detections]:
+        pose = np.eye(4) if pose is None else pose
+        self.frames += 1
+        ids, boxes, classes, scores = [], [], [], []
+        for kind in sorted({*self.tracks, *found.class_ids.tolist()}):
+            for track in self._of_class(kind, found[found.class_ids == kind], pose):
+                ids.append(track.number)
+                boxes.append(_moved(track.state[[0, 1, 2, 4, 5, 6, 3]], np.linalg.inv(pose)))
+                classes.append(kind)
+                scores.append(track.score)
+        return np.array(ids, int), Detections.of(np.reshape(boxes, (-1, 7)),
+                                                 np.array(classes, int), np.array(scores))
+
+    def _of_class(self, kind: int, found: Detections, pose: np.ndarray) -> list[_Track]:
+        tracks = self.tracks.setdefault(kind, [])
+        measured = [_moved(box.astype(float), pose)[[0, 1, 2, 6, 3, 4, 5]] for box in found.boxes]
+        for track in tracks:
+            track.predict()
+        gate, free = GATES.get(CLASSES[kind], OTHER_GATE), set(range(len(measured)))
+        if tracks and measured:
+            distance = np.array([[np.linalg.norm(m[:3] - t.state[:3]) for t in tracks]
+                                 for m in measured])
+            for i, j in zip(*linear_sum_assignment(distance)):
+                if distance[i, j] <= gate:
+                    tracks[j].update(measured[i], float(found.scores[i]))
+                    free.discard(int(i))
+        for i in sorted(free):
+            tracks.append(_Track(self.next, np.append(measured[i], np.zeros(3)),
+                                 float(found.scores[i])))
+            self.next += 1
+        self.tracks[kind] = [t for t in tracks if t.age < MAX_AGE]
+        return [t for t in self.tracks[kind] if t.hits >= MIN_HITS or self.frames <= MIN_HITS]
+
+
+def _moved(box: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """A box (7,) in another frame; pose (4, 4)."""
+    forward = pose[:3, :3] @ [np.cos(box[6]), np.sin(box[6]), 0.0]
+    return np.concatenate([pose[:3, :3] @ box[:3] + pose[:3, 3], box[3:6],
+                           [np.arctan2(forward[1], forward[0])]])

@@ -1,0 +1,84 @@
+"""Our tracker beside a plain reading of AB3DMOT, on the same detections with the same poses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from rich.table import Table
+
+from benchmark.plain_ab3dmot import PlainAb3dmot
+from lidar_perception.camera import Calibration
+from lidar_perception.runs.terminal import console
+from lidar_perception.scoring.tracking.pairs import tracked_labels
+from lidar_perception.scoring.tracking.report import TrackingReport, observe
+from lidar_perception.tracking.params import TrackingParams
+from lidar_perception.tracking.tracker import Tracker
+from lidar_perception.types import Detections, GroundTruth
+
+OPERATING = 0.3  # score from which on the peer is given detections; it does not weigh them
+SHOWN = ("HOTA", "DetA", "AssA", "MOTA", "sAMOTA", "AMOTA", "switches", "fragments", "labels",
+         "true_tracks", "tracks")
+Step = Callable[["Seen"], tuple[np.ndarray, Detections]]
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One frame: what a detector found, weak detections too, and the labels, with track ids."""
+
+    found: Detections
+    truth: GroundTruth
+    stamp_ns: int = 0
+    pose: np.ndarray | None = None
+
+
+def measure_tracking(drives: dict[str, Sequence[Seen]], calibration: Calibration | None,
+                     params: TrackingParams = TrackingParams()) -> dict:
+    """By "ours" and "plain AB3DMOT": the scores of TrackingReport, by centres, and ms, the median
+    time of a frame."""
+    return {name: _measured(drives, calibration, make) for name, make in (
+        ("plain AB3DMOT", _peer), ("ours", lambda: _ours(params)))}
+
+
+def _peer() -> Step:
+    tracker = PlainAb3dmot()
+    return lambda seen: tracker(seen.found[seen.found.scores >= OPERATING], seen.pose)
+
+
+def _ours(params: TrackingParams) -> Step:
+    tracker = Tracker(params)
+
+    def step(seen: Seen) -> tuple[np.ndarray, Detections]:
+        tracks = tracker(seen.found, seen.stamp_ns, seen.pose)
+        return tracks.ids, tracks.detections
+    return step
+
+
+def _measured(drives: dict[str, Sequence[Seen]], calibration: Calibration | None,
+              make: Callable[[], Step]) -> dict:
+    report, ms = TrackingReport(), []
+    for name, frames in drives.items():
+        step = make()
+        for i, seen in enumerate(frames):
+            start = perf_counter()
+            ids, found = step(seen)
+            ms.append((perf_counter() - start) * 1e3)
+            report.update(observe(name, i, seen.truth, tracked_labels(ids, found), calibration))
+    return {**report.compute(), "ms": float(np.median(ms)) if ms else None}
+
+
+def print_tracking(content: dict) -> None:
+    """One row a class and tracker."""
+    table = Table(title="Tracks by centres, similarity 1 - d / 2 m")
+    for name in ("class", "tracker", *SHOWN):
+        table.add_column(name, justify="left" if name in ("class", "tracker") else "right")
+    for kind in next(iter(content.values()))["classes"]:
+        table.add_section()
+        for tracker, scores in content.items():
+            own = scores["classes"][kind]
+            if own is not None:
+                table.add_row(kind, tracker, *(str(own[name]) if isinstance(own[name], int) else
+                                               f"{100 * own[name]:.1f}" for name in SHOWN))
+    console.print(table)

@@ -1,0 +1,143 @@
+"""One frame for the tracking scores: which labels and tracks there are, and how alike they are.
+
+What counts follows KITTI's tracking benchmark as TrackEval runs it: neighbour classes, labels that
+are cut off by the image's border or hardly visible, DontCare regions and small boxes neither help
+nor harm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from lidar_perception.camera import Calibration
+from lidar_perception.geometry import iou_3d
+from lidar_perception.scoring.kitti.camera_objects import CameraObjects, camera_objects
+from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
+
+SCORED = ("Car", "Pedestrian", "Cyclist")
+NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
+MAX_OCCLUSION, MAX_TRUNCATION = 2, 0  # levels of the tracking layout
+MIN_HEIGHT = 25.0    # pixels
+IN_REGION = 0.5      # share of a box in a DontCare region
+FAR = 2.0            # metres between centres from which on two boxes are not alike at all
+ALIKE = 0.5          # for CLEAR MOT, and for what is left out
+EPS = np.finfo(float).eps  # as TrackEval compares
+
+SIMILARITIES = ("centres", "3d", "image")
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """M labels of one class and its neighbours, and K tracks of the class, in one frame.
+
+    true_ids (M,), track_ids (K,) int64, each at most once; scores (K,) float64. ignored (M,) bool:
+    labels that nobody needs to find. excused (K,) bool: tracks that are not false where they match
+    nothing. similarity (M, K) float64 0..1 is what HOTA and CLEAR MOT match by, overlap (M, K)
+    float64 the IoU in space, for AB3DMOT's scores.
+    """
+
+    true_ids: np.ndarray
+    ignored: np.ndarray
+    track_ids: np.ndarray
+    scores: np.ndarray
+    excused: np.ndarray
+    similarity: np.ndarray
+    overlap: np.ndarray
+
+
+def tracked_labels(ids: np.ndarray, found: Detections) -> GroundTruth:
+    """Tracks with ids (K,) as labels with track_id and score."""
+    return GroundTruth.of(found.boxes, found.class_ids, [
+        {"track_id": int(i), "score": float(s)} for i, s in zip(ids, found.scores)])
+
+
+def pairs_of(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None,
+             similarity: str = "centres") -> dict[str, Pairs]:
+    """One frame by class of SCORED. truth and tracks with a track_id in every extra, tracks with a
+    score too. Without a calibration nothing is too small, and there are no DontCare regions.
+
+    similarity: "centres" 1 - distance / 2 m, "3d" IoU in space, "image" IoU of the 2D boxes.
+    InputError for a track id that is there twice, or none, and a number that is not finite.
+    """
+    if similarity not in SIMILARITIES:
+        raise InputError(f"similarity = {similarity!r} must be one of {', '.join(SIMILARITIES)}")
+    if similarity == "image" and calibration is None:
+        raise InputError("similarity in the image needs a calibration; take 'centres' or '3d'")
+    true_ids, track_ids = _ids(truth, "label"), _ids(tracks, "track")
+    true, found = (camera_objects(objects, calibration) for objects in (truth, tracks))
+    # Regions without a box come last there, and are in .regions.
+    true_objects, objects = true.take(np.arange(len(truth))), found.take(np.arange(len(tracks)))
+    ignored = np.array([extra.get("occluded", 0) > MAX_OCCLUSION or round(
+        extra.get("truncated", 0)) > MAX_TRUNCATION for extra in truth.extras], bool)
+    excused = (objects.pixels_high <= MIN_HEIGHT + EPS) | _in_regions(
+        objects.image_boxes, true.regions)
+    return {name: _of_class(name, true_objects, objects, true_ids, track_ids, ignored, excused,
+                            similarity) for name in SCORED}
+
+
+def _ids(objects: GroundTruth, what: str) -> np.ndarray:
+    try:
+        ids = np.array([extra["track_id"] for extra in objects.extras], np.int64)
+    except KeyError:
+        raise InputError(f"a {what} has no track id; tracking scores need one in each") from None
+    if len(np.unique(ids)) < len(ids):
+        raise InputError(f"a frame has the {what} id "
+                         f"{np.sort(ids)[:-1][np.diff(np.sort(ids)) == 0][0]} twice")
+    return ids
+
+
+def _of_class(name: str, true: CameraObjects, found: CameraObjects, true_ids: np.ndarray,
+              track_ids: np.ndarray, ignored: np.ndarray, excused: np.ndarray,
+              similarity: str) -> Pairs:
+    own, other = CLASSES.index(name), CLASSES.index(NEIGHBOURS.get(name, name))
+    rows = np.flatnonzero(np.isin(true.class_ids, [own, other]))
+    columns = np.flatnonzero(found.class_ids == own)
+    labels, tracks = true.take(rows), found.take(columns)
+    overlap = iou_3d(labels.boxes, tracks.boxes)
+    if similarity == "centres":
+        apart = np.linalg.norm(labels.boxes[:, None, :3] - tracks.boxes[None, :, :3], axis=2)
+        alike = np.maximum(1.0 - apart / FAR, 0.0)
+    else:
+        alike = overlap if similarity == "3d" else image_iou(labels.image_boxes,
+                                                             tracks.image_boxes)
+    return Pairs(true_ids[rows], ignored[rows] | (labels.class_ids != own), track_ids[columns],
+                 tracks.scores, excused[columns], alike, overlap)
+
+
+def image_iou(boxes: np.ndarray, others: np.ndarray, of_first: bool = False) -> np.ndarray:
+    """(K, M) IoU of 2D boxes (K, 4) and (M, 4) [left top right bottom]; of_first: the share of
+    each of boxes that lies in others. 0 for a box without area."""
+    low = np.maximum(boxes[:, None, :2], others[None, :, :2])
+    high = np.minimum(boxes[:, None, 2:], others[None, :, 2:])
+    shared = np.prod(np.maximum(high - low, 0.0), axis=2)
+    areas, other_areas = (np.prod(b[:, 2:] - b[:, :2], axis=1) for b in (boxes, others))
+    whole = areas[:, None] + (0.0 if of_first else other_areas - shared)
+    return np.divide(shared, whole, out=np.zeros_like(shared), where=whole > EPS)
+
+
+def _in_regions(boxes: np.ndarray, regions: np.ndarray) -> np.ndarray:
+    return np.any(image_iou(boxes, regions, of_first=True) > IN_REGION + EPS, axis=1)
+
+
+def without_ignored(pairs: Pairs) -> Pairs:
+    """What HOTA and CLEAR MOT count: without the labels that need not be found, the tracks matched
+    to them, and excused tracks that match nothing."""
+    rows, columns = best_pairs(np.where(pairs.similarity < ALIKE - EPS, 0.0, pairs.similarity))
+    gone = pairs.excused.copy()
+    gone[columns] = pairs.ignored[rows]
+    labels, tracks = np.flatnonzero(~pairs.ignored), np.flatnonzero(~gone)
+    both = np.ix_(labels, tracks)
+    return replace(pairs, true_ids=pairs.true_ids[labels], ignored=pairs.ignored[labels],
+                   track_ids=pairs.track_ids[tracks], scores=pairs.scores[tracks],
+                   excused=pairs.excused[tracks], similarity=pairs.similarity[both],
+                   overlap=pairs.overlap[both])
+
+
+def best_pairs(gain: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (P,) and columns (P,) of the greatest sum of gain (M, K), only those above 0."""
+    rows, columns = linear_sum_assignment(gain, maximize=True)
+    good = gain[rows, columns] > EPS
+    return rows[good], columns[good]

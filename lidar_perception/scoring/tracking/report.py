@@ -1,0 +1,72 @@
+"""Tracking scores by class: frames go in one by one, in any order, and the table comes out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from lidar_perception.camera import Calibration
+from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
+from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
+from lidar_perception.scoring.tracking.over_recall import over_recall
+from lidar_perception.scoring.tracking.pairs import SCORED, Pairs, pairs_of, without_ignored
+from lidar_perception.types import GroundTruth, InputError
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One frame, number index of its sequence, by class; small, and can go between processes."""
+
+    sequence: str
+    index: int
+    pairs: dict[str, Pairs]
+
+
+def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
+            calibration: Calibration | None = None, similarity: str = "centres") -> Observation:
+    """As pairs_of. InputError, with sequence and frame, where it cannot be scored."""
+    try:
+        return Observation(sequence, index, pairs_of(truth, tracks, calibration, similarity))
+    except InputError as error:
+        raise InputError(f"{sequence}/{index}: {error}") from None
+
+
+@dataclass
+class TrackingReport:
+    """Frames of sequences. A frame that comes twice counts once, the last time."""
+
+    frames: dict[tuple[str, int], dict[str, Pairs]] = field(default_factory=dict)
+
+    def update(self, observation: Observation) -> None:
+        """One frame more."""
+        self.frames[observation.sequence, observation.index] = observation.pairs
+
+    def compute(self) -> dict:
+        """What the JSON file holds: frames, sequences, and by class the scores, 0..1, and their
+        counts; None for a class that has neither label nor track."""
+        names = sorted({sequence for sequence, _ in self.frames})
+        ordered = {name: [self.frames[key] for key in sorted(self.frames) if key[0] == name]
+                   for name in names}
+        return {"frames": len(self.frames), "sequences": len(names),
+                "classes": {name: _class([[frame[name] for frame in frames]
+                                          for frames in ordered.values()]) for name in SCORED}}
+
+
+def _class(sequences: list[list[Pairs]]) -> dict | None:
+    counted = [[without_ignored(f) for f in frames] for frames in sequences]
+    hota, clear = HotaCounts(), ClearCounts()
+    for frames in counted:
+        hota, clear = hota + hota_counts(frames), clear + clear_counts(frames)
+    if clear.tp + clear.fn + clear.fp == 0:
+        return None
+    return {**hota.scores(), **clear.scores(), **over_recall(sequences),
+            "labels": clear.tp + clear.fn, "boxes": clear.tp + clear.fp,
+            "true_tracks": _tracks(counted, "true_ids"), "tracks": _tracks(counted, "track_ids"),
+            "hits": clear.tp, "misses": clear.fn, "false": clear.fp,
+            "switches": clear.switches, "fragments": clear.fragments,
+            "mostly_tracked": clear.mostly_tracked, "partly_tracked": clear.partly_tracked,
+            "mostly_lost": clear.mostly_lost}
+
+
+def _tracks(sequences: list[list[Pairs]], name: str) -> int:
+    return sum(len({i for f in frames for i in getattr(f, name).tolist()})
+               for frames in sequences)

@@ -1,0 +1,164 @@
+"""The tracker: one small state, fed frame by frame.
+
+Kalman filters over a fixed frame, assignment in two rounds by score, and birth and death by
+evidence. The same frames give the same tracks.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lidar_perception.tracking import motion
+from lidar_perception.tracking.ego import Ego, jumped, moved_boxes, next_ego, usable
+from lidar_perception.tracking.existence import probability
+from lidar_perception.tracking.params import TrackingParams
+from lidar_perception.tracking.state import States, Tracks
+from lidar_perception.tracking.step import alive, born, matched, predicted, probabilities, updated
+from lidar_perception.types import CLASSES, MAX_RANGE, Detections
+
+
+class Tracker:
+    """tracker(detections, stamp_ns, pose) -> Tracks.
+
+    params may be replaced at any time. After each call problem says what was wrong with the frame,
+    or is None; born and ended count tracks since the start, and alive those there are.
+    """
+
+    def __init__(self, params: TrackingParams = TrackingParams()):
+        self.params = params
+        self.problem: str | None = None
+        self.born = self.ended = 0
+        self._states, self._ego = States.none(), Ego.unknown()
+        self._stamp: int | None = None
+        self._next = 1
+
+    @property
+    def alive(self) -> int:
+        """How many tracks there are, those that are not reported too."""
+        return len(self._states)
+
+    def reset(self) -> None:
+        """End all tracks; ids go on."""
+        self.ended += len(self._states)
+        self._states, self._ego, self._stamp = States.none(), Ego.unknown(), None
+
+    def __call__(self, found: Detections, stamp_ns: int = 0,
+                 pose: np.ndarray | None = None) -> Tracks:
+        """The tracks after the frame of stamp_ns, 0 where it has none, whose detections these are,
+        in the sensor's frame; pose (4, 4) of the sensor in a fixed frame, None where unknown.
+
+        What cannot be used does no harm: boxes that are not finite, or without a size, are left
+        out; a frame of the same stamp, or a little late, changes nothing; time that jumps, and a
+        sensor that does, ends all tracks.
+        """
+        self.problem = None
+        seconds = self._seconds(int(stamp_ns))
+        if seconds is None:
+            return self._reported(np.zeros(len(self._states), bool))
+        self._move_ego(pose, seconds)
+        boxes, class_ids, scores = self._usable(found)
+        boxes = moved_boxes(boxes, self._ego.pose)
+        states = predicted(self._states, seconds, self.params)
+        i, j = matched(states, boxes, class_ids, scores, self.params)
+        sensor = self._ego.pose[:2, 3]
+        states = updated(states, i, boxes[j], class_ids[j], scores[j], sensor, self.params,
+                         self._ego.known)
+        free = np.ones(len(boxes), bool)
+        free[j] = False
+        start = np.flatnonzero(free & (scores >= self.params.association.strong))
+        before = len(states)
+        states = states.followed_by(born(self._next, boxes[start], class_ids[start],
+                                         scores[start], sensor, self.params))
+        self._next += len(start)
+        seen = np.zeros(len(states), bool)
+        seen[i], seen[before:] = True, True
+        hit = set(states.ids[seen].tolist())
+        kept = alive(states, self.params, self._ego.known)
+        self.born += len(start)
+        self.ended += len(states) - len(kept)
+        self._states = kept
+        return self._reported(np.array([i in hit for i in kept.ids.tolist()], bool))
+
+    def at(self, stamp_ns: int) -> Tracks:
+        """The tracks predicted to a stamp after the last frame's, which changes nothing, in the
+        frame of the sensor as it is taken to have moved on; for a frame that is lost or late."""
+        self.problem = None
+        seconds = 0.0 if self._stamp is None else (int(stamp_ns) - self._stamp) / 1e9
+        seconds = min(max(seconds, 0.0), self.params.max_gap)
+        ego = next_ego(self._ego, None, seconds, self.params.max_ego_gap)
+        states = predicted(self._states, seconds, self.params)
+        return _in_sensor_frame(states, ego, np.zeros(len(states), bool), self.params)
+
+    def _seconds(self, stamp: int) -> float | None:
+        """Since the last frame; None for a frame to leave out."""
+        if stamp == 0:
+            self.problem = "the frames have no stamps: tracks take one frame each period"
+            return self.params.period
+        last, self._stamp = self._stamp, stamp
+        if last is None:
+            return self.params.period
+        seconds = (stamp - last) / 1e9
+        if seconds == 0:
+            self.problem = "a frame has the stamp of the one before and is left out"
+            return None
+        if seconds < 0 and -seconds <= self.params.max_gap:
+            self._stamp = last
+            self.problem = f"a frame is {-seconds:.2f} s older than the last one and is left out"
+            return None
+        if seconds < 0 or seconds > self.params.max_gap:
+            self.reset()
+            self._stamp = stamp
+            self.problem = f"time jumped by {seconds:.2f} s: all tracks ended"
+            return self.params.period
+        return seconds
+
+    def _move_ego(self, pose: np.ndarray | None, seconds: float) -> None:
+        given = pose if usable(pose) else None
+        if given is not None and len(self._states) and (
+                not self._ego.known or jumped(self._ego, given, seconds)):
+            stamp, known = self._stamp, self._ego.known
+            self.reset()
+            self._stamp = stamp
+            self.problem = ("the sensor's pose jumped: all tracks ended" if known else
+                            "poses began: all tracks ended, and go on in the fixed frame")
+        if given is None and (pose is not None or self._ego.known):
+            self.problem = ("the pose is missing or not rigid: the sensor is taken to move on as "
+                            "before")
+        self._ego = next_ego(self._ego, given, seconds, self.params.max_ego_gap)
+
+    def _usable(self, found: Detections) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Boxes (K, 7), class ids (K,), scores (K,), float64, the best max_detections."""
+        boxes, scores = found.boxes.astype(np.float64), found.scores.astype(np.float64)
+        with np.errstate(invalid="ignore"):
+            good = (np.isfinite(boxes).all(axis=1) & np.isfinite(scores)
+                    & (boxes[:, 3:6] > 0).all(axis=1)
+                    & (np.abs(boxes[:, :6]) <= MAX_RANGE).all(axis=1)
+                    & (found.class_ids >= 0) & (found.class_ids < len(CLASSES)))
+        if not good.all():
+            self.problem = (f"{(~good).sum()} of {len(good)} detections are no boxes (not finite, "
+                            "or without a size) and are left out")
+        places = np.flatnonzero(good & (scores >= self.params.min_score))
+        if len(places) > self.params.max_detections:
+            self.problem = (f"{len(places)} detections are too many; the best "
+                            f"{self.params.max_detections} are taken")
+            places = np.sort(places[np.argsort(-scores[places], kind="stable")[
+                :self.params.max_detections]])
+        return boxes[places], found.class_ids[places], np.clip(scores[places], 0.0, 1.0)
+
+    def _reported(self, seen: np.ndarray) -> Tracks:
+        return _in_sensor_frame(self._states, self._ego, seen, self.params)
+
+
+def _in_sensor_frame(states: States, ego: Ego, seen: np.ndarray,
+                     params: TrackingParams) -> Tracks:
+    """Those that are to be reported."""
+    scores = probabilities(states, params, ego.known)
+    places = np.flatnonzero((scores >= params.report) & (
+        seen | (probability(states.present) >= params.report_unseen)))
+    chosen, back = states.take(places), np.linalg.inv(ego.pose)
+    forward = back[:2, 0] / max(np.hypot(*back[:2, 0]), 1e-9)
+    covariances = motion.turned(chosen.covariances, float(forward[0]), float(forward[1]))
+    velocities = chosen.means[:, 2:4] @ np.array([forward, [-forward[1], forward[0]]])
+    found = Detections.of(moved_boxes(chosen.boxes(), back), chosen.class_ids, scores[places])
+    return Tracks(chosen.ids, found, velocities, chosen.moving, covariances, chosen.means[:, 5],
+                  chosen.height_variances, seen[places], chosen.ages)

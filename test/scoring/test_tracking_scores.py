@@ -1,0 +1,170 @@
+"""HOTA, CLEAR MOT and AB3DMOT's scores: the laws they keep, and a slow reading of their papers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import tracking_reference as slow
+
+from lidar_perception.data.kitti.results import read_tracking_results, write_tracking_results
+from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
+from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
+from lidar_perception.scoring.tracking.over_recall import over_recall
+from lidar_perception.scoring.tracking.pairs import Pairs, pairs_of, tracked_labels, without_ignored
+from lidar_perception.scoring.tracking.report import TrackingReport, observe
+from lidar_perception.simulation.camera import FORWARD_CAMERA
+from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
+
+CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
+
+
+def random_sequences(seed: int) -> list[list[Pairs]]:
+    """Three sequences in which tracks follow labels, swap, fail, and others are nowhere."""
+    rng = np.random.default_rng(seed)
+    sequences = []
+    for _ in range(3):
+        frames = []
+        for _ in range(12):
+            true = np.sort(rng.choice(5, rng.integers(0, 5), replace=False))
+            tracks = np.sort(rng.choice(6, rng.integers(0, 5), replace=False)) + 10
+            same = (tracks[None, :] - 10) == true[:, None]
+            alike = rng.uniform(0, 1, same.shape) * np.where(
+                same & (rng.uniform(size=same.shape) < 0.8), 1.0, 0.6)
+            frames.append(Pairs(true, rng.uniform(size=len(true)) < 0.2, tracks,
+                                tracks / 16 + rng.uniform(0, 0.05, len(tracks)),
+                                rng.uniform(size=len(tracks)) < 0.2, alike,
+                                np.clip(alike - 0.1, 0, 1)))
+        sequences.append(frames)
+    return sequences
+
+
+def plainly(sequences):
+    return [[(list(zip(f.true_ids.tolist(), f.ignored.tolist())),
+              list(zip(f.track_ids.tolist(), f.scores.tolist(), f.excused.tolist())),
+              lambda i, j, f=f: float(f.similarity[i, j]),
+              lambda i, j, f=f: float(f.overlap[i, j])) for f in frames] for frames in sequences]
+
+
+def counted(sequences):
+    hota, clear = HotaCounts(), ClearCounts()
+    for frames in sequences:
+        kept = [without_ignored(f) for f in frames]
+        hota, clear = hota + hota_counts(kept), clear + clear_counts(kept)
+    return hota.scores(), clear
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_fast_scores_equal_a_slow_reading(seed):
+    sequences = random_sequences(seed)
+    hota, clear = counted(sequences)
+    assert [hota[k] for k in ("HOTA", "DetA", "AssA")] == pytest.approx(
+        slow.hota(plainly(sequences)), abs=1e-12)
+    assert (clear.tp, clear.fn, clear.fp, clear.switches, clear.fragments) == slow.clear(
+        plainly(sequences))
+    curve = over_recall(sequences)
+    assert [curve[k] for k in ("sAMOTA", "AMOTA", "AMOTP")] == pytest.approx(
+        slow.over_recall(plainly(sequences)), abs=1e-12)
+
+
+def test_names_of_ids_do_not_matter():
+    sequences = random_sequences(7)
+    renamed = [[replace(f, track_ids=1000 - f.track_ids, true_ids=f.true_ids * 7 + 3)
+                for f in frames] for frames in sequences]
+    assert counted(renamed)[0] == pytest.approx(counted(sequences)[0])
+    assert counted(renamed)[1].switches == counted(sequences)[1].switches
+
+
+def drive(ids=(1, 2), frames=10, switch_at=None, kind=CAR):
+    """Frames (truth, tracks) of two cars that drive side by side, found to the centimetre."""
+    result = []
+    for i in range(frames):
+        boxes = np.array([[10.0 + i, y, -1.0, 4.0, 1.8, 1.5, 0.0] for y in (-3.0, 3.0)])
+        truth = GroundTruth.of(boxes, [kind] * 2, [{"track_id": k, "occluded": 0,
+                                                    "truncated": 0.0} for k in (7, 8)])
+        names = ids[::-1] if switch_at is not None and i >= switch_at else ids
+        result.append((truth, tracked_labels(np.array(names), Detections.of(boxes, CAR, 0.9))))
+    return result
+
+
+def scored(frames, similarity="3d", order=None, calibration=None):
+    report = TrackingReport()
+    for i in order or range(len(frames)):
+        report.update(observe("a", i, *frames[i], calibration, similarity))
+    return report.compute()["classes"]["Car"]
+
+
+def test_tracks_that_are_the_labels_score_one():
+    score = scored(drive())
+    for name in ("HOTA", "DetA", "AssA", "MOTA", "MOTP"):
+        assert score[name] == pytest.approx(1.0, abs=1e-5)
+    assert (score["switches"], score["fragments"], score["mostly_tracked"]) == (0, 0, 2)
+    assert score["sAMOTA"] == pytest.approx(score["AMOTP"], abs=1e-5)
+
+
+def test_two_ids_that_change_places_are_two_switches_and_cost_association_only():
+    score = scored(drive(switch_at=5))
+    assert score["switches"] == 2 and score["DetA"] == pytest.approx(1.0)
+    assert score["AssA"] == pytest.approx(1 / 3)  # each pair 5 of 10 + 10 - 5
+
+
+def test_the_order_in_which_frames_come_does_not_matter():
+    frames = drive(switch_at=4)
+    assert scored(frames, order=[9, 3, 1, 0, 2, 8, 7, 4, 5, 6]) == scored(frames)
+
+
+def test_neighbour_classes_and_what_is_cut_off_neither_help_nor_harm():
+    vans = drive(kind=VAN)
+    assert scored(vans) is None
+    cut = [(GroundTruth.of(t.boxes, t.class_ids, [{**e, "truncated": 2.0} for e in t.extras]), k)
+           for t, k in drive()]
+    assert scored(cut) is None
+
+
+def test_a_track_in_a_dont_care_region_is_excused():
+    (_, tracks), = drive(frames=1)
+    wide = GroundTruth.of([], [], [], [("DontCare", {
+        "bbox": [0.0, 0.0, 1241.0, 374.0], "track_id": -1, "truncated": -1.0, "occluded": -1,
+        "alpha": -10.0, "dimensions": [-1.0] * 3, "location": [-1000.0] * 3,
+        "rotation_y": -10.0})])
+    nothing = GroundTruth.of([], [])
+    assert scored([(wide, tracks)], calibration=FORWARD_CAMERA) is None
+    assert scored([(nothing, tracks)], calibration=FORWARD_CAMERA)["false"] == 2
+
+
+def test_without_tracks_all_is_missed_and_without_labels_all_is_false():
+    nothing = GroundTruth.of([], [])
+    missed = scored([(truth, nothing) for truth, _ in drive()])
+    assert (missed["misses"], missed["HOTA"], missed["sAMOTA"]) == (20, 0.0, 0.0)
+    false = scored([(nothing, tracks) for _, tracks in drive()])
+    assert (false["false"], false["HOTA"], false["MOTA"]) == (20, 0.0, -20.0)
+    assert scored([(nothing, nothing)]) is None
+
+
+def test_what_cannot_be_scored_says_why():
+    truth, tracks = drive(frames=1)[0]
+    twice = tracked_labels(np.array([3, 3]), Detections.of(tracks.boxes, CAR))
+    with pytest.raises(InputError, match="a/0: a frame has the track id 3 twice"):
+        observe("a", 0, truth, twice)
+    with pytest.raises(InputError, match="no track id"):
+        pairs_of(GroundTruth.of(truth.boxes, truth.class_ids), tracks, None)
+    with pytest.raises(InputError, match="needs a calibration"):
+        pairs_of(truth, tracks, None, "image")
+
+
+def test_result_files_come_back_as_they_were(tmp_path):
+    frames = [(i, np.array([4, 9]), Detections.of(tracks.boxes, [CAR, 4], [0.25, 0.75]))
+              for i, (_, tracks) in enumerate(drive(frames=3))]
+    path = tmp_path / "0000.txt"
+    write_tracking_results(path, frames, FORWARD_CAMERA)
+    found = read_tracking_results(path, FORWARD_CAMERA.lidar_to_camera)
+    assert " Person " in path.read_text()  # the tracking benchmark's name of Person_sitting
+    for number, _, detections in frames:
+        again = found[number]
+        np.testing.assert_allclose(again.boxes, detections.boxes, atol=2e-6)
+        assert again.class_ids.tolist() == detections.class_ids.tolist()
+        assert [(e["track_id"], e["score"]) for e in again.extras] == [(4, 0.25), (9, 0.75)]
+    path.write_text(path.read_text().replace(" 0.250000\n", "\n"))
+    with pytest.raises(InputError, match="without a score"):
+        read_tracking_results(path, FORWARD_CAMERA.lidar_to_camera)

@@ -1,0 +1,96 @@
+"""The filter of the tracker: what its model says, and what measuring does to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidar_perception.geometry import wrap_angle
+from lidar_perception.tracking.motion import (
+    facing_forward,
+    keep_to_heading,
+    predict,
+    turned,
+    update,
+)
+
+NUMBERS = st.floats(-20, 20)
+STATE = st.tuples(NUMBERS, NUMBERS, NUMBERS, NUMBERS, st.floats(-3, 3), st.floats(-1.5, 1.5))
+NONE = np.zeros(1)
+
+
+def spread(seed=0, count=1):
+    parts = np.random.default_rng(seed).normal(size=(count, 6, 6))
+    return parts @ parts.transpose(0, 2, 1) + 0.1 * np.eye(6)
+
+
+@given(STATE, st.floats(0, 2), st.floats(0, 2))
+def test_two_steps_are_one_long_step(state, first, second):
+    means, p = np.array([state]), spread()
+    at_once = predict(means, p, first + second, NONE, NONE, NONE)
+    again = predict(*predict(means, p, first, NONE, NONE, NONE), second, NONE, NONE, NONE)
+    np.testing.assert_allclose(again[0][:, [0, 1, 2, 3, 5]], at_once[0][:, [0, 1, 2, 3, 5]],
+                               atol=1e-6)
+    assert wrap_angle(again[0][0, 4] - at_once[0][0, 4]) == pytest.approx(0, abs=1e-6)
+
+
+@given(STATE, st.floats(0.01, 0.5))
+def test_the_covariance_grows_along_the_slope_of_the_motion(state, seconds):
+    means, p = np.array([state]), spread(3)
+    _, grown = predict(means, p, seconds, NONE, NONE, NONE)
+    step, slope = 1e-5, np.zeros((6, 6))
+    for k in range(6):
+        ends = [predict(means + s * np.eye(6)[k], p, seconds, NONE, NONE, NONE)[0][0]
+                for s in (step, -step)]
+        slope[:, k] = ends[0] - ends[1]
+        slope[4, k] = wrap_angle(slope[4, k])
+    slope /= 2 * step
+    np.testing.assert_allclose(grown[0], slope @ p[0] @ slope.T, rtol=1e-3, atol=1e-2)
+
+
+def test_the_speed_stays_and_the_way_bends_as_the_turn_rate_says():
+    circle = np.array([[0.0, 0.0, 2.0, 0.0, 0.0, np.pi / 2]])
+    means, _ = predict(circle, spread(), 4.0, NONE, NONE, NONE)  # once around
+    np.testing.assert_allclose(means, circle, atol=1e-9)
+
+
+def test_measuring_makes_surer_and_pulls_to_what_is_measured():
+    means, p = np.zeros((4, 6)), spread(1, 4)
+    measured = np.full((4, 3), 0.3)
+    after, narrower = update(means, p, measured, np.full((4, 3), 0.1))
+    assert (np.linalg.eigvalsh(p - narrower) > -1e-9).all()
+    assert (np.linalg.eigvalsh(narrower) > 0).all()
+    sure, _ = update(means, p, measured, np.full((4, 3), 1e-5))
+    np.testing.assert_allclose(sure[:, [0, 1, 4]], measured, atol=1e-4)
+    assert (np.abs(after[:, :2] - 0.3) < 0.3 + 1e-9).all()
+
+
+@given(st.floats(-3.1, 3.1), st.floats(-1.4, 1.4))
+def test_front_and_rear_measure_the_same(heading, off):
+    means = np.array([[0, 0, 0, 0, heading, 0.0]])
+    ends = [update(means, spread(2), np.array([[0.1, 0.2, heading + off + k * np.pi]]),
+                   np.full((1, 3), 0.2))[0] for k in (0, 1)]
+    np.testing.assert_allclose(ends[0][0, :4], ends[1][0, :4], atol=1e-7)
+    assert wrap_angle(ends[0][0, 4] - ends[1][0, 4]) == pytest.approx(0, abs=1e-7)
+
+
+def test_what_drives_slips_no_more_and_what_drives_backwards_fast_has_its_rear_in_front():
+    means = np.array([[0.0, 0, 5, 1, 0, 0]])
+    kept, p = keep_to_heading(means, np.eye(6)[None], np.array([0.1]))
+    across = [np.cos(m[4]) * m[3] - np.sin(m[4]) * m[2] for m in (means[0], kept[0])]
+    assert abs(across[1]) < 0.2 * abs(across[0]) and (np.linalg.eigvalsh(p) > 0).all()
+    backwards = np.array([[0.0, 0, -5, 0, 0.2, 0], [0, 0, -0.5, 0, 0.2, 0]])
+    assert facing_forward(backwards, np.array([2.0, 2.0]))[:, 4] == pytest.approx(
+        [0.2 - np.pi, 0.2])
+
+
+def test_covariances_turn_with_the_axes():
+    angle = 0.7
+    cos, sin = np.cos(angle), np.sin(angle)
+    p = spread(5)
+    there = turned(p, cos, sin)
+    np.testing.assert_allclose(turned(there, cos, -sin), p, atol=1e-12)
+    r = np.array([[cos, -sin], [sin, cos]])
+    np.testing.assert_allclose(there[0, 2:4, 2:4], r @ p[0, 2:4, 2:4] @ r.T)

@@ -1,0 +1,45 @@
+"""The peer of the benchmark: births and deaths as AB3DMOT counts them, and the comparison."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from benchmark.plain_ab3dmot import PlainAb3dmot
+from benchmark.tracking import Seen, measure_tracking
+from lidar_perception.types import CLASSES, Detections, GroundTruth
+
+CAR = CLASSES.index("Car")
+
+
+def one(x):
+    return Detections.of([[x, 0, -1, 4, 1.8, 1.5, 0]], CAR, 0.9)
+
+
+def test_three_hits_make_a_track_and_two_misses_end_it():
+    tracker, none = PlainAb3dmot(), Detections.none()
+    for _ in range(4):
+        tracker(none)
+    shown = [len(tracker(found)[0]) for found in (one(10), one(11), one(12), none, none, one(15))]
+    assert shown == [0, 0, 1, 1, 0, 0]
+
+
+def test_it_follows_a_straight_way_and_poses_make_what_stands_stand():
+    tracker = PlainAb3dmot()
+    for i in range(20):
+        pose = np.eye(4)
+        pose[0, 3] = 0.9 * i
+        ids, found = tracker(one(30 - 0.9 * i), pose)
+        assert ids.tolist() == [1] and found.boxes[0, 0] == pytest.approx(30 - 0.9 * i, abs=0.05)
+    assert np.abs(tracker.tracks[CAR][0].state[7:]).max() < 0.05
+
+
+def test_both_trackers_are_scored_on_the_same_frames():
+    frames = [Seen(one(10 + i), GroundTruth.of(one(10 + i).boxes, [CAR], [{
+        "track_id": 5, "occluded": 0, "truncated": 0.0}]), 10**18 + i * 10**8) for i in range(12)]
+    content = measure_tracking({"a": frames}, None)
+    assert list(content) == ["plain AB3DMOT", "ours"]
+    for scores in content.values():
+        car = scores["classes"]["Car"]
+        assert (car["labels"], car["switches"], car["tracks"]) == (12, 0, 1)
+        assert car["HOTA"] > 0.8

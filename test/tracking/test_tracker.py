@@ -1,0 +1,279 @@
+"""The tracker: ids that stay, velocities that are right, evidence, and input that is broken."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lidar_perception.geometry import wrap_angle
+from lidar_perception.param_fields import with_values
+from lidar_perception.tracking.association import FORBIDDEN, assigned, costs
+from lidar_perception.tracking.ego import Ego, moved_boxes, next_ego, usable
+from lidar_perception.tracking.existence import effective_looks
+from lidar_perception.tracking.params import AssociationParams, TrackingParams
+from lidar_perception.tracking.tracker import Tracker
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
+
+CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
+TENTH = 100_000_000
+START = 10**18
+
+
+def car(x, y=0.0, yaw=0.0):
+    return [x, y, -1.0, 4.0, 1.8, 1.5, yaw]
+
+
+def person(x, y=0.0):
+    return [x, y, -0.8, 0.8, 0.6, 1.75, 0.0]
+
+
+def followed(frames, poses=None, tracker=None, stamps=None):
+    """The Tracks of every frame, at 10 Hz."""
+    tracker = tracker or Tracker()
+    return [tracker(found, START + i * TENTH if stamps is None else stamps[i],
+                    None if poses is None else poses[i]) for i, found in enumerate(frames)]
+
+
+def cars(*rows, scores=0.9, kind=CAR):
+    return Detections.of(np.reshape(rows, (-1, 7)), kind, scores)
+
+
+def pose(x, y=0.0, yaw=0.0):
+    result = np.eye(4)
+    result[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
+    result[:2, 3] = x, y
+    return result
+
+
+def crowd(seed=0, frames=20):
+    """Cars, cyclists and people on straight ways, in the fixed frame, seen with noise."""
+    rng = np.random.default_rng(seed)
+    kinds = np.array([CAR, CAR, CYCLIST, PEDESTRIAN, PEDESTRIAN, PEDESTRIAN])
+    start = np.array([car(10), car(20, 8, np.pi), car(15, -8), person(8, 4), person(12, -4),
+                      person(25, 5)])
+    velocity = np.array([[8, 0], [-5, 0], [4, 0], [1, 0.5], [0, 0], [-1, 0]])
+    for i in range(frames):
+        boxes = start.copy()
+        boxes[:, :2] += velocity * i / 10 + rng.normal(0, 0.05, (6, 2))
+        yield Detections.of(boxes, kinds, rng.uniform(0.7, 0.95, 6))
+
+
+def test_ids_stay_and_velocities_are_right():
+    tracks = followed(crowd())
+    assert {t.ids.tolist() == [1, 2, 3, 4, 5, 6] for t in tracks} == {True}
+    last = tracks[-1]
+    truth = np.array([[8, 0], [-5, 0], [4, 0], [1, 0.5], [0, 0], [-1, 0]])
+    off = last.velocities - truth
+    assert np.abs(off).max() < 0.5
+    inside = np.einsum("ni,nij,nj->n", off, np.linalg.inv(last.covariances[:, 2:4, 2:4]), off)
+    assert (inside < 16).all()  # the covariances do not promise too much
+    assert (np.linalg.eigvalsh(last.covariances) > -1e-12).all()
+    assert (last.moving[[0, 1, 2]] > 0.99).all() and last.moving[4] < 0.3
+
+
+def test_the_same_frames_give_the_same_tracks_and_nothing_given_is_changed():
+    frames = list(crowd(3))
+    before = [f.boxes.copy() for f in frames]
+    first, again = followed(frames), followed(frames)
+    for a, b in zip(first, again):
+        for name in ("ids", "velocities", "covariances", "moving"):
+            np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+        np.testing.assert_array_equal(a.detections.boxes, b.detections.boxes)
+    for frame, boxes in zip(frames, before):
+        np.testing.assert_array_equal(frame.boxes, boxes)
+
+
+def test_a_sensor_that_moves_and_turns_sees_the_same_tracks_as_one_that_stands():
+    frames = list(crowd(1))
+    poses = [pose(0.9 * i, 0.1 * i, 0.04 * i) for i in range(len(frames))]
+    moved = [Detections.of(moved_boxes(f.boxes, np.linalg.inv(p)), f.class_ids, f.scores)
+             for f, p in zip(frames, poses)]
+    standing = followed(frames, [np.eye(4)] * len(frames))
+    for still, seen, p in zip(standing, followed(moved, poses), poses):
+        assert seen.ids.tolist() == still.ids.tolist()
+        back = moved_boxes(seen.detections.boxes, p)
+        np.testing.assert_allclose(back[:, :6], still.detections.boxes[:, :6], atol=1e-3)
+        assert np.abs(wrap_angle(back[:, 6] - still.detections.boxes[:, 6])).max() < 1e-3
+        np.testing.assert_allclose(seen.velocities @ p[:2, :2].T, still.velocities, atol=1e-3)
+        np.testing.assert_allclose(seen.moving, still.moving, atol=1e-3)
+
+
+def test_without_poses_what_stands_comes_nearer():
+    frames = [cars(car(30 - 0.8 * i)) for i in range(15)]
+    alone = followed(frames)[-1]
+    assert alone.velocities[0] == pytest.approx([-8, 0], abs=0.3) and alone.moving[0] > 0.99
+    known = followed(frames, [pose(0.8 * i) for i in range(15)])[-1]
+    assert known.velocities[0] == pytest.approx([0, 0], abs=0.2) and known.moving[0] < 0.4
+
+
+def test_a_car_on_a_circle_shows_its_turn_rate():
+    angle = np.arange(40) * 0.04  # 0.4 rad/s, 4 m/s
+    tracks = followed([cars(car(10 * np.sin(a), 10 - 10 * np.cos(a), a)) for a in angle])
+    last = tracks[-1]
+    assert last.ids.tolist() == [1] and last.turn_rates[0] == pytest.approx(0.4, abs=0.08)
+    assert wrap_angle(last.detections.boxes[0, 6] - angle[-1]) == pytest.approx(0, abs=0.1)
+    assert np.hypot(*last.velocities[0]) == pytest.approx(4, abs=0.4)
+
+
+def test_a_missed_frame_keeps_id_and_place():
+    frames = [cars(car(10 + i)) if i not in (8, 9) else Detections.none() for i in range(14)]
+    tracks = followed(frames)
+    assert {t.ids.tolist()[0] for t in tracks if len(t)} == {1}
+    assert tracks[8].ids.tolist() == [1] and not tracks[8].seen[0]
+    assert tracks[8].detections.boxes[0, 0] == pytest.approx(18, abs=0.5)
+    assert tracks[12].detections.boxes[0, 0] == pytest.approx(22, abs=0.3)
+
+
+def test_what_is_gone_ends():
+    tracker = Tracker()
+    followed([cars(car(10))] * 5 + [Detections.none()] * 60, tracker=tracker)
+    assert (tracker.alive, tracker.born, tracker.ended) == (0, 1, 1)
+
+
+def test_a_weak_detection_keeps_a_track_alive_and_starts_none():
+    weak = TrackingParams().association.strong / 2
+    tracker = Tracker()
+    followed([cars(car(10), scores=weak)] * 10, tracker=tracker)
+    assert (tracker.born, tracker.alive) == (0, 0)
+    tracks = followed([cars(car(10))] * 10 + [cars(car(10), scores=weak)] * 3, tracker=tracker,
+                      stamps=[START + (20 + i) * TENTH for i in range(13)])
+    assert tracks[-1].ids.tolist() == [1] and tracks[-1].seen[0]
+
+
+def test_looks_from_one_place_count_little_and_from_others_more():
+    looks = np.arange(1.0, 500.0)
+    once = effective_looks(looks, np.zeros_like(looks), 0.5)
+    assert once[0] == 1 and (np.diff(once) > 0).all() and once[-1] < 1 / 0.5
+    assert (effective_looks(looks, np.ones_like(looks), 0.5)[5:] > 1.5 * once[5:]).all()
+    np.testing.assert_allclose(effective_looks(looks, np.zeros_like(looks), 0.0), looks)
+
+
+def test_a_post_that_is_doubtful_in_every_frame_never_becomes_sure():
+    """A score that says nothing for it, a hundred times from the same place, says nothing."""
+    neutral = TrackingParams().existence.neutral.pedestrian
+    tracker = Tracker(with_values(TrackingParams(), {"report": 0.0}))
+    tracks = followed([cars(person(15), scores=neutral, kind=PEDESTRIAN)] * 100, tracker=tracker)
+    assert max(t.detections.scores.max(initial=0) for t in tracks) < 0.6
+    better = followed([cars(person(15), scores=0.6, kind=PEDESTRIAN)] * 10)[-1]
+    assert better.detections.scores[0] > 0.7
+
+
+def test_a_front_taken_for_the_rear_does_not_turn_a_car():
+    tracks = followed([cars(car(10 + i, yaw=np.pi * (i % 2))) for i in range(20)])
+    assert [wrap_angle(t.detections.boxes[0, 6]) for t in tracks[6:]] == pytest.approx(
+        [0.0] * 14, abs=0.1)
+
+
+def test_a_class_that_changes_each_frame_is_one_track_of_the_better_one():
+    frames = [cars(person(10 + 0.1 * i), kind=[CYCLIST, PEDESTRIAN][i % 2],
+                   scores=[0.6, 0.9][i % 2]) for i in range(30)]
+    tracks = followed(frames)
+    assert {t.ids.tolist()[0] for t in tracks[1:]} == {tracks[-1].ids[0]}
+    assert {int(t.detections.class_ids[0]) for t in tracks[8:]} == {PEDESTRIAN}
+
+
+def test_of_two_tracks_in_one_place_one_ends():
+    both = Detections.of([car(10), car(10.3)], CAR, [0.9, 0.8])
+    assert all(len(t) == 1 for t in followed([both] * 5))
+
+
+def test_a_frame_that_is_lost_is_predicted_over():
+    tracker = Tracker()
+    followed([cars(car(10 + i)) for i in range(10)], tracker=tracker)
+    later = tracker.at(START + 9 * TENTH + 2 * TENTH)
+    assert later.detections.boxes[0, 0] == pytest.approx(21, abs=0.3)
+    assert len(tracker.at(0)) == 1 and len(Tracker().at(5)) == 0
+
+
+def test_stamps_that_are_missing_equal_late_or_jump():
+    tracker, found = Tracker(), cars(car(10))
+    for _ in range(3):
+        tracker(found, 0)
+        assert "no stamps" in tracker.problem
+    assert len(tracker(found, 0)) == 1
+    tracker = Tracker()
+    followed([found] * 5, tracker=tracker)
+    for stamp, words in ((START + 4 * TENTH, "left out"), (START + 2 * TENTH, "older")):
+        assert tracker(found, stamp).ids.tolist() == [1] and words in tracker.problem
+    assert tracker(found, START - 10**10).ids.tolist() == [2] and "jumped" in tracker.problem
+    assert tracker(found, START).ids.tolist() == [3] and "jumped" in tracker.problem
+    tracker(found, START + TENTH)
+    assert tracker.problem is None
+
+
+def test_poses_that_are_missing_for_a_while_are_replaced_by_the_motion_before():
+    frames = [cars(car(40 - 0.8 * i)) for i in range(20)]
+    poses = [None if 8 <= i < 13 else pose(0.8 * i) for i in range(20)]
+    tracker = Tracker()
+    tracks = followed(frames, poses, tracker)
+    assert {t.ids.tolist()[0] for t in tracks} == {1}
+    assert np.abs(tracks[-1].velocities).max() < 0.3
+    tracker(frames[-1], START + 20 * TENTH, np.full((4, 4), np.nan))
+    assert "pose is missing" in tracker.problem
+    tracker(frames[-1], START + 21 * TENTH, pose(5000.0))
+    assert "pose jumped" in tracker.problem and tracker.alive == 1
+
+
+def test_ego_motion_goes_on_as_before_for_a_while():
+    ego = next_ego(next_ego(Ego.unknown(), pose(0), 0.1, 1.0), pose(1, 0.1, 0.05), 0.1, 1.0)
+    step = np.linalg.inv(pose(0)) @ pose(1, 0.1, 0.05)
+    on = next_ego(ego, None, 0.1, 1.0)
+    np.testing.assert_allclose(on.pose, pose(1, 0.1, 0.05) @ step, atol=2e-2)
+    long = next_ego(next_ego(ego, None, 5.0, 1.0), None, 5.0, 1.0)
+    np.testing.assert_allclose(long.pose, next_ego(ego, None, 1.0, 1.0).pose)
+    assert not usable(2 * np.eye(4)) and not usable(np.eye(3)) and not usable(None)
+
+
+def test_boxes_that_are_none_are_left_out():
+    good = car(10)
+    bad = [car(np.nan), [*good[:3], 0.0, 1.8, 1.5, 0.0], car(np.inf), car(1e9)]
+    tracker = Tracker()
+    tracks = followed([Detections.of([good, *bad], CAR, 0.9)] * 4, tracker=tracker)
+    assert tracker.born == 1 and "4 of 5" in tracker.problem
+    assert np.isfinite(tracks[-1].detections.boxes).all()
+    tracker(Detections.of([good], CAR, np.nan), START + 5 * TENTH)
+    assert "1 of 1" in tracker.problem
+
+
+def test_ten_thousand_detections_a_frame_stay_within_bounds():
+    rng = np.random.default_rng(0)
+    tracker = Tracker(with_values(TrackingParams(), {"max_detections": 100, "max_tracks": 80}))
+    for i in range(5):
+        boxes = np.tile(car(0), (10_000, 1))
+        boxes[:, :2] = rng.uniform(-70, 70, (10_000, 2))
+        tracks = tracker(Detections.of(boxes, rng.integers(0, 9, 10_000),
+                                       rng.uniform(0, 1, 10_000)), START + i * TENTH)
+        assert tracker.alive <= 80 and len(tracks) <= 80
+        assert "too many" in tracker.problem
+
+
+def test_the_assignment_makes_most_pairs_within_gates_and_forbids_the_rest():
+    tracks = np.array([car(0), car(2), car(100)])
+    found = np.array([car(1.2), car(-0.4), car(50)])
+    kinds = np.zeros(3, int)
+    cost = costs(tracks, np.full(3, 0.3), kinds, np.full(3, 1.5), found, kinds,
+                 AssociationParams())
+    assert (cost[2] == FORBIDDEN).all() and (cost[:, 2] == FORBIDDEN).all()
+    assert [p.tolist() for p in assigned(cost)] == [[0, 1], [1, 0]]
+    assert len(assigned(np.zeros((0, 4)))[0]) == 0
+
+
+def test_odometry_says_how_a_simulated_drive_went():
+    pytest.importorskip("kiss_icp", reason="needs kiss-icp, the extra [odometry]")
+    from lidar_perception.simulation.drive import scans
+    from lidar_perception.tracking.ego import Odometry
+    odometry = Odometry()
+    for scan in scans(5, 6):
+        found = odometry(scan.frame.xyz)
+    assert usable(found) and np.linalg.norm(found[:3, 3] - scan.pose[:3, 3]) < 0.3
+
+
+def test_parked_cars_seen_from_a_turning_car_without_poses_keep_their_ids():
+    """They move sideways in the sensor's frame: nothing may tie their motion to their heading."""
+    parked = np.array([car(25, 4), car(32, -6, 0.1), car(40, 5)])
+    frames = [Detections.of(moved_boxes(parked, np.linalg.inv(pose(0.6 * i, 0.0, 0.02 * i))), CAR,
+                            0.9) for i in range(25)]
+    tracks = followed(frames)
+    assert {tuple(t.ids.tolist()) for t in tracks} == {(1, 2, 3)}
+    for t, found in zip(tracks[5:], frames[5:]):
+        np.testing.assert_allclose(t.detections.boxes[:, :2], found.boxes[:, :2], atol=0.3)
