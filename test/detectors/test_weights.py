@@ -58,8 +58,8 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
         torch.testing.assert_close(value, network.state_dict()[name], atol=1e-7,
                                    rtol=0 if value.ndim < 2 else 2**-10)
     found = load_detector(path, "cpu", eager())(frame())
-    assert len(found.detections) and same(found, PointPillarsDetector(TorchNetwork(network), header, CPU,
-                                               eager())(frame()))
+    expected = PointPillarsDetector(TorchNetwork(network), header, CPU, eager())(frame())
+    assert len(found.detections) and same(found, expected)
 
 
 def test_a_checkpoint_of_another_network_is_refused_with_both_values(saved):
