@@ -18,7 +18,7 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.cli.main import COMMANDS, cli
 from lidar_perception.cli.options import read_config
-from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.param_fields import parameter_fields
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS, TRUTH
@@ -275,6 +275,15 @@ def test_bad_input_is_one_line_on_stderr_and_exit_code_2(case, kitti, bag, tmp_p
     arguments, words = BAD_INPUTS[case]
     assert exit_of(monkeypatch, *map(fill, arguments)) == 2
     assert fill(words) in error_line(capsys)
+
+
+def test_a_bag_without_a_cloud_is_bad_input(tmp_path, monkeypatch, capsys):
+    with BagWriter(tmp_path / "bag") as made:
+        made.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+    for command in "nuscenes", "detection":
+        assert exit_of(monkeypatch, "evaluate", command, "--data", tmp_path / "bag", "--weights",
+                       "w", "--write-results", tmp_path / "out") == 2
+        assert "has no frame" in error_line(capsys)
 
 
 def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch, capsys):

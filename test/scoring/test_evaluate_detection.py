@@ -207,6 +207,12 @@ def test_a_scan_that_was_cut_is_skipped_and_one_that_is_refused_is_missed(kitti,
     assert content["frames"] == 1 and content["ap"]["Car"]["3d"]["hard"]["r40"] == 0
 
 
+def test_results_that_cannot_be_written_end_the_run(kitti, detector, monkeypatch, capsys):
+    line = error_of(monkeypatch, capsys, "--data", kitti, "--weights", "w", "--write-results",
+                    kitti / "training/calib/000000.txt/out")
+    assert line.startswith("Error: cannot write") and len(detector.scans) == 1
+
+
 def test_a_split_says_which_frames_are_scored(kitti, found, tmp_path):
     (found / "000000.txt").unlink()
     split = write(tmp_path / "val.txt", "000001\n000001\n")
