@@ -36,12 +36,14 @@ class Numbers:
 @dataclass(frozen=True)
 class ObjectClass:
     """looks_like: a class that it is taken for without harm, as KITTI's benchmark does; vehicle:
-    whether people can be in it."""
+    whether people can be in it; moves_as: vehicle, pedestrian or cyclist, for
+    the tracker."""
 
     name: str
     numbers: Numbers | None = None
     looks_like: str = ""
     vehicle: bool = False
+    moves_as: str = "vehicle"
 
 
 TABLE = (
@@ -50,10 +52,10 @@ TABLE = (
     ObjectClass("Van", looks_like="Car", vehicle=True),
     ObjectClass("Truck", vehicle=True),
     ObjectClass("Pedestrian", Numbers((0.8, 0.6, 1.73), 0.5, 0.35, (0.84, 0.66, 1.76), 0.40, 0.5,
-                                      0.25)),
-    ObjectClass("Person_sitting", looks_like="Pedestrian"),
+                                      0.25), moves_as="pedestrian"),
+    ObjectClass("Person_sitting", looks_like="Pedestrian", moves_as="pedestrian"),
     ObjectClass("Cyclist", Numbers((1.76, 0.6, 1.73), 0.5, 0.35, (1.76, 0.60, 1.74), 1.72, 0.5,
-                                   0.25)),
+                                   0.25), moves_as="cyclist"),
     ObjectClass("Tram", vehicle=True),
     ObjectClass("Misc"),
     ObjectClass("DontCare"),

@@ -9,6 +9,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from lidar_perception.param_fields import new_name, parameter_fields, with_values
+from lidar_perception.types import InputError
 
 TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE,
          str: Parameter.Type.STRING}
@@ -22,11 +23,11 @@ AS_FLOATS = {  # what is given, what is declared -> the value as declared
 
 def declare(node: Node, params: Any) -> Any:
     """Declare the fields of params, a dataclass; return params with what the node was given.
-    ValueError names what is out of range, or has another name by now."""
+    InputError names what is out of range, or has another name by now."""
     declared = {}
     for name in node._parameter_overrides:
         if (new := new_name(name)) in parameter_fields(params):
-            raise ValueError(f"parameter '{name}' is called '{new}' now; rename it")
+            raise InputError(f"parameter '{name}' is called '{new}' now; rename it")
     for name, f in parameter_fields(params).items():
         kind = _kind(f)
         value = list(f.default) if isinstance(f.default, tuple) else f.default

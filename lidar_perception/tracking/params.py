@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from lidar_perception.classes import TABLE
 from lidar_perception.param_fields import Params, param
-from lidar_perception.types import CLASSES
 
 KINDS = ("vehicle", "pedestrian", "cyclist")  # that move, and are told apart, in the same way
-KIND_OF_CLASS = tuple(KINDS.index({"Pedestrian": "pedestrian", "Person_sitting": "pedestrian",
-                                   "Cyclist": "cyclist"}.get(name, "vehicle"))
-                      for name in CLASSES)
+KIND_OF_CLASS = tuple(KINDS.index(row.moves_as) for row in TABLE)
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import yaml
 from bag_samples import LATCHED, cloud_frame, message_bytes, same_cloud, scans
 from mcap.reader import make_reader
@@ -14,7 +15,7 @@ from lidar_perception.data.bag import LATCHED_QOS, Bag, BagWriter
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.types import GroundTruth
+from lidar_perception.types import GroundTruth, InputError
 from lidar_perception.wire.codec import typestore
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, IMAGE, POINTS, TRUTH
 from msg_utils.point_cloud2 import to_array
@@ -141,9 +142,10 @@ def test_metadata_counts_what_is_in_the_file(written):
         assert (bag.start_ns, bag.counts) == (STAMP, counts)
 
 
-def test_a_bag_without_messages_is_a_bag(tmp_path):
+def test_a_bag_without_messages_can_be_written_and_has_no_frame(tmp_path):
     assert write_bag(tmp_path / "bag", []) == 0
-    assert list(open_recording(tmp_path / "bag")) == []
+    with pytest.raises(InputError, match=r"bag .* has no frame; record"):
+        open_recording(tmp_path / "bag")
 
 
 def test_bags_of_sqlite_are_read_alike(written, tmp_path):

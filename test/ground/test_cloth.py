@@ -256,7 +256,8 @@ def silent():
 @needs_data
 def test_on_the_real_scan_it_is_as_good_as_the_falling_cloth_of_the_wheel():
     CSF = pytest.importorskip("CSF")
-    frame, semantic, _ = open_semantic_kitti(DATA / "semantickitti")[0].load()
+    labelled = open_semantic_kitti(DATA / "semantickitti")[0]
+    frame, semantic = labelled.load(), labelled.point_truth().classes
     params = ClothParams()
     with silent():
         wheel = CSF.CSF()

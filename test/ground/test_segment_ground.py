@@ -152,7 +152,7 @@ def bare_patchwork(xyz, intensity, height=1.73, rnr=True):
 
 @needs_data
 def test_patchwork_is_the_library_on_the_first_cloud_and_silent(capfd):
-    frame, _, _ = open_semantic_kitti(DATA / "semantickitti")[0].load()
+    frame = open_semantic_kitti(DATA / "semantickitti")[0].load()
     params = GroundParams(method="patchwork")
     found = [segment_ground(frame, params) for _ in range(3)]  # no memory from cloud to cloud
     assert capfd.readouterr().out == ""
@@ -169,7 +169,7 @@ def test_patchwork_is_the_library_on_the_first_cloud_and_silent(capfd):
 @needs_data
 @each_method
 def test_on_the_real_scan_permuting_points_permutes_the_ground(method):
-    frame, _, _ = open_semantic_kitti(DATA / "semantickitti")[0].load()
+    frame = open_semantic_kitti(DATA / "semantickitti")[0].load()
     order = np.random.default_rng(0).permutation(len(frame))
     found = ground_of(frame.xyz, method)
     assert (ground_of(frame.xyz[order], method) == found[order]).mean() > 0.99

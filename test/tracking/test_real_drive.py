@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 
 def test_no_identity_switches_on_a_real_drive_without_poses(data):
-    from lidar_perception.data.kitti.folder import open_kitti
+    from lidar_perception.data.open import open_recording
     from lidar_perception.detectors.open import open_detector
-    from lidar_perception.detectors.pointpillars.params import DetectionParams
-    from lidar_perception.detectors.pointpillars.weights_file import weights_file
-    from lidar_perception.scoring.tracking.pairs import tracked_labels
-    from lidar_perception.scoring.tracking.report import TrackingReport, observe
-    from lidar_perception.tracking.tracker import Tracker
+    from lidar_perception.detectors.params import MIN_SCORE
+    from lidar_perception.scoring.run import fill
+    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
 
-    detector = open_detector(weights_file(DetectionParams(version="v4", size="compact")), "cpu",
-                             least_score=0.05)
-    tracker, report = Tracker(), TrackingReport()
-    for i, frame in enumerate(open_kitti(data / "kitti_tracking")[:20]):
-        tracks = tracker(detector(frame.load()), frame.stamp_ns)
-        report.update(observe("a", i, frame.truth(),
-                              tracked_labels(tracks.ids, tracks.detections), frame.calibration()))
+    report = TrackingReport()
+    fill(report, open_recording(data / "kitti_tracking"),
+         by_tracker(partial(open_detector, min_score=MIN_SCORE)), limit=20)
     cars = report.compute()["classes"]["Car"]
     assert cars["switches"] == 0 and cars["HOTA"] > 0.7

@@ -9,6 +9,7 @@ from lidar_perception.cli.evaluate.clusters import clusters
 from lidar_perception.cli.evaluate.detection import detection
 from lidar_perception.cli.evaluate.nuscenes import nuscenes
 from lidar_perception.cli.evaluate.segmentation import segmentation
+from lidar_perception.cli.evaluate.tracking import tracking
 
 
 @click.group()
@@ -16,5 +17,5 @@ def evaluate() -> None:
     """Score the algorithms without ROS."""
 
 
-for command in candidates, clusters, detection, nuscenes, segmentation:
+for command in candidates, clusters, detection, nuscenes, segmentation, tracking:
     evaluate.add_command(command)

@@ -27,6 +27,7 @@ from lidar_perception.reproduction.experiment import Cell, Experiment, Section, 
 from lidar_perception.reproduction.labelled import Labelled, load_labelled, nearest_seed
 from lidar_perception.reproduction.variants import Found, found_with, score, sections, seed_of
 from lidar_perception.scoring.centres.matching import match_centres
+from lidar_perception.tracking.ego import Odometry
 from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
 
 SCANS = (2, 3, 5)
@@ -49,7 +50,7 @@ def measure(frames: Sequence[Frame], number: int) -> dict[str, Any]:
     before = _scans_before(frames, number, SCANS[-1] - 1)
     scans = [f.load().xyz for f in before] + [labelled.frame.xyz]
     ages = np.array([frames[number].stamp_ns - f.stamp_ns for f in before] + [0]) / 1e9
-    poses = _odometry(scans)
+    poses = np.array([*map(Odometry(), scans)])
     obstacles = [xyz[~segment_ground(LidarFrame(xyz), BEST.ground)] for xyz in scans]
     single = segment(labelled.frame, labelled.camera, BEST)
     seed = functools.partial(nearest_seed, single, labelled)
@@ -110,23 +111,6 @@ def _scans_before(frames: Sequence[Frame], number: int, count: int) -> Sequence[
     if len(found) < count:
         raise InputError(f"has fewer than {count} scans before it")
     return found
-
-
-def _odometry(scans: list[np.ndarray]) -> np.ndarray:
-    """(S, 4, 4) poses of the sensor, by KISS-ICP (Vizzo et al., RA-L 2023)."""
-    try:
-        from kiss_icp.config.parser import KISSConfig
-        from kiss_icp.kiss_icp import KissICP
-    except ImportError:
-        raise InputError("the study far needs kiss-icp; pip install "
-                         "'lidar_perception[odometry]'") from None
-    config = KISSConfig()
-    config.mapping.voxel_size, config.data.deskew = 1.0, False
-    odometry, poses = KissICP(config), []
-    for xyz in scans:
-        odometry.register_frame(xyz.astype(np.float64), np.zeros(0))
-        poses.append(odometry.last_pose)
-    return np.array(poses)
 
 
 def _segmented(xyz: np.ndarray, labelled: Labelled, single: Segmented) -> Segmented:

@@ -13,12 +13,12 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from lidar_perception.camera import Calibration
+from lidar_perception.classes import DETECTED
 from lidar_perception.geometry import iou_3d
 from lidar_perception.scoring.kitti.camera_objects import CameraObjects, camera_objects
+from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 
-SCORED = ("Car", "Pedestrian", "Cyclist")
-NEIGHBOURS = {"Car": "Van", "Pedestrian": "Person_sitting"}
 MAX_OCCLUSION, MAX_TRUNCATION = 2, 0  # levels of the tracking layout
 MIN_HEIGHT = 25.0    # pixels
 IN_REGION = 0.5      # share of a box in a DontCare region
@@ -56,8 +56,8 @@ def tracked_labels(ids: np.ndarray, found: Detections) -> GroundTruth:
 
 def pairs_of(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None,
              similarity: str = "centres") -> dict[str, Pairs]:
-    """One frame by class of SCORED. truth and tracks with a track_id in every extra, tracks with a
-    score too. Without a calibration nothing is too small, and there are no DontCare regions.
+    """One frame by class that is detected. truth and tracks with a track_id in every extra, tracks
+    with a score too. Without a calibration nothing is too small, and there are no DontCare regions.
 
     similarity: "centres" 1 - distance / 2 m, "3d" IoU in space, "image" IoU of the 2D boxes.
     InputError for a track id that is there twice, or none, and a number that is not finite.
@@ -75,7 +75,7 @@ def pairs_of(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration |
     excused = (objects.pixels_high <= MIN_HEIGHT + EPS) | _in_regions(
         objects.image_boxes, true.regions)
     return {name: _of_class(name, true_objects, objects, true_ids, track_ids, ignored, excused,
-                            similarity) for name in SCORED}
+                            similarity) for name in DETECTED}
 
 
 def _ids(objects: GroundTruth, what: str) -> np.ndarray:

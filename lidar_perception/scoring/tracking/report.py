@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 from lidar_perception.camera import Calibration
+from lidar_perception.classes import DETECTED
+from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.detectors.contract import Detector
+from lidar_perception.scoring.run import Start
 from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
 from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
 from lidar_perception.scoring.tracking.over_recall import over_recall
-from lidar_perception.scoring.tracking.pairs import SCORED, Pairs, pairs_of, without_ignored
+from lidar_perception.scoring.tracking.pairs import Pairs, pairs_of, tracked_labels, without_ignored
+from lidar_perception.tracking.ego import Odometry
+from lidar_perception.tracking.params import TrackingParams
+from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import GroundTruth, InputError
 
 
@@ -30,11 +39,40 @@ def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
         raise InputError(f"{sequence}/{index}: {error}") from None
 
 
+def by_tracker(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
+               odometry: bool = False) -> Start:
+    """Track what the detector of open_() finds, one tracker a sequence, whose frames must come in
+    their order in one process; poses by KISS-ICP, or those of the recording where it has any."""
+    return partial(_by_tracker, open_, params, odometry)
+
+
+def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, odometry: bool,
+                recording: Recording) -> Callable[[Frame], Observation | None]:
+    detector = open_()
+    last, tracker, motion = None, Tracker(params), None
+
+    def measure(frame: Frame) -> Observation | None:
+        nonlocal last, tracker, motion
+        if frame.sequence != last:
+            last, tracker = frame.sequence, Tracker(params)
+            motion = Odometry() if odometry else None
+        scan = frame.load()
+        pose = frame.pose() if motion is None else motion(scan.xyz)
+        tracks = tracker(detector(scan).detections, frame.stamp_ns, pose)
+        truth = frame.truth()
+        if truth is None:
+            return None
+        return observe(frame.sequence, frame.index, truth,
+                       tracked_labels(tracks.ids, tracks.detections), frame.calibration())
+    return measure
+
+
 @dataclass
 class TrackingReport:
     """Frames of sequences. A frame that comes twice counts once, the last time."""
 
     frames: dict[tuple[str, int], dict[str, Pairs]] = field(default_factory=dict)
+    skipped: list[str] = field(default_factory=list)
 
     def update(self, observation: Observation) -> None:
         """One frame more."""
@@ -46,9 +84,9 @@ class TrackingReport:
         names = sorted({sequence for sequence, _ in self.frames})
         ordered = {name: [self.frames[key] for key in sorted(self.frames) if key[0] == name]
                    for name in names}
-        return {"frames": len(self.frames), "sequences": len(names),
+        return {"frames": len(self.frames), "sequences": len(names), "skipped": self.skipped,
                 "classes": {name: _class([[frame[name] for frame in frames]
-                                          for frames in ordered.values()]) for name in SCORED}}
+                                          for frames in ordered.values()]) for name in DETECTED}}
 
 
 def _class(sequences: list[list[Pairs]]) -> dict | None:

@@ -1,0 +1,66 @@
+"""evaluate tracking: tracks against labels with ids, without ROS."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import click
+
+from lidar_perception.cli.data import (
+    a_path,
+    data_option,
+    device_option,
+    json_option,
+    limit_option,
+    no_labels,
+    opened,
+    split_option,
+    write_json,
+)
+from lidar_perception.cli.options import parameter_options
+from lidar_perception.runs.terminal import console
+from lidar_perception.tracking.params import TrackingParams
+
+
+@click.command()
+@data_option
+@split_option
+@limit_option
+@a_path("--weights", "Track what the detector of this checkpoint finds, or one by its name: "
+        "pointpillars or pointnet, with the weights that come with the package.", "FILE|NAME",
+        default="pointpillars", show_default=True)
+@device_option
+@click.option("--odometry", is_flag=True, help="Take the sensor's motion from the scans, by "
+              "KISS-ICP, instead of the recording's poses. Needs the extra [odometry].")
+@json_option
+@parameter_options(TrackingParams())
+def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, device: str,
+             odometry: bool, json_file: Path | None, params: TrackingParams) -> None:
+    """HOTA, CLEAR MOT and AB3DMOT's scores of Car, Pedestrian and Cyclist.
+
+    The labels need track ids, and the frames of a drive come one after the other, so this runs in
+    one process. Without poses tracks are relative to the sensor.
+
+    \b
+    Examples:
+      lidar-perception evaluate tracking --data /data/kitti/tracking --json tracks.json
+      lidar-perception evaluate tracking --data drive --odometry --weights v4.safetensors
+    """
+    from lidar_perception.data.frame import BOXES
+    from lidar_perception.detectors.open import open_detector
+    from lidar_perception.scoring.run import fill
+    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
+    from lidar_perception.scoring.tracking.tables import print_tracking_report
+
+    recording = opened(data, split=split)
+    recording.require(BOXES, "evaluate tracking")
+    open_ = partial(open_detector, weights, device, min_score=params.min_score,
+                    sensor_height=recording.frames[0].sensor_height)
+    report = TrackingReport()
+    fill(report, recording, by_tracker(open_, params, odometry), limit=limit)
+    content = {"source": str(weights), "odometry": odometry, **report.compute()}
+    write_json(json_file, content)
+    if not report.frames:
+        raise no_labels(recording, report.skipped)
+    print_tracking_report(content, console)

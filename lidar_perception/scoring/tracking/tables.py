@@ -1,0 +1,24 @@
+"""Tables of tracks against labels."""
+
+from __future__ import annotations
+
+from rich.console import Console
+
+from lidar_perception.scoring.tables import narrow_table, print_skipped
+
+SHARES = {"HOTA": "HOTA", "DetA": "DetA", "AssA": "AssA", "MOTA": "MOTA", "sAMOTA": "sAMOTA"}
+COUNTS = {"labels": "labels", "IDSW": "switches", "false": "false"}
+
+
+def print_tracking_report(content: dict, console: Console) -> None:
+    """Scores by class in percent, and what they count."""
+    table = narrow_table(f"Tracking, {content['frames']} frames of {content['sequences']} "
+                         "sequences", "", *SHARES, *COUNTS, width=6)
+    for name, row in content["classes"].items():
+        if row is not None:
+            table.add_row(name, *(f"{100 * row[key]:.1f}" for key in SHARES.values()),
+                          *(str(row[key]) for key in COUNTS.values()))
+    table.caption = ("HOTA and MOTA by centres within 2 m, sAMOTA by 3D IoU 0.25. IDSW: a track "
+                     "that took another number.")
+    console.print(table)
+    print_skipped(content["skipped"], console)
