@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
 from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.nodes.detector_node import DetectorNode
 
 if TYPE_CHECKING:
     from lidar_perception.detectors.pointpillars.config import NetworkConfig
+    from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
 
 
 class PointPillarsNode(DetectorNode):
