@@ -13,7 +13,7 @@ import click
 import numpy as np
 
 from benchmark import clustering, ground, peers
-from benchmark.candidates import compare, print_comparison
+from benchmark.candidates import compare_candidates, print_comparison
 from benchmark.detection import measure_detection, print_detection
 from benchmark.graph import measure_graph, print_graph
 from benchmark.pointnet import measure_pointnet, print_pointnet
@@ -72,7 +72,7 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     content = {"machine": {"cpu": cpu_name(), "cores": os.cpu_count(), "python":
                            platform.python_version(), "numpy": np.__version__},
                "peers": {p.package: p.version() for p in peers.ALL},
-               "candidates": compare(frames, repeat)}
+               "candidates": compare_candidates(frames, repeat)}
     print_comparison(content["candidates"])
     in_view = [points_in_view(f, camera, ViewParams(enabled=True))[1].xyz
                for f, camera in _with_camera(recording, frames, count)]

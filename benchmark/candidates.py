@@ -19,7 +19,7 @@ from lidar_perception.scoring.centres.report import pedestrians
 SAME = 0.02  # metres between boxes of the same candidate; planes of two RANSACs differ a little
 
 
-def compare(frames: list[Frame], repeat: int) -> dict:
+def compare_candidates(frames: list[Frame], repeat: int) -> dict:
     """Medians over the frames of both, and how far their results agree."""
     ours: dict[str, list[float]] = {}
     plain: dict[str, list[float]] = {}

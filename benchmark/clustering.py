@@ -44,7 +44,7 @@ def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: fl
 
 def dbscan_times(chosen: list[int], clouds: list[np.ndarray], repeat: int,
                  title: str) -> tuple[dict, Counter, Counter]:
-    """Medians of ours and of the chosen of peers.DBSCANS (their places, which a child process can
+    """Medians of ours and of the chosen of peers.DBSCANS (their indices, which a child process can
     be told), in how many clouds their results are the same, and how many points are noise for one
     and not for the other."""
     group = [peers.DBSCANS[i] for i in chosen]

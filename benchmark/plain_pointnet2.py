@@ -13,7 +13,7 @@ from lidar_perception.detectors.pointnet.config import PointNetConfig
 
 
 def farthest(xyz: Tensor, count: int) -> Tensor:
-    """(B, count) places of points (B, N, 3), each farthest from those before it."""
+    """(B, count) indices of points (B, N, 3), each farthest from those before it."""
     batch, size = xyz.shape[:2]
     chosen = torch.zeros(batch, count, dtype=torch.long)
     apart, last = torch.full((batch, size), 1e10), torch.zeros(batch, dtype=torch.long)
@@ -26,12 +26,12 @@ def farthest(xyz: Tensor, count: int) -> Tensor:
 
 
 def ball(radius: float, count: int, xyz: Tensor, centres: Tensor) -> Tensor:
-    """(B, M, count) places of the first points within the radius of centres (B, M, 3)."""
+    """(B, M, count) indices of the first points within the radius of centres (B, M, 3)."""
     size = xyz.shape[1]
-    places = torch.arange(size).expand(*centres.shape[:2], size).clone()
-    places[torch.cdist(centres, xyz) > radius] = size
-    places = places.sort(dim=-1).values[..., :count]
-    return torch.where(places == size, places[..., :1].clamp(max=size - 1), places)
+    indices = torch.arange(size).expand(*centres.shape[:2], size).clone()
+    indices[torch.cdist(centres, xyz) > radius] = size
+    indices = indices.sort(dim=-1).values[..., :count]
+    return torch.where(indices == size, indices[..., :1].clamp(max=size - 1), indices)
 
 
 class SetAbstraction(nn.Module):
@@ -48,9 +48,9 @@ class SetAbstraction(nn.Module):
     def forward(self, xyz: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
         every = torch.arange(len(xyz))[:, None]
         centres = xyz[every, farthest(xyz, self.count)]
-        places = ball(self.radius, self.neighbours, xyz, centres)
-        rows = torch.cat([xyz[every[:, :, None], places] - centres[:, :, None],
-                          features[every[:, :, None], places]], dim=-1)
+        indices = ball(self.radius, self.neighbours, xyz, centres)
+        rows = torch.cat([xyz[every[:, :, None], indices] - centres[:, :, None],
+                          features[every[:, :, None], indices]], dim=-1)
         return centres, self.layers(rows.permute(0, 3, 2, 1)).amax(dim=2).transpose(1, 2)
 
 

@@ -13,16 +13,16 @@ from benchmark.timing import Clock
 from lidar_perception.runs.terminal import track
 from lidar_perception.simulation.pairs import View
 from lidar_perception.simulation.raycast import cast, cast_batch
-from lidar_perception.simulation.returns import measure
+from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.scene import Moment, Scene, make_scene
 from lidar_perception.simulation.sensor import HDL64E
 
-LEAST_ACTORS = 150  # near the sensor
+MIN_ACTORS = 150  # near the sensor
 BATCH = 16
 
 
 def measure_simulation(streets: int, repeat: int) -> dict:
-    """Full HDL-64E scans of the first `streets` streets with LEAST_ACTORS things in sight."""
+    """Full HDL-64E scans of the first `streets` streets with MIN_ACTORS things in sight."""
     title = "Simulator, HDL-64E"
     scenes = _busy(streets)
     first = scenes[0]
@@ -49,7 +49,7 @@ def _busy(count: int) -> list[tuple[Scene, Moment]]:
     while len(found) < count:
         scene = make_scene(seed)
         near = [a for a in scene.actors if np.hypot(a.x, a.y) < HDL64E.max_range]
-        if len(near) >= LEAST_ACTORS:
+        if len(near) >= MIN_ACTORS:
             found.append((scene, scene.at(0.0, HDL64E.height)))
         seed += 1
     return found
@@ -60,7 +60,7 @@ def _calls(scene: Scene, moment: Moment) -> dict:
     return {"scene": partial(scene.at, 0.0, HDL64E.height),
             "cast": partial(cast, moment.solids, scene.ground, moment.position, HDL64E,
                             moment.motion),
-            "returns": lambda: measure(hits, HDL64E, moment.motion, np.random.default_rng(0))}
+            "returns": lambda: returns_of(hits, HDL64E, moment.motion, np.random.default_rng(0))}
 
 
 def _on_gpu(scenes: list[tuple[Scene, Moment]]) -> float:

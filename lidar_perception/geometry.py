@@ -49,7 +49,7 @@ def box_corners(boxes: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack([x, y, below], -1), np.stack([x, y, above], -1)], axis=1)
 
 
-MOST_CORNERS = 8  # of what two rectangles share; four cuts add one corner each
+MAX_CORNERS = 8  # of what two rectangles share; four cuts add one corner each
 
 
 def bev_and_3d_iou(boxes: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -77,7 +77,7 @@ def _rows(boxes: np.ndarray) -> np.ndarray:
 def _ious(boxes, others):
     bev = np.zeros((len(boxes), len(others)))
     space = np.zeros((len(boxes), len(others)))
-    work = np.empty((4, MOST_CORNERS))
+    work = np.empty((4, MAX_CORNERS))
     for i in range(len(boxes)):
         a = boxes[i]
         area_a = a[3] * a[4]
@@ -104,7 +104,7 @@ def _ious(boxes, others):
 
 @njit(cache=True, nogil=True)
 def _shared_area(a, b, work):
-    """Area that two rectangles share; work (4, MOST_CORNERS) float64 is overwritten."""
+    """Area that two rectangles share; work (4, MAX_CORNERS) float64 is overwritten."""
     x, y, cut_x, cut_y = work[0], work[1], work[2], work[3]
     cos, sin = math.cos(b[6]), math.sin(b[6])
     dx, dy = a[0] - b[0], a[1] - b[1]

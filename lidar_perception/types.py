@@ -47,10 +47,10 @@ class LidarFrame:
     def __len__(self) -> int:
         return len(self.xyz)
 
-    def take(self, places: np.ndarray) -> LidarFrame:
-        """The frame of the points at places (M,)."""
-        intensity = None if self.intensity is None else self.intensity.take(places)
-        return LidarFrame(self.xyz.take(places, axis=0), intensity, self.stamp_ns, self.frame_id)
+    def take(self, indices: np.ndarray) -> LidarFrame:
+        """The frame of the points at indices (M,)."""
+        intensity = None if self.intensity is None else self.intensity.take(indices)
+        return LidarFrame(self.xyz.take(indices, axis=0), intensity, self.stamp_ns, self.frame_id)
 
 
 def usable_returns(xyz: np.ndarray) -> np.ndarray:

@@ -36,5 +36,5 @@ def scene():
     return np.concatenate(parts).astype(np.float32)
 
 
-def boxes_at(places, height=1.8):
-    return np.array([[x + 0.05, y, GROUND_Z + height / 2, 0.6, 0.8, height, 0] for x, y in places])
+def boxes_at(indices, height=1.8):
+    return np.array([[x + 0.05, y, GROUND_Z + height / 2, 0.6, 0.8, height, 0] for x, y in indices])

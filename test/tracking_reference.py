@@ -1,7 +1,7 @@
 """Tracking scores by their definitions, one box at a time: slow, and sharing nothing with ours.
 
 A frame is (labels, tracks, alike, overlap): labels [(id, ignored)], tracks [(id, score, excused)],
-and two functions of their places. Assignments are found by trying all of them.
+and two functions of their indices. Assignments are found by trying all of them.
 """
 
 from itertools import permutations

@@ -20,26 +20,31 @@ from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import Segmented, grounded_boxes, points_in_view
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.ground.segment import segment_ground
+from lidar_perception.groups import renumbered
 from lidar_perception.types import LidarFrame
 
 
 def segment(frame: LidarFrame, camera: Camera | None = None,
             params: PipelineParams = PipelineParams(), *, ground: np.ndarray | None = None,
             cluster_ids: np.ndarray | None = None) -> Segmented:
-    """Stages up to the boxes; ground (N,) bool and cluster_ids (N,) int of the frame's points are
-    computed where they are None. InputError if the crop is on and there is no camera."""
+    """Stages up to the boxes; ground (N,) bool and cluster_ids (N,) of the frame's points, from
+    whatever clustering, are computed where they are None. InputError if the crop is on and there
+    is no camera."""
     t0 = perf_counter()
-    places, seen = points_in_view(frame, camera, params.view)
+    indices, seen = points_in_view(frame, camera, params.view)
     t1 = perf_counter()
-    ground = segment_ground(seen, params.ground) if ground is None else ground[places]
+    ground = segment_ground(seen, params.ground) if ground is None else ground[indices]
     t2 = perf_counter()
-    cluster_ids = (cluster_obstacles(seen.xyz, ground, params.clustering) if cluster_ids is None
-                   else cluster_ids[places])
+    numbers = None
+    if cluster_ids is None:
+        cluster_ids = cluster_obstacles(seen.xyz, ground, params.clustering)
+    else:
+        cluster_ids, numbers = renumbered(cluster_ids[indices])
     t3 = perf_counter()
     boxes = grounded_boxes(seen.xyz, ground, cluster_ids, params.boxes.shape)
     t4 = perf_counter()
     ms = dict(view=t1 - t0, ground=t2 - t1, clustering=t3 - t2, boxes=t4 - t3)
-    return Segmented(places, seen.xyz, ground, cluster_ids, boxes,
+    return Segmented(indices, seen.xyz, ground, cluster_ids, boxes, numbers,
                      ms={k: v * 1e3 for k, v in ms.items()})
 
 

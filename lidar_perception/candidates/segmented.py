@@ -18,12 +18,12 @@ from lidar_perception.wire.params import ViewParams
 class Segmented:
     """Ground, clusters and boxes of the M points of a frame that are in view.
 
-    places (M,) int64 their rows in the frame, xyz (M, 3) float32, ground (M,) bool, cluster_ids
+    indices (M,) int64 their rows in the frame, xyz (M, 3) float32, ground (M,) bool, cluster_ids
     (M,) int32 with 0 = none, boxes (K, 7) float32 of clusters 1..K down to the ground plane;
     numbers (K,) int64: what the cloud calls these clusters, None for 1..K; ms per step.
     """
 
-    places: np.ndarray
+    indices: np.ndarray
     xyz: np.ndarray
     ground: np.ndarray
     cluster_ids: np.ndarray
@@ -61,12 +61,12 @@ def explain_nothing(usable: int, ground: np.ndarray,
 
 def points_in_view(frame: LidarFrame, camera: Camera | None,
                    params: ViewParams) -> tuple[np.ndarray, LidarFrame]:
-    """places (M,) int64 of the points of the frame in the camera's view, and the frame of these;
+    """indices (M,) int64 of the points of the frame in the camera's view, and the frame of these;
     all of them while the crop is off. InputError if it is on and there is no camera."""
     if not params.enabled:
         return np.arange(len(frame)), frame
     if camera is None:
         raise InputError("view.enabled is on but there is no camera calibration; give CameraInfo "
                          "and the LiDAR-to-camera transform, or set view.enabled to false")
-    places = np.flatnonzero(camera.in_view(frame.xyz))
-    return places, frame.take(places)
+    indices = np.flatnonzero(camera.in_view(frame.xyz))
+    return indices, frame.take(indices)

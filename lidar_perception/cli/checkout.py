@@ -12,7 +12,7 @@ import click
 from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
-MOST_WORKERS = 4  # each holds torch and compiles what it runs
+MAX_WORKERS = 4  # each holds torch and compiles what it runs
 PASS_ON = dict(ignore_unknown_options=True, help_option_names=[])
 
 
@@ -31,7 +31,7 @@ def test(arguments: tuple[str, ...]) -> None:
     """
     if arguments:
         sys.exit(_run("test", ["-m", "pytest", *arguments]))
-    workers = min(os.cpu_count() or 1, MOST_WORKERS)
+    workers = min(os.cpu_count() or 1, MAX_WORKERS)
     core = _run("test", ["-m", "pytest", "-n", str(workers), "--dist", "loadfile",
                          *(f"--ignore=test/{path.name}" for path in _with_processes())])
     rest = _run("test", ["-m", "pytest", *map(str, _with_processes())])

@@ -123,10 +123,10 @@ def _draw_best(result: Path, picture: Path, single: bool) -> bool:
             return False
         best = max(hits, key=lambda s: hits[s])
         for _, _, msg in bag.messages({cloud_topic(single)}):
-            frame, places = to_frame(msg)
+            frame, indices = to_frame(msg)
             if frame.stamp_ns == best:
-                ids = column(msg, "cluster_id", places).astype(np.int32)
-                draw_frame(picture, frame.xyz, column(msg, "ground", places) > 0, ids,
+                ids = column(msg, "cluster_id", indices).astype(np.int32)
+                draw_frame(picture, frame.xyz, column(msg, "ground", indices) > 0, ids,
                            frames[best][TRUTH],
                            frames[best][final], title=f"{hits[best][0]} of {hits[best][1]} "
                            f"pedestrians found, stamp {best / 1e9:.1f} s")

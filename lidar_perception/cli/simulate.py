@@ -131,17 +131,17 @@ def _compare(real: Path, frames: int, seed: int, streets: Streets, json_file: Pa
              png: Path | None) -> None:
     from lidar_perception.candidates.configurations import PAPER
     from lidar_perception.candidates.warm_up import warm_up
-    from lidar_perception.simulation.realism.compare import compare, evenly, measure
+    from lidar_perception.simulation.realism.compare import evenly, measured_scans, side_by_side
     from lidar_perception.simulation.realism.report import draw_realism, print_realism
 
     recording = opened(real)
     recording.require(BOXES, "simulate --compare")
     chosen = evenly(recording)
     warm_up()
-    measured = measure(track(chosen, "measuring real scans", len(chosen)), PAPER)
-    simulated = measure(track(_frames(seed, frames, streets), "measuring simulated scans", frames),
-                        PAPER)
-    content = {"data": str(real), "seed": seed, **compare(measured, simulated)}
+    measured = measured_scans(track(chosen, "measuring real scans", len(chosen)), PAPER)
+    made = track(_frames(seed, frames, streets), "measuring simulated scans", frames)
+    simulated = measured_scans(made, PAPER)
+    content = {"data": str(real), "seed": seed, **side_by_side(measured, simulated)}
     if json_file:
         write_text(json_file, json.dumps(content, indent=1))
     if png:

@@ -71,10 +71,10 @@ def _by_band(xyz, limits):
 def _joined(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray,
             eps: tuple[float, ...]) -> np.ndarray:
     """labels (N,) with clusters joined across neighbouring bands, numbered anew in order; bands
-    hold the places of their points."""
+    hold the indices of their points."""
     count = int(labels.max(initial=0))
     pairs = [np.zeros((0, 2), np.int64)]
-    clustered = [places[labels[places] > 0] for places in bands]
+    clustered = [indices[labels[indices] > 0] for indices in bands]
     for inner, outer, reach in zip(clustered, clustered[1:], map(min, eps, eps[1:])):
         if len(inner) and len(outer):
             pairs.append(_touching(xyz, labels, inner, outer, reach))

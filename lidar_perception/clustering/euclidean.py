@@ -75,11 +75,11 @@ def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
         component[tree.order] = _components_by_tree(tree, reach[tree.order] ** 2, enough)
     size = np.bincount(component + 1)  # the first is of none
     kept = (component >= 0) & (size[component + 1] >= params.min_size)
-    parent, places = np.arange(len(size), dtype=np.int32), np.arange(n)
-    labels = np.where(kept, number_clusters(places, kept, component, parent)[component], 0)
+    parent, indices = np.arange(len(size), dtype=np.int32), np.arange(n)
+    labels = np.where(kept, number_clusters(indices, kept, component, parent)[component], 0)
     if params.gamma > 0.0:
         parent = _merged(xyz, labels, params.gamma)
-        labels = number_clusters(places, kept, labels, parent)[labels]
+        labels = number_clusters(indices, kept, labels, parent)[labels]
     return labels.astype(np.int32)
 
 

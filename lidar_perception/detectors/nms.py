@@ -17,7 +17,7 @@ from lidar_perception.types import CLASSES, Detections
 def best_of_each(boxes: np.ndarray, scores: np.ndarray, kinds: np.ndarray,
                  classes: tuple[str, ...], params: NmsParams) -> Detections:
     """Detections, best first, of the boxes (N, 7) with scores (N,) that stay; kinds (N,) int are
-    places in classes."""
+    indices in classes."""
     kept = suppressed(boxes, scores, kinds, params.iou, params.across_classes)[:params.max_boxes]
     ids = np.array([CLASSES.index(name) for name in classes])
     return Detections.of(boxes[kept], ids[kinds[kept]], scores[kept])
@@ -25,7 +25,7 @@ def best_of_each(boxes: np.ndarray, scores: np.ndarray, kinds: np.ndarray,
 
 def suppressed(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: float,
                across_classes: bool = False) -> np.ndarray:
-    """(M,) int64 places of the boxes (N, 7) that stay, best score first; of equal scores the first.
+    """(M,) int64 indices of the boxes (N, 7) that stay, best score first, then the first.
 
     A box goes if one that stays has a higher score, the same label (N,) int (any, with
     across_classes) and an IoU above iou, seen from above.

@@ -14,7 +14,7 @@ from lidar_perception.types import SENSOR_HEIGHT, Detections, LidarFrame
 
 def visible(frame: LidarFrame, config: NetworkConfig,
             pose: SensorPoseParams = SensorPoseParams()) -> tuple[np.ndarray, LidarFrame]:
-    """places (M,) int64 of the frame's points in the network's range, and the frame of these, its
+    """indices (M,) int64 of the frame's points in the network's range, and the frame of these, its
     coordinates levelled and as from SENSOR_HEIGHT. Points that are not finite are left out."""
     shift = np.float32(pose.height - SENSOR_HEIGHT)
     xyz = level(frame.xyz, pose)
@@ -23,9 +23,10 @@ def visible(frame: LidarFrame, config: NetworkConfig,
         for axis, offset in enumerate((0, 0, shift)):
             values = xyz[:, axis]
             inside &= (values >= config.low[axis] - offset) & (values < config.high[axis] - offset)
-    places = np.flatnonzero(inside)
-    seen = frame.take(places)
-    return places, replace(seen, xyz=xyz.take(places, axis=0) + np.array([0, 0, shift], np.float32))
+    indices = np.flatnonzero(inside)
+    seen = frame.take(indices)
+    moved = xyz.take(indices, axis=0) + np.array([0, 0, shift], np.float32)
+    return indices, replace(seen, xyz=moved)
 
 
 def levelled(frame: LidarFrame, pose: SensorPoseParams) -> LidarFrame:

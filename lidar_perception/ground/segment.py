@@ -1,4 +1,4 @@
-"""The ground of a frame, by any of the three methods; and how high the sensor hangs."""
+"""The ground of a frame, by any of the three methods; and how high the sensor is mounted."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
 # Where the height of the sensor is measured: beyond the vehicle, near enough for a plane.
 NEAREST, FARTHEST = 2.5, 25.0    # m
 PLANE = ThresholdParams(max_slope=15.0)
-LEAST_SHARE = 0.15               # of these points on the plane
+MIN_SHARE = 0.15               # of these points on the plane
 HEIGHT_TOLERANCE = 0.25          # m between the parameter and the measured height
 
 
@@ -66,7 +66,7 @@ def measured_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPoseParams()
         return None
     x, y, z = near.T
     on_plane = np.abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= PLANE.inlier_distance
-    return -float(plane[2]) if on_plane.mean() >= LEAST_SHARE else None
+    return -float(plane[2]) if on_plane.mean() >= MIN_SHARE else None
 
 
 def height_problem(measured: float | None, pose: SensorPoseParams) -> str | None:

@@ -33,14 +33,14 @@ class CandidateRefinement(LidarNode):
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, places = to_frame(msg)
-            ground, clusters = column(msg, "ground", places), cluster_column(msg, places)
+            frame, indices = to_frame(msg)
+            ground, clusters = column(msg, "ground", indices), cluster_column(msg, indices)
             if clusters is None:
                 raise InputError("the cloud has no column 'cluster_id'; remap ~/input/points to "
                                  "the clustering's output")
             ids, numbers = clusters
             ground = np.zeros(len(ids), bool) if ground is None else ground > 0
-            segmented = Segmented(places, frame.xyz, ground, ids,
+            segmented = Segmented(indices, frame.xyz, ground, ids,
                                   grounded_boxes(frame.xyz, ground, ids,
                                                  self.params.boxes.shape), numbers)
             self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params))

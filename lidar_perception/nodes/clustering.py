@@ -32,12 +32,12 @@ class Clustering(LidarNode):
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, places = to_frame(msg)
-            marked = column(msg, "ground", places)
+            frame, indices = to_frame(msg)
+            marked = column(msg, "ground", indices)
             ground = np.zeros(len(frame), bool) if marked is None else marked > 0
             ids = cluster_obstacles(frame.xyz, ground, self.params.clustering)
             self.points.publish(encode(add_columns(
-                msg, bag_message, cluster_id=spread(ids, places, msg, "u4"))))
+                msg, bag_message, cluster_id=spread(ids, indices, msg, "u4"))))
         self.boxes.publish(msg.header, lambda: grounded_boxes(
             frame.xyz, ground, ids, self.params.boxes.shape))
         self.counts["clusters"] = int(ids.max(initial=0))

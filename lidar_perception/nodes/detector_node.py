@@ -91,8 +91,8 @@ class DetectorNode(LidarNode):
         if self.detector is None:
             return
         with self.frame(to_ns(msg.header.stamp)):
-            frame, places = to_frame(msg, self.params.input.intensity_max)
-            ground, clusters = column(msg, "ground", places), cluster_column(msg, places)
+            frame, indices = to_frame(msg, self.params.input.intensity_max)
+            ground, clusters = column(msg, "ground", indices), cluster_column(msg, indices)
             self.detector.params = self.params
             found = self.detector(frame, ground=None if ground is None else ground > 0,
                                   cluster_ids=None if clusters is None else clusters[0])

@@ -37,15 +37,15 @@ class GroundSegmentation(LidarNode):
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable = self.sensor.frame(msg)
             camera = self.camera.get(frame.frame_id, self.params.view)
-            places, seen = points_in_view(frame, camera, self.params.view)
+            indices, seen = points_in_view(frame, camera, self.params.view)
             ground = segment_ground(seen, self.params.ground)
-            places = usable.take(places)
+            indices = usable.take(indices)
             self.points.publish(encode(add_columns(
-                msg, bag_message, ground=spread(ground, places, msg, "u1"),
-                in_view=spread(1, places, msg, "u1"))))
+                msg, bag_message, ground=spread(ground, indices, msg, "u1"),
+                in_view=spread(1, indices, msg, "u1"))))
         for publisher, chosen in ((self.ground, ground), (self.nonground, ~ground)):
             if publisher.get_subscription_count():
-                publisher.publish(encode(from_array(to_array(msg).take(places[chosen]), msg.header,
+                publisher.publish(encode(from_array(to_array(msg).take(indices[chosen]), msg.header,
                                                     bag_message)))
         plane = fit_plane(seen.xyz.compress(ground, axis=0))
         if plane is not None:

@@ -46,9 +46,9 @@ class Perception(LidarNode):
             self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params),
                                  problem)
         if self.points.get_subscription_count():
-            places = usable.take(segmented.places)
+            indices = usable.take(segmented.indices)
             self.points.publish(encode(add_columns(
-                msg, bag_message, ground=spread(segmented.ground, places, msg, "u1"),
-                in_view=spread(1, places, msg, "u1"),
-                cluster_id=spread(segmented.cluster_ids, places, msg, "u4"))))
+                msg, bag_message, ground=spread(segmented.ground, indices, msg, "u1"),
+                in_view=spread(1, indices, msg, "u1"),
+                cluster_id=spread(segmented.cluster_ids, indices, msg, "u4"))))
         self.boxes.publish(msg.header, lambda: segmented.boxes)

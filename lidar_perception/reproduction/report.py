@@ -25,8 +25,8 @@ from lidar_perception.runs.files import write_bytes, write_text
 LEGEND = ("A figure, [its 95 % interval] from drawing the frames anew with replacement "
           "(bootstrap), and the paper's figure. An interval from a few frames, or from frames that "
           "all agree, is too narrow.")
-MOST_ROWS = 30   # of a table that is open in the page
-MOST_NAMES = 10  # of skipped frames for one reason
+MAX_ROWS = 30   # of a table that is open in the page
+MAX_NAMES = 10  # of skipped frames for one reason
 
 
 def write_report(out: Path, experiment: Experiment, records: list[dict[str, Any]],
@@ -58,7 +58,7 @@ def skipped_groups(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
         if "skipped" in record:
             groups.setdefault(re.sub(r"\d+", "0", record["skipped"]), []).append(record)
     return [{"count": len(group), "reason": group[0]["skipped"],
-             "names": [r["frame"] for r in group[:MOST_NAMES]]}
+             "names": [r["frame"] for r in group[:MAX_NAMES]]}
             for group in sorted(groups.values(), key=len, reverse=True)]
 
 
@@ -87,7 +87,7 @@ def to_html(experiment: Experiment, sections: list[Section], about: dict[str, st
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     return environment.from_string(source).render(
         title=experiment.title, question=experiment.question, about=about, skipped=skipped,
-        sections=sections, legend=LEGEND, most_rows=MOST_ROWS, parts=parts, picture=picture,
+        sections=sections, legend=LEGEND, max_rows=MAX_ROWS, parts=parts, picture=picture,
         is_number=is_number)
 
 
@@ -156,10 +156,10 @@ def plain(value: Any) -> Any:
 
 
 def print_report(sections: list[Section], skipped: list[dict[str, Any]], console: Console,
-                 most_rows: int = 20) -> None:
+                 max_rows: int = 20) -> None:
     """The tables that fit on a screen, without intervals, and what was skipped."""
     for table in (table for section in sections for table in section.tables):
-        if len(table.rows) <= most_rows:
+        if len(table.rows) <= max_rows:
             console.print(_grid(table))
     console.print("In brackets: the paper's. The report has the intervals.", style="dim")
     for group in skipped:

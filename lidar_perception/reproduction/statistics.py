@@ -31,8 +31,8 @@ def bootstrap(counts: np.ndarray, values: Callable[[np.ndarray], np.ndarray],
     for first in range(0, params.replicates, step):
         rows = min(step, params.replicates - first)
         # How often each frame was drawn: the multinomial weights of its counts.
-        places = rng.integers(frames, size=(rows, frames)) + frames * np.arange(rows)[:, None]
-        weights = np.bincount(places.ravel(), minlength=rows * frames).reshape(rows, frames)
+        indices = rng.integers(frames, size=(rows, frames)) + frames * np.arange(rows)[:, None]
+        weights = np.bincount(indices.ravel(), minlength=rows * frames).reshape(rows, frames)
         drawn.append(values((weights @ flat).reshape(rows, *shape)))
     limits = _percentiles(np.concatenate(drawn), params.level)
     return np.stack([value, *np.where(np.isnan(value), np.nan, limits)])

@@ -33,7 +33,7 @@ from lidar_perception.scoring.centres.matching import RANGE_NAMES, counts_by_ran
 from lidar_perception.types import InputError
 
 SHOWN = RANGE_NAMES[:4]  # beyond 60 m there is hardly anything to score
-MOST_LINES = 6  # in a figure, which has as many colours
+MAX_LINES = 6  # in a figure, which has as many colours
 MIDDLES = (7.5, 22.5, 37.5, 52.5)  # of these, metres
 COUNTS = ("tp", "fp", "fn")
 
@@ -62,7 +62,7 @@ NOTHING = Found(np.zeros((0, 7), np.float32), np.zeros(0), 0.0)
 Finder = Callable[[Labelled, Callable[[PipelineParams], Segmented]], dict[str, Found]]
 
 
-def compare(name: str, title: str, question: str, variants: Mapping[str, PipelineParams]
+def compared_variants(name: str, title: str, question: str, variants: Mapping[str, PipelineParams]
             ) -> Experiment:
     """A study whose variants are settings; the first is what the others are compared with."""
     return study(name, title, question, functools.partial(by_settings, dict(variants)),
@@ -72,11 +72,11 @@ def compare(name: str, title: str, question: str, variants: Mapping[str, Pipelin
 def study(name: str, title: str, question: str, find: Finder, variants: Sequence[str],
           settings: dict[str, Any]) -> Experiment:
     """A study with a function of its own, of a module, that finds boxes by variant."""
-    return Experiment(name, title, question, functools.partial(measure, find),
+    return Experiment(name, title, question, functools.partial(measured_variants, find),
                       functools.partial(sections, title, tuple(variants)), settings)
 
 
-def measure(find: Finder, frames: Sequence[Frame], number: int) -> dict[str, Any]:
+def measured_variants(find: Finder, frames: Sequence[Frame], number: int) -> dict[str, Any]:
     """The record of one frame: variant -> see score()."""
     labelled = load_labelled(frames[number])
     return {"frame": frames[number].name,
@@ -204,8 +204,8 @@ def sections(title: str, names: Sequence[str], records: list[dict[str, Any]], ke
 
 
 def _most_telling(scores: dict[str, np.ndarray]) -> list[str]:
-    """The MOST_LINES variants with the largest F1 over all ranges, in their order."""
-    best = sorted(scores, key=lambda name: -np.nan_to_num(scores[name][0, -1, 2]))[:MOST_LINES]
+    """The MAX_LINES variants with the largest F1 over all ranges, in their order."""
+    best = sorted(scores, key=lambda name: -np.nan_to_num(scores[name][0, -1, 2]))[:MAX_LINES]
     return [name for name in scores if name in best]
 
 

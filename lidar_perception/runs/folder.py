@@ -1,4 +1,4 @@
-"""A folder that is made frame by frame: marked until it is whole, and gone on with after a stop.
+"""A folder that is made frame by frame: marked until it is complete, and resumed after a stop.
 
 While it is made it holds INCOMPLETE, a JSON file of what was asked, and .parts with one file for
 each finished frame: that frame's share of the files that belong to many frames, such as the label

@@ -1,5 +1,5 @@
 """Work on many items in many processes that end with the one that started them: after ctrl-C, after
-a kill, for want of memory."""
+a kill, out of memory."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _receive(receiver: Connection, running: dict, what: str) -> Iterator:
         process.join()
         if process.exitcode:
             raise InputError(f"a process that {what} ended with exit code {process.exitcode}"
-                             + (", perhaps for want of memory: try fewer --jobs"
+                             + (", perhaps out of memory: try fewer --jobs"
                                 if process.exitcode == -signal.SIGKILL else "")) from None
         return
     if error is not None:

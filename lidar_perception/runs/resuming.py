@@ -1,5 +1,5 @@
-"""Folders that are made in many steps: one process at a time, and gone on with only if the same is
-asked for as before."""
+"""Folders that are made in many steps: by one process at a time, and resumed only with identical
+settings."""
 
 from __future__ import annotations
 

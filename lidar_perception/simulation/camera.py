@@ -17,13 +17,13 @@ FORWARD_CAMERA = Calibration(
 
 # People who label leave out what they can hardly see. The least of the 20 pedestrians of the real
 # frames at hand has 16 points; of KITTI's they are few that have less than 5.
-LEAST_VISIBLE = 0.15  # share of the object
+MIN_VISIBLE = 0.15  # share of the object
 MIN_POINTS = 5
 
 
 def worth_a_label(truth: GroundTruth) -> np.ndarray:
     """(K,) bool: the simulated objects of which enough is seen."""
-    return np.array([e["visible"] >= LEAST_VISIBLE and e["num_points"] >= MIN_POINTS
+    return np.array([e["visible"] >= MIN_VISIBLE and e["num_points"] >= MIN_POINTS
                      for e in truth.extras], bool)
 
 
@@ -45,6 +45,6 @@ def kitti_labels(truth: GroundTruth) -> GroundTruth:
 
 
 def _part(truth: GroundTruth, mask: np.ndarray) -> GroundTruth:
-    places = np.flatnonzero(mask)
-    return GroundTruth.of(truth.boxes[places], truth.class_ids[places],
-                          [truth.extras[i] for i in places])
+    indices = np.flatnonzero(mask)
+    return GroundTruth.of(truth.boxes[indices], truth.class_ids[indices],
+                          [truth.extras[i] for i in indices])

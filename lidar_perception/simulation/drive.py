@@ -11,7 +11,7 @@ import numpy as np
 from lidar_perception.data.semantickitti import MOVING
 from lidar_perception.simulation.pairs import View
 from lidar_perception.simulation.raycast import Hits, cast_batch
-from lidar_perception.simulation.returns import measure
+from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.scene import ANY, SECONDS, Moment, Scene, Streets, make_scene
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
@@ -91,7 +91,7 @@ def scans_at(places: Sequence[tuple[int, int]], sensor: Sensor, streets: Streets
 
 def _scan(seed: int, i: int, sensor: Sensor, scene: Scene, moment: Moment,
           hits: Hits) -> SimulatedScan:
-    got = measure(hits, sensor, moment.motion, np.random.default_rng([seed, i]))
+    got = returns_of(hits, sensor, moment.motion, np.random.default_rng([seed, i]))
     stamp = START_NS + round(i * 10**9 / sensor.rate)
     pose = np.eye(4)
     pose[:3, 3] = moment.position - scene.sensor_position(0.0, sensor.height)

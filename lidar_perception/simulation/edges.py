@@ -14,7 +14,7 @@ from typing import NamedTuple
 import torch
 
 from lidar_perception.simulation.hashing import uniform
-from lidar_perception.simulation.pairs import Scene
+from lidar_perception.simulation.pairs import CastScene
 
 OUTLIER = 1  # SemanticKITTI's class of returns that are from no surface
 
@@ -42,7 +42,7 @@ def at_edges(solid: torch.Tensor) -> torch.Tensor:
     return edge
 
 
-def footprint(scene: Scene, divergence: float) -> torch.Tensor:
+def footprint(scene: CastScene, divergence: float) -> torch.Tensor:
     """(3, R) directions to a random place, uniform in the disc of each ray's beam."""
     x, y, z = scene.direction
     radius = divergence / 2 * torch.sqrt(uniform(3, scene.ray_salt))
@@ -53,7 +53,7 @@ def footprint(scene: Scene, divergence: float) -> torch.Tensor:
     return moved / torch.linalg.norm(moved, dim=0)
 
 
-def merged(scene: Scene, one: Met, other: Met, pulse: float) -> Met:
+def merged(scene: CastScene, one: Met, other: Met, pulse: float) -> Met:
     """What the beams report whose two rays meet one and other."""
     share = uniform(5, scene.ray_salt)  # of other
     first, second = one.brightness * (1 - share), other.brightness * share

@@ -36,7 +36,7 @@ class View(NamedTuple):
     seed: int = 0
 
 
-class Scene(NamedTuple):
+class CastScene(NamedTuple):
     """P solids and R rays of all views as tensors, float64 where nothing is said.
 
     matrix (9, P): to the unit shape; offset (3, P): where that takes the frame's origin; drift
@@ -71,7 +71,7 @@ class Runs(NamedTuple):
     count: torch.Tensor
 
 
-def scene_of(views: Sequence[View], sensor: Sensor, device: str) -> Scene:
+def scene_of(views: Sequence[View], sensor: Sensor, device: str) -> CastScene:
     """Everything about the views that their pairs need, on the device."""
     def tensor(parts, dtype=torch.float64):
         return torch.as_tensor(np.concatenate(parts), dtype=dtype, device=device)
@@ -85,7 +85,7 @@ def scene_of(views: Sequence[View], sensor: Sensor, device: str) -> Scene:
     to_unit = [np.swapaxes(v.solids.axes, 1, 2) / v.solids.half[:, :, None] for v in views]
     drift = [np.einsum("pij,pj->pi", m, np.asarray(v.motion.velocity) - v.solids.velocity)
              for m, v in zip(to_unit, views)]
-    return Scene(
+    return CastScene(
         matrix=tensor([m.reshape(-1, 9) for m in to_unit]).T.contiguous(),
         offset=tensor([-np.einsum("pij,pj->pi", m, v.solids.centre)
                        for m, v in zip(to_unit, views)]).T.contiguous(),
@@ -121,7 +121,7 @@ def runs_of(views: Sequence[View], sensor: Sensor, device: str) -> Runs:
     return Runs(*(torch.as_tensor(part[order], device=device) for part in (solid, first, count)))
 
 
-def meetings(scene: Scene, runs: Runs, chunk: int, only: torch.Tensor | None = None
+def meetings(scene: CastScene, runs: Runs, chunk: int, only: torch.Tensor | None = None
              ) -> Iterator[tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
     """Batches of pairs that meet: solid (n,), ray (n,) int64 and range (n,) m; only (R,) bool:
     the rays to look at. At most chunk pairs, or one run, are looked at at a time."""
@@ -158,7 +158,7 @@ def _meetings(kind, scene, runs, chunk, only):
         yield solid[met], ray[met], t[met]
 
 
-def unit_rays(scene: Scene, solid: torch.Tensor, ray: torch.Tensor, lift: torch.Tensor):
+def unit_rays(scene: CastScene, solid: torch.Tensor, ray: torch.Tensor, lift: torch.Tensor):
     """Start and direction, three tensors each, of rays in the frames of unit shapes; solid and
     lift must broadcast to ray."""
     m = scene.matrix[:, solid]
@@ -192,7 +192,7 @@ def span(kind: int, start, way) -> tuple[torch.Tensor, torch.Tensor]:
     return enter, leave
 
 
-def stop(scene: Scene, solid: torch.Tensor, ray: torch.Tensor, enter: torch.Tensor,
+def stop(scene: CastScene, solid: torch.Tensor, ray: torch.Tensor, enter: torch.Tensor,
          leave: torch.Tensor) -> torch.Tensor:
     """(n,) range at which rays that pass through the solids' shapes are stopped; inf where they
     are not, as when they start within an opaque one."""
@@ -214,7 +214,7 @@ def stop(scene: Scene, solid: torch.Tensor, ray: torch.Tensor, enter: torch.Tens
     return t
 
 
-def shade(scene: Scene, solid: torch.Tensor, ray: torch.Tensor
+def shade(scene: CastScene, solid: torch.Tensor, ray: torch.Tensor
           ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """Range, brightness and cosine of the incidence (n,) of pairs that meet."""
     far, cosine = torch.zeros_like(scene.lift[ray]), torch.zeros_like(scene.lift[ray])

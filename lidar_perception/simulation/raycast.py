@@ -15,7 +15,15 @@ import numpy as np
 import torch
 
 from lidar_perception.simulation.edges import Met, at_edges, footprint, merged
-from lidar_perception.simulation.pairs import Runs, Scene, View, meetings, runs_of, scene_of, shade
+from lidar_perception.simulation.pairs import (
+    CastScene,
+    Runs,
+    View,
+    meetings,
+    runs_of,
+    scene_of,
+    shade,
+)
 from lidar_perception.simulation.sensor import STILL, Motion, Sensor
 from lidar_perception.simulation.solids import Solids
 from lidar_perception.simulation.terrain import Ground, GroundHits, cast_ground
@@ -82,7 +90,7 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _first(views: Sequence[View], scene: Scene, runs: Runs, sensor: Sensor, chunk: int,
+def _first(views: Sequence[View], scene: CastScene, runs: Runs, sensor: Sensor, chunk: int,
            only: torch.Tensor | None = None) -> tuple[Met, list[np.ndarray]]:
     """What all rays meet, or those of only (R,) bool; and how many rays meet each view's owners."""
     ground = _grounds(views, scene, sensor, only)
@@ -107,7 +115,7 @@ def _key(t: torch.Tensor, solid: torch.Tensor) -> torch.Tensor:
     return (t.to(torch.float32).view(torch.int32).to(torch.int64) << 32) + solid
 
 
-def _grounds(views: Sequence[View], scene: Scene, sensor: Sensor,
+def _grounds(views: Sequence[View], scene: CastScene, sensor: Sensor,
              only: torch.Tensor | None) -> GroundHits:
     """What the rays meet of their view's ground."""
     found, size = [], scene.direction.shape[1] // len(views)
@@ -122,7 +130,7 @@ def _grounds(views: Sequence[View], scene: Scene, sensor: Sensor,
     return GroundHits(*(torch.cat(part) for part in zip(*found)))
 
 
-def _met(scene: Scene, ground: GroundHits, solid: torch.Tensor) -> Met:
+def _met(scene: CastScene, ground: GroundHits, solid: torch.Tensor) -> Met:
     """Everything about the solids (R,) that are nearest, or else the ground."""
     met = Met(ground.range, ground.brightness, ground.cosine,
               torch.where(solid == NO_SOLID, -1, solid), torch.zeros_like(ground.semantic),

@@ -36,7 +36,7 @@ class Returns(NamedTuple):
     time: np.ndarray
 
 
-def measure(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator,
+def returns_of(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Generator,
             compensated: bool = True) -> Returns:
     """What the sensor reports. compensated: the points are where they were met, in the frame at
     the stamp, as KITTI publishes them; otherwise as if the sensor had stood still.

@@ -18,7 +18,7 @@ def costs(tracks: np.ndarray, spread: np.ndarray, kinds: np.ndarray, reach: np.n
 
     tracks (N, 7) predicted boxes and found (M, 7) detected ones, in the same frame; spread (N,)
     metres, the standard deviation of a predicted centre as it would be measured; kinds (N,),
-    found_kinds (M,) places in KINDS; reach (N,) metres.
+    found_kinds (M,) indices in KINDS; reach (N,) metres.
     """
     dx, dy = (tracks[:, None, axis] - found[None, :, axis] for axis in (0, 1))
     apart = np.sqrt(dx * dx + dy * dy)

@@ -44,9 +44,9 @@ class States:
     def __len__(self) -> int:
         return len(self.ids)
 
-    def take(self, places: np.ndarray) -> States:
-        """The tracks at places (M,)."""
-        return States(*(getattr(self, f.name)[places] for f in fields(self)))
+    def take(self, indices: np.ndarray) -> States:
+        """The tracks at indices (M,)."""
+        return States(*(getattr(self, f.name)[indices] for f in fields(self)))
 
     def copy(self) -> States:
         """With arrays of its own."""

@@ -137,13 +137,13 @@ class Tracker:
         if not good.all():
             self.problem = (f"{(~good).sum()} of {len(good)} detections are no boxes (not finite, "
                             "or without a size) and are left out")
-        places = np.flatnonzero(good & (scores >= self.params.min_score))
-        if len(places) > self.params.max_detections:
-            self.problem = (f"{len(places)} detections are too many; the best "
+        indices = np.flatnonzero(good & (scores >= self.params.min_score))
+        if len(indices) > self.params.max_detections:
+            self.problem = (f"{len(indices)} detections are too many; the best "
                             f"{self.params.max_detections} are taken")
-            places = np.sort(places[np.argsort(-scores[places], kind="stable")[
+            indices = np.sort(indices[np.argsort(-scores[indices], kind="stable")[
                 :self.params.max_detections]])
-        return boxes[places], found.class_ids[places], np.clip(scores[places], 0.0, 1.0)
+        return boxes[indices], found.class_ids[indices], np.clip(scores[indices], 0.0, 1.0)
 
     def _reported(self, seen: np.ndarray) -> Tracks:
         return _in_sensor_frame(self._states, self._ego, seen, self.params)
@@ -153,12 +153,12 @@ def _in_sensor_frame(states: States, ego: Ego, seen: np.ndarray,
                      params: TrackingParams) -> Tracks:
     """Those that are to be reported."""
     scores = probabilities(states, params, ego.known)
-    places = np.flatnonzero((scores >= params.report) & (
+    indices = np.flatnonzero((scores >= params.report) & (
         seen | (probability(states.present) >= params.report_unseen)))
-    chosen, back = states.take(places), np.linalg.inv(ego.pose)
+    chosen, back = states.take(indices), np.linalg.inv(ego.pose)
     forward = back[:2, 0] / max(np.hypot(*back[:2, 0]), 1e-9)
     covariances = motion.turned(chosen.covariances, float(forward[0]), float(forward[1]))
     velocities = chosen.means[:, 2:4] @ np.array([forward, [-forward[1], forward[0]]])
-    found = Detections.of(moved_boxes(chosen.boxes(), back), chosen.class_ids, scores[places])
+    found = Detections.of(moved_boxes(chosen.boxes(), back), chosen.class_ids, scores[indices])
     return Tracks(chosen.ids, found, velocities, chosen.moving, covariances, chosen.means[:, 5],
-                  chosen.height_variances, seen[places], chosen.ages)
+                  chosen.height_variances, seen[indices], chosen.ages)

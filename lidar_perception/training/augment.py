@@ -21,7 +21,7 @@ BORDER = 0.01  # m: points so near to a box are taken for its own, as labels are
 
 
 @dataclass(frozen=True)
-class Scene:
+class TrainingScene:
     """points (N, 4) float32 [x y z intensity]; boxes (M, 7) float64 [x y z l w h yaw], class_ids
     (M,) int into CLASSES. wanted (M,) bool: not so hidden that nobody would label it. around: the
     labels are all around, not ahead only."""
@@ -33,7 +33,8 @@ class Scene:
     around: bool = False
 
 
-def augmented(scene: Scene, params: AugmentParams, rng: np.random.Generator) -> Scene:
+def augmented(scene: TrainingScene, params: AugmentParams,
+              rng: np.random.Generator) -> TrainingScene:
     """All changes but the turn and the objects of other scenes, see database.with_objects."""
     scene = with_moved_objects(scene, params.object_turn, params.object_shift, rng)
     if rng.random() < params.flip:
@@ -47,8 +48,8 @@ def augmented(scene: Scene, params: AugmentParams, rng: np.random.Generator) -> 
                   rng.uniform(-params.tilt, params.tilt, 2))
 
 
-def faced(scene: Scene, params: AugmentParams, low: np.ndarray, high: np.ndarray,
-          rng: np.random.Generator) -> Scene:
+def faced(scene: TrainingScene, params: AugmentParams, low: np.ndarray, high: np.ndarray,
+          rng: np.random.Generator) -> TrainingScene:
     """The scene turned, and what can come between low and high (3,) by all other changes, metres:
     first, since most of a scan lies elsewhere."""
     turn = np.pi if scene.around and params.turn else params.turn
@@ -58,7 +59,7 @@ def faced(scene: Scene, params: AugmentParams, low: np.ndarray, high: np.ndarray
     return cropped(scene, low - margin[0], high + margin[1])
 
 
-def cropped(scene: Scene, low: np.ndarray, high: np.ndarray) -> Scene:
+def cropped(scene: TrainingScene, low: np.ndarray, high: np.ndarray) -> TrainingScene:
     """The points between low and high (3,), and the boxes whose centre is, seen from above."""
     kept = np.ones(len(scene.points), bool)
     for axis in range(3):
@@ -69,14 +70,14 @@ def cropped(scene: Scene, low: np.ndarray, high: np.ndarray) -> Scene:
                    class_ids=scene.class_ids[here], wanted=scene.wanted[here])
 
 
-def flipped(scene: Scene) -> Scene:
+def flipped(scene: TrainingScene) -> TrainingScene:
     """Left and right swapped."""
     points = scene.points * np.array([1, -1, 1, 1], np.float32)
     boxes = scene.boxes * [1, -1, 1, 1, 1, 1, -1]
     return replace(scene, points=points, boxes=boxes)
 
 
-def turned(scene: Scene, angle: float) -> Scene:
+def turned(scene: TrainingScene, angle: float) -> TrainingScene:
     """Turned about the sensor, counter-clockwise."""
     cos, sin = np.cos(angle), np.sin(angle)
     matrix = np.array([[cos, sin], [-sin, cos]])
@@ -87,7 +88,7 @@ def turned(scene: Scene, angle: float) -> Scene:
     return replace(scene, points=points, boxes=boxes)
 
 
-def scaled(scene: Scene, factor: float) -> Scene:
+def scaled(scene: TrainingScene, factor: float) -> TrainingScene:
     """Every length times factor."""
     points, boxes = scene.points.copy(), scene.boxes.copy()
     points[:, :3] *= np.float32(factor)
@@ -95,12 +96,12 @@ def scaled(scene: Scene, factor: float) -> Scene:
     return replace(scene, points=points, boxes=boxes)
 
 
-def thinned(scene: Scene, share: float, rng: np.random.Generator) -> Scene:
+def thinned(scene: TrainingScene, share: float, rng: np.random.Generator) -> TrainingScene:
     """About this share of the points left out."""
     return replace(scene, points=scene.points[rng.random(len(scene.points)) >= share])
 
 
-def brightened(scene: Scene, factor: float, offset: float) -> Scene:
+def brightened(scene: TrainingScene, factor: float, offset: float) -> TrainingScene:
     """Intensities times factor, plus offset, within 0 .. 1. Those of 0 stay: that is what sensors
     report of the weakest returns, however bright the others are."""
     points = scene.points.copy()
@@ -142,7 +143,8 @@ def blurred(points: np.ndarray, beam: float, point: float, rng: np.random.Genera
     return moved
 
 
-def raised(scene: Scene, height: float, slopes: Sequence[float] = (0.0, 0.0)) -> Scene:
+def raised(scene: TrainingScene, height: float,
+           slopes: Sequence[float] = (0.0, 0.0)) -> TrainingScene:
     """As from a sensor mounted lower by height, metres, on ground that rises by slopes, along x and
     y. Boxes stay upright, so that points in a box stay in it if the slopes are 0."""
     points, boxes = scene.points.copy(), scene.boxes.copy()
@@ -151,7 +153,8 @@ def raised(scene: Scene, height: float, slopes: Sequence[float] = (0.0, 0.0)) ->
     return replace(scene, points=points, boxes=boxes)
 
 
-def with_moved_objects(scene: Scene, turn: float, shift: float, rng: np.random.Generator) -> Scene:
+def with_moved_objects(scene: TrainingScene, turn: float, shift: float,
+                       rng: np.random.Generator) -> TrainingScene:
     """Each object, with its points, turned about its middle by up to `turn` and shifted along x and
     y by about `shift`; not where it would touch another one, nor if it touches one already."""
     points, boxes = scene.points.copy(), scene.boxes.copy()

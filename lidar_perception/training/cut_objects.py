@@ -13,19 +13,20 @@ from lidar_perception.detectors.pointnet.clusters import ground_under
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.training.augment import Scene, grown
+from lidar_perception.training.augment import TrainingScene, grown
 from lidar_perception.training.database import THING, Database
 from lidar_perception.training.putting import inside
 from lidar_perception.types import CLASSES, PEDESTRIAN, LidarFrame
 
 WIDEST = 1.2          # m to a side
 HEIGHTS = 0.6, 4.5    # m of its top above the ground
-MOST_GAP = 0.8        # m between the ground and the lowest point
+MAX_GAP = 0.8        # m between the ground and the lowest point
 APART = 0.3           # m from every labelled box
 MOST = 20             # of a scene
 
 
-def cut_objects(scenes: Iterable[Scene], classes: tuple[str, ...], min_points: int) -> Database:
+def cut_objects(scenes: Iterable[TrainingScene], classes: tuple[str, ...],
+                min_points: int) -> Database:
     """The wanted objects of some classes that have enough points; where boxes overlap, none. If
     people are among them, things that look like people, too."""
     chosen = [CLASSES.index(name) for name in classes]
@@ -49,7 +50,7 @@ def cut_objects(scenes: Iterable[Scene], classes: tuple[str, ...], min_points: i
                     np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
 
 
-def things_in(scene: Scene, min_points: int,
+def things_in(scene: TrainingScene, min_points: int,
               rng: np.random.Generator) -> tuple[np.ndarray, list[np.ndarray]]:
     """Boxes (K, 7) float64, from the ground up along the axes, and the points (N, 4) of each: the
     clusters of obstacles of a person's width with so many points that touch no box of the scene; at
@@ -66,7 +67,7 @@ def things_in(scene: Scene, min_points: int,
     boxes[:, 2] = floor + boxes[:, 5] / 2
     kept = ((sizes >= min_points) & (boxes[:, 3:5].max(axis=1, initial=0) <= WIDEST)
             & (boxes[:, 5] >= HEIGHTS[0]) & (boxes[:, 5] <= HEIGHTS[1])
-            & (low[:, 2] - floor <= MOST_GAP))
+            & (low[:, 2] - floor <= MAX_GAP))
     kept = np.flatnonzero(kept)
     kept = kept[~bev_iou(grown(boxes[kept]), grown(scene.boxes, APART)).any(axis=1)]
     kept = rng.permutation(kept)[:MOST]

@@ -20,7 +20,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from lidar_perception.runs.terminal import errors
-from lidar_perception.training.augment import Scene
+from lidar_perception.training.augment import TrainingScene
 from lidar_perception.types import InputError
 
 AHEAD = 4  # batches that each worker prepares in advance
@@ -43,15 +43,15 @@ class Stream:
     """
 
     sources: tuple[Any, ...]
-    prepare: Callable[[Scene, np.random.Generator], Any]
+    prepare: Callable[[TrainingScene, np.random.Generator], Any]
     seed: int = 0
 
     def __len__(self) -> int:
         """Scenes of an epoch."""
         return sum(map(len, self.sources))
 
-    def scene(self, place: int) -> Scene:
-        """Scene `place` of all sources behind one another."""
+    def scene(self, place: int) -> TrainingScene:
+        """TrainingScene `place` of all sources behind one another."""
         source, i = source_of(self.sources, place)
         return source.scene(i)
 
@@ -167,7 +167,7 @@ class RawScenes:
         except InputError as error:
             return Item(None, (str(error),))
 
-    def some(self, most: int, jobs: int) -> Iterator[Scene]:
+    def some(self, most: int, jobs: int) -> Iterator[TrainingScene]:
         """At most so many, drawn by the stream's seed; what cannot be used is left out."""
         chosen = np.random.default_rng(self.stream.seed).permutation(len(self.stream))[:most]
         numbers = ([int(n)] for n in chosen)

@@ -12,14 +12,14 @@ import numpy as np
 from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN
 from lidar_perception.geometry import bev_iou
 from lidar_perception.runs.files import write_bytes
-from lidar_perception.training.augment import BORDER, Scene, grown, turned, with_reflector
+from lidar_perception.training.augment import BORDER, TrainingScene, grown, turned, with_reflector
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.putting import floor_under, put_among
 from lidar_perception.types import InputError
 
 NEIGHBOURHOOD = 3.0  # m: the ground under an object is looked for so far around it
 GROUND_SHARE = 0.1   # of the points there lie lower
-MOST_STEP = 1.0      # m: from further up or down nothing is put there
+MAX_STEP = 1.0      # m: from further up or down nothing is put there
 THINGS = (-1.1, 0.5)  # m from the sensor's height up: what is there is no ground, and hides people
 SECTORS = 720        # directions that are told apart
 TRIES = 64           # of them drawn for an object
@@ -62,8 +62,8 @@ class Database:
                              "again") from None
 
 
-def with_objects(scene: Scene, database: Database, params: AugmentParams, low: np.ndarray,
-                 high: np.ndarray, rng: np.random.Generator) -> Scene:
+def with_objects(scene: TrainingScene, database: Database, params: AugmentParams, low: np.ndarray,
+                 high: np.ndarray, rng: np.random.Generator) -> TrainingScene:
     """The scene with objects of the database until it has as many of each class as params say, or
     DRAWN times as many as it lacks were tried; and with so many things, which are no objects.
 
@@ -127,7 +127,7 @@ def _put(box, own, points, boxes, free, low, high,
     if bev_iou(grown(box[None]), grown(boxes)).any():
         return None
     step = floor_under(points, box, NEIGHBOURHOOD, GROUND_SHARE) - (box[2] - box[5] / 2)
-    if not abs(step) <= MOST_STEP:  # NaN: no ground
+    if not abs(step) <= MAX_STEP:  # NaN: no ground
         return None
     box[2] += step
     own[:, 2] += np.float32(step)
@@ -165,6 +165,6 @@ def _direction(box: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.ndar
 def _about_sensor(box: np.ndarray, points: np.ndarray,
                   angle: float) -> tuple[np.ndarray, np.ndarray]:
     """A box and its points (N, 4), turned about the sensor."""
-    alone = Scene(points, box[None], np.zeros(1, int), np.ones(1, bool))
+    alone = TrainingScene(points, box[None], np.zeros(1, int), np.ones(1, bool))
     alone = turned(alone, angle)
     return alone.boxes[0], alone.points

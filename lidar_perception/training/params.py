@@ -7,7 +7,7 @@ from typing import Any
 
 from lidar_perception.param_fields import Params, flatten, param
 
-INDIFFERENT = ("log_steps", "save_steps", "most_skipped", "data.cache", "data.cache_gb")
+INDIFFERENT = ("log_steps", "save_steps", "max_skipped", "data.cache", "data.cache_gb")
 PAPER_SHARE = 751 / 7518  # of the frames that paper B holds out
 
 
@@ -38,7 +38,7 @@ class LoopParams(Params):
     save_steps: int = param(200, "Steps between saves of the state that a resumed run needs.",
                             low=1, high=10**9)
     log_steps: int = param(10, "Steps between logged losses.", low=1, high=10**6)
-    most_skipped: int = param(50, "Give up after this many consecutive steps whose loss or "
+    max_skipped: int = param(50, "Give up after this many consecutive steps whose loss or "
                               "gradient is not finite.", low=1, high=10**6)
     seed: int = param(0, "Seed of the weights, the order of the scenes and their augmentation.",
                       low=0, high=2**31 - 1)

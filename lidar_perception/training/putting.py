@@ -11,7 +11,7 @@ TOUCH = 1e-3         # m: nothing is nearer to the sensor
 
 @njit(cache=True, nogil=True)
 def inside(points: np.ndarray, box: np.ndarray, margin: float) -> np.ndarray:
-    """Rising places (K,) int64 of the points (N, 3 or more) inside box (7,) float64, grown by
+    """Rising indices (K,) int64 of the points (N, 3 or more) inside box (7,) float64, grown by
     margin, metres. As geometry.points_in_box, four times as fast."""
     found, count = np.empty(len(points), np.int64), 0
     cos, sin = np.cos(box[6]), np.sin(box[6])

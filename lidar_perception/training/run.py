@@ -127,7 +127,7 @@ class Run:
                 buffer.copy_(before)
             self.progress.skipped += 1
             self.progress.in_a_row += 1
-            if self.progress.in_a_row >= self.params.most_skipped:
+            if self.progress.in_a_row >= self.params.max_skipped:
                 raise InputError(f"the loss or its gradient was not finite in "
                                  f"{self.progress.in_a_row} steps in a row, up to step "
                                  f"{self.progress.step}; lower --lr or look at the data")

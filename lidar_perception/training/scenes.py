@@ -24,7 +24,7 @@ from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels, wor
 from lidar_perception.simulation.drive import longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Streets
 from lidar_perception.simulation.sensor import Sensor, sensor_named
-from lidar_perception.training.augment import Scene
+from lidar_perception.training.augment import TrainingScene
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 
 
@@ -49,7 +49,7 @@ class RecordedScenes:
     def __getstate__(self) -> dict:
         return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # open where it is read
 
-    def scene(self, i: int) -> Scene:
+    def scene(self, i: int) -> TrainingScene:
         """InputError naming the file that cannot be used."""
         frame = self.frame(i)
         scan, truth, camera = frame.load(), frame.truth(), frame.camera()
@@ -57,7 +57,7 @@ class RecordedScenes:
         points = np.column_stack([scan.xyz, intensity])
         if self.view and camera is not None:
             points = points[camera.in_view(scan.xyz)]
-        return Scene(points, truth.boxes, truth.class_ids, np.ones(len(truth), bool),
+        return TrainingScene(points, truth.boxes, truth.class_ids, np.ones(len(truth), bool),
                      around=camera is None)
 
     def frame(self, i: int) -> Frame:
@@ -107,11 +107,11 @@ class SimulatedScenes:
     def _sensor(self) -> Sensor:
         return replace(sensor_named(self.sensor), height=SENSOR_HEIGHT)
 
-    def scene(self, i: int) -> Scene:
+    def scene(self, i: int) -> TrainingScene:
         """With the labels all around."""
         frame, truth = self.scan(i)
-        return Scene(np.column_stack([frame.xyz, frame.intensity]), truth.boxes, truth.class_ids,
-                     worth_a_label(truth), around=True)
+        return TrainingScene(np.column_stack([frame.xyz, frame.intensity]), truth.boxes,
+                             truth.class_ids, worth_a_label(truth), around=True)
 
     def frame(self, i: int) -> Frame:
         """To validate on: with the labels that KITTI would have, in the image of a camera that

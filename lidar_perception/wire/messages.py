@@ -26,7 +26,7 @@ INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # the first that the clou
 
 
 def to_frame(msg: Any, intensity_max: float | None = None) -> tuple[LidarFrame, np.ndarray]:
-    """The usable points of a PointCloud2 and their places (N,) in the cloud; if the cloud has a
+    """The usable points of a PointCloud2 and their indices (N,) in the cloud; if the cloud has a
     column in_view, only the points where it is not 0. InputError for a broken cloud.
 
     intensity_max: the value that means 1; 0 takes the largest value of an integer field, and 1
@@ -34,10 +34,10 @@ def to_frame(msg: Any, intensity_max: float | None = None) -> tuple[LidarFrame, 
     """
     try:
         points = to_array(msg)
-        places = None
+        indices = None
         if "in_view" in (points.dtype.names or ()):
-            places = np.flatnonzero(_single(points, "in_view"))
-            points = points.take(places)
+            indices = np.flatnonzero(_single(points, "in_view"))
+            points = points.take(indices)
         coordinates = xyz(points)
         intensity = None if intensity_max is None else _intensity(points, intensity_max)
     except CloudError as error:
@@ -45,11 +45,11 @@ def to_frame(msg: Any, intensity_max: float | None = None) -> tuple[LidarFrame, 
     usable = usable_returns(coordinates)
     if not usable.all():
         kept = np.flatnonzero(usable)
-        places = kept if places is None else places.take(kept)
+        indices = kept if indices is None else indices.take(kept)
         coordinates = coordinates.take(kept, axis=0)
         intensity = None if intensity is None else intensity.take(kept)
     frame = LidarFrame(coordinates, intensity, to_ns(msg.header.stamp), msg.header.frame_id)
-    return frame, np.arange(len(points)) if places is None else places
+    return frame, np.arange(len(points)) if indices is None else indices
 
 
 def _intensity(points: np.ndarray, full: float) -> np.ndarray | None:
@@ -72,25 +72,25 @@ def intensity_problem(frame: LidarFrame) -> str | None:
             "(255 for most drivers)")
 
 
-def spread(values: np.ndarray | int, places: np.ndarray, msg: Any, dtype: str) -> np.ndarray:
-    """Values (N,) at places (N,) as a column of the whole cloud msg; 0 elsewhere."""
+def spread(values: np.ndarray | int, indices: np.ndarray, msg: Any, dtype: str) -> np.ndarray:
+    """Values (N,) at indices (N,) as a column of the whole cloud msg; 0 elsewhere."""
     column = np.zeros(msg.height * msg.width, dtype)
-    column[places] = values
+    column[indices] = values
     return column
 
 
-def column(msg: Any, name: str, places: np.ndarray) -> np.ndarray | None:
-    """(N,) values of a field at places (N,); None where the cloud has no such field. InputError if
+def column(msg: Any, name: str, indices: np.ndarray) -> np.ndarray | None:
+    """(N,) values of a field at indices (N,); None where the cloud has no such field. InputError if
     it holds more than one number a point."""
     points = to_array(msg)
-    return _single(points, name).take(places) if name in (points.dtype.names or ()) else None
+    return _single(points, name).take(indices) if name in (points.dtype.names or ()) else None
 
 
-def cluster_column(msg: Any, places: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """labels (N,) int32 of the points at places (N,), 0 none and 1..K, from the column cluster_id
+def cluster_column(msg: Any, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """labels (N,) int32 of the points at indices (N,), 0 none and 1..K, from the column cluster_id
     of whatever clustering, and numbers (K,) int64, the ids there (see groups.renumbered); None
     where the cloud has no such column. InputError if it holds no ids."""
-    ids = column(msg, "cluster_id", places)
+    ids = column(msg, "cluster_id", indices)
     return None if ids is None else renumbered(ids)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from candidate_samples import GROUND_Z, PEOPLE, boxes_at, person, scene
 from hypothesis import given, settings
@@ -18,7 +16,7 @@ from lidar_perception.candidates.seed_sources import clicked_seed, fixed_seed, t
 from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.data.kitti.folder import open_kitti
-from lidar_perception.groups import group_points, renumbered
+from lidar_perception.groups import group_points
 from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
 
 few = settings(max_examples=40, database=None)
@@ -172,14 +170,14 @@ def test_on_a_real_frame_the_seeds_own_cluster_passes_every_stage():
 
 def test_candidates_keep_the_numbers_that_a_foreign_clustering_gave():
     """Gaps, giants: the candidates are those of 1..K, under the cloud's numbers."""
-    s = segment(LidarFrame(scene()))
+    frame = LidarFrame(scene())
+    s = segment(frame)
     k = len(s.boxes)
     source = fixed_seed(seed_from_points(s.xyz[s.cluster_ids == 1], s.boxes[0]))
     expected = refined(s, source)
     assert len(expected.final) > 1
     for foreign in (np.arange(1, k + 1) * 2 + 1, np.arange(k) * 10_000_000 + 2**31):
         ids = np.concatenate([[0], foreign])[s.cluster_ids].astype(np.uint32)
-        labels, numbers = renumbered(ids)
-        found = refined(replace(s, cluster_ids=labels, numbers=numbers), source)
+        found = refined(segment(frame, ground=s.ground, cluster_ids=ids), source)
         np.testing.assert_array_equal(found.final.boxes, expected.final.boxes)
         np.testing.assert_array_equal(found.clusters, foreign[expected.clusters - 1])

@@ -32,7 +32,7 @@ def template():
 def test_frames_without_objects_give_empty_results_of_the_right_shape(xyz):
     s, found = find_candidates(LidarFrame(xyz.astype(np.float32)), template())
     assert isinstance(s, Segmented)
-    assert s.places.tolist() == list(range(len(xyz))) and s.xyz.shape == (len(xyz), 3)
+    assert s.indices.tolist() == list(range(len(xyz))) and s.xyz.shape == (len(xyz), 3)
     assert s.ground.shape == (len(xyz),) and s.ground.dtype == bool
     assert s.cluster_ids.shape == (len(xyz),) and s.cluster_ids.dtype == np.int32
     assert s.boxes.shape == (0, 7) and s.boxes.dtype == np.float32
@@ -66,7 +66,7 @@ def test_the_crop_is_the_pipeline_on_the_points_in_view():
     inside = camera.in_view(xyz)
     assert 0 < inside.sum() < len(xyz)
     cropped, found = find_candidates(LidarFrame(xyz), template(), camera, CROP)
-    np.testing.assert_array_equal(cropped.places, np.flatnonzero(inside))
+    np.testing.assert_array_equal(cropped.indices, np.flatnonzero(inside))
     alone, expected = find_candidates(LidarFrame(xyz[inside]), template())
     np.testing.assert_array_equal(cropped.xyz, alone.xyz)
     np.testing.assert_array_equal(cropped.cluster_ids, alone.cluster_ids)

@@ -36,7 +36,7 @@ def core_mask(xyz, eps, min_samples):
 
 
 def partition(labels):
-    """The clusters as a set of sets of places, whatever their numbers."""
+    """The clusters as a set of sets of indices, whatever their numbers."""
     return {frozenset(np.flatnonzero(labels == k).tolist()) for k in np.unique(labels) if k > 0}
 
 
@@ -87,8 +87,8 @@ def test_border_points_go_to_the_first_cluster_that_touches_them(min_samples):
     ("one point", np.ones((1, 3))),
     ("all equal", np.full((50, 3), 7.3)),
     ("at the origin", np.zeros((50, 3))),
-    ("two places", np.repeat([[0.0, 0, 0], [1, 1, 1]], 20, axis=0)),
-    ("two places within eps", np.repeat([[0.0, 0, 0], [0.25, 0, 0]], 20, axis=0)),
+    ("two indices", np.repeat([[0.0, 0, 0], [1, 1, 1]], 20, axis=0)),
+    ("two indices within eps", np.repeat([[0.0, 0, 0], [0.25, 0, 0]], 20, axis=0)),
     ("two clusters at one place", np.concatenate([np.eye(3)] * 10)),
     ("line", np.linspace(0, 8, 33)[:, None] * [1, 0, 0]),
     ("slanted line", np.linspace(0, 8, 65)[:, None] * [1, 2, -3]),

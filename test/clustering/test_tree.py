@@ -46,7 +46,7 @@ ARRANGEMENTS = {
     "a blob and dust": lambda rng, n: rng.random((n, 3)) * np.where(np.arange(n) % 2, 1e-3, 3)[
         :, None],
     "parallel walls": lambda rng, n: np.column_stack([np.arange(n) % 2 * 0.31, rng.random((n, 2))]),
-    "a few places": lambda rng, n: rng.integers(0, 3, (n, 3)) * 0.25,
+    "a few indices": lambda rng, n: rng.integers(0, 3, (n, 3)) * 0.25,
 }
 each = pytest.mark.parametrize("arrange", ARRANGEMENTS.values(), ids=ARRANGEMENTS)
 
@@ -56,7 +56,7 @@ def points_of(arrange, count, seed=0):
 
 
 def lattice(data, most=60):
-    """Points on a coarse lattice, where distances tie and places coincide."""
+    """Points on a coarse lattice, where distances tie and indices coincide."""
     rows = data.draw(st.lists(st.tuples(*[st.integers(-4, 4)] * 3), min_size=1, max_size=most))
     return np.array(rows) * data.draw(st.sampled_from([0.125, 0.25]))
 
@@ -170,7 +170,7 @@ def test_the_work_of_local_thresholds_has_a_bound(arrange):
 
 
 @pytest.mark.parametrize("arrange", [ARRANGEMENTS[name] for name in (
-    "a cube", "equal", "a line", "a sphere", "two blobs out of reach", "a few places")])
+    "a cube", "equal", "a line", "a sphere", "two blobs out of reach", "a few indices")])
 def test_a_sample_gives_nearly_the_same_means_whatever_the_order(arrange):
     xyz = points_of(arrange, 3000)
     cells = cells_of(xyz, 0.5)

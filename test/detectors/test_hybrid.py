@@ -56,7 +56,7 @@ def found(judge):
 def clusters(found):
     segmented, candidates = found
     ids = np.where(np.isin(segmented.cluster_ids, candidates.clusters), segmented.cluster_ids, 0)
-    return clusters_of(cloud().take(segmented.places), ids, ground=segmented.ground)
+    return clusters_of(cloud().take(segmented.indices), ids, ground=segmented.ground)
 
 
 def rescored(judge, **changes) -> Detections:

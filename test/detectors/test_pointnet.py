@@ -95,16 +95,16 @@ def test_the_ground_is_that_around_a_place_however_it_slopes(rng):
     flat = rng.uniform(-40, 40, (20_000, 3))
     flat[:, 2] = 0.05 * flat[:, 0] - 1.7
     flat = flat[np.hypot(flat[:, 0] - 10, flat[:, 1]) > 4]  # none near here, but farther on
-    places = np.array([[10.0, 0], [-20, 5], [30, -30], [39, 39], [500, 0], [9e4, 9e4]])
-    found = ground_under(flat.astype(np.float32), places)
-    for place, height in zip(places, found):
+    indices = np.array([[10.0, 0], [-20, 5], [30, -30], [39, 39], [500, 0], [9e4, 9e4]])
+    found = ground_under(flat.astype(np.float32), indices)
+    for place, height in zip(indices, found):
         apart = np.hypot(*(flat[:, :2] - place).T)
         near = next((r for r in NEAR if (apart <= r).sum() >= 3), None)
         wanted = -SENSOR_HEIGHT if near is None else flat[apart <= near, 2].mean()
         assert height == pytest.approx(wanted, abs=1e-5)
     assert found[0] == pytest.approx(-1.2, abs=0.02) and found[4] == found[5] == -SENSOR_HEIGHT
     assert len(ground_under(flat, np.zeros((0, 2)))) == 0
-    assert (ground_under(flat[:0], places) == -SENSOR_HEIGHT).all()
+    assert (ground_under(flat[:0], indices) == -SENSOR_HEIGHT).all()
     # heights are over it: a hill changes nothing
     clusters = replace(blobs(rng, [20, 30]), ground=np.array([-1.7, -1.5]))
     lifted = replace(clusters, points=clusters.points + np.float32([0, 0, 3, 0]),
@@ -141,13 +141,13 @@ def test_the_nearest_are_those_that_a_full_search_finds(rng):
     xyz = torch.from_numpy(rng.normal(size=(3, 20, 3)))
     valid = torch.from_numpy(rng.random((3, 20)) < 0.7)
     valid[:, :5] = True
-    squared, places = nearest(xyz[:, :5], xyz, valid, 4)
+    squared, indices = nearest(xyz[:, :5], xyz, valid, 4)
     for b in range(3):
         for c in range(5):
             apart = ((xyz[b] - xyz[b, c]) ** 2).sum(-1)
             apart[~valid[b]] = torch.inf
             assert torch.allclose(squared[b, c], apart.sort().values[:4], atol=1e-9)
-            assert torch.equal(apart[places[b, c]].sort().values, apart.sort().values[:4])
+            assert torch.equal(apart[indices[b, c]].sort().values, apart.sort().values[:4])
 
 
 def test_groups_are_what_plain_loops_make_of_them(rng):

@@ -63,7 +63,7 @@ def moved(found: Detections, turn: float = 0.0, shift=(0, 0, 0)) -> Detections:
 
 
 def alike(a: Detections | Found, b: Detections | Found, atol: float = 1e-4) -> bool:
-    """Whether both say the same; scores that hardly differ may have changed places."""
+    """Whether both say the same; scores that hardly differ may have changed indices."""
     a, b = (x.detections if isinstance(x, Found) else x for x in (a, b))
     if len(a) != len(b):
         return False

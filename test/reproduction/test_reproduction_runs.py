@@ -238,7 +238,7 @@ def test_a_record_that_is_no_json_is_a_mistake(few, tmp_path):
 
 
 def test_a_process_that_is_killed_ends_the_run_with_a_reason(few, tmp_path):
-    with pytest.raises(InputError, match=r"measured frames.*want of memory: try fewer --jobs"):
+    with pytest.raises(InputError, match=r"measured frames.*out of memory: try fewer --jobs"):
         runner.run(small(end_the_process), open_recording(few), tmp_path / "out", jobs=2)
 
 

@@ -123,8 +123,8 @@ def test_confidence_over_scans_is_the_mean_of_the_log_odds():
 # --- parts ---------------------------------------------------------------------------------
 
 
-def boxes_at(places):
-    return np.array([[x, y, -0.9, 0.6, 0.6, 1.7, 0] for x, y in places]).reshape(-1, 7)
+def boxes_at(indices):
+    return np.array([[x, y, -0.9, 0.6, 0.6, 1.7, 0] for x, y in indices]).reshape(-1, 7)
 
 
 def test_a_given_pedestrian_is_neither_found_nor_missed():

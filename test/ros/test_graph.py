@@ -98,14 +98,14 @@ def test_the_published_cloud_holds_all_fields_and_the_offline_columns(run, offli
         clouds = [m for _, _, m in bag.messages({cloud_topic(single)})]
     assert len(clouds) == len(sent)
     for msg in clouds:
-        frame, places = to_frame(msg)
+        frame, indices = to_frame(msg)
         original = to_array(sent[frame.stamp_ns])
         for name in original.dtype.names:
             np.testing.assert_array_equal(to_array(msg)[name], original[name])
         segmented, _ = offline[0][frame.stamp_ns]
-        np.testing.assert_array_equal(places, segmented.places)
-        np.testing.assert_array_equal(column(msg, "ground", places) > 0, segmented.ground)
-        np.testing.assert_array_equal(column(msg, "cluster_id", places), segmented.cluster_ids)
+        np.testing.assert_array_equal(indices, segmented.indices)
+        np.testing.assert_array_equal(column(msg, "ground", indices) > 0, segmented.ground)
+        np.testing.assert_array_equal(column(msg, "cluster_id", indices), segmented.cluster_ids)
         assert msg.header.frame_id == "velodyne"
 
 

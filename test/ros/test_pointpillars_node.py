@@ -113,9 +113,9 @@ def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, 
     segmented = segment(scan, None, params)
     columns = segmented.ground, segmented.cluster_ids
     assert segmented.ground.any() and segmented.cluster_ids.max() >= 2
-    marked, places = points[-1], np.arange(len(scan))
-    np.testing.assert_array_equal(column(marked, "ground", places) > 0, segmented.ground)
-    np.testing.assert_array_equal(column(marked, "cluster_id", places), segmented.cluster_ids)
+    marked, indices = points[-1], np.arange(len(scan))
+    np.testing.assert_array_equal(column(marked, "ground", indices) > 0, segmented.ground)
+    np.testing.assert_array_equal(column(marked, "cluster_id", indices), segmented.cluster_ids)
     assert_equal(received(found, 1), offline(weights, message(1), *columns))
     assert received(found, 1).frame_id == "lidar"
 

@@ -18,7 +18,7 @@ from lidar_perception.data.nuscenes.boxes import NAMES, GlobalBoxes
 from lidar_perception.data.nuscenes.folder import open_nuscenes
 from lidar_perception.data.nuscenes.results import (
     DETECTED,
-    MOST_BOXES,
+    MAX_BOXES,
     read_results,
     to_results,
     write_results,
@@ -127,9 +127,9 @@ def test_boxes_go_to_the_file_and_back(root, tmp_path):
 
 def test_only_the_best_boxes_of_a_frame_are_written(root):
     frame, rng = open_nuscenes(root)[0], np.random.default_rng(0)
-    scores = rng.uniform(0, 1, MOST_BOXES + 50)
+    scores = rng.uniform(0, 1, MAX_BOXES + 50)
     made = to_results(Detections.of(np.ones((len(scores), 7)), 0, scores), frame)
-    assert len(made) == MOST_BOXES and made.scores.min() > np.sort(scores)[49]
+    assert len(made) == MAX_BOXES and made.scores.min() > np.sort(scores)[49]
     broken = Detections.of(np.full((1, 7), np.nan), 0)
     with pytest.raises(InputError, match=r"scene-0103/00: a box or score .* not finite"):
         to_results(broken, frame)

@@ -11,7 +11,7 @@ from lidar_perception.simulation.hashing import uniform
 from lidar_perception.simulation.pairs import View
 from lidar_perception.simulation.raycast import cast, cast_batch
 from lidar_perception.simulation.realism.roughness import roughness
-from lidar_perception.simulation.returns import measure
+from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.sensor import HDL64E, STILL, Motion, generic, rays
 from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID, Solids
 from lidar_perception.simulation.terrain import Ground, cast_ground, surface_height, tufts
@@ -154,12 +154,12 @@ def test_a_wall_is_flat_only_after_compensation():
     wall = solids(BOX, (10, 0, 0), (1, 40, 8))
     exact = replace(SENSOR, range_noise=0.0, dropout=0.0)
     hits = cast(wall, Ground(), NO_GROUND, exact, DRIVE)
-    flat, raw = (measure(hits, exact, DRIVE, np.random.default_rng(0), compensated)
+    flat, raw = (returns_of(hits, exact, DRIVE, np.random.default_rng(0), compensated)
                  for compensated in (True, False))
     assert len(flat.xyz) > 1000 and np.abs(flat.xyz[:, 0] - 9).max() < 1e-5
     assert np.ptp(raw.xyz[:, 0]) > 0.1
     still = cast(wall, Ground(), NO_GROUND, exact)
-    assert np.ptp(measure(still, exact, STILL, np.random.default_rng(0), False).xyz[:, 0]) < 1e-5
+    assert np.ptp(returns_of(still, exact, STILL, np.random.default_rng(0), False).xyz[:, 0]) < 1e-5
 
 
 @pytest.fixture

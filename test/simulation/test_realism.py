@@ -18,14 +18,14 @@ from lidar_perception.cli.main import cli
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.simulation.realism.compare import (
-    LEAST_SAMPLES,
-    MOST_SCANS,
-    compare,
+    MAX_SCANS,
+    MIN_SAMPLES,
     evenly,
     factor_off,
-    measure,
+    measured_scans,
     median_interval,
     ratio,
+    side_by_side,
 )
 from lidar_perception.simulation.realism.report import draw_realism, print_realism
 from lidar_perception.simulation.realism.scan_statistics import (
@@ -90,7 +90,7 @@ def changed(change, count: int = SCANS) -> list[Frame]:
 
 @cache
 def street():
-    return measure(map(recorded, range(SCANS)), PAPER)
+    return measured_scans(map(recorded, range(SCANS)), PAPER)
 
 
 def judged(content: dict, names=CURVES) -> list[dict]:
@@ -99,7 +99,7 @@ def judged(content: dict, names=CURVES) -> list[dict]:
 
 
 def test_a_recording_is_as_real_as_itself():
-    content = compare(street(), street())
+    content = side_by_side(street(), street())
     assert content["within"] == content["judged"] == len(judged(content)) > 100
     assert all(b["ratio"] == 1.0 and factor_off(b) == 1.0 for b in judged(content))
     assert all(content["curves"][name]["judged"] for name in CURVES if "histogram" not in name)
@@ -108,7 +108,7 @@ def test_a_recording_is_as_real_as_itself():
 def test_half_the_points_are_found_by_the_points_and_not_by_the_heights():
     def half(frame, rng):
         return frame.take(np.flatnonzero(rng.random(len(frame)) < 0.5))
-    content = compare(street(), measure(changed(half), PAPER))
+    content = side_by_side(street(), measured_scans(changed(half), PAPER))
     for name in COUNTS:
         bins = [b for b in judged(content, [name]) if b["real"]["median"] >= 100]
         assert all(b["ratio"] == pytest.approx(0.5, abs=0.1) for b in bins), name
@@ -118,7 +118,7 @@ def test_half_the_points_are_found_by_the_points_and_not_by_the_heights():
 
 
 def test_a_weaker_light_is_found_by_the_intensities_alone():
-    content = compare(street(), measure(
+    content = side_by_side(street(), measured_scans(
         changed(lambda frame, rng: replace(frame, intensity=frame.intensity * 0.5)), PAPER))
     for name, curve in content["curves"].items():
         if name not in LIGHT:
@@ -128,7 +128,7 @@ def test_a_weaker_light_is_found_by_the_intensities_alone():
 
 
 def test_the_order_of_the_points_does_not_matter():
-    content = compare(street(), measure(
+    content = side_by_side(street(), measured_scans(
         changed(lambda frame, rng: frame.take(rng.permutation(len(frame)))), PAPER))
     for name, curve in content["curves"].items():
         for b in curve["bins"]:
@@ -148,25 +148,26 @@ def test_counts_add_up():
 
 
 def test_bins_with_few_real_samples_are_not_judged():
-    content = compare(measure(map(recorded, range(LEAST_SAMPLES - 1)), PAPER), street())
+    content = side_by_side(measured_scans(map(recorded, range(MIN_SAMPLES - 1)), PAPER), street())
     assert all(content["curves"][name]["judged"] == 0 for name in (*COUNTS, *EXTENTS))
     for name, curve in content["curves"].items():
         for b in curve["bins"]:
-            few = b["real"]["n"] < LEAST_SAMPLES or CURVES[name].histogram
+            few = b["real"]["n"] < MIN_SAMPLES or CURVES[name].histogram
             assert (b["within"] is None) == few, (name, b)
 
 
 def test_what_is_missing_on_the_simulated_side_is_wrong():
-    content = compare(street(), measure([], PAPER))
-    assert content["within"] == 0 and content["judged"] == compare(street(), street())["judged"]
+    content = side_by_side(street(), measured_scans([], PAPER))
+    assert content["within"] == 0
+    assert content["judged"] == side_by_side(street(), street())["judged"]
 
 
 def test_nothing_is_compared_with_nothing():
     none = LidarFrame(np.zeros((0, 3), np.float32))
     empty = Frame.of("0", none, GroundTruth.of([], []), CALIBRATION)
     for scans in ([], [empty], [Frame.of("0", none, None, CALIBRATION)]):
-        measured = measure(scans, PAPER)
-        content = compare(measured, measured)
+        measured = measured_scans(scans, PAPER)
+        content = side_by_side(measured, measured)
         assert (content["judged"], content["share"]) == (0, None)
         print_realism(content, Console(file=StringIO()))
 
@@ -174,7 +175,7 @@ def test_nothing_is_compared_with_nothing():
 def test_scans_without_intensity_or_camera_have_the_other_curves():
     bare = [Frame.of(r.name, replace(r.load(), intensity=None), r.truth())
             for r in map(recorded, range(2))]
-    measured = measure(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
+    measured = measured_scans(bare, replace(PAPER, view=replace(PAPER.view, enabled=False)))
     assert all((len(rows) == 0) == (name in LIGHT) for name, rows in measured.rows.items()
                if not name.startswith(("stage", "final")))
 
@@ -184,7 +185,7 @@ def test_a_scan_cropped_to_the_view_counts_for_its_objects_only():
     seen = np.flatnonzero(whole.camera().in_view(whole.load().xyz))
     cropped = with_scan(whole, whole.load().take(seen))
     assert is_whole(whole.load()) and not is_whole(cropped.load())
-    measured = measure([cropped], PAPER)
+    measured = measured_scans([cropped], PAPER)
     assert (measured.scans, measured.whole_scans) == (1, 0)
     assert all(not measured.rows[name] for name in ("points", "clusters", "ground intensity"))
     expected = rows_of(whole)
@@ -236,10 +237,10 @@ def test_the_interval_holds_the_median():
 
 def test_what_lies_among_uncertain_real_samples_is_plausible():
     def thinned(shares):
-        return measure([with_scan(r, r.load().take(np.flatnonzero(
+        return measured_scans([with_scan(r, r.load().take(np.flatnonzero(
             np.random.default_rng(100).random(len(r.load())) < share)))
             for r, share in zip(map(recorded, range(SCANS)), shares)], PAPER)
-    content = compare(thinned(np.linspace(0.3, 1, SCANS)), thinned([0.9] * SCANS))
+    content = side_by_side(thinned(np.linspace(0.3, 1, SCANS)), thinned([0.9] * SCANS))
     points = judged(content, ["scan points", "Car points"])
     assert not any(b["within"] for b in points) and all(b["plausible"] for b in points)
     assert content["within"] < content["plausible"] <= content["judged"]
@@ -248,13 +249,13 @@ def test_what_lies_among_uncertain_real_samples_is_plausible():
 
 def test_content_survives_json_and_is_shown(tmp_path):
     import matplotlib.pyplot as plt
-    content = compare(street(), measure(map(recorded, range(3)), PAPER))
+    content = side_by_side(street(), measured_scans(map(recorded, range(3)), PAPER))
     again = json.loads(json.dumps(content, allow_nan=False))
     assert again == content
     shown = StringIO()
     print_realism(again, Console(file=shown, width=100))
     assert f"{content['within']} of {content['judged']} bins" in shown.getvalue()
-    draw_realism(tmp_path / "new/realism.png", compare(street(), measure([], PAPER)))
+    draw_realism(tmp_path / "new/realism.png", side_by_side(street(), measured_scans([], PAPER)))
     picture = plt.imread(tmp_path / "new/realism.png")
     assert min(picture.shape[:2]) > 1000 and picture[..., :3].std() > 0.05
     with pytest.raises(InputError, match="cannot write"):
@@ -271,7 +272,7 @@ def tracking_folder(root):
 @pytest.mark.parametrize("make", [lambda root: object_folder(root, walker_label(), 1),
                                   tracking_folder])
 def test_object_and_tracking_folders_are_read(tmp_path, make):
-    measured = measure(evenly(open_recording(make(tmp_path))), PAPER)
+    measured = measured_scans(evenly(open_recording(make(tmp_path))), PAPER)
     assert measured.objects == {"Car": 0, "Pedestrian": 1, "Cyclist": 0}
     assert (measured.scans, measured.whole_scans, measured.skipped) == (1, 1, [])
 
@@ -287,21 +288,21 @@ def test_folders_without_labels_are_refused(tmp_path):
 def test_broken_scans_are_skipped_and_counted(tmp_path):
     scans = sorted(object_folder(tmp_path, walker_label(), 3).rglob("velodyne/*.bin"))
     write(scans[1], b"cut")
-    measured = measure(evenly(open_recording(tmp_path)), PAPER)
+    measured = measured_scans(evenly(open_recording(tmp_path)), PAPER)
     assert measured.scans == 2 and len(measured.skipped) == 1
-    assert compare(measured, measured)["real"]["skipped"] == measured.skipped
+    assert side_by_side(measured, measured)["real"]["skipped"] == measured.skipped
     for scan in scans:
         write(scan, b"cut")
     with pytest.raises(InputError, match=r"none of 3 scans can be read: .*000000.bin"):
-        measure(evenly(open_recording(tmp_path)), PAPER)
+        measured_scans(evenly(open_recording(tmp_path)), PAPER)
 
 
 def test_of_a_large_folder_an_even_choice_is_compared(tmp_path):
     recording = open_recording(object_folder(tmp_path, walker_label(), 1))
-    many = [replace(recording.frames[0], name=str(i)) for i in range(3 * MOST_SCANS)]
+    many = [replace(recording.frames[0], name=str(i)) for i in range(3 * MAX_SCANS)]
     chosen = evenly(replace(recording, frames=many))
     numbers = [int(f.name) for f in chosen]
-    assert len(numbers) == MOST_SCANS
+    assert len(numbers) == MAX_SCANS
     assert (numbers[0], numbers[-1]) == (0, len(many) - 1) and set(np.diff(numbers)) <= {3, 4}
 
 
@@ -318,7 +319,7 @@ def test_the_command_compares(tmp_path):
 
 def test_real_scans_are_as_real_as_themselves(data):
     scans = [r for r in open_recording(data / "kitti_object") if is_whole(r.load())][:2]
-    first, second = (measure(scans, PAPER) for _ in range(2))
-    content = compare(first, second)
+    first, second = (measured_scans(scans, PAPER) for _ in range(2))
+    content = side_by_side(first, second)
     assert all(b["ratio"] in (1.0, None) for c in content["curves"].values() for b in c["bins"])
     assert first.whole_scans == 2

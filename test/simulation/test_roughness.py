@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidar_perception.simulation.realism.roughness import LEAST_CELLS, roughness, scatter_of_cells
+from lidar_perception.simulation.realism.roughness import MIN_CELLS, roughness, scatter_of_cells
 
 LIMITS = np.array([0.0, 5.0, 15.0, np.inf])
 
@@ -57,4 +57,4 @@ def test_a_range_needs_some_cells():
     few = plane(4)
     few = few[np.hypot(few[:, 0], few[:, 1]) < 5]
     row = roughness(few, np.array([0.0, 5.0, 15.0]))
-    assert LEAST_CELLS < 60 and row[0] < 1e-4 and np.isnan(row[1])
+    assert MIN_CELLS < 60 and row[0] < 1e-4 and np.isnan(row[1])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidar_perception.simulation.raycast import Hits
-from lidar_perception.simulation.returns import measure
+from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.sensor import (
     HDL64E,
     SENSORS,
@@ -35,7 +35,7 @@ def hits(sensor, distance, brightness=0.3, cosine=1.0):
 
 
 def measured(sensor, distance, brightness=0.3, motion=STILL, seed=0, cosine=1.0, **flags):
-    return measure(hits(sensor, distance, brightness, cosine), sensor, motion,
+    return returns_of(hits(sensor, distance, brightness, cosine), sensor, motion,
                    np.random.default_rng(seed), **flags)
 
 

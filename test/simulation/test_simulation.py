@@ -9,7 +9,7 @@ from lidar_perception.geometry import box_corners, points_in_box
 from lidar_perception.simulation import drive as drives
 from lidar_perception.simulation.drive import drive, truth
 from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.returns import measure
+from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.scene import ANY, CROWDED
 from lidar_perception.simulation.sensor import HDL64E, STILL
 from lidar_perception.simulation.terrain import surface_height
@@ -29,7 +29,7 @@ def scan(seed, t, sensor=COARSE):
     scene = street(seed)
     moment = scene.at(t, sensor.height)
     hits = cast(moment.solids, scene.ground, moment.position, sensor)
-    xyz, _, owner, *_ = measure(hits, sensor, STILL, np.random.default_rng(0))
+    xyz, _, owner, *_ = returns_of(hits, sensor, STILL, np.random.default_rng(0))
     return scene, moment, hits, xyz, owner
 
 
@@ -68,7 +68,7 @@ def test_frames_are_as_promised():
 @pytest.mark.parametrize("seed", [0, 2])
 def test_points_of_an_object_lie_in_its_box(seed, t):
     _, moment, hits, xyz, owner = scan(seed, t)
-    semantic = measure(hits, COARSE, STILL, np.random.default_rng(0)).semantic
+    semantic = returns_of(hits, COARSE, STILL, np.random.default_rng(0)).semantic
     for box, track, speed, kind in zip(moment.boxes, moment.track_ids, moment.speeds,
                                        moment.class_ids):
         own = (owner == track) & (semantic != 99)  # 99: what a person carries

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.returns import measure
+from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.sensor import HDL64E, STILL
 from lidar_perception.simulation.shapes import (
     buildings,
@@ -201,7 +201,7 @@ def points_of(thing, distance, yaw, seed):
     solids = place(made, base, np.full(len(made), yaw), np.ones(len(made)),
                    np.zeros((len(made), 3)))
     hits = cast(solids, Ground(), np.array([0.0, 0.0, 1e4]), HDL64E, STILL, seed)
-    xyz = measure(hits, HDL64E, STILL, np.random.default_rng(seed)).xyz
+    xyz = returns_of(hits, HDL64E, STILL, np.random.default_rng(seed)).xyz
     return xyz + np.array([0.0, 0.0, 1.73])
 
 

@@ -25,7 +25,7 @@ from lidar_perception.scoring.points.clusters import (
     uncared,
     unknown_where,
 )
-from lidar_perception.training.augment import Scene
+from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.data import JudgedScenes
 from lidar_perception.training.params import ClusterAugmentParams
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes, cut
@@ -168,7 +168,7 @@ def test_a_scene_is_cut_by_our_own_clustering_and_around_its_objects(rng, tmp_pa
                             rng.random(12_000)])
     objects = in_boxes(rng, BOXES[:3], 500).points
     points = np.concatenate([flat, objects]).astype(np.float32)
-    scene = Scene(points, BOXES[:3], ids("Car", "Pedestrian", "Cyclist"),
+    scene = TrainingScene(points, BOXES[:3], ids("Car", "Pedestrian", "Cyclist"),
                   np.array([True, True, False]))
     made = cut(scene, CONFIG, 5)
     assert set(made.labels[~made.loose]) >= {0, 1, 2}

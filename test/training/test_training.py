@@ -274,7 +274,7 @@ def test_too_many_of_them_in_a_row_are_an_error(tmp_path):
             for now, inputs, wanted in super().batches(step):
                 yield now, inputs, wanted * (torch.nan if now > 2 else 1)
 
-    params = LoopParams(**{**vars(PARAMS), "most_skipped": 4})
+    params = LoopParams(**{**vars(PARAMS), "max_skipped": 4})
     with pytest.raises(InputError, match="in 4 steps in a row, up to step 7"):
         train(Broken().task(), params, tmp_path)
 

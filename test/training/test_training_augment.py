@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from lidar_perception.geometry import bev_iou, points_in_box, wrap_angle
 from lidar_perception.training.augment import (
     STEP,
-    Scene,
+    TrainingScene,
     augmented,
     blurred,
     brightened,
@@ -40,7 +40,7 @@ STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0
                       height=0, tilt=0)
 
 
-def random_scene(seed: int, around: bool = False) -> Scene:
+def random_scene(seed: int, around: bool = False) -> TrainingScene:
     """Ground, and up to a dozen boxes full of points that do not touch."""
     rng = np.random.default_rng(seed)
     boxes, ids = np.zeros((0, 7)), []
@@ -57,10 +57,10 @@ def random_scene(seed: int, around: bool = False) -> Scene:
         parts.append(flat @ np.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]]) + box[:3])
     xyz = np.concatenate(parts)
     points = np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32)
-    return Scene(points, boxes, np.array(ids, int), np.ones(len(ids), bool), around)
+    return TrainingScene(points, boxes, np.array(ids, int), np.ones(len(ids), bool), around)
 
 
-def members(scene: Scene, margin: float = 0.0) -> np.ndarray:
+def members(scene: TrainingScene, margin: float = 0.0) -> np.ndarray:
     """(M, N) bool: which points are in which box."""
     return np.array([points_in_box(scene.points[:, :3], box, margin) for box in scene.boxes],
                     bool).reshape(len(scene.boxes), len(scene.points))
@@ -129,8 +129,8 @@ def test_changes_are_undone_by_their_inverses(seed, angle):
 
 
 def test_a_turn_takes_what_is_ahead_to_the_left():
-    scene = Scene(np.array([[5, 0, 1, 0.5]], np.float32), np.array([[5.0, 0, 1, 4, 2, 1, 0.1]]),
-                  np.array([CAR]), np.ones(1, bool))
+    scene = TrainingScene(np.array([[5, 0, 1, 0.5]], np.float32),
+                          np.array([[5.0, 0, 1, 4, 2, 1, 0.1]]), np.array([CAR]), np.ones(1, bool))
     changed = turned(scene, np.pi / 2)
     np.testing.assert_allclose(changed.points, [[0, 5, 1, 0.5]], atol=1e-6)
     np.testing.assert_allclose(changed.boxes, [[0, 5, 1, 4, 2, 1, 0.1 + np.pi / 2]], atol=1e-9)
@@ -215,9 +215,9 @@ def one_walker(x: float) -> Database:
                     np.array([PEDESTRIAN], np.int32), own, np.array([0, len(own)]))
 
 
-def street_with(*walls: np.ndarray) -> Scene:
+def street_with(*walls: np.ndarray) -> TrainingScene:
     ground = wall(-1.73, (-15, 15), (0, 15))[::7][:, [2, 1, 0, 3]]
-    return Scene(np.concatenate([ground, *walls]), np.zeros((0, 7)), np.zeros(0, int),
+    return TrainingScene(np.concatenate([ground, *walls]), np.zeros((0, 7)), np.zeros(0, int),
                  np.zeros(0, bool))
 
 
@@ -327,7 +327,7 @@ def test_nothing_that_may_come_into_view_is_cut_off(seed, larger, higher):
     scene, params = random_scene(seed), AugmentParams(turn=0, scale=0.1, height=0.3, tilt=0.1)
     low, high = np.array([0, -10, -1.8]), np.array([10.0, 10, 0.5])
 
-    def changed(scene: Scene) -> Scene:
+    def changed(scene: TrainingScene) -> TrainingScene:
         scene = raised(scaled(scene, 1 + larger * params.scale), higher * params.height,
                        (higher * params.tilt, -larger * params.tilt))
         return cropped(scene, low, high)
@@ -342,8 +342,8 @@ def test_nothing_that_may_come_into_view_is_cut_off(seed, larger, higher):
 
 def test_scenes_that_are_labelled_all_around_are_turned_all_around():
     def bearings(around: bool) -> np.ndarray:
-        scene = Scene(np.array([[5, 0, -1, 0.5]], np.float32), np.zeros((0, 7)), np.zeros(0, int),
-                      np.zeros(0, bool), around)
+        scene = TrainingScene(np.array([[5, 0, -1, 0.5]], np.float32), np.zeros((0, 7)),
+                              np.zeros(0, int), np.zeros(0, bool), around)
         turned = [faced(scene, AugmentParams(), np.full(3, -9.0), np.full(3, 9.0),
                         np.random.default_rng(seed)).points[0] for seed in range(60)]
         return np.abs(np.arctan2(*np.array(turned).T[1::-1]))
@@ -365,7 +365,7 @@ def test_objects_survive_their_file_and_a_broken_file_is_named(tmp_path):
 
 def test_where_there_is_no_ground_nothing_is_put():
     database = cut_objects([random_scene(k) for k in range(4)], ("Car",), 5)
-    empty = Scene(np.zeros((0, 4), np.float32), np.zeros((0, 7)), np.zeros(0, int),
+    empty = TrainingScene(np.zeros((0, 4), np.float32), np.zeros((0, 7)), np.zeros(0, int),
                   np.zeros(0, bool))
     assert len(with_objects(empty, database, AugmentParams(), *AREA,
                             np.random.default_rng(0)).boxes) == 0

@@ -27,7 +27,7 @@ from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED
 from lidar_perception.geometry import points_in_box
 from lidar_perception.simulation import drive
 from lidar_perception.training import scenes as scenes_module
-from lidar_perception.training.augment import Scene
+from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cut_objects import cut_objects
 from lidar_perception.training.data import Batches, Item, JudgedScenes, RawScenes, Stream
 from lidar_perception.training.params import AugmentParams
@@ -203,7 +203,7 @@ class Numbers:
 
     def scene(self, i):
         point = np.full((1, 4), self.first + i, np.float32)
-        return Scene(point, np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool))
+        return TrainingScene(point, np.zeros((0, 7)), np.zeros(0, int), np.zeros(0, bool))
 
 
 def taken(batches: Batches, first: int, steps: int) -> list:
@@ -229,9 +229,9 @@ def test_the_stream_depends_on_the_seed_alone():
 
 # PointPillars' samples
 
-def scene_of_two(**changes) -> Scene:
+def scene_of_two(**changes) -> TrainingScene:
     boxes = BOXES.numpy().astype(np.float64)
-    return Scene(**{**dict(points=two_objects(), boxes=boxes, wanted=np.ones(2, bool),
+    return TrainingScene(**{**dict(points=two_objects(), boxes=boxes, wanted=np.ones(2, bool),
                            class_ids=np.array([CAR, PEDESTRIAN])), **changes})
 
 

@@ -17,7 +17,7 @@ from lidar_perception.types import InputError
 # and tracking calibration files do not say it.
 IMAGE_SIZES = {721.5377: (1242, 375), 707.0493: (1224, 370), 718.3351: (1238, 374),
                707.0912: (1226, 370), 718.856: (1241, 376)}
-MOST_SKEW = 0.01  # of a rotation that was rounded
+MAX_SKEW = 0.01  # of a rotation that was rounded
 
 
 def read_calibration(path: Path, image: Path | None = None) -> Calibration:
@@ -74,7 +74,7 @@ def _pose(path: Path, rectify: np.ndarray, velodyne: np.ndarray) -> np.ndarray:
     """(4, 4) LiDAR into the rectified camera frame."""
     pose = homogeneous(rectify) @ homogeneous(velodyne)
     turn = pose[:3, :3]
-    if not (np.isfinite(pose).all() and np.allclose(turn @ turn.T, np.eye(3), atol=MOST_SKEW)
+    if not (np.isfinite(pose).all() and np.allclose(turn @ turn.T, np.eye(3), atol=MAX_SKEW)
             and np.linalg.det(turn) > 0):
         raise InputError(f"the pose of the LiDAR in {path} is no rotation; download KITTI's "
                          "calibration again")

@@ -21,7 +21,7 @@ from lidar_perception.types import CLASSES, GroundTruth, InputError
 TABLE = "sample_annotation"
 BLOCK = 4096        # labels whose numbers are made columns at a time
 BIKE_RACK = "static_object.bicycle_rack"
-MOST_TIME = 1.5     # seconds between two labels from which a velocity is taken; twice it from three
+MAX_TIME = 1.5     # seconds between two labels from which a velocity is taken; twice it from three
 # Of types.CLASSES. A bicycle with a rider is a Cyclist, what is named nowhere here is Misc.
 CLASS_OF = {"car": "Car", "truck": "Truck", "pedestrian": "Pedestrian"}
 
@@ -151,7 +151,7 @@ def _velocities(centres: np.ndarray, seconds: np.ndarray, neighbours: np.ndarray
     own = np.arange(len(centres))
     first, last = (np.where(rows >= 0, rows, own) for rows in neighbours.T)
     time = seconds[last] - seconds[first]
-    most = np.where((neighbours >= 0).all(axis=1), 2 * MOST_TIME, MOST_TIME)
+    most = np.where((neighbours >= 0).all(axis=1), 2 * MAX_TIME, MAX_TIME)
     known = (time > 0) & (time <= most)
     way = (centres[last] - centres[first])[:, :2]
     return np.divide(way, time[:, None], out=np.full_like(way, np.nan), where=known[:, None])

@@ -13,7 +13,7 @@ from lidar_perception.data.nuscenes.boxes import ATTRIBUTES, NAMES, GlobalBoxes,
 from lidar_perception.runs.files import write_text
 from lidar_perception.types import CLASSES, Detections, InputError
 
-MOST_BOXES = 500    # of a frame
+MAX_BOXES = 500    # of a frame
 # The classes of our detectors in the words of nuScenes; its bicycles have their riders inside.
 DETECTED = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle"}
 META = {"use_camera": False, "use_lidar": True, "use_radar": False, "use_map": False,
@@ -22,7 +22,7 @@ META = {"use_camera": False, "use_lidar": True, "use_radar": False, "use_map": F
 
 def to_results(found: Detections, frame: Frame) -> GlobalBoxes:
     """Detections of a frame as nuScenes has them, without a velocity and an attribute. Only the
-    classes in DETECTED, and the best MOST_BOXES of them. InputError for numbers that are not
+    classes in DETECTED, and the best MAX_BOXES of them. InputError for numbers that are not
     finite."""
     if not (np.isfinite(found.boxes).all() and np.isfinite(found.scores).all()):
         raise InputError(f"{frame.name}: a box or score of the detector is not finite; its weights "
@@ -30,7 +30,7 @@ def to_results(found: Detections, frame: Frame) -> GlobalBoxes:
     kinds = np.array([NAMES.index(DETECTED[name]) if name in DETECTED else -1 for name in CLASSES])
     kinds = kinds[found.class_ids]
     chosen = np.flatnonzero(kinds >= 0)
-    chosen = chosen[np.argsort(-found.scores[chosen], kind="stable")][:MOST_BOXES]
+    chosen = chosen[np.argsort(-found.scores[chosen], kind="stable")][:MAX_BOXES]
     return GlobalBoxes.of(*in_global(found.boxes[chosen], frame.native.pose), kinds[chosen],
                           scores=found.scores[chosen])
 
@@ -73,8 +73,8 @@ def read_results(path: Path, frames: Sequence[Frame]) -> dict[str, GlobalBoxes]:
 
 
 def _boxes(where: str, rows: list) -> GlobalBoxes:
-    if not isinstance(rows, list) or len(rows) > MOST_BOXES:
-        raise InputError(f"{where}, needs a list of at most {MOST_BOXES} boxes; leave out those of "
+    if not isinstance(rows, list) or len(rows) > MAX_BOXES:
+        raise InputError(f"{where}, needs a list of at most {MAX_BOXES} boxes; leave out those of "
                          "the lowest scores")
     try:
         boxes = GlobalBoxes.of(

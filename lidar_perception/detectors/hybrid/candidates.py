@@ -71,7 +71,7 @@ class RescoredCandidates:
                                                 ground=ground, cluster_ids=cluster_ids)
         t0 = perf_counter()
         chosen = np.flatnonzero(np.isin(segmented.cluster_ids, candidates.clusters))
-        seen = seen_by(self.judge, frame.take(segmented.places), pose)
+        seen = seen_by(self.judge, frame.take(segmented.indices), pose)
         clusters = clusters_of(seen.take(chosen), segmented.cluster_ids[chosen]).on(
             seen.xyz.compress(segmented.ground, axis=0))
         result, whole = judged(self.judge, candidates.final, clusters, params.weight, pose)

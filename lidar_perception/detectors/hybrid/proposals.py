@@ -1,4 +1,4 @@
-"""Proposals of another detector confirmed, or not, by the shape of what is in them."""
+"""Proposals of another detector, confirmed or rejected by the shape of the points in them."""
 
 from __future__ import annotations
 
@@ -91,5 +91,5 @@ def points_of(boxes: np.ndarray, frame: LidarFrame, seen: LidarFrame, margin: fl
     points[:, :3] = seen.xyz[rows]
     if seen.intensity is not None:
         points[:, 3] = seen.intensity[rows]
-    first = np.concatenate([[0], np.cumsum([len(places) for places in inside])]).astype(np.int64)
+    first = np.concatenate([[0], np.cumsum([len(indices) for indices in inside])]).astype(np.int64)
     return Clusters(points, first, np.arange(1, len(boxes) + 1))

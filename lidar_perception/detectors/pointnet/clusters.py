@@ -41,7 +41,7 @@ class Clusters:
         return np.diff(self.first)
 
     def take(self, chosen: np.ndarray) -> Clusters:
-        """The clusters at places (M,)."""
+        """The clusters at indices (M,)."""
         sizes = self.sizes[chosen]
         first = np.concatenate([[0], np.cumsum(sizes)])
         rows = np.repeat(self.first[chosen] - first[:-1], sizes) + np.arange(first[-1])
@@ -90,29 +90,29 @@ def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, min_points: int = 1,
     return found if ground is None else found.on(frame.xyz.compress(ground, axis=0))
 
 
-def ground_under(xyz: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """(K,) float64: the mean z of the ground's points (G, 3) around each of places (K, 2), within
+def ground_under(xyz: np.ndarray, indices: np.ndarray) -> np.ndarray:
+    """(K,) float64: the mean z of the ground's points (G, 3) around each of indices (K, 2), within
     the first of NEAR that has FEWEST of them; -SENSOR_HEIGHT where none has. Metres."""
-    if len(places) == 0:
+    if len(indices) == 0:
         return np.zeros(0)
-    low = places.min(axis=0) - NEAR[-1]
-    size = places.max(axis=0) + NEAR[-1] - low
-    if not (size < WIDEST).all():  # one far away makes the others wait
-        return np.array([ground_under(xyz, place[None])[0] for place in places])
+    low = indices.min(axis=0) - NEAR[-1]
+    size = indices.max(axis=0) + NEAR[-1] - low
+    if not (size < WIDEST).all():  # a distant outlier would blow up the grid
+        return np.array([ground_under(xyz, place[None])[0] for place in indices])
     shape = np.ceil(size / NEAR[0]).astype(np.int64) + 1
     column = np.floor((xyz[:, :2] - low) / NEAR[0])
     inside = ((column >= 0) & (column < shape)).all(axis=1)
     cell = (column[inside] @ np.array([shape[1], 1.0])).astype(np.int64)
     order = np.argsort(cell, kind="stable")
     start = np.searchsorted(cell[order], np.arange(shape.prod() + 1))
-    return _ground_under(xyz[inside][order].astype(np.float64), start, shape, low, places)
+    return _ground_under(xyz[inside][order].astype(np.float64), start, shape, low, indices)
 
 
 @njit(cache=True, nogil=True)
-def _ground_under(xyz, start, shape, low, places):
-    heights = np.full(len(places), -SENSOR_HEIGHT)
-    for k in range(len(places)):
-        x, y = places[k]
+def _ground_under(xyz, start, shape, low, indices):
+    heights = np.full(len(indices), -SENSOR_HEIGHT)
+    for k in range(len(indices)):
+        x, y = indices[k]
         row, column = int((x - low[0]) / NEAR[0]), int((y - low[1]) / NEAR[0])
         for reach in NEAR:
             cells = int(np.ceil(reach / NEAR[0]))
@@ -175,16 +175,16 @@ def _sampled(points, first, count, seed):
             low, high = min(low, own[i, 2]), max(high, own[i, 2])
         centres[k] /= size
         low_high[k, 0], low_high[k, 1] = low, high
-        places = np.arange(size)
+        indices = np.arange(size)
         state = np.uint64(seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019)
         kept = min(size, count)
         for i in range(kept):  # the beginning of a shuffle (Fisher and Yates)
             state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
             j = i + int((state >> np.uint64(33)) % np.uint64(size - i))
-            places[i], places[j] = places[j], places[i]
+            indices[i], indices[j] = indices[j], indices[i]
             valid[k, i] = True
         for i in range(count):
-            row = own[places[i % kept]]
+            row = own[indices[i % kept]]
             for axis in range(3):
                 out[k, i, axis] = row[axis] - centres[k, axis]
             out[k, i, 3] = row[3]

@@ -57,7 +57,7 @@ def mlp(*channels: int) -> nn.Sequential:
 
 
 def nearest(centres: Tensor, xyz: Tensor, valid: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """squared (B, M, k) rising, and places (B, M, k), of the nearest of xyz (B, N, 3) to each
+    """squared (B, M, k) rising, and indices (B, M, k), of the nearest of xyz (B, N, 3) to each
     centre (B, M, 3), inf where no valid one is left; k = count."""
     # Differences, not a matrix product: a point is at no distance from itself in any format.
     squared = (centres[:, :, None] - xyz[:, None]).square().sum(dim=-1)    # (B, M, N)
@@ -65,10 +65,10 @@ def nearest(centres: Tensor, xyz: Tensor, valid: Tensor, count: int) -> tuple[Te
     return squared.topk(count, dim=2, largest=False)
 
 
-def taken(values: Tensor, places: Tensor) -> Tensor:
-    """(B, M, k, C): rows of values (B, N, C) at places (B, M, k)."""
-    index = places.flatten(1)[..., None].expand(-1, -1, values.shape[-1])
-    return values.gather(1, index).view(*places.shape, -1)
+def taken(values: Tensor, indices: Tensor) -> Tensor:
+    """(B, M, k, C): rows of values (B, N, C) at indices (B, M, k)."""
+    index = indices.flatten(1)[..., None].expand(-1, -1, values.shape[-1])
+    return values.gather(1, index).view(*indices.shape, -1)
 
 
 class LocalNet(nn.Module):
@@ -86,11 +86,11 @@ class LocalNet(nn.Module):
 
     def forward(self, points: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
         xyz, centres = points[..., :3], points[:, :count, :3]
-        squared, places = nearest(centres, xyz, valid, max(k for _, k in self.groups))
+        squared, indices = nearest(centres, xyz, valid, max(k for _, k in self.groups))
         scales, density = [], []
         for (radius, k), net in zip(self.groups, self.nets):
             within = squared[..., :k] <= radius * radius                   # (B, M, k)
-            near = taken(points, torch.where(within, places[..., :k], places[..., :1]))
+            near = taken(points, torch.where(within, indices[..., :k], indices[..., :1]))
             around = (near[..., :3] - centres[:, :, None]) / radius        # (B, M, k, 3)
             scales.append(net(torch.cat([around, near[..., 3:]], dim=-1)).amax(dim=2))
             density.append(within.sum(dim=-1) / (k * radius))
@@ -110,10 +110,10 @@ class CoarseNet(nn.Module):
 
     def forward(self, xyz: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
         centres = xyz[:, :count]
-        squared, places = nearest(centres, xyz, valid, self.neighbours)
-        places = torch.where(squared <= self.radius**2, places, places[..., :1])
-        around = (taken(xyz, places) - centres[:, :, None]) / self.radius
-        return self.net(torch.cat([around, taken(features, places)], dim=-1)).amax(dim=2)
+        squared, indices = nearest(centres, xyz, valid, self.neighbours)
+        indices = torch.where(squared <= self.radius**2, indices, indices[..., :1])
+        around = (taken(xyz, indices) - centres[:, :, None]) / self.radius
+        return self.net(torch.cat([around, taken(features, indices)], dim=-1)).amax(dim=2)
 
 
 class PointNet(nn.Module):

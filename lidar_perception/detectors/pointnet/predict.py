@@ -35,7 +35,7 @@ class Predictions:
         return self.probabilities[np.arange(len(self.kinds)), self.kinds]
 
     def take(self, chosen: np.ndarray) -> Predictions:
-        """Those of the clusters at places (M,)."""
+        """Those of the clusters at indices (M,)."""
         return Predictions(self.probabilities[chosen], self.kinds[chosen], self.boxes[chosen])
 
 

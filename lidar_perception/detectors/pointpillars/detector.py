@@ -70,12 +70,12 @@ class PointPillarsDetector(NetworkDetector):
         require_columns(frame, ground=ground, cluster_ids=cluster_ids)
         t0 = perf_counter()
         pose = self.params.ground.sensor_pose
-        places, seen = visible(frame, self.config, pose)
+        indices, seen = visible(frame, self.config, pose)
         seen = with_intensity_scaled(seen, self.settings.intensity_scale)
         t1 = perf_counter()
         inputs = network_input(
-            seen, self.config, None if ground is None else ground.take(places).astype(bool),
-            None if cluster_ids is None else cluster_ids.take(places),
+            seen, self.config, None if ground is None else ground.take(indices).astype(bool),
+            None if cluster_ids is None else cluster_ids.take(indices),
             self.params.ground, self.params.clustering)
         t2 = perf_counter()
         problem = self._problem(frame, seen, inputs)

@@ -19,9 +19,9 @@ from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.detectors.view import levelled_ground
 from lidar_perception.ground.params import GroundParams
+from lidar_perception.groups import renumbered
 from lidar_perception.types import CLASSES, LidarFrame
 
-SPARSE = 16  # largest number of a cluster, in points, up to which a table of all numbers is made
 MAP_CLASSES = tuple(BY_SIZE)  # a channel each: vehicle, two-wheeler, pedestrian
 
 
@@ -58,23 +58,11 @@ def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | 
     if seen.intensity is not None:
         points[:, 3] = seen.intensity
     if needs_clusters:
-        cluster_ids = renumbered(cluster_ids)
+        cluster_ids, _ = renumbered(cluster_ids)
     if config.cluster_ids:
         points[:, 4] = cluster_ids
     return NetworkInput(points, draw_clusters(seen.xyz, cluster_ids, config)
                         if config.pseudo_map else None)
-
-
-def renumbered(cluster_ids: np.ndarray) -> np.ndarray:
-    """(N,) int32: the ids above 0 as 1..K in their order; 0 and below become 0."""
-    ids = np.maximum(np.asarray(cluster_ids, np.int64), 0)
-    if ids.max(initial=0) > SPARSE * (len(ids) + 1):  # of another program, whose numbers are large
-        _, ids = np.unique(np.append(ids, 0), return_inverse=True)
-        ids = ids[:-1]
-    place = np.zeros(int(ids.max(initial=0)) + 1, np.int32)
-    place[ids] = 1
-    place[0] = 0
-    return np.where(ids > 0, np.cumsum(place)[ids], 0).astype(np.int32)
 
 
 def draw_clusters(xyz: np.ndarray, cluster_ids: np.ndarray, config: NetworkConfig) -> np.ndarray:

@@ -163,8 +163,8 @@ class Head(nn.Module):
 
     def boxes_at(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
         """codes (M, 7) and directions (M, 2) of anchors (M,) of the only cloud."""
-        places, kinds = anchors // self.kinds, anchors % self.kinds
-        rows = features[0].flatten(1)[:, places].T  # (M, C)
+        indices, kinds = anchors // self.kinds, anchors % self.kinds
+        rows = features[0].flatten(1)[:, indices].T  # (M, C)
 
         def one(conv: nn.Conv2d, width: int) -> Tensor:
             weight = conv.weight.view(self.kinds, width, -1)[kinds]  # (M, width, C)

@@ -57,9 +57,9 @@ def make_pillars(clouds: Sequence[Tensor], config: NetworkConfig) -> Pillars:
 
 
 def first_of_each(cells: Tensor, count: int) -> Tensor:
-    """Ascending places (M,) of the first `count` points of each cell, in the order of the cloud."""
-    ordered, places = torch.sort(cells, stable=True)
+    """Ascending indices (M,) of the first `count` points of each cell, in the cloud's order."""
+    ordered, indices = torch.sort(cells, stable=True)
     _, sizes = torch.unique_consecutive(ordered, return_counts=True)
     starts = torch.repeat_interleave(torch.cumsum(sizes, 0) - sizes, sizes)
     rank = torch.arange(len(cells), device=cells.device) - starts
-    return torch.sort(places[rank < count]).values
+    return torch.sort(indices[rank < count]).values

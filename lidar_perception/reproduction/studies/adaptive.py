@@ -16,27 +16,27 @@ from lidar_perception.reproduction.labelled import Labelled, nearest_seed
 from lidar_perception.reproduction.variants import NOTHING, Found, clusters_as_tall, study
 from lidar_perception.types import InputError
 
-MOST_STEPS = 8
+MAX_STEPS = 8
 FIRST_RANGE, METRES_A_STEP = 15.0, 7.5  # by range: a first step from here on, another each 7.5 m
 FULL_COUNT = 200                        # by points: a step each time they halve below this
-LEAST_FILL = 0.8                        # by fill: until the image is as full as 0.8 of the seed's
+MIN_FILL = 0.8                        # by fill: until the image is as full as 0.8 of the seed's
 
 
 def _copies(steps: np.ndarray) -> np.ndarray:
-    """(K, 1 + MOST_STEPS) scales of so many copies (K,) for each cluster; 1 adds none."""
-    k = np.arange(1 + MOST_STEPS)
+    """(K, 1 + MAX_STEPS) scales of so many copies (K,) for each cluster; 1 adds none."""
+    k = np.arange(1 + MAX_STEPS)
     scales = np.maximum(PAPER.cpa.min_scale, 1.0 - k * PAPER.cpa.decrement)
     return np.where(k <= steps[:, None], scales, 1.0)
 
 
 def by_range(ranges: np.ndarray) -> np.ndarray:
     """(K,) steps for horizontal ranges (K,) in metres."""
-    return np.clip(np.ceil((ranges - FIRST_RANGE) / METRES_A_STEP), 0, MOST_STEPS)
+    return np.clip(np.ceil((ranges - FIRST_RANGE) / METRES_A_STEP), 0, MAX_STEPS)
 
 
 def by_points(counts: np.ndarray) -> np.ndarray:
     """(K,) steps for clusters of so many points (K,)."""
-    return np.clip(np.ceil(np.log2(FULL_COUNT / np.maximum(counts, 1))), 0, MOST_STEPS)
+    return np.clip(np.ceil(np.log2(FULL_COUNT / np.maximum(counts, 1))), 0, MAX_STEPS)
 
 
 def find(labelled: Labelled, segments: Callable[[PipelineParams], Segmented]
@@ -64,12 +64,12 @@ def find(labelled: Labelled, segments: Callable[[PipelineParams], Segmented]
 
 def _by_fill(points: np.ndarray, start: np.ndarray, seed: Seed) -> np.ndarray:
     """(K,) the fewest steps after which a silhouette is as full as the seed's, nearly."""
-    wanted = LEAST_FILL * covered(seed.silhouette(PAPER)[None])[0] / (ROWS * COLUMNS)
+    wanted = MIN_FILL * covered(seed.silhouette(PAPER)[None])[0] / (ROWS * COLUMNS)
     clusters = len(start) - 1
     fill = np.stack([covered(silhouettes(points, start, _copies(np.full(clusters, steps))))
-                     for steps in range(MOST_STEPS + 1)]) / (ROWS * COLUMNS)
+                     for steps in range(MAX_STEPS + 1)]) / (ROWS * COLUMNS)
     enough = fill >= wanted
-    return np.where(enough.any(axis=0), enough.argmax(axis=0), MOST_STEPS)
+    return np.where(enough.any(axis=0), enough.argmax(axis=0), MAX_STEPS)
 
 
 NAMES = ("none", "2 in 15-30 m (the paper)", "by range", "by points", "by fill")

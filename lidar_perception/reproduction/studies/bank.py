@@ -8,7 +8,7 @@ import numpy as np
 
 from lidar_perception.candidates.seeds import MIN_POINTS, Seed
 from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.returns import measure
+from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.sensor import HDL64E, STILL
 from lidar_perception.simulation.shapes.people import pedestrian
 from lidar_perception.simulation.solids import place
@@ -32,7 +32,7 @@ def template_bank() -> dict[tuple[float, float], Seed]:
             solids = place(made, base, np.full(len(made), view), np.ones(len(made)),
                            np.zeros((len(made), 3)))
             hits = cast(solids, Ground(), UNDERGROUND, HDL64E, STILL)
-            xyz = measure(hits, HDL64E, STILL, np.random.default_rng(0)).xyz
+            xyz = returns_of(hits, HDL64E, STILL, np.random.default_rng(0)).xyz
             if len(xyz) >= MIN_POINTS:
                 bank[far, view] = Seed(xyz, -HDL64E.height, height)
     return bank

@@ -14,7 +14,7 @@ from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.reproduction.experiment import Experiment, Section
 from lidar_perception.reproduction.labelled import Labelled
-from lidar_perception.reproduction.variants import Found, by_settings, measure, sections
+from lidar_perception.reproduction.variants import Found, by_settings, measured_variants, sections
 
 SOURCES = {"ground_truth": "nearest truth", "automatic": "automatic seed", "file": "template"}
 VARIANTS = {f"{name}, {title}": with_values(params, {"seed.source": source})
@@ -43,5 +43,5 @@ def report(records: list[dict[str, Any]]) -> list[Section]:
 STUDY = Experiment(
     "configurations", "The configurations paper and best",
     "What does `best` gain, with the seed of the paper's protocol and without ground truth?",
-    functools.partial(measure, find), report,
+    functools.partial(measured_variants, find), report,
     {name: flatten(params) for name, params in VARIANTS.items()})

@@ -3,9 +3,9 @@ turned about z only or aligned with all principal axes."""
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.param_fields import with_values
-from lidar_perception.reproduction.variants import compare
+from lidar_perception.reproduction.variants import compared_variants
 
-STUDY = compare(
+STUDY = compared_variants(
     "geometry", "Silhouette geometry",
     "Should the window follow the cluster or have a fixed size, and the axes the yaw alone?",
     {f"{window}, {axis}": with_values(PAPER, {"stm.window": window, "stm.axis": axis,

@@ -2,7 +2,7 @@
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.param_fields import with_values
-from lidar_perception.reproduction.variants import compare
+from lidar_perception.reproduction.variants import compared_variants
 
 CPA = PAPER.cpa.steps
 
@@ -11,7 +11,7 @@ def _with(steps: int, dilations: int):
     return with_values(PAPER, {"cpa.steps": steps, "stm.dilations": dilations})
 
 
-STUDY = compare(
+STUDY = compared_variants(
     "morphology", "CPA against morphology",
     "What do CPA, a stronger dilation and both add to plain template matching?",
     {"none": _with(0, 1), "CPA (the paper)": _with(CPA, 1), "dilated twice": _with(0, 2),

@@ -48,9 +48,9 @@ class CameraObjects:
         """(K,) float64 height of the 2D boxes."""
         return self.image_boxes[:, 3] - self.image_boxes[:, 1]
 
-    def take(self, places: np.ndarray) -> CameraObjects:
-        """The objects at places (M,), with all regions."""
-        return CameraObjects(**{f.name: getattr(self, f.name).take(places, axis=0)
+    def take(self, indices: np.ndarray) -> CameraObjects:
+        """The objects at indices (M,), with all regions."""
+        return CameraObjects(**{f.name: getattr(self, f.name).take(indices, axis=0)
                                 for f in fields(self) if f.name != "regions"},
                              regions=self.regions)
 

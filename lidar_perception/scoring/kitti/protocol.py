@@ -28,9 +28,9 @@ METRICS = ("image", "bev", "3d")
 STRICT = {name: of.strict for name, of in DETECTED.items()}    # overlap needed for a hit
 RELAXED = {name: of.relaxed for name, of in DETECTED.items()}  # seen from above and in space
 DIFFICULTIES = ("easy", "moderate", "hard")
-LEAST_PIXELS = (40, 25, 25)        # height of the 2D box
-MOST_OCCLUDED = (0, 1, 2)
-MOST_TRUNCATED = (0.15, 0.3, 0.5)
+MIN_PIXELS = (40, 25, 25)        # height of the 2D box
+MAX_OCCLUDED = (0, 1, 2)
+MAX_TRUNCATED = (0.15, 0.3, 0.5)
 
 COUNTED, IGNORED, OTHER = 0, 1, -1
 
@@ -102,15 +102,15 @@ def true_states(objects: CameraObjects, name: str, difficulty: str) -> np.ndarra
     level = DIFFICULTIES.index(difficulty)
     own = objects.class_ids == CLASSES.index(name)
     like = objects.class_ids == CLASSES.index(NEIGHBOURS.get(name, name))
-    fit = ((objects.occluded <= MOST_OCCLUDED[level])
-           & (objects.truncated <= MOST_TRUNCATED[level])
-           & (objects.pixels_high >= LEAST_PIXELS[level]))
+    fit = ((objects.occluded <= MAX_OCCLUDED[level])
+           & (objects.truncated <= MAX_TRUNCATED[level])
+           & (objects.pixels_high >= MIN_PIXELS[level]))
     return np.where(own & fit, COUNTED, np.where(own | like, IGNORED, OTHER)).astype(np.int8)
 
 
 def found_states(objects: CameraObjects, name: str, difficulty: str) -> np.ndarray:
     """(K,) int8 COUNTED, IGNORED or OTHER of detections, for the class called name."""
-    low = objects.pixels_high < LEAST_PIXELS[DIFFICULTIES.index(difficulty)]
+    low = objects.pixels_high < MIN_PIXELS[DIFFICULTIES.index(difficulty)]
     own = objects.class_ids == CLASSES.index(name)
     return np.where(low, IGNORED, np.where(own, COUNTED, OTHER)).astype(np.int8)
 

@@ -27,7 +27,7 @@ DISTANCES = (0.5, 1.0, 2.0, 4.0)    # metres between centres, below which a dete
 ERROR_DISTANCE = 2.0                # of the hits whose errors are taken
 RECALLS = np.linspace(0.0, 1.0, 101)
 FIRST_RECALL = 11                   # the first place of RECALLS above the least recall of 0.1
-LEAST_PRECISION = 0.1
+MIN_PRECISION = 0.1
 AP_WEIGHT = 5                       # of mAP in NDS, beside one for each of ERRORS
 IN_RACKS = ("bicycle", "motorcycle")  # not counted inside a bicycle rack
 
@@ -79,14 +79,14 @@ def class_scores(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: 
     first = np.searchsorted(true_frames, np.arange(frames + 1))
     ap, errors = {}, {}
     for distance in DISTANCES:
-        places = _hits(found.centres, found_frames, truth.centres, first, distance)
-        precision, confidence = _curves(places >= 0, found.scores, len(truth))
-        above = np.maximum(precision[FIRST_RECALL:] - LEAST_PRECISION, 0)
-        ap[distance] = float(above.mean()) / (1 - LEAST_PRECISION)
+        indices = _hits(found.centres, found_frames, truth.centres, first, distance)
+        precision, confidence = _curves(indices >= 0, found.scores, len(truth))
+        above = np.maximum(precision[FIRST_RECALL:] - MIN_PRECISION, 0)
+        ap[distance] = float(above.mean()) / (1 - MIN_PRECISION)
         if distance == ERROR_DISTANCE:
-            hits = found[places >= 0]
+            hits = found[indices >= 0]
             errors = {error: _at_recalls(values, hits.scores, confidence) for error, values in
-                      hit_errors(truth[places[places >= 0]], hits, name in HALF_TURNS).items()}
+                      hit_errors(truth[indices[indices >= 0]], hits, name in HALF_TURNS).items()}
     errors |= dict.fromkeys(UNDEFINED.get(name, ()), math.nan)
     return ClassScores(len(truth), len(found), ap, errors)
 
@@ -95,7 +95,7 @@ def class_scores(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: 
 def _hits(centres, frames, true_centres, first, most):
     """(K,) int64 row of the object that each detection hits, -1 without one; detections by falling
     score, objects of frame f in rows first[f] .. first[f + 1]."""
-    places, taken = np.full(len(centres), -1), np.zeros(len(true_centres), np.bool_)
+    indices, taken = np.full(len(centres), -1), np.zeros(len(true_centres), np.bool_)
     for i in range(len(centres)):
         best, least = -1, np.inf
         for j in range(first[frames[i]], first[frames[i] + 1]):
@@ -104,8 +104,8 @@ def _hits(centres, frames, true_centres, first, most):
             if not taken[j] and away < least:
                 best, least = j, away
         if least < most:
-            places[i], taken[best] = best, True
-    return places
+            indices[i], taken[best] = best, True
+    return indices
 
 
 def _curves(hit: np.ndarray, scores: np.ndarray, objects: int) -> tuple[np.ndarray, np.ndarray]:

@@ -48,11 +48,11 @@ def hota_counts(frames: list[Pairs]) -> HotaCounts:
     """The counts of one sequence; its frames in order, as without_ignored gives them."""
     true_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.true_ids for f in frames)]))
     track_ids = np.unique(np.concatenate([np.zeros(0, np.int64), *(f.track_ids for f in frames)]))
-    places = [(np.searchsorted(true_ids, f.true_ids), np.searchsorted(track_ids, f.track_ids))
+    indices = [(np.searchsorted(true_ids, f.true_ids), np.searchsorted(track_ids, f.track_ids))
               for f in frames]
     together = np.zeros((len(true_ids), len(track_ids)))
     true_count, track_count = np.zeros((len(true_ids), 1)), np.zeros((1, len(track_ids)))
-    for f, (i, j) in zip(frames, places):
+    for f, (i, j) in zip(frames, indices):
         s = f.similarity
         either = s.sum(axis=0) + s.sum(axis=1)[:, None] - s
         together[np.ix_(i, j)] += np.divide(s, either, out=np.zeros_like(s), where=either > EPS)
@@ -61,7 +61,7 @@ def hota_counts(frames: list[Pairs]) -> HotaCounts:
     alignment = together / np.maximum(true_count + track_count - together, EPS)
     matches = np.zeros((len(ALPHAS), len(true_ids), len(track_ids)))
     located = _zeros()
-    for f, (i, j) in zip(frames, places):
+    for f, (i, j) in zip(frames, indices):
         # Pairs that nothing speaks for may match too; they are below every alpha.
         rows, columns = best_pairs(alignment[np.ix_(i, j)] * f.similarity)
         alike = f.similarity[rows, columns]

@@ -1,11 +1,11 @@
 """Simulated against real scans: what a scan, its labelled objects and the pipeline's results are
 like, side by side.
 
-    compare(measure(real, protocol), measure(simulated, protocol))
+    side_by_side(measured_scans(real, protocol), measured_scans(simulated, protocol))
 
 A bin of a curve is the median and the 10 and 90 % quantiles of its samples, the scans or objects.
 Two bins are compared by the ratio of their medians, simulated over real. A bin is judged if it has
-LEAST_SAMPLES real samples, and is right if its ratio is 0.8 .. 1.2; one without simulated samples
+MIN_SAMPLES real samples, and is right if its ratio is 0.8 .. 1.2; one without simulated samples
 is wrong. It is plausible if it is right or the simulated median lies in the 95 % interval of the
 real one: few real scans do not say more.
 """
@@ -36,8 +36,8 @@ from lidar_perception.simulation.realism.scan_statistics import (
 )
 from lidar_perception.types import InputError
 
-MOST_SCANS = 500  # of a folder that are compared; of a larger one, evenly spread
-LEAST_SAMPLES = 5
+MAX_SCANS = 500  # of a folder that are compared; of a larger one, evenly spread
+MIN_SAMPLES = 5
 WITHIN = (0.8, 1.2)
 
 
@@ -84,9 +84,9 @@ class Measured:
 
 
 def evenly(recording: Recording) -> list[Frame]:
-    """The frames of a recording, or an even choice of MOST_SCANS of them; InputError if no scan has
+    """The frames of a recording, or an even choice of MAX_SCANS of them; InputError if no scan has
     labels."""
-    count = min(len(recording), MOST_SCANS)
+    count = min(len(recording), MAX_SCANS)
     chosen = np.linspace(0, len(recording) - 1, count).astype(int)
     frames = [recording.frames[i] for i in chosen]
     if not any(map(_may_have_labels, frames)):
@@ -95,7 +95,7 @@ def evenly(recording: Recording) -> list[Frame]:
     return frames
 
 
-def measure(scans: Iterable[Frame], protocol: PipelineParams) -> Measured:
+def measured_scans(scans: Iterable[Frame], protocol: PipelineParams) -> Measured:
     """Every curve of the scans; those that cannot be read are skipped. InputError if all are."""
     measured = Measured()
     for frame in scans:
@@ -109,7 +109,7 @@ def measure(scans: Iterable[Frame], protocol: PipelineParams) -> Measured:
     return measured
 
 
-def compare(real: Measured, simulated: Measured) -> dict:
+def side_by_side(real: Measured, simulated: Measured) -> dict:
     """The curves side by side, as the JSON file holds them."""
     sides = {"real": real, "simulated": simulated}
     tables = {side: measured.report.compute() for side, measured in sides.items()}
@@ -152,7 +152,7 @@ def _may_have_labels(frame: Frame) -> bool:
 
 def _compared(curve: Curve, name: str, real: dict, simulated: dict) -> dict:
     value, within, plausible = ratio(simulated["median"], real["median"]), None, None
-    if real["n"] >= LEAST_SAMPLES and not curve.histogram:
+    if real["n"] >= MIN_SAMPLES and not curve.histogram:
         within = plausible = value is not None and WITHIN[0] <= value <= WITHIN[1]
         if simulated["n"]:
             off = abs(simulated["median"] - real["median"])

@@ -11,7 +11,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from lidar_perception.scoring.pictures import save_picture
-from lidar_perception.simulation.realism.compare import LEAST_SAMPLES, factor_off
+from lidar_perception.simulation.realism.compare import MIN_SAMPLES, factor_off
 from lidar_perception.simulation.realism.scan_statistics import CURVES
 
 WORST = 25
@@ -60,7 +60,7 @@ def _print_curves(content: dict, console: Console) -> None:
     unknown = sum(not curve["judged"] and not CURVES[name].histogram
                   for name, curve in content["curves"].items())
     table.caption = ("typical: the median factor between simulated and real. ratio: simulated / "
-                     f"real at the worst bin. {unknown} curves have no bin with {LEAST_SAMPLES} "
+                     f"real at the worst bin. {unknown} curves have no bin with {MIN_SAMPLES} "
                      "real samples.")
     console.print(table)
 
@@ -124,7 +124,7 @@ def draw_realism(path: Path, content: dict) -> None:
     for axes in grid.flat[len(content["curves"]):]:
         axes.set_visible(False)
     handles = [Patch(color=REAL, label="real"), Patch(color=SIMULATED, label="simulated"),
-               Patch(color="#eeeeee", label=f"fewer than {LEAST_SAMPLES} real samples"),
+               Patch(color="#eeeeee", label=f"fewer than {MIN_SAMPLES} real samples"),
                Patch(color=WRONG, label="red title: most bins are wrong")]
     figure.legend(handles=handles, loc="outside lower right", ncols=4, fontsize=13)
     figure.suptitle(f"{summary(content)}; {content['real']['scans']} real "

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 CELL = 1.0            # m
-LEAST_IN_CELL = 8     # points
-LEAST_GROUND = 0.6    # share of the points of a cell that must be low for it to be ground
+MIN_IN_CELL = 8     # points
+MIN_GROUND = 0.6    # share of the points of a cell that must be low for it to be ground
 DEEPEST, HIGHEST = 0.2, 0.35  # this share of a cell may be lower; low is up to so many m above
-LEAST_CELLS = 20      # of a range whose roughness is told
+MIN_CELLS = 20      # of a range whose roughness is told
 UPPER = 0.75          # of the cells; most are of the road, which is smooth
 EVEN = 1e-6           # m2, added to the scatter along x and y: a line of points has a plane, too
 
@@ -25,7 +25,7 @@ def scatter_of_cells(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low = points[first + (DEEPEST * (count - 1)).astype(int), 2]
     near = points[:, 2] < low[cell] + HIGHEST
     left = np.bincount(cell[near], minlength=len(count))
-    kept = (left >= LEAST_IN_CELL) & (left >= LEAST_GROUND * count)
+    kept = (left >= MIN_IN_CELL) & (left >= MIN_GROUND * count)
     points, cell = points[near & kept[cell]], cell[near & kept[cell]]
     left = left[kept]
     number = (np.cumsum(kept) - 1)[cell]
@@ -44,11 +44,11 @@ def scatter_of_cells(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def roughness(xyz: np.ndarray, limits: np.ndarray) -> np.ndarray:
     """(B,) UPPER quantile of the scatter of the cells in each range from limits (B + 1,) metres;
-    NaN where there are fewer than LEAST_CELLS."""
+    NaN where there are fewer than MIN_CELLS."""
     middle, scatter = scatter_of_cells(xyz)
     where = np.searchsorted(limits, np.hypot(*middle.T), side="right") - 1
     row = np.full(len(limits) - 1, np.nan)
     for i in range(len(row)):
-        if (where == i).sum() >= LEAST_CELLS:
+        if (where == i).sum() >= MIN_CELLS:
             row[i] = np.quantile(scatter[where == i], UPPER)
     return row

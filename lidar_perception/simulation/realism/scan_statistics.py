@@ -29,8 +29,8 @@ CLASSES = tuple(DETECTED)
 PERSON_HEIGHT = 1.7       # metres; the seed's height for the height filter of paper A's stage 1
 SECTORS, WHOLE = 36, 27   # of a turn; a scan with points in fewer is cropped to a camera's view
 MIN_POINTS = 5          # of an object whose extent or intensity is measured
-LEAST_IN_BIN = 50         # points of a scan in a range bin whose ground share is measured
-QUERIES, LEAST_QUERIES = 600, 10  # points in a range bin whose neighbour is measured
+MIN_IN_BIN = 50         # points of a scan in a range bin whose ground share is measured
+QUERIES, MIN_QUERIES = 600, 10  # points in a range bin whose neighbour is measured
 RANGES = np.array([0.0, 5, 10, 15, 20, 30, 40, 60, 80, np.inf])
 OBJECT_RANGES = np.array([0.0, 10, 20, 30, 45, 60])
 ELEVATIONS = np.arange(-26.0, 4.1, 2.0)
@@ -109,7 +109,7 @@ def scan_rows(frame: LidarFrame, params: PipelineParams = PipelineParams()) -> d
     person = height_matches(boxes, PERSON_HEIGHT, params.height)
     rows = {"scan points": [len(xyz)], "points": count,
             "elevation": np.histogram(elevation, ELEVATIONS)[0],
-            "ground share": np.where(count >= LEAST_IN_BIN, on_ground / np.maximum(count, 1),
+            "ground share": np.where(count >= MIN_IN_BIN, on_ground / np.maximum(count, 1),
                                      np.nan),
             "roughness": roughness(xyz, RANGES),
             "neighbour": _neighbours(xyz, where),
@@ -174,7 +174,7 @@ def _neighbours(xyz: np.ndarray, where: np.ndarray) -> np.ndarray:
     for i in range(len(row)):
         members = np.flatnonzero(where == i)
         chosen = members[np.linspace(0, len(members) - 1, min(len(members), QUERIES)).astype(int)]
-        if len(chosen) >= LEAST_QUERIES:
+        if len(chosen) >= MIN_QUERIES:
             row[i] = np.median(tree.query(xyz[chosen], k=2)[0][:, 1])
     return row
 

@@ -23,7 +23,7 @@ from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.scoring.points.clusters import labelled
-from lidar_perception.training.augment import Scene
+from lidar_perception.training.augment import TrainingScene
 from lidar_perception.types import CLASSES, LidarFrame
 
 AROUND = 0.3  # m: points so near to an object are looked at, too
@@ -79,7 +79,7 @@ class CutScenes:
         return self.cache / f"{hashlib.sha1(repr(made).encode()).hexdigest()[:12]}_{i:08}.npz"
 
 
-def cut(scene: Scene, config: PointNetConfig, min_points: int) -> CutScene:
+def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutScene:
     """The clusters of a scene, and after them the points around each object that is wanted."""
     frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
     ground = segment_ground(frame, config.ground)

@@ -37,7 +37,7 @@ from lidar_perception.detectors.view import visible
 from lidar_perception.scoring.detections import detected
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.training.augment import Scene, augmented, faced
+from lidar_perception.training.augment import TrainingScene, augmented, faced
 from lidar_perception.training.data import Batches, JudgedScenes, loaded
 from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
@@ -82,7 +82,7 @@ class Preparation:
     def __getstate__(self) -> dict:
         return {k: v for k, v in self.__dict__.items() if k != "_objects"}
 
-    def __call__(self, scene: Scene, rng: np.random.Generator) -> Sample:
+    def __call__(self, scene: TrainingScene, rng: np.random.Generator) -> Sample:
         """InputError if the network would see no point."""
         low, high = np.array(self.config.low), np.array(self.config.high)
         scene = faced(scene, self.augment, low, high, rng)
@@ -97,7 +97,7 @@ class Preparation:
         boxes, labels, counted = self._objects_to_find(scene, seen.xyz)
         return Sample(inputs.points, inputs.cluster_map, boxes, labels, counted)
 
-    def _objects_to_find(self, scene: Scene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
+    def _objects_to_find(self, scene: TrainingScene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
         low, high = np.array(self.config.low), np.array(self.config.high)
         names = [CLASSES[i] for i in scene.class_ids]
         labels = np.array([self._label(LIKE.get(name, name)) for name in names], np.int64)
@@ -165,7 +165,7 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
 
 
 def frame_to_judge(source: Any, i: int) -> Frame:
-    """Scene i of a source, read, to validate on. InputError naming the file that cannot be
+    """TrainingScene i of a source, read, to validate on. InputError naming the file that cannot be
     used."""
     frame = source.frame(i)
     return Frame.of(frame.name, frame.load(), frame.truth(), frame.calibration())
