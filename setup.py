@@ -3,13 +3,12 @@
 import sys
 from glob import glob
 from pathlib import Path
+from runpy import run_path
 
 from setuptools import find_packages, setup
 
 NAME = "lidar_perception"
-NODES = ["bag_player", "bag_recorder", "ground_segmentation", "clustering",
-         "candidate_refinement", "evaluator", "perception", "pointpillars_detector",
-         "pointnet_detector"]
+NODES = list(run_path("lidar_perception/nodes/__init__.py")["NODES"])
 
 
 def node_executables() -> list[str]:

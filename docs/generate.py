@@ -62,7 +62,7 @@ ALWAYS_OUT = [
 ]
 COLUMNS = "columns `ground` (uint8, 1 = ground) and `in_view` (uint8, 1 = processed)"
 
-NODES: dict[str, dict[str, Any]] = {
+PAGES: dict[str, dict[str, Any]] = {
     "ground_segmentation": dict(
         params=params.GroundNodeParams(),
         what="Marks the ground points of a cloud, by one plane, by Patchwork++ or by a cloth "
@@ -157,7 +157,7 @@ NODES: dict[str, dict[str, Any]] = {
 
 
 def page(name: str) -> str:
-    node = NODES[name]
+    node = PAGES[name]
     lines = [f"# {name}", "", node["what"], "",
              f"    ros2 run lidar_perception {name}      # or: lidar-perception run {name}", ""]
     for title, rows in (("Subscribes", node["inputs"]), ("Publishes", node["outputs"] + ALWAYS_OUT),
@@ -231,7 +231,7 @@ def _range(f: Any) -> str:
 
 if __name__ == "__main__":
     FOLDER.mkdir(exist_ok=True)
-    for name in NODES:
+    for name in PAGES:
         (FOLDER / f"{name}.md").write_text(page(name))
     BEST.write_text(best())
     POINTPILLARS.write_text(pointpillars())

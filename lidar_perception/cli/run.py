@@ -6,7 +6,8 @@ import sys
 
 import click
 
-from lidar_perception.nodes.main import NODES, run
+from lidar_perception.nodes import NODES
+from lidar_perception.nodes.main import run
 
 
 @click.command(context_settings=dict(ignore_unknown_options=True, allow_interspersed_args=False))

@@ -13,43 +13,18 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+from lidar_perception.nodes import NODES
 from lidar_perception.runs.threads import wait_asleep
 
 if TYPE_CHECKING:
     from lidar_perception.nodes.stopping import Stop
-
-NODES = {  # executable -> class; the module has the executable's name
-    "bag_player": "BagPlayer",
-    "bag_recorder": "BagRecorder",
-    "ground_segmentation": "GroundSegmentation",
-    "clustering": "Clustering",
-    "candidate_refinement": "CandidateRefinement",
-    "evaluator": "Evaluator",
-    "perception": "Perception",
-    "pointpillars_detector": "PointPillarsNode",
-    "pointnet_detector": "PointNetNode",
-}
-
-
-BOXES = "params.BoxNodeParams"
-PARAMS = {  # executable -> its parameters
-    "bag_player": ("params.PlayerParams",),
-    "bag_recorder": ("params.RecorderParams",),
-    "ground_segmentation": ("params.GroundNodeParams", "params.CloudNodeParams"),
-    "clustering": ("params.ClusteringNodeParams", BOXES),
-    "candidate_refinement": ("params.RefinementNodeParams", BOXES),
-    "evaluator": ("params.EvaluatorParams",),
-    "perception": ("candidates.params.PipelineParams", BOXES),
-    "pointpillars_detector": ("detectors.pointpillars.params.DetectorParams", BOXES),
-    "pointnet_detector": ("detectors.pointnet.params.PointNetDetectorParams", BOXES),
-}
 
 
 def node_parameters(name: str) -> dict[str, Any]:
     """Name of each parameter of a node -> its dataclass field, with the node's default."""
     from lidar_perception.param_fields import parameter_fields
     found: dict[str, Any] = {}
-    for path in PARAMS[name]:
+    for path in NODES[name][1:]:
         module, _, params = path.rpartition(".")
         made = getattr(importlib.import_module(f"lidar_perception.{module}"), params)()
         found |= parameter_fields(made)
@@ -128,7 +103,7 @@ def run(name: str, arguments: list[str]) -> int:
     if hasattr(module, "warm_up"):
         with one_at_a_time():
             module.warm_up()
-    return _spin(getattr(module, NODES[name]), rclpy, arguments, perf_counter() - begin, stop)
+    return _spin(getattr(module, NODES[name][0]), rclpy, arguments, perf_counter() - begin, stop)
 
 
 def _spin(node_class: type, rclpy, arguments: list[str], seconds: float, stop: Stop) -> int:

@@ -200,9 +200,11 @@ def test_more_copies_fill_a_silhouette_no_less():
 
 
 def test_precision_and_recall_and_reliability_by_hand():
-    precision, recall = confidence.precision_recall(np.array([1, 0, 1, 0]), 4)
+    precision, recall = confidence.precision_recall(np.array([0.1, 0.9, 0.8, 0.5]),
+                                                    np.array([0, 1, 0, 1]), 4)
     assert precision.tolist() == [1, 0.5, pytest.approx(2 / 3), 0.5]
     assert recall.tolist() == [0.25, 0.25, 0.5, 0.5]
+    assert confidence.precision_recall(np.ones(2), np.zeros(2), 3)[0].tolist() == []
     bins = confidence.reliability(np.array([0.05, 0.07, 0.95, 1.0]), np.array([0, 1, 1, 1]))
     assert bins[0] == (pytest.approx(0.06), 0.5, 2) and bins[9] == (pytest.approx(0.975), 1.0, 2)
     assert bins[5] == (None, None, 0)

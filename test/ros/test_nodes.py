@@ -14,8 +14,8 @@ from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.data.bag import Bag
+from lidar_perception.nodes import NODES
 from lidar_perception.nodes.inputs import Paired
-from lidar_perception.nodes.main import NODES
 from lidar_perception.nodes.runtime import LATCHED
 from lidar_perception.param_fields import flatten, parameter_fields
 from lidar_perception.wire.codec import bag_message

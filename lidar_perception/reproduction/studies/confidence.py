@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from sklearn.calibration import calibration_curve
+from sklearn.metrics import precision_recall_curve
 
 from lidar_perception.candidates.confidence import confidence, shape_features
 from lidar_perception.candidates.configurations import BEST, PAPER
@@ -67,8 +69,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
         scores, hits, frame = _flat([r["scored"][name] for r in records])
         estimates = _intervals(scores, hits, frame, truth)
         rows.append((name, *cells(estimates), str(int(hits.sum())), str(len(hits))))
-        precision, recall = precision_recall(hits[np.argsort(-scores, kind="stable")],
-                                             truth.sum())
+        precision, recall = precision_recall(scores, hits, truth.sum())
         curves.append(Line(name, tuple(100 * recall), tuple(100 * precision)))
         if name.startswith("confidence"):
             bins = reliability(scores, hits)
@@ -97,18 +98,24 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
                         (Panel("", "claimed [%]", "true [%]", tuple(lines)),)),))]
 
 
-def precision_recall(hits: np.ndarray, truth: float) -> tuple[np.ndarray, np.ndarray]:
-    """Precision and recall (D,) after each of the candidates, best first: hits (D,) 0 | 1."""
-    tp = np.cumsum(hits)
-    return tp / np.maximum(np.arange(1, len(hits) + 1), 1), tp / max(truth, 1)
+def precision_recall(scores: np.ndarray, hits: np.ndarray,
+                     truth: float) -> tuple[np.ndarray, np.ndarray]:
+    """Precision and recall (D,) at each of the D scores that there are, the highest first; hits
+    (N,) 0 | 1 of candidates with scores (N,), truth pedestrians."""
+    if not hits.any():
+        return np.zeros(0), np.zeros(0)
+    precision, recall, _ = precision_recall_curve(hits, scores)
+    return precision[-2::-1], recall[-2::-1] * hits.sum() / truth  # of all, not of those found
 
 
 def reliability(scores: np.ndarray, hits: np.ndarray) -> list[tuple]:
     """(mean score, share of hits, candidates) for each of BINS; None where there are none."""
-    place = np.clip(np.searchsorted(BINS, scores, side="right") - 1, 0, len(BINS) - 2)
-    count = np.bincount(place, minlength=len(BINS) - 1)
-    sums = (np.bincount(place, weights=w, minlength=len(BINS) - 1) for w in (scores, hits))
-    return [(a / n, b / n, int(n)) if n else (None, None, 0) for a, b, n in zip(*sums, count)]
+    if len(scores) == 0:
+        return [(None, None, 0)] * (len(BINS) - 1)
+    true, claimed = calibration_curve(hits, scores, n_bins=len(BINS) - 1)
+    count = np.bincount(np.searchsorted(BINS[1:-1], scores), minlength=len(BINS) - 1)
+    rows = zip(claimed.tolist(), true.tolist())  # of bins with candidates
+    return [(*next(rows), int(n)) if n else (None, None, 0) for n in count]
 
 
 def _flat(frames: list[list]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
