@@ -63,13 +63,13 @@ class PlainAb3dmot:
         self.frames = 0
         self.next = 1
 
-    def __call__(self, found: Detections, pose: np.ndarray | None = None
+    def __call__(self, detections: Detections, pose: np.ndarray | None = None
                  ) -> tuple[np.ndarray, Detections]:
         pose = np.eye(4) if pose is None else pose
         self.frames += 1
         ids, boxes, classes, scores = [], [], [], []
-        for kind in sorted({*self.tracks, *found.class_ids.tolist()}):
-            for track in self._of_class(kind, found[found.class_ids == kind], pose):
+        for kind in sorted({*self.tracks, *detections.class_ids.tolist()}):
+            for track in self._of_class(kind, detections[detections.class_ids == kind], pose):
                 ids.append(track.number)
                 boxes.append(_moved(track.state[[0, 1, 2, 4, 5, 6, 3]], np.linalg.inv(pose)))
                 classes.append(kind)
@@ -77,9 +77,10 @@ class PlainAb3dmot:
         return np.array(ids, int), Detections.of(np.reshape(boxes, (-1, 7)),
                                                  np.array(classes, int), np.array(scores))
 
-    def _of_class(self, kind: int, found: Detections, pose: np.ndarray) -> list[_Track]:
+    def _of_class(self, kind: int, detections: Detections, pose: np.ndarray) -> list[_Track]:
         tracks = self.tracks.setdefault(kind, [])
-        measured = [_moved(box.astype(float), pose)[[0, 1, 2, 6, 3, 4, 5]] for box in found.boxes]
+        moved = (_moved(box.astype(float), pose) for box in detections.boxes)
+        measured = [box[[0, 1, 2, 6, 3, 4, 5]] for box in moved]
         for track in tracks:
             track.predict()
         gate, free = GATES.get(CLASSES[kind], OTHER_GATE), set(range(len(measured)))
@@ -88,11 +89,11 @@ class PlainAb3dmot:
                                  for m in measured])
             for i, j in zip(*linear_sum_assignment(distance)):
                 if distance[i, j] <= gate:
-                    tracks[j].update(measured[i], float(found.scores[i]))
+                    tracks[j].update(measured[i], float(detections.scores[i]))
                     free.discard(int(i))
         for i in sorted(free):
             tracks.append(_Track(self.next, np.append(measured[i], np.zeros(3)),
-                                 float(found.scores[i])))
+                                 float(detections.scores[i])))
             self.next += 1
         self.tracks[kind] = [t for t in tracks if t.age < MAX_AGE]
         return [t for t in self.tracks[kind] if t.hits >= MIN_HITS or self.frames <= MIN_HITS]

@@ -35,16 +35,16 @@ def levelled(frame: LidarFrame, pose: SensorPoseParams) -> LidarFrame:
     return replace(frame, xyz=xyz + np.array([0, 0, shift], np.float32) if shift else xyz)
 
 
-def in_sensor_frame(found: Detections, pose: SensorPoseParams) -> Detections:
+def in_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detections:
     """Boxes as from a level sensor at SENSOR_HEIGHT, to those of a sensor with this pose."""
-    boxes = found.boxes.copy()
+    boxes = detections.boxes.copy()
     boxes[:, 2] -= pose.height - SENSOR_HEIGHT
     if pose.roll or pose.pitch:
         back = level(np.eye(3, dtype=np.float32), pose).T
         heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], axis=1) @ back[:2]
         boxes[:, :3] = boxes[:, :3] @ back
         boxes[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
-    return Detections(boxes, found.class_ids, found.scores)
+    return Detections(boxes, detections.class_ids, detections.scores)
 
 
 def with_intensity_scaled(frame: LidarFrame, factor: float) -> LidarFrame:

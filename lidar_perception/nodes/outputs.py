@@ -81,12 +81,13 @@ class DetectionOutputs:
         self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE)
                            for step in steps}
 
-    def publish(self, header: Any, found: Detections, ms: Mapping[str, float]) -> None:
-        """Publish what was found, and the times of the steps that are known."""
-        self.markers.publish(header, found)
+    def publish(self, header: Any, detections: Detections, ms: Mapping[str, float]) -> None:
+        """Publish detections, and the times of the steps that are known."""
+        self.markers.publish(header, detections)
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             self.detections_3d.publish(to_detection_array(
-                found.boxes, [CLASSES[i] for i in found.class_ids], found.scores, make=ros_message,
+                detections.boxes, [CLASSES[i] for i in detections.class_ids], detections.scores,
+                make=ros_message,
                 header=header_message(to_ns(header.stamp), header.frame_id, ros_message)))
         for step, publisher in self.step_times.items():
             if step in ms:

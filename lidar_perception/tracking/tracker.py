@@ -42,7 +42,7 @@ class Tracker:
         self.ended += len(self._states)
         self._states, self._ego, self._stamp = States.none(), Ego.unknown(), None
 
-    def __call__(self, found: Detections, stamp_ns: int = 0,
+    def __call__(self, detections: Detections, stamp_ns: int = 0,
                  pose: np.ndarray | None = None) -> Tracks:
         """The tracks after the frame of stamp_ns, 0 where it has none, whose detections these are,
         in the sensor's frame; pose (4, 4) of the sensor in a fixed frame, None where unknown.
@@ -56,7 +56,7 @@ class Tracker:
         if seconds is None:
             return self._reported(np.zeros(len(self._states), bool))
         self._move_ego(pose, seconds)
-        boxes, class_ids, scores = self._usable(found)
+        boxes, class_ids, scores = self._usable(detections)
         boxes = moved_boxes(boxes, self._ego.pose)
         states = predicted(self._states, seconds, self.params)
         i, j = matched(states, boxes, class_ids, scores, self.params)
@@ -126,14 +126,14 @@ class Tracker:
                             "before")
         self._ego = next_ego(self._ego, given, seconds, self.params.max_ego_gap)
 
-    def _usable(self, found: Detections) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _usable(self, detections: Detections) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Boxes (K, 7), class ids (K,), scores (K,), float64, the best max_detections."""
-        boxes, scores = found.boxes.astype(np.float64), found.scores.astype(np.float64)
+        boxes, scores = detections.boxes.astype(np.float64), detections.scores.astype(np.float64)
         with np.errstate(invalid="ignore"):
             good = (np.isfinite(boxes).all(axis=1) & np.isfinite(scores)
                     & (boxes[:, 3:6] > 0).all(axis=1)
                     & (np.abs(boxes[:, :6]) <= MAX_RANGE).all(axis=1)
-                    & (found.class_ids >= 0) & (found.class_ids < len(CLASSES)))
+                    & (detections.class_ids >= 0) & (detections.class_ids < len(CLASSES)))
         if not good.all():
             self.problem = (f"{(~good).sum()} of {len(good)} detections are no boxes (not finite, "
                             "or without a size) and are left out")
@@ -143,7 +143,7 @@ class Tracker:
                             f"{self.params.max_detections} are taken")
             indices = np.sort(indices[np.argsort(-scores[indices], kind="stable")[
                 :self.params.max_detections]])
-        return boxes[indices], found.class_ids[indices], np.clip(scores[indices], 0.0, 1.0)
+        return boxes[indices], detections.class_ids[indices], np.clip(scores[indices], 0.0, 1.0)
 
     def _reported(self, seen: np.ndarray) -> Tracks:
         return _in_sensor_frame(self._states, self._ego, seen, self.params)

@@ -20,19 +20,19 @@ META = {"use_camera": False, "use_lidar": True, "use_radar": False, "use_map": F
         "use_external": True}
 
 
-def to_results(found: Detections, frame: Frame) -> GlobalBoxes:
+def to_results(detections: Detections, frame: Frame) -> GlobalBoxes:
     """Detections of a frame as nuScenes has them, without a velocity and an attribute. Only the
     classes in DETECTED, and the best MAX_BOXES of them. InputError for numbers that are not
     finite."""
-    if not (np.isfinite(found.boxes).all() and np.isfinite(found.scores).all()):
+    if not (np.isfinite(detections.boxes).all() and np.isfinite(detections.scores).all()):
         raise InputError(f"{frame.name}: a box or score of the detector is not finite; its weights "
                          "or its input are broken")
     kinds = np.array([NAMES.index(DETECTED[name]) if name in DETECTED else -1 for name in CLASSES])
-    kinds = kinds[found.class_ids]
+    kinds = kinds[detections.class_ids]
     chosen = np.flatnonzero(kinds >= 0)
-    chosen = chosen[np.argsort(-found.scores[chosen], kind="stable")][:MAX_BOXES]
-    return GlobalBoxes.of(*in_global(found.boxes[chosen], frame.native.pose), kinds[chosen],
-                          scores=found.scores[chosen])
+    chosen = chosen[np.argsort(-detections.scores[chosen], kind="stable")][:MAX_BOXES]
+    return GlobalBoxes.of(*in_global(detections.boxes[chosen], frame.native.pose), kinds[chosen],
+                          scores=detections.scores[chosen])
 
 
 def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:

@@ -28,16 +28,17 @@ def known(judge: PointNetDetector, class_ids: np.ndarray) -> np.ndarray:
     return np.isin(class_ids, [CLASSES.index(name) for name in judge.config.classes])
 
 
-def judged(judge: PointNetDetector, found: Detections, clusters: Clusters, weight: float,
+def judged(judge: PointNetDetector, detections: Detections, clusters: Clusters, weight: float,
            pose: SensorPoseParams = SensorPoseParams()) -> tuple[Detections, np.ndarray]:
-    """found with combined scores, and boxes (K, 7) float32 as the network makes them out, in the
-    sensor's frame; K may be 0.
+    """The detections with combined scores, and boxes (K, 7) float32 as the network makes them out,
+    in the sensor's frame; K may be 0.
 
-    found: detections of classes that are known, detection i of the points of cluster i, which are
-    those of seen_by. Each is judged by itself.
+    detections: of classes that are known, detection i of the points of cluster i, which are those
+    of seen_by. Each is judged by itself.
     """
-    kinds = np.array([judge.config.classes.index(CLASSES[i]) for i in found.class_ids], np.int64)
+    names = [CLASSES[i] for i in detections.class_ids]
+    kinds = np.array([*map(judge.config.classes.index, names)], np.int64)
     seen = judge.guarded(lambda: predict(judge.network, clusters, kinds=kinds))
-    scores = combined(found.scores, seen.scores.astype(np.float32), weight)
+    scores = combined(detections.scores, seen.scores.astype(np.float32), weight)
     boxes = in_sensor_frame(Detections.of(seen.boxes), pose).boxes
-    return Detections.of(found.boxes, found.class_ids, scores), boxes
+    return Detections.of(detections.boxes, detections.class_ids, scores), boxes

@@ -48,10 +48,10 @@ class Pairs:
     overlap: np.ndarray
 
 
-def tracked_labels(ids: np.ndarray, found: Detections) -> GroundTruth:
+def tracked_labels(ids: np.ndarray, detections: Detections) -> GroundTruth:
     """Tracks with ids (K,) as labels with track_id and score."""
-    return GroundTruth.of(found.boxes, found.class_ids, [
-        {"track_id": int(i), "score": float(s)} for i, s in zip(ids, found.scores)])
+    return GroundTruth.of(detections.boxes, detections.class_ids, [
+        {"track_id": int(i), "score": float(s)} for i, s in zip(ids, detections.scores)])
 
 
 def pairs_of(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration | None,
