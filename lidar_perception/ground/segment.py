@@ -56,7 +56,7 @@ def level(xyz: np.ndarray, pose: SensorPoseParams) -> np.ndarray:
 
 def measured_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPoseParams()) -> float | None:
     """Metres of the sensor above the plane that holds most of the points (N, 3) around it;
-    negative if that is overhead, as for a sensor that hangs upside down. None where there is no
+    negative if that is overhead, as for a sensor mounted upside down. None where there is no
     such plane."""
     xyz = level(xyz, pose)
     square = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
@@ -74,7 +74,7 @@ def height_problem(measured: float | None, pose: SensorPoseParams) -> str | None
     if measured is None or abs(measured - pose.height) <= HEIGHT_TOLERANCE:
         return None
     if measured < 0:
-        return (f"the ground seems to be {-measured:.2f} m above the sensor; if it hangs upside "
-                "down, set ground.sensor_pose.roll to 3.1416")
+        return (f"the ground seems to be {-measured:.2f} m above the sensor; if it is mounted "
+                "upside down, set ground.sensor_pose.roll to 3.1416")
     return (f"the sensor is {measured:.2f} m above the ground but ground.sensor_pose.height is "
             f"{pose.height:g}; set it to {measured:.2f}")
