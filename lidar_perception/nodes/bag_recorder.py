@@ -15,6 +15,7 @@ from lidar_perception.types import InputError
 from lidar_perception.wire.codec import typestore
 from msg_utils.messages import message_class
 
+DEPTH = 100  # messages of a topic that may wait while the machine is busy, before any is lost
 DISCOVERY_PERIOD = 0.2  # seconds between looks for the type of a topic that is not there yet
 
 
@@ -54,7 +55,8 @@ class BagRecorder(LidarNode):
             self.queue.put(("topic", topic, types[topic][0],
                             LATCHED_QOS if latched else SENSOR_QOS))
             self._subscribe(topic, message_class(types[topic][0]),
-                            LATCHED if latched else RELIABLE if reliable else SENSOR_DATA)
+                            LATCHED if latched else QoSProfile(depth=DEPTH, reliability=(
+                                RELIABLE if reliable else SENSOR_DATA).reliability))
         if self.waiting:
             self.report(WARN, f"waiting for {', '.join(self.waiting)}", expected=True)
         else:

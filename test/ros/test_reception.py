@@ -134,8 +134,9 @@ def test_two_sensors_in_namespaces(processes, peer):
         peer.send(talker, cloud(street, stamp), lambda s=side: found[s], f"the result of {side}")
         assert {to_ns(m.markers[0].header.stamp) for m in found[side]} == {stamp}
         assert found[side][0].markers[0].lifetime.sec == 2  # and then a dead node's boxes go
-    assert all(peer.diagnostics[f"{side}/{node}"].hardware_id in (side, f"{side}/lidar")
-               for side in talkers for node in STAGES)
+    own = {f"{side}/{node}": (side, f"{side}/lidar") for side in talkers for node in STAGES}
+    peer.wait(lambda: own.keys() <= peer.diagnostics.keys(), "diagnostics of all")
+    assert all(peer.diagnostics[name].hardware_id in ids for name, ids in own.items())
     peer.wait(lambda: all(peer.diagnostics[f"{side}/clustering"].hardware_id == f"{side}/lidar"
                           for side in talkers), "the sensors' frames")
     names = {name for name, _ in peer.node.get_topic_names_and_types()}
