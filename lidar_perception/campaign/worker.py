@@ -161,7 +161,7 @@ def _serve(part: str, limits: Limits, folder: Path, quiet: bool, connection: Con
 
 def _measured(attempt: Any, case: Case, limits: Limits) -> Outcome:
     """The outcome, with its time and memory, which may make it a failure."""
-    held, begin = _memory_mb("VmRSS", reset=True), monotonic()
+    held, begin = memory_mb("VmRSS", reset=True), monotonic()
     try:
         outcome = attempt(case)
     except Exception as error:
@@ -170,7 +170,7 @@ def _measured(attempt: Any, case: Case, limits: Limits) -> Outcome:
         outcome = Outcome(FAILED, f"{type(error).__name__}: {error} "
                           f"({Path(last.filename).name}:{last.lineno})")
     sys.stderr.flush()
-    taken = max(0.0, _memory_mb("VmHWM") - held)
+    taken = max(0.0, memory_mb("VmHWM") - held)
     outcome = replace(outcome, seconds=monotonic() - begin, megabytes=taken)
     if 0 < limits.megabytes < taken and outcome.verdict != FAILED:
         return replace(outcome, verdict=FAILED, reason=f"took {taken:.0f} MB, more than "
@@ -178,7 +178,7 @@ def _measured(attempt: Any, case: Case, limits: Limits) -> Outcome:
     return outcome
 
 
-def _memory_mb(name: str, reset: bool = False) -> float:
+def memory_mb(name: str, reset: bool = False) -> float:
     """Of this process, as Linux calls it: VmRSS now, VmHWM at most since the last reset; 0 where
     there is no /proc."""
     try:

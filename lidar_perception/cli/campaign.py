@@ -7,6 +7,7 @@ import tempfile
 from pathlib import Path
 
 import click
+from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
@@ -68,14 +69,13 @@ def campaign(minutes: float, seed: int, only: tuple[str, ...], cases: int | None
 
 
 def _print(tallies: list[Tally]) -> None:
-    table = Table()
-    for name in ("part", "tried", SURVIVED, REFUSED, FAILED, SKIPPED, "seconds", "slowest case",
-                 "most memory"):
+    table = Table(box=SIMPLE_HEAD)
+    for name in ("part", "tried", SURVIVED, REFUSED, FAILED, SKIPPED, "s", "slowest", "MB"):
         table.add_column(name, justify="left" if name == "part" else "right")
     for t in tallies:
         table.add_row(t.part, f"{t.tried:,}", *(f"{t.verdicts[v]:,}" for v in (
             SURVIVED, REFUSED, FAILED, SKIPPED)), f"{t.seconds:.0f}", f"{t.slowest:.1f} s",
-            f"{t.largest:.0f} MB")
+            f"{t.largest:.0f}")
     console.print(table)
     for t in tallies:
         for name, figures in t.figures.items():
