@@ -58,17 +58,18 @@ class MarkerParams(Params):
 
 
 @dataclass(frozen=True)
-class CloudNodeParams:
+class CloudNodeParams(Params):
     """What a node that takes clouds has besides the numbers of its algorithm."""
 
     input: ReceptionParams = ReceptionParams()
+    autostart: bool = param(True, "Configure and activate at the start. false: a lifecycle manager "
+                            "does, as Nav2's, or `ros2 lifecycle`.", fixed=True)
 
 
 @dataclass(frozen=True)
-class BoxNodeParams:
+class BoxNodeParams(CloudNodeParams):
     """What a node that makes boxes of clouds has besides the numbers of its algorithm."""
 
-    input: ReceptionParams = ReceptionParams()
     output: MarkerParams = MarkerParams()
 
 

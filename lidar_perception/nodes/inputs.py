@@ -126,6 +126,17 @@ class SeedInput:
         node.input("ground_truth", MARKERS, self._on_truth, RELIABLE)
         node.input(relative(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE,
                    private=False)
+        node.inputs.append(self)
+        if self.params.source in ("file", "automatic"):
+            self._template()  # a missing one is known before the first cloud
+
+    def open(self) -> None:
+        """The node is active."""
+
+    def close(self) -> None:
+        """The node is not active any more: what waits is too old when it is again."""
+        self.paired.clouds.clear()
+        self.paired.partners.clear()
 
     @property
     def params(self) -> SeedParams:
@@ -137,11 +148,14 @@ class SeedInput:
         elif self.params.source == "click":
             self.deliver(msg, partial(self._from_click, msg.header.frame_id))
         else:
-            if self.loaded is None or self.loaded[0] != self.params.file:
-                self.loaded = (self.params.file, load_seed(self.params.file))
-            template = self.loaded[1]
+            template = self._template()
             self.deliver(msg, fixed_seed(template) if self.params.source == "file"
                          else automatic_seed(template, self.node.params))
+
+    def _template(self) -> Seed:
+        if self.loaded is None or self.loaded[0] != self.params.file:
+            self.loaded = (self.params.file, load_seed(self.params.file))
+        return self.loaded[1]
 
     def _on_truth(self, msg: Any) -> None:
         objects = from_marker_array(msg)

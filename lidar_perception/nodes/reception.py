@@ -35,7 +35,7 @@ class Arrivals:
     way, or, where the queue was full, what a newer cloud has pushed out of it.
     """
 
-    def __init__(self, depth: int):
+    def __init__(self, depth: int = DEPTH):
         self.depth = depth
         self.sent = self.dropped = self.lost = 0
         self.sequence: int | None = None  # of the last cloud
@@ -64,6 +64,12 @@ class Arrivals:
             intervals = np.diff(np.array(self.stamps, float), axis=0)
             period = np.median(intervals[:, 1] / intervals[:, 0])
             self.learned = 1e9 / period if period > 0 else None
+
+    def interrupted(self, dropped: int) -> None:
+        """Nothing is taken for a while; dropped is how many were waiting."""
+        self.dropped += dropped
+        self.sequence = None
+        self.stamps.clear()
 
     def recent(self) -> tuple[int, int, int]:
         """Of the last SHARE_OF sent, or of more where one gap was longer: how many that are, how
@@ -102,9 +108,21 @@ class Reception:
         self.go_on = node.create_guard_condition(self._deliver_one)
         self.look_again = node.create_guard_condition(self.adapt)
         self.last_time: float | None = None  # monotonic, of the last cloud
+        self.subscription: Any = None
+        self.arrivals = Arrivals()
+
+    def open(self) -> None:
+        """Subscribe."""
         self.subscription = self._subscribe()
-        self.arrivals = Arrivals(self.subscription.qos_profile.depth)
+        self.arrivals.depth = self.subscription.qos_profile.depth
         self.adapt()
+
+    def close(self) -> None:
+        """End the subscription. What waits is dropped; what is sent meanwhile is not missed."""
+        self.node.destroy_subscription(self.subscription)
+        self.subscription, self.last_time = None, None
+        self.arrivals.interrupted(len(self.waiting))
+        self.waiting.clear()
 
     def _subscribe(self) -> Any:
         kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH]
@@ -122,6 +140,8 @@ class Reception:
 
     def adapt(self) -> None:
         """Subscribe again if the publishers offer something else than before."""
+        if self.subscription is None:
+            return
         wanted = self.params().reliability
         offered = {info.qos_profile.reliability for info in self.publishers()}
         if wanted == "auto" and offered:
@@ -165,6 +185,8 @@ class Reception:
 
     def values(self) -> dict[str, Any]:
         """For the diagnostics."""
+        if self.subscription is None:
+            return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped}
         rate, learned = self.arrivals.rate(), self.params().rate or self.arrivals.learned
         return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped,
                 "reliability": self._how(),
@@ -173,6 +195,8 @@ class Reception:
 
     def problems(self) -> list[Problem]:
         """What is wrong with the topic now, each with its remedy."""
+        if self.subscription is None:
+            return []
         found, params = [], self.params()
         publishers = self.publishers()
         if len(publishers) > 1:
