@@ -34,7 +34,7 @@ class GroundSegmentation(ManagedNode):
         self.points = self.output("points", CLOUD)
         self.ground = self.output("ground", CLOUD)
         self.nonground = self.output("nonground", CLOUD)
-        self.input("points", CLOUD, self.on_points)
+        self.input("points", CLOUD, self.on_points, needs=self.camera.missing)
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):

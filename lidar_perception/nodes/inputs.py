@@ -33,6 +33,7 @@ class CameraInput:
     """The camera from ~/input/camera_info and ~/input/extrinsics, or from /tf_static."""
 
     def __init__(self, node: LidarNode):
+        self.node = node
         self.info: Any = None
         self.transforms: dict[tuple[str, str], Any] = {}
         self.cameras: dict[str, Camera] = {}  # by LiDAR frame
@@ -51,6 +52,13 @@ class CameraInput:
     def _on_transform(self, msg: Any) -> None:
         self.transforms[msg.header.frame_id, msg.child_frame_id] = msg
         self.cameras.clear()
+
+    def missing(self, cloud: Any) -> str | None:
+        """What a cloud waits for; None if it can be cropped, or is not to be."""
+        params = self.node.params.view
+        if not params.enabled or self.get(cloud.header.frame_id, params) is not None:
+            return None
+        return "the camera's calibration: CameraInfo, and the transform from the LiDAR"
 
     def get(self, lidar_frame: str, params: ViewParams) -> Camera | None:
         """The camera as seen from lidar_frame; None until both messages are there, and while the

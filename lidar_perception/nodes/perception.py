@@ -37,7 +37,7 @@ class Perception(ManagedNode):
         self.points = self.output("points", CLOUD)
         self.boxes = ClusterBoxes(self)
         self.seed = SeedInput(self, self.on_cloud)
-        self.input("points", CLOUD, self.seed.add_cloud)
+        self.input("points", CLOUD, self.seed.add_cloud, needs=self.camera.missing)
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):

@@ -95,26 +95,35 @@ class LidarNode(Node):
         return SetParametersResult(successful=True)
 
     def input(self, topic: str, type_name: str, callback: Callable,
-              qos: QoSProfile | None = None, private: bool = True) -> None:
+              qos: QoSProfile | None = None, private: bool = True,
+              needs: Callable[[Any], str | None] = lambda _: None) -> None:
         """Subscribe to ~/input/TOPIC, or with private=False to the name as it is. callback gets
         rosbags' class of the message, the one that offline code reads from bags: it views the
         received bytes, where rclpy's own class copies them several times. Without qos the topic
-        is received as reception.py does."""
+        is received as reception.py does: needs says what a cloud still waits for, which comes by
+        another input, and None if nothing."""
         name = f"~/input/{topic}" if private else topic
         _warm_up_type(type_name)
 
-        def guarded(data: bytes) -> None:
+        def guarded(data: bytes, patient: bool = False) -> str | None:
+            missing = None
             try:
                 msg = decode(data, type_name)
                 if type_name == CLOUD:
                     self.frame_id = msg.header.frame_id
-                callback(msg)
+                missing = needs(msg)
+                if missing is None or not patient:
+                    callback(msg)
             except InputError as error:
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {error}")
             except Exception as error:
                 self.get_logger().error(traceback.format_exc())
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {type(error).__name__}: "
                             f"{error}; this is a bug, please report it with the message")
+            if qos is not None:
+                for reception in self._receptions():
+                    reception.try_again()
+            return missing
 
         def lost(event: Any) -> None:
             self.counts["lost"] += event.total_count_change
@@ -220,6 +229,7 @@ class LidarNode(Node):
     def _tick(self) -> None:
         for reception in self._receptions():
             reception.adapt()  # where the middleware has no events that say so
+            reception.try_again()
         self.publish_diagnostics()
 
     def spin(self, executor: Executor) -> None:
