@@ -51,8 +51,9 @@ class Said:
             return Outcome(FAILED, f"traceback: {last}")
         if self.code == 0:
             return Outcome(SURVIVED)
-        if self.code == 1 and (lines or self.out.strip()):
-            return Outcome(REFUSED, f"exit code 1: {last or self.out.strip().splitlines()[-1]}")
+        said = [line for line in self.out.splitlines() if line.strip()] or lines
+        if self.code == 1 and said:
+            return Outcome(REFUSED, f"exit code 1: {said[-1]}")
         if self.code == 2 and last.startswith("Error: "):
             return Outcome(REFUSED, last.removeprefix("Error: "))
         return Outcome(FAILED, f"exit code {self.code} without one line that says why: {last}")

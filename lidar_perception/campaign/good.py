@@ -12,12 +12,7 @@ from lidar_perception.campaign.mutation import FLOATS, INTEGERS, mutate_message
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, Detections, GroundTruth
 from lidar_perception.wire.codec import bag_message, decode, encode
-from lidar_perception.wire.messages import (
-    camera_info,
-    detection_markers,
-    extrinsics,
-    truth_markers,
-)
+from lidar_perception.wire.messages import camera_info, detection_markers, extrinsics, truth_markers
 from msg_utils.point_cloud2 import CloudError, add_columns, from_array, to_array
 from msg_utils.stamps import header_message
 

@@ -15,15 +15,7 @@ from rclpy.context import Context
 from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
-from lidar_perception.campaign.case import (
-    FAILED,
-    REFUSED,
-    SURVIVED,
-    Case,
-    Outcome,
-    generator,
-    pick,
-)
+from lidar_perception.campaign.case import FAILED, REFUSED, SURVIVED, Case, Outcome, generator, pick
 from lidar_perception.campaign.good import CLOUD, good, mutated
 from lidar_perception.campaign.mutation import mutate_bytes
 from lidar_perception.candidates.warm_up import warm_up
@@ -59,8 +51,9 @@ TRIED: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
             ("automatic", "l_shape", True), ("click", "axis_aligned", True))]),
     "perception": (24, POINTS | CAMERA | SEED, [
         {"seed.source": source, "view.enabled": view, "stm.window": window}
-        for source, view, window in (("ground_truth", True, "stretched"), ("file", False, "stretched"),
-                                     ("automatic", False, "metric"), ("click", False, "metric"))]),
+        for source, view, window in (
+            ("ground_truth", True, "stretched"), ("file", False, "stretched"),
+            ("automatic", False, "metric"), ("click", False, "metric"))]),
     "evaluator": (8, {"input/ground_truth": MARKERS, "input/final": MARKERS}, [{}]),
     "pointnet_detector": (0.5, POINTS, [{}]),
     "pointpillars_detector": (0.2, POINTS, [{}]),
@@ -123,15 +116,15 @@ class Tried:
     def attempt(self, case: Case) -> Outcome:
         """Deliver the messages that the case needs beside its own, its own, and perhaps a good
         one."""
-        self._set(case.settings["params"])
+        self.set(case.settings["params"])
         topic, beside = case.settings["topic"], [t for t in self.inputs if t != "input/points"]
         for other in beside:
             if other != topic:
                 self.calls[other](good(self.inputs[other]))
-        said = [self._deliver(topic, case.data)]
+        said = [self.deliver(topic, case.data)]
         if case.settings["then_good"]:
-            said += [self._deliver(t, good(self.inputs[t])) for t in [topic, *self.inputs]]
-        for level, message in said:
+            said += [self.deliver(t, good(self.inputs[t])) for t in [topic, *self.inputs]]
+        for _, message in said:
             if BUG in message:
                 return Outcome(FAILED, message)
         if (problem := self._unsound()) is not None:
@@ -141,7 +134,8 @@ class Tried:
             return Outcome(FAILED, f"a good message was refused after it: {said[-1][1]}")
         return Outcome(REFUSED, message) if level == ERROR else Outcome(SURVIVED)
 
-    def _set(self, params: dict[str, Any]) -> None:
+    def set(self, params: dict[str, Any]) -> None:
+        """Change parameters of the node, as at run time."""
         if params != self.params:
             for result in self.node.set_parameters(
                     [Parameter(name, value=value) for name, value in params.items()]):
@@ -149,7 +143,8 @@ class Tried:
                     raise InputError(result.reason)
             self.params = params
 
-    def _deliver(self, topic: str, data: bytes) -> tuple[bytes, str]:
+    def deliver(self, topic: str, data: bytes) -> tuple[bytes, str]:
+        """The level and message of the diagnostics after a message, which starts from OK."""
         if topic == "input/points":
             self.sent.clear()
         self.node.state = (OK, "")
