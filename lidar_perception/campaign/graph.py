@@ -108,7 +108,7 @@ class Graph:
             for topic, kind in TOPICS.items():
                 self.send(topic, stamped(good(kind), stamp) if kind == CLOUD else
                           markers(True, stamp) if kind == MARKERS else good(kind))
-            self.outside.until(lambda: not waiting, 0.7)
+            self.spin(0.7)
             waiting -= {name for name in waiting if name in self.outside.diagnostics and (
                 name in SPEAKING or self.outside.value_of(name, "last_stamp_ns") in stamps)}
 

@@ -21,6 +21,7 @@ from lidar_perception.campaign.mutation import mutate_bytes
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.graph import private_domain
+from lidar_perception.nodes.reception import Reception
 from lidar_perception.nodes.runtime import ERROR, MARKERS, OK
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode
@@ -101,11 +102,13 @@ class Tried:
         module = importlib.import_module(f"lidar_perception.nodes.{name}")
         self.node = getattr(module, NODES[name][0])(
             context=context, enable_rosout=False, start_parameter_services=False)
+        self.node.start()
         self.inputs = TRIED[name][1]
         self.calls = {s.topic_name.removeprefix(f"/{name}").lstrip("/"): s.callback
                       for s in self.node.subscriptions}
-        for reception in self.node._receptions:  # what they get comes as from a queue
-            self.calls[reception.topic.removeprefix(f"/{name}").lstrip("/")] = reception.deliver
+        for made in self.node.inputs:
+            if isinstance(made, Reception):  # what it delivers, without its queue
+                self.calls[made.topic.removeprefix(f"/{name}").lstrip("/")] = made.deliver
         self.params: dict[str, Any] = {}
         self.sent: list[tuple[str, bytes]] = []
         for publisher in self.node.publishers:
