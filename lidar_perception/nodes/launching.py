@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import yaml
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
-from lidar_perception.nodes.graph import BEHIND, graph_of, prefixed, relative
+from lidar_perception.nodes.graph import BEHIND, SINGLE, STAGES, graph_of, prefixed, relative
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS
 
@@ -35,6 +36,10 @@ ARGUMENTS = {
                    "that of the parameter file."),
     "single": dict(**SWITCHES, description="Each detector in one process, which finds ground and "
                    "clusters itself."),
+    "rviz": dict(**SWITCHES, description="Start RViz with config/lidar_perception.rviz, in the "
+                 "same namespace."),
+    "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: that of its "
+                       "file, velodyne."),
     "use_sim_time": dict(**SWITCHES, description="Take the time from /clock."),
     "log_level": dict(default_value="info", description="debug, info, ..."),
 }
@@ -65,7 +70,8 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     graph = prefixed(graph_of(detectors, single), prefix)
     owner = {prefix + node: name for name in reversed(detectors)
              for node in graph_of([name], single)}
-    return [Node(
+    viewer = [_viewer(value, config_folder)] if value["rviz"] == "true" else []
+    return viewer + [Node(
         package="lidar_perception", executable=node.removeprefix(prefix), name=node,
         namespace=value["namespace"] or None, output="screen",
         parameters=[value["config"] or str(config_folder / f"{CONFIGS[owner[node]]}.param.yaml"),
@@ -74,6 +80,35 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
                     for a, b in remap.items()],
         ros_arguments=["--log-level", value["log_level"]],
     ) for node, remap in graph.items()]
+
+
+def _viewer(value: dict[str, str], config_folder: Path) -> Node:
+    """RViz, its topics renamed as those of the nodes are."""
+    file = config_folder / "lidar_perception.rviz"
+    frame = ["-f", value["rviz_frame"]] if value["rviz_frame"] else []
+    renamed = {topic: _shown(topic, value) for _, topic in rviz_topics(file)}
+    return Node(
+        package="rviz2", executable="rviz2", name=value["name_prefix"] + "rviz",
+        namespace=value["namespace"] or None, arguments=["-d", str(file), *frame], output="screen",
+        parameters=[{"use_sim_time": value["use_sim_time"] == "true"}],
+        remappings=[(a, b) for a, b in renamed.items() if a != b])
+
+
+def rviz_topics(file: Path) -> list[tuple[str, str]]:
+    """(class, topic) of each display and tool of an RViz file that has a topic."""
+    manager = yaml.safe_load(file.read_text())["Visualization Manager"]
+    return [(each["Class"], each["Topic"]["Value"])
+            for each in [*manager["Displays"], *manager["Tools"]] if "Topic" in each]
+
+
+def _shown(topic: str, value: dict[str, str]) -> str:
+    node, slash, rest = topic.partition("/")
+    if topic == relative(POINTS):
+        return value["points"]
+    if value["single"] == "true" and node in STAGES:
+        node = next(iter(SINGLE))
+    ours = node in {*graph_of([*BEHIND]), *SINGLE}
+    return (value["name_prefix"] if ours else "") + node + slash + rest
 
 
 def _given(value: dict[str, str], detector: str, detectors: list[str]) -> dict[str, Any]:
