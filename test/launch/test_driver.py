@@ -49,7 +49,8 @@ class TestDriver(unittest.TestCase):
         environment = {k: v for k, v in os.environ.items() if k not in PROFILE_VARIABLES}
         driver = subprocess.Popen(
             [sys.executable, DRIVER, "/driver_points", "reliable",
-             *map(str, (COUNT, 10, POINTS, 1))], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+             *map(str, (COUNT, 10, POINTS, 1))], env=environment,
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         rclpy.init()
         node = rclpy.create_node("listener")
         found, values = [], {}
