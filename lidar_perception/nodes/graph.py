@@ -125,7 +125,9 @@ def chosen_clouds(bag: str, types: Mapping[str, str], wanted: str = "") -> str:
     clouds = cloud_topics(types)
     if wanted in clouds or (not wanted and len(clouds) == 1):
         return wanted or clouds[0]
-    has = f"it has {', '.join(clouds)}" if clouds else "it has none at all"
+    if not clouds:
+        raise InputError(f"{bag} has no clouds: none of its topics is a sensor_msgs/PointCloud2")
+    has = f"it has {', '.join(clouds)}"
     raise InputError(f"{bag} has no cloud on {wanted}; {has}" if wanted else
                      f"{bag}: give the topic of the clouds with points:=TOPIC; {has}")
 
