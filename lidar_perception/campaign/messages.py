@@ -26,6 +26,7 @@ from lidar_perception.nodes.runtime import ERROR, MARKERS, OK
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode
 from msg_utils.markers import from_marker_array
+from msg_utils.messages import message_class
 from msg_utils.point_cloud2 import CloudError, to_array
 
 INFO, TRANSFORM = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/TransformStamped"
@@ -110,10 +111,9 @@ class Tried:
             if isinstance(made, Reception):  # what it delivers, without its queue
                 self.calls[made.topic.removeprefix(f"/{name}").lstrip("/")] = made.deliver
         self.params: dict[str, Any] = {}
-        self.sent: list[tuple[str, bytes]] = []
+        self.sent: list[tuple[Any, bytes]] = []
         for publisher in self.node.publishers:
-            publisher.publish = lambda data, topic=publisher.topic_name: self.sent.append(
-                (topic, data))
+            publisher.publish = lambda data, by=publisher: self.sent.append((by, data))
             publisher.get_subscription_count = lambda: 1  # so that all is made that can be
 
     def attempt(self, case: Case) -> Outcome:
@@ -156,14 +156,14 @@ class Tried:
 
     def _unsound(self) -> str | None:
         """What is wrong with what the node has published; None if nothing is."""
-        for topic, data in self.sent:
-            if not isinstance(data, bytes):
-                continue
-            name = topic.rpartition("/")[2]
+        clouds, boxes = message_class(CLOUD), message_class(MARKERS)
+        for publisher, data in self.sent:
+            topic, kind = publisher.topic_name, publisher.msg_type
             try:
-                if name in ("points", "ground", "nonground"):
+                if kind is clouds:
                     to_array(decode(data, CLOUD))
-                elif not np.isfinite(from_marker_array(decode(data, MARKERS)).boxes).all():
+                elif kind is boxes and not np.isfinite(
+                        from_marker_array(decode(data, MARKERS)).boxes).all():
                     return f"{topic} has boxes that are not finite"
             except (InputError, CloudError, ValueError) as error:
                 return f"{topic} cannot be read: {error}"

@@ -18,6 +18,7 @@ from lidar_perception.data.kitti.labels import (
     read_tracking_labels,
     read_tracklets,
 )
+from lidar_perception.runs.files import regular
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.topics import LIDAR_FRAME
 
@@ -30,7 +31,7 @@ SCANS = ("velodyne_reduced", "velodyne")  # of one name, the full scan wins
 def read_velodyne(path: Path) -> np.ndarray:
     """(N, 4) float32 [x y z reflectance] of a .bin file."""
     try:
-        raw = np.fromfile(path, np.float32)
+        raw = np.fromfile(regular(path), np.float32)
     except OSError as error:
         raise InputError(f"cannot read {path}: {error}") from None
     if path.stat().st_size % 16:
@@ -189,7 +190,7 @@ def _raw_stamps(path: Path) -> list[int]:
     """Nanoseconds of the lines '2011-09-26 13:02:25.594360375', read as UTC."""
     try:
         stamps = []
-        for line in path.read_text().split("\n"):
+        for line in regular(path).read_text().split("\n"):
             if line.strip():
                 seconds, _, fraction = line.strip().partition(".")
                 when = datetime.strptime(seconds, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)

@@ -19,6 +19,7 @@ from lidar_perception.data.frame import BOXES, POSES, Frame, Recording
 from lidar_perception.data.nuscenes.boxes import matrices
 from lidar_perception.data.nuscenes.labels import NuscenesLabels, read_labels
 from lidar_perception.data.nuscenes.tables import Tables
+from lidar_perception.runs.files import regular
 from lidar_perception.types import GroundTruth, InputError, LidarFrame, usable_returns
 from lidar_perception.wire.topics import LIDAR_FRAME
 
@@ -60,7 +61,7 @@ def _truth(key: KeyFrame) -> GroundTruth | None:
 def read_sweep(path: Path) -> np.ndarray:
     """(N, 5) float32 [x y z intensity ring] of a .pcd.bin file."""
     try:
-        raw = np.fromfile(path, np.float32)
+        raw = np.fromfile(regular(path), np.float32)
         size = path.stat().st_size
     except OSError as error:
         raise InputError(f"cannot read the sweep {path}: {error.strerror}; unpack the file blobs "
