@@ -67,7 +67,8 @@ class Attempt:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        subprocess.run([sys.executable, "-m", "lidar_perception.campaign.samples", str(folder)],
+        subprocess.run([sys.executable, "-m", "lidar_perception.campaign.samples", "write_samples",
+                        str(folder)],
                        check=True)
         for i in range(40):  # as many frames as take a while
             for part, ending in (("velodyne", "bin"), ("calib", "txt"), ("label_2", "txt")):
@@ -84,13 +85,17 @@ class Attempt:
         kind, what, how = (case.settings[key] for key in ("kind", "what", "how"))
         if kind == "node":
             return self._node(what, signal.Signals[how])
-        if self.graph is not None:
-            self.graph.__exit__()
-            self.graph = None
+        self.close()
         if kind == "stopped":
             name, moment = how.split()
             return self._stopped(what, signal.Signals[name], float(moment))
         return self._no_room(WRITERS[what], how, read_only=kind == "read-only")
+
+    def close(self) -> None:
+        """End the nodes."""
+        if self.graph is not None:
+            self.graph.__exit__()
+            self.graph = None
 
     def _node(self, name: str, fault: signal.Signals) -> Outcome:
         """The others live on, and all serve a good cloud once the node is there again."""
@@ -114,8 +119,7 @@ class Attempt:
                 self.graph.start(name)
             self.graph.alive()
         except (InputError, subprocess.TimeoutExpired) as error:
-            self.graph.__exit__()
-            self.graph = None
+            self.close()
             return Outcome(FAILED, f"{name}, {fault.name}: {error}")
         return Outcome(SURVIVED)
 

@@ -39,16 +39,20 @@ INSTEAD = ("nothing", "an empty file", "a folder", "a pipe", "a link to itself",
 
 
 @functools.cache
-def sound() -> dict[str, dict[str, bytes]]:
-    """Format -> path of a file -> its bytes."""
+def _made(what: str) -> dict[str, bytes]:
     with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder)
         # In a process of its own: threads that torch starts here would be missing in forked ones.
-        subprocess.run([sys.executable, "-m", "lidar_perception.campaign.samples", folder],
+        subprocess.run([sys.executable, "-m", "lidar_perception.campaign.samples", what, folder],
                        check=True)
-        return {name: {path.relative_to(root).as_posix(): path.read_bytes()
-                       for path in sorted((root / name).rglob("*")) if path.is_file()}
-                for name in COMMANDS}
+        return {path.relative_to(folder).as_posix(): path.read_bytes()
+                for path in sorted(Path(folder).rglob("*")) if path.is_file()}
+
+
+def sound(name: str) -> dict[str, bytes]:
+    """Path of each file of a format -> its bytes."""
+    return {path: data for path, data in _made(
+        "write_onnx" if name == "onnx" else "write_samples").items()
+        if path.startswith(f"{name}/")}
 
 
 def case_of(seed: int, number: int) -> Case:
@@ -56,8 +60,9 @@ def case_of(seed: int, number: int) -> Case:
     rng = generator("files", seed, number)
     names = [name for name, (weight, _) in COMMANDS.items() for _ in range(int(weight))]
     name = pick(rng, names)
-    path = pick(rng, sorted(sound()[name]))
-    data, instead = sound()[name][path], ""
+    files = sound(name)
+    path, instead = pick(rng, sorted(files)), ""
+    data = files[path]
     if rng.random() < 0.05:
         instead = what = pick(rng, INSTEAD)
         data = b""
@@ -76,9 +81,8 @@ class Attempt:
 
     def __init__(self, folder: Path):
         self.folder = folder
-        for contents in sound().values():
-            for path, data in contents.items():
-                _put(folder / path, data)
+        for path, data in _made("write_samples").items():
+            _put(folder / path, data)
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
         load_all()
 
@@ -89,7 +93,9 @@ class Attempt:
             return run_command(case.settings["command"], self.folder, SECONDS).outcome(MEGABYTES)
         finally:
             _remove(path)
-            _put(path, sound()[case.settings["path"].partition("/")[0]][case.settings["path"]])
+            name = case.settings["path"].partition("/")[0]
+            if name != "onnx":
+                _put(path, sound(name)[case.settings["path"]])
             for made in self.folder.glob("made*"):
                 _remove(made)
 

@@ -45,9 +45,13 @@ class Attempt:
         try:
             self.graph.alive()
         except InputError as error:
-            self.graph.__exit__()
-            self.graph = None
+            self.close()
             return Outcome(FAILED, str(error))
         bugs = self.graph.bugs()[known:]
-        return Outcome(FAILED, bugs[0]) if bugs else Outcome(SURVIVED, figures={
-            "messages": BURST})
+        return Outcome(FAILED, bugs[0]) if bugs else Outcome(SURVIVED)
+
+    def close(self) -> None:
+        """End the nodes."""
+        if self.graph is not None:
+            self.graph.__exit__()
+            self.graph = None

@@ -95,7 +95,11 @@ def run_campaign(out: Path, minutes: float, seed: int, only: Sequence[str] = (),
         weight = PARTS[name][0] / sum(PARTS[n][0] for n in chosen[i:])
         tally = Tally(name)
         tallies.append(tally)
-        _run_part(tally, out, seed, weight * max(0.0, end - monotonic()), most, watch)
+        try:
+            _run_part(tally, out, seed, weight * max(0.0, end - monotonic()), most, watch)
+        except KeyboardInterrupt:  # what is known so far is said all the same
+            tally.problem = "interrupted"
+            break
     return tallies
 
 

@@ -7,6 +7,7 @@ import importlib
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 import sys
 import traceback
@@ -22,6 +23,7 @@ from lidar_perception.campaign.case import FAILED, Case, Outcome
 from lidar_perception.types import InputError
 
 START_SECONDS = 900.0     # for what a part makes before its first case, on a busy machine
+END_SECONDS = 30.0
 ADDRESS_BYTES = 16 * 2**30  # no process of the campaign gets more than this
 
 
@@ -46,6 +48,10 @@ class Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
+        if self.process is not None:  # nodes that are killed leave shared memory behind
+            with suppress(OSError):
+                self.connection.send(("close",))
+                self.process.join(END_SECONDS)
         self.stop()
 
     def start(self) -> None:
@@ -130,6 +136,7 @@ def _serve(part: str, limits: Limits, folder: Path, quiet: bool, connection: Con
         for stream in (1, 2):
             os.dup2(log, stream)
     work = folder / "work" / part
+    shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True, exist_ok=True)
     try:
         module = importlib.import_module(f"lidar_perception.campaign.{part}")
@@ -142,6 +149,10 @@ def _serve(part: str, limits: Limits, folder: Path, quiet: bool, connection: Con
     with suppress(EOFError, ConnectionError):
         while True:
             what, *order = connection.recv()
+            if what == "close":
+                if hasattr(attempt, "close"):
+                    attempt.close()
+                os._exit(0)  # without waiting for what DDS or torch still do
             if what == "describe":
                 seed, number = order
                 connection.send(("outcome", number, None, module.case_of(seed, number)))
