@@ -144,7 +144,8 @@ class Attempt:
             begin, code = monotonic(), _run(self.folder, command, f"whole {work}/made")
             if code:
                 return Outcome(FAILED, f"{work}: exit code {code} without any fault")
-            self.wholes[work] = monotonic() - begin, _files(self.folder / f"whole {work}/made", pattern)
+            self.wholes[work] = monotonic() - begin, _files(
+                self.folder / f"whole {work}/made", pattern)
         seconds, wanted = self.wholes[work]
         out = f"stopped {work}/made"
         shutil.rmtree(self.folder / f"stopped {work}", ignore_errors=True)
