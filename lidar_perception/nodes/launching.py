@@ -39,6 +39,8 @@ ARGUMENTS = {
                    "that of the parameter file."),
     "single": dict(**SWITCHES, description="Each detector in one process, which finds ground and "
                    "clusters itself."),
+    "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
+                      "lifecycle manager configures and activates the nodes."),
     "use_sim_time": dict(**SWITCHES, description="Take the time from /clock."),
     "log_level": dict(default_value="info", description="debug, info, ..."),
 }
@@ -143,6 +145,8 @@ def _detectors(value: dict[str, str]) -> list[str]:
 def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, Any]:
     """Parameters that arguments set."""
     given: dict[str, Any] = {"use_sim_time": value["use_sim_time"] == "true"}
+    if value["autostart"] == "false":
+        given["autostart"] = False
     if value["reliability"]:
         given["input.reliability"] = value["reliability"]
     detector = node.removesuffix("_detector")
