@@ -74,21 +74,28 @@ class Peer(Outside):
 
         self.wait(condition, what)
 
-    def wait(self, condition: Callable[[], Any], what: str, timeout: float = TIMEOUT) -> None:
-        """Spin until condition() holds. AssertionError names what was waited for."""
-        failed: dict[str, int] = {}
+    def wait(self, condition: Callable[[], Any], what: str | Callable[[], str],
+             timeout: float = TIMEOUT) -> None:
+        """Spin until condition() holds. AssertionError names what was waited for, and what was
+        seen."""
+        met = False
 
-        def done() -> bool:
-            failed.update(self.processes.failed() if self.processes else {})
-            return bool(condition() or failed)
+        def over() -> bool:
+            nonlocal met
+            met = bool(condition())
+            return met or bool(self._failed())
 
-        came = self.until(done, timeout)
-        if failed and not condition():
-            names = ", ".join(f"{name} with code {code}" for name, code in failed.items())
-            raise AssertionError(f"while the test waited for {what}, there ended {names}; "
+        self.until(over, timeout)
+        if met or (self._failed() and condition()):  # it may have been the end that was waited for
+            return
+        what = what if isinstance(what, str) else what()
+        if ended := ", ".join(f"{k} with code {v}" for k, v in self._failed().items()):
+            raise AssertionError(f"while the test waited for {what}, there ended {ended}; "
                                  f"{self.seen()}")
-        if not came:
-            raise AssertionError(f"waited {timeout:.0f} s in vain for {what}; {self.seen()}")
+        raise AssertionError(f"waited {timeout:.0f} s in vain for {what}; {self.seen()}")
+
+    def _failed(self) -> dict[str, int]:
+        return self.processes.failed() if self.processes else {}
 
     def wait_for_topics(self, *topics: str, timeout: float = TIMEOUT) -> None:
         """Until each has a publisher."""
@@ -97,7 +104,7 @@ class Peer(Outside):
         def missing() -> list[str]:
             return [name for name in names if not self.node.count_publishers(name)]
 
-        self.wait(lambda: not missing(), _Late(lambda: "publishers of " + ", ".join(missing())),
+        self.wait(lambda: not missing(), lambda: "publishers of " + ", ".join(missing()),
                   timeout)
 
     def wait_for_messages(self, topic: str, kind: str | type, count: int = 1,
@@ -167,16 +174,6 @@ class Peer(Outside):
         finally:
             assert not self.change(node, {
                 name: parameter_value_to_python(old) for name, old in zip(values, before)})
-
-
-class _Late:
-    """A text that is made when it is needed."""
-
-    def __init__(self, make: Callable[[], str]):
-        self.make = make
-
-    def __str__(self) -> str:
-        return self.make()
 
 
 def _named(kind: str | type) -> tuple[str, type]:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lidar_perception.nodes.graph import CLOUDS, Graph, Processes, graph_of
+from lidar_perception.nodes.graph import CLOUDS, Graph, Processes, graph_of, relative
 from lidar_perception.param_fields import flatten
 from lidar_perception.wire.topics import POINTS
 
@@ -28,11 +28,12 @@ class NodesUnderTest(Processes):
         super().__exit__(*error)
 
     def start_graph(self, detectors: Sequence[str], params: Any = None, *, single: bool = False,
-                    points: str = POINTS, namespace: str = "") -> Graph:
+                    points: str = relative(POINTS), namespace: str = "") -> Graph:
         """Start the nodes of one or several of candidates, pointpillars and pointnet, as the launch
         files do: ground and clusters once for all, or with single one process a detector. params: a
         dataclass of parameters, or NAME: value, for all nodes that have a parameter of that name;
-        points: the topic of the clouds. Returns node -> remapping."""
+        points: the topic of the clouds, in the namespace unless it starts with /. Returns node ->
+        remapping."""
         values = {} if params is None else (
             params if isinstance(params, Mapping) else flatten(params))
         own = {node: {a: points if b == CLOUDS["~/input/points"] else b for a, b in remap.items()}
