@@ -92,7 +92,7 @@ class Peer(Outside):
         if ended := ", ".join(f"{k} with code {v}" for k, v in self._failed().items()):
             raise AssertionError(f"while the test waited for {what}, there ended {ended}; "
                                  f"{self.seen()}")
-        raise AssertionError(f"waited {timeout:.0f} s in vain for {what}; {self.seen()}")
+        raise AssertionError(f"waited {timeout:g} s in vain for {what}; {self.seen()}")
 
     def _failed(self) -> dict[str, int]:
         return self.processes.failed() if self.processes else {}
