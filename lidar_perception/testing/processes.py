@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -46,8 +47,17 @@ class NodesUnderTest(Processes):
         """Start bag_player, which waits up to two minutes for a subscriber of the clouds. follow:
         topics of detections; the next cloud comes when those before have their answer there, so
         that none is lost however slow the machine is. params: others of bag_player."""
+        if "bag_player" in self.running:
+            self.end("bag_player")
         self.start("bag_player", {}, {"bag": str(bag), "wait_timeout": 120.0,
                                       "follow_timeout": 60.0, "follow": list(follow), **params})
+
+    def end(self, name: str, timeout: float = 15.0) -> int:
+        """SIGINT to one process, if it still runs; its exit code."""
+        process = self.running[name]
+        if process.poll() is None:
+            process.send_signal(signal.SIGINT)
+        return process.wait(timeout)
 
     def log(self, name: str) -> str:
         """What a process has written so far."""
