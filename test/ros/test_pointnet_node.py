@@ -14,7 +14,7 @@ from detection_samples import lively as lively_pointpillars
 from detection_samples import tiny as tiny_pointpillars
 from pointnet_samples import eager, lively, small
 from test_bad_input import BAD, CLOUD, MARKERS, QUIET, cloud
-from test_pointpillars_node import assert_equal, message, received
+from test_pointpillars_node import REMAP, assert_equal, message, received
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
@@ -168,11 +168,9 @@ UNUSABLE = {  # weights made in a folder; words of the diagnostic
 
 def test_weights_that_cannot_be_used_are_a_diagnostic(shared_processes, peer, tmp_path):
     for i, (make, _) in enumerate(UNUSABLE.values()):
-        shared_processes.start(NODE, {"~/input/points": "/in"}, {
-            "pointnet.weights": str(make(tmp_path))}, namespace=f"bad{i}")
-    talker = peer.talker("/in", CLOUD)
+        shared_processes.start(NODE, REMAP, {"pointnet.weights": str(make(tmp_path))}, f"bad{i}")
+    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
     for i, (make, words) in enumerate(UNUSABLE.values()):
-        found = peer.listen(f"/bad{i}{FOUND}", MARKERS)
         peer.send(talker, message(1), lambda n=f"bad{i}/{NODE}", w=words: w in peer.message_of(n),
                   words)
         assert ord(peer.diagnostics[f"bad{i}/{NODE}"].level) == 2 and not found

@@ -31,6 +31,7 @@ from msg_utils.markers import box_pose, from_marker_array, pose_yaw
 
 NODE = "pointpillars_detector"
 EXPERTS = Path(__file__).resolve().parents[2] / "config" / "pointpillars.param.yaml"
+REMAP = {"~/input/points": "/in", "~/output/detections": "/found"}
 BETWEEN, FOUND = POINTPILLARS[NODE]["~/input/points"], f"/{NODE}/output/detections"
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -233,8 +234,7 @@ UNUSABLE = {  # parameters made in a folder; level, words of the diagnostic
 def unusable(shared_processes, tmp_path_factory):
     """A node for each, in a namespace of its own, all started at once."""
     for i, (make, _, _) in enumerate(UNUSABLE.values()):
-        shared_processes.start(NODE, {"~/input/points": "/in"}, make(
-            tmp_path_factory.mktemp("weights")), namespace=f"bad{i}")
+        shared_processes.start(NODE, REMAP, make(tmp_path_factory.mktemp("weights")), f"bad{i}")
     return {case: f"bad{i}/{NODE}" for i, case in enumerate(UNUSABLE)}
 
 
@@ -263,10 +263,9 @@ def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, sha
     if missing is None:
         pytest.skip("weights of all versions and sizes come with the package")
     version, size = missing.split()
-    processes.start(NODE, {"~/input/points": "/in"}, {
-        "pointpillars.version": version, "pointpillars.size": size}, namespace="none")
-    peer, node = shared_peer, f"none/{NODE}"
-    found = peer.listen(f"/none{FOUND}", MARKERS)
+    processes.start(NODE, REMAP, {"pointpillars.version": version, "pointpillars.size": size},
+                    "none")
+    peer, node, found = shared_peer, f"none/{NODE}", shared_peer.listen("/found", MARKERS)
     peer.send(to_unusable, message(1), lambda: f"no weights for {missing}" in
               peer.message_of(node), "the diagnostic")
     peer.diagnostics.clear()
