@@ -13,6 +13,8 @@ from lidar_perception.types import CLASSES, InputError
 from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
 
+__tracebackhide__ = True  # pytest shows the line of the test that asserts
+
 SHOWN = 20  # of what is missing, and of what is extra
 
 

@@ -18,6 +18,8 @@ from lidar_perception.testing.processes import NodesUnderTest
 from lidar_perception.wire.codec import decode, encode, typestore
 from msg_utils.messages import message_class
 
+__tracebackhide__ = True  # pytest shows the line of the test that waited
+
 TIMEOUT = 60.0  # seconds; the first start on a machine compiles
 LEVELS = {0: "OK", 1: "WARN", 2: "ERROR", 3: "STALE"}
 
