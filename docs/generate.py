@@ -67,6 +67,9 @@ MANAGED_SERVICES = [
      "shut down."),
     ("~/get_state", "lifecycle_msgs/GetState", "And the others of a managed node."),
 ]
+OBSTACLES_OUT = ("~/output/obstacles", CLOUD, "x y z, and intensity where the cloud has one, of "
+                 "the points that are no ground and within the heights of `obstacles`, for a "
+                 "costmap ([nav2](../nav2.md)); made only while subscribed.")
 COLUMNS = "columns `ground` (uint8, 1 = ground) and `in_view` (uint8, 1 = processed)"
 
 PAGES: dict[str, dict[str, Any]] = {
@@ -78,7 +81,8 @@ PAGES: dict[str, dict[str, Any]] = {
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN],
         outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS}."),
                  ("~/output/ground", CLOUD, "Ground points only; made only while subscribed."),
-                 ("~/output/nonground", CLOUD, "The other points in view; likewise.")]),
+                 ("~/output/nonground", CLOUD, "The other points in view; likewise."),
+                 OBSTACLES_OUT]),
     "clustering": dict(
         params=params.ClusteringNodeParams(),
         what="Clusters the points that are not ground: distance-aware DBSCAN, exact, or adaptive "
@@ -104,6 +108,7 @@ PAGES: dict[str, dict[str, Any]] = {
         outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS} and `cluster_id`; "
                   "made only while subscribed."),
                  ("~/output/boxes", MARKERS, "Cluster boxes; made only while subscribed."),
+                 OBSTACLES_OUT,
                  *CANDIDATES_OUT]),
     "pointpillars_detector": dict(
         params=DetectorParams(),

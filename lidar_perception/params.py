@@ -19,7 +19,7 @@ from lidar_perception.candidates.params import (
     StmParams,
 )
 from lidar_perception.clustering.params import BoxParams, ClusteringParams
-from lidar_perception.ground.params import GroundParams
+from lidar_perception.ground.params import GroundParams, ObstacleParams
 from lidar_perception.param_fields import Params, param
 from lidar_perception.wire.params import InputParams, ViewParams
 
@@ -74,6 +74,20 @@ class BoxNodeParams(CloudNodeParams):
     """What a node that makes boxes of clouds has besides the numbers of its algorithm."""
 
     output: MarkerParams = MarkerParams()
+
+
+@dataclass(frozen=True)
+class GroundRobotParams(CloudNodeParams):
+    """What ground_segmentation has besides."""
+
+    obstacles: ObstacleParams = ObstacleParams()
+
+
+@dataclass(frozen=True)
+class PerceptionRobotParams(BoxNodeParams):
+    """What perception has besides."""
+
+    obstacles: ObstacleParams = ObstacleParams()
 
 
 # Each node declares the groups of its own stages, under the same names.

@@ -125,7 +125,9 @@ def chosen_clouds(bag: str, types: Mapping[str, str], wanted: str = "") -> str:
     clouds = cloud_topics(types)
     if wanted in clouds or (not wanted and len(clouds) == 1):
         return wanted or clouds[0]
-    has = f"it has {', '.join(clouds)}" if clouds else "it has none at all"
+    if not clouds:
+        raise InputError(f"{bag} has no clouds: none of its topics is a sensor_msgs/PointCloud2")
+    has = f"it has {', '.join(clouds)}"
     raise InputError(f"{bag} has no cloud on {wanted}; {has}" if wanted else
                      f"{bag}: give the topic of the clouds with points:=TOPIC; {has}")
 
@@ -169,11 +171,14 @@ class Processes:
         file.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}))
         rules = {**remap, **({"__ns": f"/{namespace}"} if namespace else {})}
         remapping = [word for rule in rules.items() for word in ("-r", ":=".join(rule))]
+        self.run(name, [sys.executable, "-m", "lidar_perception.nodes.main", node, "--ros-args",
+                        "--params-file", str(file), *remapping])
+
+    def run(self, name: str, command: Sequence[str]) -> None:
+        """Start any program; what it writes goes to the log."""
         with open(self.logs / f"{name}.log", "w") as log:
             self.running[name] = subprocess.Popen(
-                [sys.executable, "-m", "lidar_perception.nodes.main", node, "--ros-args",
-                 "--params-file", str(file), *remapping],
-                env=self.environment, stdin=subprocess.DEVNULL, stdout=log,
+                command, env=self.environment, stdin=subprocess.DEVNULL, stdout=log,
                 stderr=subprocess.STDOUT)
 
     def check(self, *finished: str) -> None:

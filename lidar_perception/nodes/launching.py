@@ -11,7 +11,16 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
-from lidar_perception.nodes.graph import ALONE, BEHIND, EXPERTS, graph_of, prefixed, relative
+from lidar_perception.nodes.graph import (
+    ALONE,
+    BEHIND,
+    EXPERTS,
+    SINGLE,
+    STAGES,
+    graph_of,
+    prefixed,
+    relative,
+)
 from lidar_perception.param_fields import flatten
 from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
 from lidar_perception.types import InputError
@@ -41,6 +50,10 @@ ARGUMENTS = {
                    "clusters itself."),
     "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
                       "lifecycle manager configures and activates the nodes."),
+    "rviz": dict(**SWITCHES, description="Start RViz with config/lidar_perception.rviz, in the "
+                 "same namespace."),
+    "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: that of its "
+                       "file, velodyne."),
     "use_sim_time": dict(**SWITCHES, description="Take the time from /clock."),
     "log_level": dict(default_value="info", description="debug, info, ..."),
 }
@@ -72,7 +85,8 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     files = {node: value["config"] or _own_file(name, config_folder) for name in detectors
              for node in (ALONE if single else BEHIND)[name]}
     files |= dict.fromkeys(EXPERTS, _expert_file(value, config_folder))
-    return [Node(
+    viewer = [_viewer(value, config_folder)] if value["rviz"] == "true" else []
+    return viewer + [Node(
         package="lidar_perception", executable=node.removeprefix(prefix), name=node,
         namespace=value["namespace"] or None, output="screen",
         parameters=[files[node.removeprefix(prefix)],
@@ -140,6 +154,35 @@ def _detectors(value: dict[str, str]) -> list[str]:
     if not detectors:
         raise InputError(f"detectors is empty; give one or several of {','.join(BEHIND)}")
     return detectors
+
+
+def _viewer(value: dict[str, str], config_folder: Path) -> Node:
+    """RViz, its topics renamed as those of the nodes are."""
+    file = config_folder / "lidar_perception.rviz"
+    frame = ["-f", value["rviz_frame"]] if value["rviz_frame"] else []
+    renamed = {topic: _shown(topic, value) for _, topic in rviz_topics(file)}
+    return Node(
+        package="rviz2", executable="rviz2", name=value["name_prefix"] + "rviz",
+        namespace=value["namespace"] or None, arguments=["-d", str(file), *frame], output="screen",
+        parameters=[{"use_sim_time": value["use_sim_time"] == "true"}],
+        remappings=[(a, b) for a, b in renamed.items() if a != b])
+
+
+def rviz_topics(file: Path) -> list[tuple[str, str]]:
+    """(class, topic) of each display and tool of an RViz file that has a topic."""
+    manager = yaml.safe_load(file.read_text())["Visualization Manager"]
+    return [(each["Class"], each["Topic"]["Value"])
+            for each in [*manager["Displays"], *manager["Tools"]] if "Topic" in each]
+
+
+def _shown(topic: str, value: dict[str, str]) -> str:
+    node, slash, rest = topic.partition("/")
+    if topic == relative(POINTS):
+        return value["points"]
+    if value["single"] == "true" and node in STAGES:
+        node = next(iter(SINGLE))
+    ours = node in {*graph_of([*BEHIND]), *SINGLE}
+    return (value["name_prefix"] if ours else "") + node + slash + rest
 
 
 def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, Any]:

@@ -127,6 +127,21 @@ def test_a_second_sensor_has_names_of_its_own(launched):
     assert ("~/input/points", "points") in started["ground_segmentation"].remappings
 
 
+def test_rviz_follows_the_names_of_the_graph(launched):
+    _, nodes = launched("detectors")
+    assert "rviz2" not in nodes()
+    plain = nodes(rviz="true", points="/cloud", rviz_frame="base_link", namespace="left")["rviz2"]
+    assert plain.remappings == [("points", "/cloud")] and plain.namespace == "left"
+    assert plain.arguments == ["-d", str(ROOT / "config/lidar_perception.rviz"), "-f", "base_link"]
+    prefixed = dict(nodes(rviz="true", name_prefix="left_")["rviz2"].remappings)
+    assert prefixed["clustering/output/points"] == "left_clustering/output/points"
+    assert not {"points", "clicked_point"} & set(prefixed)  # of no node of ours
+    single = dict(nodes(rviz="true", single="true")["rviz2"].remappings)
+    assert single["clustering/output/points"] == "perception/output/points"
+    assert single["candidate_refinement/output/detections"] == "perception/output/detections"
+    assert "pointnet_detector/output/detections" not in single
+
+
 @pytest.mark.parametrize("name", ["pointpillars", "pointnet"])
 def test_weights_and_device_of_a_detector_are_arguments(name, launched):
     expected = {f"{name}.weights": "w.safetensors", f"{name}.device": "cpu",

@@ -15,12 +15,10 @@ from rclpy.parameter import Parameter
 from test_bad_input import CLOUD, MARKERS
 from test_pointpillars_node import NODE, REMAP, assert_equal, message, offline, received, values
 
-from lidar_perception.data.bag import Bag
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
 from lidar_perception.wire.codec import encode
-from lidar_perception.wire.topics import POINTS
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 LEADS_TO = {"configure": State.PRIMARY_STATE_INACTIVE, "activate": State.PRIMARY_STATE_ACTIVE,
@@ -34,12 +32,6 @@ def weights(tmp_path_factory):
     path = tmp_path_factory.mktemp("weights") / "v4.safetensors"
     save_checkpoint(path, lively(tiny("v4")), Header(tiny("v4")))
     return path
-
-
-@pytest.fixture(scope="module")
-def good_cloud(drive_bag):
-    with Bag(drive_bag) as bag:
-        return next(m for _, _, m in bag.messages({POINTS}))
 
 
 def state(peer, node):
