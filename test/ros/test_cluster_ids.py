@@ -7,7 +7,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from test_bad_input import CLOUD, MARKERS, RELIABLE_IN
+from test_bad_input import CLOUD, MARKERS
 from test_graph import PAPER
 
 from lidar_perception.candidates.pipeline import find_candidates, segment
@@ -15,11 +15,9 @@ from lidar_perception.candidates.seed_sources import fixed_seed
 from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.data.open import open_recording
 from lidar_perception.param_fields import with_values
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.wire.messages import column, to_frame
 from msg_utils.markers import from_marker_array
-from msg_utils.point_cloud2 import from_array
-from msg_utils.stamps import header_message
 
 FILE = {"view.enabled": False, "seed.source": "file"}
 
@@ -35,21 +33,17 @@ def test_boxes_and_candidates_have_the_ids_of_the_cloud(processes, peer, drive_b
     assert len(segmented.indices) == len(scan)
     own = segmented.cluster_ids.astype(np.int64)
     foreign = np.where(own > 0, 2**32 - 5 - 7 * own, 0)
-    points = np.zeros(len(scan), [(n, "<f4") for n in "xyz"] + [("ground", "u1"),
-                                                              ("cluster_id", "<u4")])
-    for i, name in enumerate("xyz"):
-        points[name] = scan.xyz[:, i]
-    points["ground"], points["cluster_id"] = segmented.ground, foreign
-    msg = from_array(points, header_message(1, "lidar", bag_message), bag_message)
+    msg = cloud_message(scan.xyz, ground=segmented.ground.astype("u1"),
+                        cluster_id=foreign.astype("u4"))
     _, expected = find_candidates(scan, seed, None, params, ground=segmented.ground,
                                   cluster_ids=foreign)
     assert len(expected.final) and expected.clusters.max() > 2**31 and set(
         expected.clusters) <= set(foreign)
 
-    shared = {**RELIABLE_IN, "seed.source": "file"}
     for node in ("candidate_refinement", "clustering"):
         processes.start(node, {"~/input/points": "/in", "~/output/detections": "/found",
-                               "~/output/boxes": "/boxes", "~/output/points": "/out"}, shared)
+                               "~/output/boxes": "/boxes", "~/output/points": "/out"},
+                        {"seed.source": "file"})
     found, boxes, out = (peer.listen("/found", MARKERS), peer.listen("/boxes", MARKERS),
                          peer.listen("/out", CLOUD))
     peer.send(peer.talker("/in", CLOUD), msg, lambda: found and boxes and out, "results of both")
