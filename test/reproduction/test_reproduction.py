@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -116,7 +117,7 @@ def test_hits_and_misses_are_the_truth_in_every_part_of_a_record(kitti, measured
 
 def test_the_stages_are_those_of_evaluate_candidates(kitti, measured):
     report = CandidateReport()
-    fill(report, open_recording(kitti), by_pipeline(PAPER))
+    fill(report, open_recording(kitti), partial(by_pipeline, PAPER))
     assert report.frames == len(measured)
     for stage, score in report.scores.items():
         for key in ("tp", "fp", "fn"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import detection_samples
 import numpy as np
@@ -68,7 +69,7 @@ def taken(root, *detectors) -> dict:
     """The report of detectors: functions of a frame to a detector, or None."""
     contenders = [Contender(str(i), each) for i, each in enumerate(detectors)]
     report = ComparisonReport(contenders)
-    fill(report, open_recording(root), by_contenders(lambda: contenders))
+    fill(report, open_recording(root), partial(by_contenders, lambda: contenders))
     return report.compute()
 
 
