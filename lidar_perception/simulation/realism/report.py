@@ -45,7 +45,7 @@ def typical_factor(curve: dict) -> float | None:
 
 def _print_curves(content: dict, console: Console) -> None:
     table = narrow_table("Simulated against real, worst curves first",
-                   "curve", "within 20 %", "typical", "worst at", "ratio")
+                   "curve", "within 20 %", "typical", "worst at", "ratio", fold=True)
     judged = [c for c in content["curves"].values() if c["judged"]]
     for curve in sorted(judged, key=lambda c: (c["share"], -typical_factor(c))):
         worst = max((b for b in curve["bins"] if b["within"] is not None), key=factor_off)
@@ -64,7 +64,8 @@ def _print_worst(content: dict, console: Console) -> None:
     bins = [(curve, b) for curve in content["curves"].values() for b in curve["bins"]
             if b["within"] is False]
     table = narrow_table(f"The {min(WORST, len(bins))} worst bins of {len(bins)} not within 20 %",
-                   "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio")
+                   "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio",
+                         fold=True)
     for curve, b in sorted(bins, key=lambda item: -factor_off(item[1]))[:WORST]:
         table.add_row(_title(curve), b["bin"],
                       *(cell for side in ("real", "simulated") for cell in _cells(b[side])),
