@@ -12,6 +12,7 @@ from numba import njit
 from lidar_perception.classes import BY_SIZE, CLASSES, DETECTED, MAX_DIAGONAL
 from lidar_perception.clustering.params import BOX_SHAPES
 from lidar_perception.clustering.rectangles import grouped, rectangles
+from lidar_perception.groups import cluster_count
 
 
 @njit(cache=True, nogil=True)
@@ -43,7 +44,7 @@ def oriented_boxes(xyz: np.ndarray, labels: np.ndarray, shape: str) -> np.ndarra
     if shape not in BOX_SHAPES:
         raise ValueError(f"shape = {shape!r} must be one of {', '.join(BOX_SHAPES)}")
     xyz = np.ascontiguousarray(xyz, np.float32)
-    count = int(labels.max(initial=0))
+    count = cluster_count(labels)
     low, high, sizes = extents(xyz, labels, count)
     low[sizes == 0] = high[sizes == 0] = 0
     boxes = np.zeros((count, 7), np.float32)
@@ -65,7 +66,7 @@ def ellipses(xyz: np.ndarray, labels: np.ndarray) -> np.ndarray:
     ellipse filled evenly. It covers most of a cluster; a few stray points may lie outside.
     """
     members = np.flatnonzero(labels > 0)
-    cluster, count = labels[members] - 1, int(labels.max(initial=0))
+    cluster, count = labels[members] - 1, cluster_count(labels)
     sizes = np.maximum(np.bincount(cluster, minlength=count), 1)
 
     def mean(values):

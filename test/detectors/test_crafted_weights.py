@@ -69,8 +69,8 @@ def mutated(header, rng):
 
 
 SMALL = {
-    "pointpillars": (lambda: Header(tiny("v4"), {"steps": 1}, {"map": 0.5}, "abc"), lively, load_detector,
-                     eager()),
+    "pointpillars": (lambda: Header(tiny("v4"), {"steps": 1}, {"map": 0.5}, "abc"), lively,
+                     load_detector, eager()),
     "pointnet": (lambda: Header(pointnet_config(points=16, centroids=8, coarse=4,
                                                 neighbours=(4, 4, 4), coarse_neighbours=4)),
                  make_pointnet, load_pointnet_detector,
