@@ -27,8 +27,14 @@ class Config(Protocol):
     """What a network looks like, a dataclass. network: its name in NETWORKS."""
 
     network: ClassVar[str]
-    classes: Any  # tuple of names
-    title: Any    # which one of its network, a str
+
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The names of what it detects."""
+
+    @property
+    def title(self) -> str:
+        """Which one of its network it is."""
 
 
 POINTPILLARS, POINTNET = NetworkConfig.network, PointNetConfig.network
@@ -81,7 +87,7 @@ PARTS = {"config": dict, "training": dict, "metrics": dict, "commit": str}
 def _content(text: str | None, source: str) -> dict[str, Any]:
     """The header's parts, all there, of a network that is known."""
     try:
-        content = json.loads(text)
+        content = json.loads(text or "")
         parts = {name: content[name] for name in ("format", *PARTS)}
         network = content.get("network", POINTPILLARS)  # the first files had no such key
         if not all(isinstance(parts[name], kind) for name, kind in PARTS.items()):

@@ -26,7 +26,7 @@ def config_of(kind: type[C], content: Any, source: str) -> C:
 
 def _as(kind: Any, value: Any, name: str) -> Any:
     """value as a kind, a type or tuple[...]. ValueError naming what does not fit."""
-    if dataclasses.is_dataclass(kind) and isinstance(value, dict):
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind) and isinstance(value, dict):
         hints = get_type_hints(kind)
         known = {f.name for f in dataclasses.fields(kind)}
         if unknown := sorted(set(value) - known):
