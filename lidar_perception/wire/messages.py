@@ -92,7 +92,7 @@ def thin_cloud(msg: Any, xyz: np.ndarray, indices: np.ndarray, make: Any) -> Any
     names = to_array(msg).dtype.names or ()
     fields = {axis: xyz[:, i] for i, axis in enumerate("xyz")}
     for name in [n for n in INTENSITY_FIELDS if n in names][:1]:
-        fields["intensity"] = column(msg, name, indices)
+        fields["intensity"] = _single(to_array(msg), name).take(indices)
     points = np.empty(len(xyz), [(name, "<f4") for name in fields])
     for name, values in fields.items():
         points[name] = values
