@@ -189,7 +189,7 @@ def detection_markers(detections: Detections, header: Any, make: Any, previous: 
     where it is one cluster of the cloud: a marker's own id has 32 bits, which not every cluster_id
     fits. previous and lifetime_ns as in to_marker_array."""
     labels = [CLASSES[i] for i in detections.class_ids]
-    texts: list[dict] = [{"id": i} for i in range(len(detections))]
+    texts: list[dict[str, int]] = [{"id": i} for i in range(len(detections))]
     for text, cluster in zip(texts, () if clusters is None else clusters):
         text["cluster_id"] = int(cluster)
     return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
