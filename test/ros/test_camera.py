@@ -47,8 +47,6 @@ def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, processes
         processes.start(node, remap, {**flatten(PAPER), "input.max_wait": 3600.0})
     found = peer.listen(f"/{last}/output/detections", MARKERS)
     truth, cloud = peer.talker(TRUTH, MARKERS), peer.talker(POINTS, CLOUD)
-    peer.wait(truth.get_subscription_count, "the node that takes labels")
-    truth.publish(encode(sent[TRUTH]))
     peer.send(cloud, sent[POINTS], lambda: "waits for the camera's calibration"
               in peer.message_of(first), "the reason why it waits")
     assert not found
@@ -56,7 +54,7 @@ def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, processes
     for topic, msg in camera.items():
         assert not found
         peer.talker(topic, types[topic], LATCHED).publish(encode(msg))
-    peer.wait(lambda: found, "the detections")
+    peer.send(truth, sent[TRUTH], lambda: found, "the detections")
     received = to_detections(from_marker_array(found[-1]))
     np.testing.assert_array_equal(received.boxes, expected.boxes)
     np.testing.assert_array_equal(received.scores, expected.scores)
