@@ -9,8 +9,9 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import fit_plane, inlier_share
 from lidar_perception.nodes.inputs import CameraInput
+from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import Obstacles
-from lidar_perception.nodes.runtime import CLOUD, OK, WARN, LidarNode
+from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import GroundNodeParams, GroundRobotParams
 from lidar_perception.wire.codec import bag_message, encode
@@ -21,19 +22,21 @@ from msg_utils.stamps import to_ns
 __all__ = ["GroundSegmentation", "warm_up"]
 
 
-class GroundSegmentation(LidarNode):
+class GroundSegmentation(ManagedNode):
     """One plane, Patchwork++ or cloth simulation. ~/output/ground, nonground and obstacles are made
     only while somebody subscribes."""
 
     def __init__(self, **options: Any):
         super().__init__("ground_segmentation", GroundNodeParams(), GroundRobotParams(), **options)
+
+    def configure(self) -> None:
         self.camera = CameraInput(self)
         self.sensor = SensorCheck(self)
         self.points = self.output("points", CLOUD)
         self.ground = self.output("ground", CLOUD)
         self.nonground = self.output("nonground", CLOUD)
         self.obstacles = Obstacles(self)
-        self.input("points", CLOUD, self.on_points)
+        self.input("points", CLOUD, self.on_points, needs=self.camera.missing)
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):

@@ -10,8 +10,9 @@ from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import explain_nothing
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.inputs import CameraInput, SeedInput
+from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes, Obstacles
-from lidar_perception.nodes.runtime import CLOUD, LidarNode
+from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import PerceptionRobotParams
 from lidar_perception.wire.codec import bag_message, encode
@@ -22,12 +23,14 @@ from msg_utils.stamps import to_ns
 __all__ = ["Perception", "warm_up"]
 
 
-class Perception(LidarNode):
+class Perception(ManagedNode):
     """Same stages, parameters and results as the graph of single nodes, without the copies
     between them. ~/output/points, boxes and obstacles are made only while somebody subscribes."""
 
     def __init__(self, **options: Any):
         super().__init__("perception", PipelineParams(), PerceptionRobotParams(), **options)
+
+    def configure(self) -> None:
         self.camera = CameraInput(self)
         self.sensor = SensorCheck(self)
         self.outputs = CandidateOutputs(self, STEPS)
@@ -35,7 +38,7 @@ class Perception(LidarNode):
         self.boxes = ClusterBoxes(self)
         self.obstacles = Obstacles(self)
         self.seed = SeedInput(self, self.on_cloud)
-        self.input("points", CLOUD, self.seed.add_cloud)
+        self.input("points", CLOUD, self.seed.add_cloud, needs=self.camera.missing)
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
