@@ -7,6 +7,7 @@ import subprocess
 import sys
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -193,3 +194,22 @@ def test_a_sensor_that_slows_down_is_seen_by_its_own_clock():
         info["source_timestamp"] = 29 * 10**8 + (info["publication_sequence_number"] - 29) * 10**9
         arrivals.add([info], 0)
     assert arrivals.learned == pytest.approx(10) and arrivals.rate() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("remap, buffer, profile", [
+    ("~/input/points:=/velodyne_points", 8 << 20, "fastdds_driver.xml"),
+    ("~/input/points:=/velodyne_points", 212_992, "fastdds.xml"),
+    ("~/input/points:=clustering/output/points", 8 << 20, "fastdds.xml")])
+def test_clouds_of_a_driver_come_by_udp_where_a_socket_holds_one(remap, buffer, profile,
+                                                                 monkeypatch):
+    from lidar_perception.nodes import main
+    monkeypatch.setattr(main, "socket_buffer", lambda: buffer)
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=1 << 20, f_frsize=4096))
+    for name in PROFILE_VARIABLES:
+        monkeypatch.setenv(name, "")
+    arguments = ["pointpillars_detector", "--ros-args", "-r", remap]
+    main.use_large_shared_memory(main.fed_by_a_driver(arguments))
+    assert {Path(os.environ[name]).name for name in PROFILE_VARIABLES} == {profile}
+    assert Path(os.environ[PROFILE_VARIABLES[0]]).is_file()
+    main.use_large_shared_memory(True)  # what is set stays
+    assert Path(os.environ[PROFILE_VARIABLES[0]]).name == profile
