@@ -60,9 +60,6 @@ ALWAYS_OUT = [
     ("/diagnostics", "diagnostic_msgs/DiagnosticArray", "Once a second and at every change: state, "
      "reason, counts, rate, lost and dropped clouds, subscribers of the outputs."),
 ]
-OBSTACLES_OUT = ("~/output/obstacles", CLOUD, "x y z, and intensity where the cloud has one, of "
-                 "the points that are no ground and within the heights of `obstacles`, for a "
-                 "costmap ([nav2](../nav2.md)); made only while subscribed.")
 MANAGED_OUT = [("~/transition_event", "lifecycle_msgs/TransitionEvent", "Each change of the state, "
                 "see [lifecycle](../lifecycle.md).")]
 MANAGED_SERVICES = [
@@ -70,6 +67,9 @@ MANAGED_SERVICES = [
      "shut down."),
     ("~/get_state", "lifecycle_msgs/GetState", "And the others of a managed node."),
 ]
+OBSTACLES_OUT = ("~/output/obstacles", CLOUD, "x y z, and intensity where the cloud has one, of "
+                 "the points that are no ground and within the heights of `obstacles`, for a "
+                 "costmap ([nav2](../nav2.md)); made only while subscribed.")
 COLUMNS = "columns `ground` (uint8, 1 = ground) and `in_view` (uint8, 1 = processed)"
 
 PAGES: dict[str, dict[str, Any]] = {

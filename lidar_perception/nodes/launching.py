@@ -95,35 +95,6 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     ) for node, remap in graph.items()]
 
 
-def _viewer(value: dict[str, str], config_folder: Path) -> Node:
-    """RViz, its topics renamed as those of the nodes are."""
-    file = config_folder / "lidar_perception.rviz"
-    frame = ["-f", value["rviz_frame"]] if value["rviz_frame"] else []
-    renamed = {topic: _shown(topic, value) for _, topic in rviz_topics(file)}
-    return Node(
-        package="rviz2", executable="rviz2", name=value["name_prefix"] + "rviz",
-        namespace=value["namespace"] or None, arguments=["-d", str(file), *frame], output="screen",
-        parameters=[{"use_sim_time": value["use_sim_time"] == "true"}],
-        remappings=[(a, b) for a, b in renamed.items() if a != b])
-
-
-def rviz_topics(file: Path) -> list[tuple[str, str]]:
-    """(class, topic) of each display and tool of an RViz file that has a topic."""
-    manager = yaml.safe_load(file.read_text())["Visualization Manager"]
-    return [(each["Class"], each["Topic"]["Value"])
-            for each in [*manager["Displays"], *manager["Tools"]] if "Topic" in each]
-
-
-def _shown(topic: str, value: dict[str, str]) -> str:
-    node, slash, rest = topic.partition("/")
-    if topic == relative(POINTS):
-        return value["points"]
-    if value["single"] == "true" and node in STAGES:
-        node = next(iter(SINGLE))
-    ours = node in {*graph_of([*BEHIND]), *SINGLE}
-    return (value["name_prefix"] if ours else "") + node + slash + rest
-
-
 def conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
     """What to say about the parameter file of ground and clusters: a line for each detector whose
     own file has other numbers; none where the user chose the file."""
@@ -181,6 +152,35 @@ def _detectors(value: dict[str, str]) -> list[str]:
     if not detectors:
         raise InputError(f"detectors is empty; give one or several of {','.join(BEHIND)}")
     return detectors
+
+
+def _viewer(value: dict[str, str], config_folder: Path) -> Node:
+    """RViz, its topics renamed as those of the nodes are."""
+    file = config_folder / "lidar_perception.rviz"
+    frame = ["-f", value["rviz_frame"]] if value["rviz_frame"] else []
+    renamed = {topic: _shown(topic, value) for _, topic in rviz_topics(file)}
+    return Node(
+        package="rviz2", executable="rviz2", name=value["name_prefix"] + "rviz",
+        namespace=value["namespace"] or None, arguments=["-d", str(file), *frame], output="screen",
+        parameters=[{"use_sim_time": value["use_sim_time"] == "true"}],
+        remappings=[(a, b) for a, b in renamed.items() if a != b])
+
+
+def rviz_topics(file: Path) -> list[tuple[str, str]]:
+    """(class, topic) of each display and tool of an RViz file that has a topic."""
+    manager = yaml.safe_load(file.read_text())["Visualization Manager"]
+    return [(each["Class"], each["Topic"]["Value"])
+            for each in [*manager["Displays"], *manager["Tools"]] if "Topic" in each]
+
+
+def _shown(topic: str, value: dict[str, str]) -> str:
+    node, slash, rest = topic.partition("/")
+    if topic == relative(POINTS):
+        return value["points"]
+    if value["single"] == "true" and node in STAGES:
+        node = next(iter(SINGLE))
+    ours = node in {*graph_of([*BEHIND]), *SINGLE}
+    return (value["name_prefix"] if ours else "") + node + slash + rest
 
 
 def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, Any]:
