@@ -17,7 +17,7 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 from test_bad_input import CLOUD, MARKERS, cloud
 
 from lidar_perception.nodes.graph import STAGES
-from lidar_perception.nodes.main import PROFILE_VARIABLES
+from lidar_perception.nodes.main import PROFILE_VARIABLES, SOCKET_BUFFER, socket_buffer
 from lidar_perception.nodes.reception import RATE_OF, SHARE_OF, Arrivals
 from lidar_perception.wire.codec import encode
 from msg_utils.stamps import to_ns
@@ -44,8 +44,9 @@ def driver(peer, reliability, count, points=KITTI, first=1, hz=10):
 
 
 def test_an_ordinary_driver(processes, peer):
-    """RELIABLE loses nothing; BEST_EFFORT, which comes later, is received too, and what it loses
-    is counted and said with a remedy; the end of it is an ERROR, then STALE, then forgotten."""
+    """RELIABLE loses nothing; of BEST_EFFORT, which comes later, most arrives where a socket may
+    hold a cloud, and what is lost is counted and said with a remedy; the end of it is an ERROR,
+    then STALE, then forgotten."""
     def value(key):
         return int(peer.value_of(NODE, key) or 0)
 
@@ -55,6 +56,8 @@ def test_an_ordinary_driver(processes, peer):
     def done():
         return value("frames") + value("dropped")
 
+    for name in PROFILE_VARIABLES:  # the node chooses its profile, as one started by a user
+        processes.environment.pop(name, None)
     processes.start(NODE, {"~/input/points": "/in"}, {"input.error_after": 1, "input.stale_after":
                                                       3, "input.max_lost": 0})
     with driver(peer, "reliable", 30):
@@ -71,6 +74,8 @@ def test_an_ordinary_driver(processes, peer):
         assert peer.value_of(NODE, "reliability") == "best effort"
     peer.wait(lambda: "no cloud" in peer.message_of(NODE), "the end")
     assert value("frames") > before and done() + value("lost") <= 60
+    if socket_buffer() >= SOCKET_BUFFER:
+        assert done() - 30 > 15  # a plain rclpy subscriber gets a third of them
     if value("lost"):
         log = (processes.logs / f"{NODE}.log").read_text()
         assert log.count("were lost on the way; let /driver publish reliable") == 1
