@@ -9,6 +9,7 @@ dataclass is made, with the name, the value and the range in the message.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 from lidar_perception.candidates.params import (
     ConfidenceParams,
@@ -21,6 +22,7 @@ from lidar_perception.candidates.params import (
 from lidar_perception.clustering.params import BoxParams, ClusteringParams
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import Params, param
+from lidar_perception.tracking.params import EgoParams, TrackingParams, tracking_of
 from lidar_perception.wire.params import InputParams, ViewParams
 
 
@@ -58,6 +60,22 @@ class MarkerParams(Params):
 
 
 @dataclass(frozen=True)
+class TrackMarkerParams(MarkerParams):
+    """Boxes, and the ways of tracks."""
+
+    trail: float = param(2.0, "The way of a track is drawn for this time; 0 draws none.", unit="s",
+                         low=0.0, high=60.0)
+
+
+@dataclass(frozen=True)
+class OptionalTracking(TrackingParams):
+    """Tracks in one process with a detector."""
+
+    enabled: bool = param(False, "Publish tracks of what is detected, too, on ~/output/tracks.",
+                          fixed=True)
+
+
+@dataclass(frozen=True)
 class CloudNodeParams:
     """What a node that takes clouds has besides the numbers of its algorithm."""
 
@@ -70,6 +88,33 @@ class BoxNodeParams:
 
     input: ReceptionParams = ReceptionParams()
     output: MarkerParams = MarkerParams()
+
+
+@dataclass(frozen=True)
+class DetectionNodeParams:
+    """What a node that detects objects in clouds has besides the numbers of its algorithm."""
+
+    input: ReceptionParams = ReceptionParams()
+    output: TrackMarkerParams = TrackMarkerParams()
+    tracking: OptionalTracking = OptionalTracking()
+    ego: EgoParams = EgoParams()
+
+    @staticmethod
+    def of(detector: str) -> DetectionNodeParams:
+        """With the tracker's numbers for a detector."""
+        return DetectionNodeParams(tracking=OptionalTracking(**vars(tracking_of(detector))))
+
+
+CANDIDATES, POINTPILLARS, POINTNET = (partial(DetectionNodeParams.of, name)
+                                      for name in ("candidates", "pointpillars", "pointnet"))
+
+
+@dataclass(frozen=True)
+class TrackInputParams:
+    """What the tracker has besides its numbers. Each detection counts, so some may wait."""
+
+    input: ReceptionParams = ReceptionParams(queue=10)
+    output: TrackMarkerParams = TrackMarkerParams()
 
 
 # Each node declares the groups of its own stages, under the same names.
@@ -97,6 +142,12 @@ class RefinementNodeParams:
     resolution: ResolutionParams = ResolutionParams()
     confidence: ConfidenceParams = ConfidenceParams()
     seed: SeedParams = SeedParams()
+
+
+@dataclass(frozen=True)
+class TrackerNodeParams:
+    tracking: TrackingParams = TrackingParams()
+    ego: EgoParams = EgoParams()
 
 
 @dataclass(frozen=True)

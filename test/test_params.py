@@ -25,17 +25,21 @@ from lidar_perception.params import (
     BoxNodeParams,
     CloudNodeParams,
     ClusteringNodeParams,
+    DetectionNodeParams,
     GroundNodeParams,
     PlayerParams,
     RefinementNodeParams,
+    TrackerNodeParams,
+    TrackInputParams,
 )
+from lidar_perception.tracking import params as tracking_params
 from lidar_perception.training import params as training_params
 from lidar_perception.training.params import PointPillarsTraining
 from lidar_perception.types import InputError
 from lidar_perception.wire import params as wire_params
 
 MODULES = (node_params, candidate_params, clustering_params, detector_params, ground_params,
-           wire_params, pointpillars_params, pointnet_params, training_params)
+           wire_params, tracking_params, pointpillars_params, pointnet_params, training_params)
 
 
 def groups_below(base: type) -> list[type]:
@@ -44,7 +48,8 @@ def groups_below(base: type) -> list[type]:
 
 GROUPS = [group for group in groups_below(Params)
           if group.__module__ in [each.__name__ for each in MODULES]]
-COMPOSITES = [BoxNodeParams, CloudNodeParams, PipelineParams, GroundNodeParams,
+COMPOSITES = [BoxNodeParams, DetectionNodeParams, TrackerNodeParams, TrackInputParams,
+              CloudNodeParams, PipelineParams, GroundNodeParams,
               ClusteringNodeParams, RefinementNodeParams,
               DetectorParams, PointNetDetectorParams, PointPillarsTraining]
 FIELDS = [pytest.param(group, f, id=f"{group.__name__}.{f.name}")

@@ -13,7 +13,7 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.inputs import SeedInput
 from lidar_perception.nodes.outputs import CandidateOutputs
 from lidar_perception.nodes.runtime import CLOUD, LidarNode
-from lidar_perception.params import BoxNodeParams, RefinementNodeParams
+from lidar_perception.params import DetectionNodeParams, RefinementNodeParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import cluster_column, column, to_frame
 from msg_utils.stamps import to_ns
@@ -25,8 +25,8 @@ class CandidateRefinement(LidarNode):
     """Ground snapping, height filter, STM and CPA."""
 
     def __init__(self, **options: Any):
-        super().__init__("candidate_refinement", RefinementNodeParams(), BoxNodeParams(),
-                         **options)
+        super().__init__("candidate_refinement", RefinementNodeParams(),
+                         DetectionNodeParams.of("candidates"), **options)
         self.outputs = CandidateOutputs(self)
         self.seed = SeedInput(self, self.on_cloud)
         self.input("points", CLOUD, self.seed.add_cloud)
@@ -43,4 +43,5 @@ class CandidateRefinement(LidarNode):
             segmented = Segmented(indices, frame.xyz, ground, ids,
                                   grounded_boxes(frame.xyz, ground, ids,
                                                  self.params.boxes.shape), numbers)
-            self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params))
+            self.outputs.publish(msg.header, frame.xyz,
+                                 lambda: refined(segmented, source, self.params))

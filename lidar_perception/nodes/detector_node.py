@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import os
 import traceback
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.params import NetworkParams
 from lidar_perception.nodes.main import one_at_a_time
 from lidar_perception.nodes.outputs import DetectionOutputs
 from lidar_perception.nodes.runtime import CLOUD, ERROR, OK, WARN, LidarNode
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.params import BoxNodeParams
+from lidar_perception.params import DetectionNodeParams
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.messages import cluster_column, column, to_frame
 from msg_utils.stamps import to_ns
@@ -29,7 +31,7 @@ class DetectorNode(LidarNode):
     group: ClassVar[str]  # of the parameters, a NetworkParams
 
     def __init__(self, name: str, params: Any, steps: tuple[str, ...], **options: Any):
-        super().__init__(name, params, BoxNodeParams(), **options)
+        super().__init__(name, params, DetectionNodeParams.of(self.group), **options)
         self.sensor = SensorCheck(self)
         self.outputs = DetectionOutputs(self, steps)
         self.report(WARN, "loading the network", expected=True)
@@ -93,14 +95,26 @@ class DetectorNode(LidarNode):
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices = to_frame(msg, self.params.input.intensity_max)
             ground, clusters = column(msg, "ground", indices), cluster_column(msg, indices)
-            self.detector.params = self.params
+            own = getattr(self.params, self.group)
+            self.detector.params = self._with_weak(own)
             found = self.detector(frame, ground=None if ground is None else ground > 0,
                                   cluster_ids=None if clusters is None else clusters[0])
-            self.outputs.publish(msg.header, found.detections, found.ms)
-        self._diagnose(frame, found)
+            weak = found.detections
+            if self.outputs.tracks is not None:
+                found = replace(found, detections=weak[own.scores.passed(weak)])
+            untracked = self.outputs.publish(msg.header, found.detections, found.ms, frame.xyz,
+                                             weak)
+        self._diagnose(frame, found, untracked)
 
-    def _diagnose(self, frame: LidarFrame, found: Found) -> None:
-        problem = found.problem or self.sensor.problem(frame)
+    def _with_weak(self, own: NetworkParams) -> Any:
+        """The parameters, with thresholds that let through what a tracker needs as well."""
+        if self.outputs.tracks is None:
+            return self.params
+        low = own.scores.at_most(self.robot.tracking.min_score)
+        return replace(self.params, **{self.group: replace(own, scores=low)})
+
+    def _diagnose(self, frame: LidarFrame, found: Found, untracked: str | None) -> None:
+        problem = found.problem or self.sensor.problem(frame) or untracked
         self.counts.update(detections=len(found.detections), device=str(self.detector.device))
         self.counts["best scores"] = " ".join(
             f"{name} {score:.2f}" for name, score in found.best.items())

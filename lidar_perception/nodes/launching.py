@@ -10,9 +10,20 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
-from lidar_perception.nodes.graph import BEHIND, graph_of, prefixed, relative
+from lidar_perception.nodes.graph import (
+    BEHIND,
+    ODOMETRY_IN,
+    TRACKER,
+    executable_of,
+    graph_of,
+    prefixed,
+    relative,
+    trackers_of,
+)
+from lidar_perception.param_fields import flatten
+from lidar_perception.tracking.params import tracking_of
 from lidar_perception.types import InputError
-from lidar_perception.wire.topics import POINTS
+from lidar_perception.wire.topics import ODOMETRY, POINTS
 
 CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet"}
 NETWORKS = ("pointpillars", "pointnet")  # as their groups of parameters
@@ -33,6 +44,10 @@ ARGUMENTS = {
                     "that comes with the package."),
     "device": dict(default_value="", description="auto, cpu, cuda, cuda:N of the networks; empty: "
                    "that of the parameter file."),
+    "tracking": dict(**SWITCHES, description="Tracks of what each detector finds: a tracker behind "
+                     "each; with `single` in the detector's process."),
+    "odometry": dict(default_value=relative(ODOMETRY), description="Topic of the odometry, for "
+                     "the trackers."),
     "single": dict(**SWITCHES, description="Each detector in one process, which finds ground and "
                    "clusters itself."),
     "use_sim_time": dict(**SWITCHES, description="Take the time from /clock."),
@@ -62,23 +77,45 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     if not detectors:
         raise InputError(f"detectors is empty; give one or several of {','.join(BEHIND)}")
     single, prefix = value["single"] == "true", value["name_prefix"]
-    graph = prefixed(graph_of(detectors, single), prefix)
+    tracking = value["tracking"] == "true"
+    graph = prefixed(graph_of(detectors, single, tracking and not single), prefix)
     owner = {prefix + node: name for name in reversed(detectors)
              for node in graph_of([name], single)}
+    trackers = {prefix + node: name for node, name in trackers_of(detectors).items()}
+    topics = {relative(POINTS): value["points"], relative(ODOMETRY): value["odometry"]}
+
+    def parameters(node: str) -> list[Any]:
+        detector = trackers.get(node) or owner[node]
+        name = TRACKER if node in trackers else CONFIGS[detector]
+        file = value["config"] or str(config_folder / f"{name}.param.yaml")
+        if node in trackers:
+            return [_tracked(detector), file, _given(value, "", detectors)]
+        return [file, _given(value, detector, detectors, tracking and single)]
+
+    def remapped(node: str) -> dict[str, str]:
+        in_process = ODOMETRY_IN if tracking and single else {}
+        return {a: topics.get(b, b) for a, b in {**graph[node], **in_process}.items()}
+
     return [Node(
-        package="lidar_perception", executable=node.removeprefix(prefix), name=node,
-        namespace=value["namespace"] or None, output="screen",
-        parameters=[value["config"] or str(config_folder / f"{CONFIGS[owner[node]]}.param.yaml"),
-                    _given(value, owner[node], detectors)],
-        remappings=[(a, value["points"] if b == relative(POINTS) else b)
-                    for a, b in remap.items()],
-        ros_arguments=["--log-level", value["log_level"]],
-    ) for node, remap in graph.items()]
+        package="lidar_perception", executable=executable_of(node.removeprefix(prefix)), name=node,
+        namespace=value["namespace"] or None, output="screen", parameters=parameters(node),
+        remappings=[*remapped(node).items()], ros_arguments=["--log-level", value["log_level"]],
+    ) for node in graph]
 
 
-def _given(value: dict[str, str], detector: str, detectors: list[str]) -> dict[str, Any]:
+def _tracked(detector: str) -> dict[str, Any]:
+    """What the tracker behind a detector has instead of the defaults; files stand above it."""
+    default = flatten(tracking_of(""))
+    return {f"tracking.{name}": number for name, number in flatten(tracking_of(detector)).items()
+            if number != default[name]}
+
+
+def _given(value: dict[str, str], detector: str, detectors: list[str],
+           tracking: bool = False) -> dict[str, Any]:
     """Parameters that arguments set."""
     given: dict[str, Any] = {"use_sim_time": value["use_sim_time"] == "true"}
+    if tracking:
+        given["tracking.enabled"] = True
     if value["reliability"]:
         given["input.reliability"] = value["reliability"]
     if detector in NETWORKS:

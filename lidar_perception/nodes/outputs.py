@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,6 +11,7 @@ from std_msgs.msg import Float64
 from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import class_by_diagonal
 from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
+from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, has_detections_3d
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import detection_markers
@@ -68,21 +68,25 @@ class DetectionMarkers:
 
 
 class DetectionOutputs:
-    """~/output/detections (and ~/output/detections_3d where vision_msgs is installed), and the time
-    of each step."""
+    """~/output/detections (and ~/output/detections_3d where vision_msgs is installed), the time
+    of each step, and with the parameter tracking.enabled the tracks."""
 
     def __init__(self, node: LidarNode, steps: tuple[str, ...]):
         self.markers = DetectionMarkers(node, "detections")
         self.detections_3d = None
-        if importlib.util.find_spec("vision_msgs"):
+        if has_detections_3d():
             self.detections_3d = node.create_publisher(
-                message_class("vision_msgs/msg/Detection3DArray"), "~/output/detections_3d",
-                RELIABLE)
+                message_class(DETECTIONS_3D), "~/output/detections_3d", RELIABLE)
         self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE)
                            for step in steps}
+        self.tracks = (TrackOutputs(node, lambda: node.robot, clouds=True)
+                       if node.robot.tracking.enabled else None)
 
-    def publish(self, header: Any, detections: Detections, ms: Mapping[str, float]) -> None:
-        """Publish detections, and the times of the steps that are known."""
+    def publish(self, header: Any, detections: Detections, ms: Mapping[str, float],
+                xyz: np.ndarray, weak: Detections | None = None) -> str | None:
+        """Publish detections of the scan xyz (N, 3), the times of the steps that are known, and
+        where there is a tracker the tracks; it is given `weak`, with those below the thresholds
+        too, if there are any. Returns what was wrong for the tracker."""
         self.markers.publish(header, detections)
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             self.detections_3d.publish(to_detection_array(
@@ -92,6 +96,9 @@ class DetectionOutputs:
         for step, publisher in self.step_times.items():
             if step in ms:
                 publisher.publish(Float64(data=ms[step]))
+        if self.tracks is None:
+            return None
+        return self.tracks.publish(header, detections if weak is None else weak, xyz)
 
 
 class CandidateOutputs:
@@ -104,10 +111,10 @@ class CandidateOutputs:
                        for stage in ("stage1", "stage2")}
         self.final = DetectionOutputs(node, steps)
 
-    def publish(self, header: Any, find: Callable[[], Candidates],
+    def publish(self, header: Any, xyz: np.ndarray, find: Callable[[], Candidates],
                 problem: str | None = None) -> None:
-        """Publish what find() gives; where it raises InputError, no candidates and the reason.
-        problem is what is known to be wrong with the frame already."""
+        """Publish what find() gives for the scan xyz (N, 3); where it raises InputError, no
+        candidates and the reason. problem is what is known to be wrong with the frame already."""
         try:
             candidates = find()
         except InputError as error:
@@ -115,8 +122,8 @@ class CandidateOutputs:
         for stage, markers in self.stages.items():
             if markers.publisher.get_subscription_count():
                 markers.publish(header, getattr(candidates, stage))
-        self.final.publish(header, candidates.final, candidates.ms)
-        self._diagnose(candidates, problem)
+        untracked = self.final.publish(header, candidates.final, candidates.ms, xyz)
+        self._diagnose(candidates, problem or untracked)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:
         self.node.counts["candidates"] = len(candidates.final)

@@ -13,7 +13,7 @@ from lidar_perception.nodes.inputs import CameraInput, SeedInput
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes
 from lidar_perception.nodes.runtime import CLOUD, LidarNode
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.params import BoxNodeParams
+from lidar_perception.params import DetectionNodeParams
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import spread
 from msg_utils.point_cloud2 import add_columns
@@ -27,7 +27,8 @@ class Perception(LidarNode):
     between them. ~/output/points and ~/output/boxes are made only while somebody subscribes."""
 
     def __init__(self, **options: Any):
-        super().__init__("perception", PipelineParams(), BoxNodeParams(), **options)
+        super().__init__("perception", PipelineParams(), DetectionNodeParams.of("candidates"),
+                         **options)
         self.camera = CameraInput(self)
         self.sensor = SensorCheck(self)
         self.outputs = CandidateOutputs(self, STEPS)
@@ -43,8 +44,8 @@ class Perception(LidarNode):
                                 self.params)
             problem = (explain_nothing(len(frame), segmented.ground, segmented.cluster_ids)
                        or self.sensor.problem(frame))
-            self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params),
-                                 problem)
+            self.outputs.publish(msg.header, frame.xyz,
+                                 lambda: refined(segmented, source, self.params), problem)
         if self.points.get_subscription_count():
             indices = usable.take(segmented.indices)
             self.points.publish(encode(add_columns(

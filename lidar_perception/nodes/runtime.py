@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from std_msgs.msg import Float64
 
@@ -46,7 +47,7 @@ class LidarNode(Node):
 
     params is a dataclass of params.py; its fields are declared as ROS parameters, and a change at
     run time goes through the same checks. So is robot, what the node has besides its algorithm's
-    numbers: CloudNodeParams or BoxNodeParams where it takes clouds.
+    numbers: CloudNodeParams, BoxNodeParams ... where it takes clouds.
     """
 
     def __init__(self, name: str, params: Any, robot: Any = None, **options: Any):
@@ -89,14 +90,15 @@ class LidarNode(Node):
               qos: QoSProfile | None = None, private: bool = True) -> None:
         """Subscribe to ~/input/TOPIC, or with private=False to the name as it is. callback gets
         rosbags' class of the message, the one that offline code reads from bags: it views the
-        received bytes, where rclpy's own class copies them several times. Without qos the topic
-        is received as reception.py does."""
+        received bytes, where rclpy's own class copies them several times. Types that rosbags does
+        not come with are of rclpy's class. Without qos the topic is received as reception.py
+        does."""
         name = f"~/input/{topic}" if private else topic
         _warm_up_type(type_name)
 
         def guarded(data: bytes) -> None:
             try:
-                msg = decode(data, type_name)
+                msg = _decoded(data, type_name)
                 if type_name == CLOUD:
                     self.frame_id = msg.header.frame_id
                 callback(msg)
@@ -111,8 +113,9 @@ class LidarNode(Node):
             self.counts["lost"] += event.total_count_change
 
         if qos is None:
+            what = "cloud" if type_name == CLOUD else "array"
             self._receptions.append(Reception(self, message_class(type_name), name, guarded,
-                                              lambda: self.robot.input))
+                                              lambda: self.robot.input, what))
             return
         self.create_subscription(
             message_class(type_name), name, guarded, qos, raw=True,
@@ -215,6 +218,12 @@ class LidarNode(Node):
 
     def close(self) -> None:
         """Called once before the node is destroyed."""
+
+
+def _decoded(data: bytes, type_name: str) -> Any:
+    if type_name in typestore().fielddefs:
+        return decode(data, type_name)
+    return deserialize_message(data, message_class(type_name))
 
 
 def _warm_up_type(type_name: str) -> None:
