@@ -63,7 +63,7 @@ class EgoInput:
     def _on_odometry(self, msg: Any) -> None:
         pose = pose_of(msg.pose.pose)
         self.child = msg.child_frame_id
-        self.history.add(to_ns(msg.header.stamp), pose)
+        self._add(to_ns(msg.header.stamp), pose)
 
     def _on_cloud(self, msg: Any) -> None:
         self._register(to_ns(msg.header.stamp), to_frame(msg)[0].xyz)
@@ -75,4 +75,8 @@ class EgoInput:
         if not 0 < gap <= 2 * self.params().max_gap:  # a map of another place, or of another time
             self.icp, self.history = Odometry(), PoseHistory()
         self.scan_ns = stamp_ns
-        self.history.add(stamp_ns, self.icp(xyz))
+        self._add(stamp_ns, self.icp(xyz))
+
+    def _add(self, stamp_ns: int, pose: np.ndarray) -> None:
+        self.history.add(stamp_ns, pose)
+        self.node.counts["last_pose_ns"] = stamp_ns
