@@ -39,19 +39,20 @@ def measure_tracking(drives: dict[str, Sequence[Seen]], calibration: Calibration
     """By "ours" and "plain AB3DMOT": the scores of TrackingReport, by centres, and ms, the median
     time of a frame."""
     return {name: _measured(drives, calibration, make) for name, make in (
-        ("plain AB3DMOT", _peer), ("ours", lambda: _ours(params)))}
+        ("plain AB3DMOT", lambda: peer(PlainAb3dmot())), ("ours", lambda: tracker(params)))}
 
 
-def _peer() -> Step:
-    tracker = PlainAb3dmot()
-    return lambda seen: tracker(seen.found[seen.found.scores >= OPERATING], seen.pose)
+def peer(plain: PlainAb3dmot, operating: float = OPERATING) -> Step:
+    """One drive by the peer, which gets detections from the score `operating` on."""
+    return lambda seen: plain(seen.found[seen.found.scores >= operating], seen.pose)
 
 
-def _ours(params: TrackingParams) -> Step:
-    tracker = Tracker(params)
+def tracker(params: TrackingParams) -> Step:
+    """One drive by our tracker."""
+    ours = Tracker(params)
 
     def step(seen: Seen) -> tuple[np.ndarray, Detections]:
-        tracks = tracker(seen.found, seen.stamp_ns, seen.pose)
+        tracks = ours(seen.found, seen.stamp_ns, seen.pose)
         return tracks.ids, tracks.detections
     return step
 

@@ -60,10 +60,8 @@ class NeutralParams(Params):
     cyclist: float = param(0.3, "Of cyclists.", low=0.001, high=0.999)
 
 
-# Fitted for each detector that the package comes with, see docs/tracking.md.
-NEUTRAL = {
-    "pointpillars": NeutralParams(),
-}
+# Of detectors whose scores mean something else than those of PointPillars, see docs/tracking.md.
+NEUTRAL = {"pointnet": NeutralParams(pedestrian=0.5)}
 
 
 @dataclass(frozen=True)
