@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from typing import Self
 
 from lidar_perception.candidates.params import (
     ConfidenceParams,
@@ -20,7 +21,7 @@ from lidar_perception.candidates.params import (
     StmParams,
 )
 from lidar_perception.clustering.params import BoxParams, ClusteringParams
-from lidar_perception.ground.params import GroundParams
+from lidar_perception.ground.params import GroundParams, ObstacleParams
 from lidar_perception.param_fields import Params, param
 from lidar_perception.tracking.params import EgoParams, TrackingParams, tracking_of
 from lidar_perception.wire.params import InputParams, ViewParams
@@ -36,6 +37,9 @@ class ReceptionParams(Params):
         choices=("auto", "reliable", "best_effort"))
     queue: int = param(1, "Clouds that wait while one is worked on; older ones are dropped, and "
                           "counted. 1: the newest wins.", low=1, high=1000)
+    max_wait: float = param(10.0, "A cloud that needs what has not come yet, such as the camera's "
+                            "calibration with view.enabled, waits for this time.", unit="s",
+                            low=0.0, high=3600.0)
     rate: float = param(0.0, "Clouds a second that the sensor sends; 0 takes what the first 21 "
                         "say.", unit="Hz", low=0.0, high=1000.0)
     min_rate: float = param(0.7, "WARN below this share of the rate.", low=0.0, high=1.0)
@@ -76,44 +80,60 @@ class OptionalTracking(TrackingParams):
 
 
 @dataclass(frozen=True)
-class CloudNodeParams:
+class CloudNodeParams(Params):
     """What a node that takes clouds has besides the numbers of its algorithm."""
 
     input: ReceptionParams = ReceptionParams()
+    autostart: bool = param(True, "Configure and activate at the start. false: a lifecycle manager "
+                            "does, as Nav2's, or `ros2 lifecycle`.", fixed=True)
 
 
 @dataclass(frozen=True)
-class BoxNodeParams:
+class BoxNodeParams(CloudNodeParams):
     """What a node that makes boxes of clouds has besides the numbers of its algorithm."""
 
-    input: ReceptionParams = ReceptionParams()
     output: MarkerParams = MarkerParams()
 
 
 @dataclass(frozen=True)
-class DetectionNodeParams:
-    """What a node that detects objects in clouds has besides the numbers of its algorithm."""
+class GroundRobotParams(CloudNodeParams):
+    """What ground_segmentation has besides."""
 
-    input: ReceptionParams = ReceptionParams()
+    obstacles: ObstacleParams = ObstacleParams()
+
+
+@dataclass(frozen=True)
+class DetectionNodeParams(BoxNodeParams):
+    """What a node that detects objects in clouds has besides."""
+
     output: TrackMarkerParams = TrackMarkerParams()
     tracking: OptionalTracking = OptionalTracking()
     ego: EgoParams = EgoParams()
 
-    @staticmethod
-    def of(detector: str) -> DetectionNodeParams:
+    @classmethod
+    def of(cls, detector: str) -> Self:
         """With the tracker's numbers for a detector."""
-        return DetectionNodeParams(tracking=OptionalTracking(**vars(tracking_of(detector))))
+        return cls(tracking=OptionalTracking(**vars(tracking_of(detector))))
+
+
+@dataclass(frozen=True)
+class PerceptionRobotParams(DetectionNodeParams):
+    """What perception has besides."""
+
+    obstacles: ObstacleParams = ObstacleParams()
 
 
 CANDIDATES, POINTPILLARS, POINTNET = (partial(DetectionNodeParams.of, name)
                                       for name in ("candidates", "pointpillars", "pointnet"))
+PERCEPTION = partial(PerceptionRobotParams.of, "candidates")
 
 
 @dataclass(frozen=True)
-class TrackInputParams:
-    """What the tracker has besides its numbers. Each detection counts, so some may wait."""
+class TrackInputParams(CloudNodeParams):
+    """What the tracker has besides its numbers. Each detection counts, so some may wait, and each
+    waits a little for its pose."""
 
-    input: ReceptionParams = ReceptionParams(queue=10)
+    input: ReceptionParams = ReceptionParams(queue=10, max_wait=0.2)
     output: TrackMarkerParams = TrackMarkerParams()
 
 

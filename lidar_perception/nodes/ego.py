@@ -48,6 +48,12 @@ class EgoInput:
             self._register(stamp_ns, xyz)
         return self.history.at(stamp_ns, self.params().max_gap)
 
+    def needed(self, stamp_ns: int) -> str | None:
+        """What a frame of this stamp should wait for: its pose, where poses come but are a little
+        behind."""
+        behind = stamp_ns - self.history.newest
+        return "the pose of its time" if 0 < behind <= self.params().max_gap * 1e9 else None
+
     def problem(self, frame_id: str) -> str | None:
         """What is wrong with the poses for frames in frame_id, with the remedy."""
         if self.child and frame_id and self.child != frame_id:

@@ -28,6 +28,11 @@ class PoseHistory:
     def __len__(self) -> int:
         return len(self._stamps)
 
+    @property
+    def newest(self) -> int:
+        """The stamp of the newest, 0 for none."""
+        return self._stamps[-1] if self._stamps else 0
+
     def add(self, stamp_ns: int, pose: np.ndarray) -> bool:
         """False for what is no pose, which is left out."""
         if not usable(pose):

@@ -209,6 +209,7 @@ def test_detection_arrays_are_tracked_as_markers_are(domain):
     context, shown = Context(), []
     rclpy.init(context=context, domain_id=domain)
     node, tracker = TrackerNode(context=context), Tracker()
+    node.configure()
     node.tracks.markers = SimpleNamespace(publish=lambda data: shown.append(decode(data, MARKERS)))
     for i, found in enumerate(crowd()):
         boxes = [SimpleNamespace(

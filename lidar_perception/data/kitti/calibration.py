@@ -64,9 +64,9 @@ def matrix(values: dict, path: Path, name: str, shape: tuple[int, ...],
            other: str = "") -> np.ndarray:
     """The one of a name, or else of another. InputError, naming the file, if it is not there."""
     found = values.get(name, values.get(other))
-    if found is None or found.size != np.prod(shape):
-        raise InputError(f"{path} has no {name} of {int(np.prod(shape))} numbers; download KITTI's "
-                         "calibration again")
+    if found is None or found.size != np.prod(shape) or not np.isfinite(found).all():
+        raise InputError(f"{path} has no {name} of {int(np.prod(shape))} finite numbers; download "
+                         "KITTI's calibration again")
     return found.reshape(shape)
 
 
