@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.types import CLASSES, Detections
-from msg_utils.markers import COLORS, OTHER_COLOR, box_pose, to_marker_array
+from msg_utils.markers import ADD, COLORS, OTHER_COLOR, box_pose, to_marker_array
 from msg_utils.stamps import duration_message
 
 ARROW, LINE_STRIP, TEXT = 0, 4, 9
@@ -19,7 +19,7 @@ MAX_ID = 2**31      # a marker's id is an int32
 
 def track_markers(ids: np.ndarray, detections: Detections, velocities: np.ndarray,
                   moving: np.ndarray, trails: Sequence[np.ndarray], header: Any, make: Any, *,
-                  extras: Sequence[dict] | None = None,
+                  extras: Sequence[dict[str, Any]] | None = None,
                   previous: Iterable[tuple[str, int]] = (), lifetime_ns: int = 0) -> Any:
     """MarkerArray of K tracks with ids (K,): the boxes as detection_markers() has them, with the
     id, the velocity (2,) m/s, the probability of motion and extras in the text; and in the
@@ -54,11 +54,18 @@ def track_markers(ids: np.ndarray, detections: Detections, velocities: np.ndarra
     return markers
 
 
+def drawn_trails(msg: Any) -> dict[int, np.ndarray]:
+    """id -> trail (N, 3) float64 of the tracks of a MarkerArray that have one."""
+    return {int(m.id): np.array([[p.x, p.y, p.z] for p in m.points], np.float64)
+            for m in msg.markers if m.ns == TRAIL and m.action == ADD}
+
+
 def _drawn(make: Any, header: Any, ns: str, number: int, label: str, lifetime_ns: int, *,
-           scale: tuple, points: Iterable = (), **more: Any) -> Any:
+           scale: tuple[float, float, float],
+           points: Iterable[np.ndarray] = (), **more: Any) -> Any:
     r, g, b = COLORS.get(label, OTHER_COLOR)
     more.setdefault("pose", box_pose(np.zeros(7), make))
-    return make("visualization_msgs/msg/Marker", header=header, ns=ns, id=int(number), action=0,
+    return make("visualization_msgs/msg/Marker", header=header, ns=ns, id=int(number), action=ADD,
                 lifetime=duration_message(lifetime_ns, make),
                 scale=make("geometry_msgs/msg/Vector3", x=scale[0], y=scale[1], z=scale[2]),
                 color=make("std_msgs/msg/ColorRGBA", r=r, g=g, b=b, a=1.0),

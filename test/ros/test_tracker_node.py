@@ -10,7 +10,6 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from rclpy.qos import QoSProfile
-from ros_peer import Peer
 from test_bad_input import MARKERS
 from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, person, pose
 
@@ -21,6 +20,7 @@ from lidar_perception.nodes.tracker import TrackerNode
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
+from lidar_perception.testing.peer import Peer
 from lidar_perception.tracking.params import tracking_of
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
