@@ -11,7 +11,10 @@ from rich.table import Table
 
 from benchmark.plain_ab3dmot import PlainAb3dmot
 from lidar_perception.camera import Calibration
-from lidar_perception.runs.terminal import console
+from lidar_perception.data.frame import Recording
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.params import MIN_SCORE
+from lidar_perception.runs.terminal import console, track
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
 from lidar_perception.tracking.params import TrackingParams
@@ -32,6 +35,22 @@ class Seen:
     truth: GroundTruth
     stamp_ns: int = 0
     pose: np.ndarray | None = None
+
+
+def measure_recording(recording: Recording) -> dict:
+    """What PointPillars finds in the drives of a recording, tracked by both; {} without track ids
+    in the labels."""
+    if not recording.frames or not recording.frames[0].sequence:
+        return {}
+    detector = open_detector(min_score=MIN_SCORE,
+                             sensor_height=recording.frames[0].sensor_height)
+    drives: dict[str, list[Seen]] = {}
+    for frame in track(recording, "detecting", len(recording)):
+        truth = frame.truth()
+        if truth is not None and all("track_id" in extra for extra in truth.extras):
+            drives.setdefault(frame.sequence, []).append(
+                Seen(detector(frame.load()).detections, truth, frame.stamp_ns, frame.pose()))
+    return measure_tracking(drives, recording.frames[0].calibration()) if drives else {}
 
 
 def measure_tracking(drives: dict[str, Sequence[Seen]], calibration: Calibration | None,
