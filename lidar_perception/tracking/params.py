@@ -139,9 +139,9 @@ class EgoParams(Params):
                            unit="s", low=0.0, high=100.0)
 
 
-def tracking_of(detector: str) -> TrackingParams:
-    """The tracker's numbers for a detector, as LOAD of detectors/open.py or the graph names it;
-    those of any other are the defaults."""
-    params = TrackingParams()
-    own = NEUTRAL.get(detector, params.existence.neutral)
-    return replace(params, existence=replace(params.existence, neutral=own))
+def tracking_of(detector: str, params: TrackingParams = TrackingParams()) -> TrackingParams:
+    """params for a detector, as LOAD of detectors/open.py or the graph names it: with its own
+    neutral scores, if it has any and params has the defaults there."""
+    if params.existence.neutral != NeutralParams() or detector not in NEUTRAL:
+        return params
+    return replace(params, existence=replace(params.existence, neutral=NEUTRAL[detector]))

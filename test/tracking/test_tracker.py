@@ -11,7 +11,7 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.tracking.association import FORBIDDEN, assigned, costs
 from lidar_perception.tracking.ego import Ego, moved_boxes, next_ego, usable
 from lidar_perception.tracking.existence import effective_looks
-from lidar_perception.tracking.params import AssociationParams, TrackingParams
+from lidar_perception.tracking.params import AssociationParams, TrackingParams, tracking_of
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import PEDESTRIAN, Detections
 
@@ -242,3 +242,11 @@ def test_parked_cars_seen_from_a_turning_car_without_poses_keep_their_ids():
     assert {tuple(t.ids.tolist()) for t in tracks} == {(1, 2, 3)}
     for t, found in zip(tracks[5:], frames[5:]):
         np.testing.assert_allclose(t.detections.boxes[:, :2], found.boxes[:, :2], atol=0.3)
+
+
+def test_a_detector_has_its_own_neutral_scores_unless_others_are_given():
+    own = tracking_of("pointnet").existence.neutral
+    assert own != TrackingParams().existence.neutral and own.pedestrian == 0.5
+    assert tracking_of("pointpillars") == tracking_of("of another program") == TrackingParams()
+    given = with_values(TrackingParams(), {"existence.neutral.pedestrian": 0.7, "report": 0.1})
+    assert tracking_of("pointnet", given) == given
