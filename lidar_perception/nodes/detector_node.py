@@ -85,7 +85,7 @@ class DetectorNode(ManagedNode):
             if self.outputs.tracks is not None:
                 found = replace(found, detections=weak[own.scores.passed(weak)])
             untracked = self.outputs.publish(msg.header, found.detections, found.ms, frame.xyz,
-                                             weak)
+                                             weak=weak)
         self._diagnose(frame, found, untracked)
 
     def _with_weak(self, own: NetworkParams) -> Any:

@@ -78,9 +78,10 @@ class DetectionMarkers:
         self.node, self.publisher = node, node.output(topic, MARKERS)
         self.shown: Any = ()
 
-    def publish(self, header: Any, detections: Detections) -> None:
+    def publish(self, header: Any, detections: Detections,
+                clusters: np.ndarray | None = None) -> None:
         message = detection_markers(detections, header, bag_message, self.shown,
-                                    lifetime_ns(self.node))
+                                    lifetime_ns(self.node), clusters)
         self.shown = marker_keys(message)
         self.publisher.publish(encode(message))
 
@@ -101,11 +102,13 @@ class DetectionOutputs:
                        if node.robot.tracking.enabled else None)
 
     def publish(self, header: Any, detections: Detections, ms: Mapping[str, float],
-                xyz: np.ndarray, weak: Detections | None = None) -> str | None:
-        """Publish detections of the scan xyz (N, 3), the times of the steps that are known, and
-        where there is a tracker the tracks; it is given `weak`, with those below the thresholds
-        too, if there are any. Returns what was wrong for the tracker."""
-        self.markers.publish(header, detections)
+                xyz: np.ndarray, *, weak: Detections | None = None,
+                clusters: np.ndarray | None = None) -> str | None:
+        """Publish detections of the scan xyz (N, 3), with the cluster_id of each where it is known,
+        the times of the steps that are known, and where there is a tracker the tracks; it is given
+        `weak`, with those below the thresholds too, if there are any. Returns what was wrong for
+        the tracker."""
+        self.markers.publish(header, detections, clusters)
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             self.detections_3d.publish(to_detection_array(
                 detections.boxes, [CLASSES[i] for i in detections.class_ids], detections.scores,
@@ -140,7 +143,8 @@ class CandidateOutputs:
         for stage, markers in self.stages.items():
             if markers.publisher.get_subscription_count():
                 markers.publish(header, getattr(candidates, stage))
-        untracked = self.final.publish(header, candidates.final, candidates.ms, xyz)
+        untracked = self.final.publish(header, candidates.final, candidates.ms, xyz,
+                                       clusters=candidates.clusters)
         self._diagnose(candidates, problem or untracked)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:
