@@ -28,7 +28,7 @@ STRANGERS = {
     "classes": [], "types": ["numpy"], "param_fields": [], "geometry": ["numpy", "numba"],
     "camera": NUMBERS,
     "groups": ["numpy"], "runs": ["rich"], "wire": ["numpy", "scipy", "rosbags", "msg_utils"],
-    "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils"],
+    "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils", "lz4", "zstandard"],
     "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,
     "detectors": [*NUMBERS, "torch", "safetensors", "onnx", "onnxruntime", "onnxscript"],
     "tracking": ["numpy", "scipy", "kiss_icp"], "params": [],
