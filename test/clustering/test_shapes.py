@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 from lidar_perception.clustering.params import BOX_SHAPES
 from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
-from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.geometry import box_corners, points_in_box
 from lidar_perception.types import CLASSES
 
@@ -289,7 +289,7 @@ def test_the_diagonal_is_that_of_length_and_width_and_no_box_has_no_class():
 @needs_data
 def test_most_boxes_of_real_cars_lie_along_the_cars():
     errors = {"min_area": [], "l_shape": []}
-    for frame in open_kitti(DATA / "kitti_object"):
+    for frame in open_recording(DATA / "kitti_object"):
         xyz = frame.load().xyz
         for car in frame.truth().of_class(CLASSES.index("Car")):
             inside = xyz[points_in_box(xyz, car)]

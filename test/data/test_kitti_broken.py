@@ -6,7 +6,6 @@ import pytest
 from kitti_samples import LAYOUTS, TRACKING_LABELS, TRACKLETS, raw_folder
 from samples import LABELS, calibration_text, object_folder, write
 
-from lidar_perception.data.kitti.folder import open_kitti
 from lidar_perception.data.open import open_recording
 from lidar_perception.types import InputError
 
@@ -80,7 +79,7 @@ def test_broken_time_stamps_are_named(tmp_path, text):
     if text is not None:
         write(path, text)
     with pytest.raises(InputError, match=r"velodyne_points/timestamps\.txt"):
-        open_kitti(tmp_path)
+        open_recording(tmp_path)
 
 
 @pytest.mark.parametrize("layout, scan", [
@@ -90,13 +89,4 @@ def test_a_scan_whose_name_is_no_number_is_named(tmp_path, layout, scan):
     root = LAYOUTS[layout](tmp_path)
     write(root / scan, b"")
     with pytest.raises(InputError, match=r"notes\.bin"):
-        open_kitti(root)
-
-
-@pytest.mark.parametrize("make", [lambda p: p, lambda p: p / "missing",
-                                  lambda p: write(p / "file", b"")])
-def test_what_is_no_kitti_folder_is_named(tmp_path, make):
-    root = make(tmp_path)
-    with pytest.raises(InputError, match="KITTI") as error:
-        open_kitti(root)
-    assert str(root) in str(error.value)
+        open_recording(root)

@@ -379,8 +379,8 @@ def test_weights_that_do_not_come_with_the_package_are_asked_for(saved, tmp_path
 
 
 def test_real_scans_of_any_network_go_through(data):
-    from lidar_perception.data.kitti.folder import open_kitti
-    scan = open_kitti(data / "kitti_object")[0].load()
+    from lidar_perception.data.open import open_recording
+    scan = open_recording(data / "kitti_object").frames[0].load()
     for name in "improved", "pointnet", "pointnet2":
         config = small(name)
         found = PointNetDetector(lively(config), Header(config), CPU,
