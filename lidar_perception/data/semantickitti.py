@@ -13,7 +13,7 @@ from lidar_perception.data.kitti.calibration import homogeneous, matrices, matri
 from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS, load_velodyne, read_velodyne
 from lidar_perception.data.kitti.write import numbers, write_velodyne
 from lidar_perception.data.records import read_records
-from lidar_perception.runs.files import write_bytes
+from lidar_perception.runs.files import regular, write_bytes
 from lidar_perception.types import InputError, usable_returns
 
 UNLABELLED = (0, 1)  # unlabelled; outlier, such as a reflection: nobody knows what these points are

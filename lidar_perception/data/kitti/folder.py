@@ -19,6 +19,7 @@ from lidar_perception.data.kitti.labels import (
     read_tracklets,
 )
 from lidar_perception.data.records import read_records
+from lidar_perception.runs.files import regular
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.topics import LIDAR_FRAME
 
