@@ -24,7 +24,7 @@ class Tracker:
     or is None; born and ended count tracks since the start, and alive those there are.
     """
 
-    def __init__(self, params: TrackingParams = TrackingParams()):
+    def __init__(self, params: TrackingParams = TrackingParams()) -> None:
         self.params = params
         self.problem: str | None = None
         self.born = self.ended = 0
