@@ -136,7 +136,7 @@ def test_a_cloud_message_holds_its_columns():
 
 
 def test_without_launch_it_says_what_is_missing(monkeypatch):
-    for module in ("launch", "launch_testing", "launch_testing.actions", "launch.actions"):
+    for module in ("launch", "launch.actions", "launch.launch_description", "launch_testing"):
         monkeypatch.setitem(__import__("sys").modules, module, None)
     for call in description, launch_file:
         with pytest.raises(InputError, match=r"launch.* is not installed; it comes with ROS 2"):
