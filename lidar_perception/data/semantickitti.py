@@ -85,7 +85,7 @@ def _pose(sequence: Path, i: int) -> np.ndarray | None:
         return None
     lidar_to_camera = matrix(matrices(calibration), calibration, "Tr", (3, 4))
     try:
-        moved = np.array(poses.read_text().splitlines()[i].split(), float).reshape(3, 4)
+        moved = np.array(regular(poses).read_text().splitlines()[i].split(), float).reshape(3, 4)
     except (OSError, ValueError, IndexError) as error:
         raise InputError(f"cannot read pose {i} of {poses} ({error}); download it again") from None
     to_camera = homogeneous(lidar_to_camera)

@@ -48,6 +48,8 @@ ARGUMENTS = {
                    "that of the parameter file."),
     "single": dict(**SWITCHES, description="Each detector in one process, which finds ground and "
                    "clusters itself."),
+    "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
+                      "lifecycle manager configures and activates the nodes."),
     "rviz": dict(**SWITCHES, description="Start RViz with config/lidar_perception.rviz, in the "
                  "same namespace."),
     "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: that of its "
@@ -186,6 +188,8 @@ def _shown(topic: str, value: dict[str, str]) -> str:
 def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, Any]:
     """Parameters that arguments set."""
     given: dict[str, Any] = {"use_sim_time": value["use_sim_time"] == "true"}
+    if value["autostart"] == "false":
+        given["autostart"] = False
     if value["reliability"]:
         given["input.reliability"] = value["reliability"]
     detector = node.removesuffix("_detector")

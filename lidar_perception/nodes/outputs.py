@@ -78,9 +78,10 @@ class DetectionMarkers:
         self.node, self.publisher = node, node.output(topic, MARKERS)
         self.shown: Any = ()
 
-    def publish(self, header: Any, detections: Detections) -> None:
+    def publish(self, header: Any, detections: Detections,
+                clusters: np.ndarray | None = None) -> None:
         message = detection_markers(detections, header, bag_message, self.shown,
-                                    lifetime_ns(self.node))
+                                    lifetime_ns(self.node), clusters)
         self.shown = marker_keys(message)
         self.publisher.publish(encode(message))
 
@@ -99,9 +100,11 @@ class DetectionOutputs:
         self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE)
                            for step in steps}
 
-    def publish(self, header: Any, detections: Detections, ms: Mapping[str, float]) -> None:
-        """Publish detections, and the times of the steps that are known."""
-        self.markers.publish(header, detections)
+    def publish(self, header: Any, detections: Detections, ms: Mapping[str, float],
+                clusters: np.ndarray | None = None) -> None:
+        """Publish detections, with the cluster_id of each where it is known, and the times of the
+        steps that are known."""
+        self.markers.publish(header, detections, clusters)
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             self.detections_3d.publish(to_detection_array(
                 detections.boxes, [CLASSES[i] for i in detections.class_ids], detections.scores,
@@ -133,7 +136,7 @@ class CandidateOutputs:
         for stage, markers in self.stages.items():
             if markers.publisher.get_subscription_count():
                 markers.publish(header, getattr(candidates, stage))
-        self.final.publish(header, candidates.final, candidates.ms)
+        self.final.publish(header, candidates.final, candidates.ms, candidates.clusters)
         self._diagnose(candidates, problem)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:

@@ -15,6 +15,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from lidar_perception.nodes.main import SOCKET_BUFFER, socket_buffer
 from lidar_perception.params import ReceptionParams
 
 WARN, ERROR, STALE = DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
@@ -252,8 +253,10 @@ class Reception:
     def _remedy(self, publishers: list[Any]) -> str:
         offered = {p.qos_profile.reliability for p in publishers}
         if BEST_EFFORT in offered:
+            sysctl = (f", or set net.core.rmem_max to {2 * SOCKET_BUFFER} (sysctl) and start this "
+                      "node again") if socket_buffer() < SOCKET_BUFFER else ""
             return (f"let {_name(publishers[0])} publish reliable, or start it with "
-                    f"FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}")
+                    f"FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}{sysctl}")
         if self.subscription.qos_profile.reliability == BEST_EFFORT:
             return "receive it reliable: input.reliability auto, and no qos_overrides"
         return ("raise the depth of the publisher's queue; between machines also net.core.rmem_max "

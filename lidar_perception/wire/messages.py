@@ -184,13 +184,16 @@ def to_detections(objects: MarkedObjects) -> Detections:
 
 
 def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
-                      lifetime_ns: int = 0) -> Any:
-    """MarkerArray of detections, with their ids in the text too; previous and lifetime_ns as in
-    to_marker_array."""
+                      lifetime_ns: int = 0, clusters: np.ndarray | None = None) -> Any:
+    """MarkerArray of K detections, with their ids in the text too, and the cluster_id (K,) of each
+    where it is one cluster of the cloud: a marker's own id has 32 bits, which not every cluster_id
+    fits. previous and lifetime_ns as in to_marker_array."""
     labels = [CLASSES[i] for i in detections.class_ids]
+    texts: list[dict[str, int]] = [{"id": i} for i in range(len(detections))]
+    for text, cluster in zip(texts, () if clusters is None else clusters):
+        text["cluster_id"] = int(cluster)
     return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
-                           extras=[{"id": i} for i in range(len(detections))], previous=previous,
-                           lifetime_ns=lifetime_ns)
+                           extras=texts, previous=previous, lifetime_ns=lifetime_ns)
 
 
 def _class_ids(labels: list[str]) -> list[int]:

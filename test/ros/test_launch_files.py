@@ -82,6 +82,8 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
         assert node.ros_arguments == ["--log-level", "debug"]
         if not node.name.endswith("_detector"):
             assert node.parameters[0] == config
+    for node in nodes(autostart="false").values():
+        assert node.parameters[1] == {"use_sim_time": False, "autostart": False}
     assert nodes(config="mine.yaml")["clustering"].parameters[0] == "mine.yaml"
 
 

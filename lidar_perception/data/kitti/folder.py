@@ -166,7 +166,7 @@ def _raw_stamps(path: Path) -> list[int]:
     """Nanoseconds of the lines '2011-09-26 13:02:25.594360375', read as UTC."""
     try:
         stamps = []
-        for line in path.read_text().split("\n"):
+        for line in regular(path).read_text().split("\n"):
             if line.strip():
                 seconds, _, fraction = line.strip().partition(".")
                 when = datetime.strptime(seconds, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
