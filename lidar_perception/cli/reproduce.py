@@ -79,6 +79,6 @@ def reproduce(experiment: str, study: str | None, data: Path, split: Path | None
     console.print(f"report: {page}", soft_wrap=True)
 
 
-def _load(place: str) -> Any:
-    module, attribute = place.split(":")
+def _load(target: str) -> Any:
+    module, attribute = target.split(":")
     return getattr(importlib.import_module(module), attribute)

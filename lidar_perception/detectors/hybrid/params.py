@@ -10,7 +10,7 @@ BOXES = ("cluster", "network")
 
 
 @dataclass(frozen=True)
-class JudgingParams(Params):
+class WeightParams(Params):
     """How much the network's probability weighs beside the score that a box comes with."""
 
     weight: float = param(0.5, "Weight of the network's probability in the score, a geometric "
@@ -20,7 +20,7 @@ class JudgingParams(Params):
 
 
 @dataclass(frozen=True)
-class RescoringParams(JudgingParams):
+class RescoringParams(WeightParams):
     """STM-CPA candidates, scored again by the class of their points."""
 
     min_confidence: float = param(0.05, "Candidates less like a pedestrian than this are left "
@@ -34,7 +34,7 @@ class RescoringParams(JudgingParams):
 
 
 @dataclass(frozen=True)
-class ConfirmingParams(JudgingParams):
+class ConfirmingParams(WeightParams):
     """Proposals of PointPillars, confirmed by the shape of what is in them."""
 
     margin: float = param(0.2, "Points so far outside a proposal's box belong to its cluster, too.",
