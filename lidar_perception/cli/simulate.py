@@ -29,7 +29,7 @@ from lidar_perception.types import InputError
 @click.option("--sensor", "sensor_name", default="hdl64e", show_default=True,
               help=f"One of {', '.join(SENSORS)}, or {GENERIC}.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
-              help="Scans; with --compare, one of each of as many streets.")
+              help="Number of scans; with --compare, one scan of each of that many streets.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
               help="Seed of the first street; the same seed gives the same bytes.")
 @click.option("--street", "kind", type=click.Choice(list(KINDS)), help="Streets of this kind only. "
@@ -37,8 +37,7 @@ from lidar_perception.types import InputError
 @click.option("--people", type=click.FloatRange(0), default=1.0, show_default=True,
               help="Pedestrians and cyclists, as a multiple of KITTI's.")
 @click.option("--streets-of", type=click.IntRange(1), metavar="N",
-              help="Scans of each street. Default: 1 for kitti, 20 s of "
-                   "driving for the others.")
+              help="Scans of each street. Default: 1 for kitti, a drive of 20 s for the others.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes that write the folders of a data "
               "set. Default: one for each core.")
 @click.option("--resume", is_flag=True, help="Resume an unfinished data set; needs identical "
@@ -52,7 +51,8 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
              kind: str | None, people: float, streets_of: int | None, jobs: int | None,
              resume: bool, force: bool, compare: Path | None, json: Path | None,
              png: Path | None) -> None:
-    """Write labelled scans of simulated streets as a bag or data set, or measure how real they are.
+    """Write labelled scans of simulated streets as a bag or data set, or measure how realistic they
+    are.
 
     A file INCOMPLETE marks an unfinished data set; --resume resumes it.
 
