@@ -19,7 +19,7 @@ from lidar_perception.candidates.params import (
     StmParams,
 )
 from lidar_perception.clustering.params import BoxParams, ClusteringParams
-from lidar_perception.ground.params import GroundParams
+from lidar_perception.ground.params import GroundParams, ObstacleParams
 from lidar_perception.param_fields import Params, param
 from lidar_perception.wire.params import InputParams, ViewParams
 
@@ -34,6 +34,9 @@ class ReceptionParams(Params):
         choices=("auto", "reliable", "best_effort"))
     queue: int = param(1, "Clouds that wait while one is worked on; older ones are dropped, and "
                           "counted. 1: the newest wins.", low=1, high=1000)
+    max_wait: float = param(10.0, "A cloud that needs what has not come yet, such as the camera's "
+                            "calibration with view.enabled, waits for this time.", unit="s",
+                            low=0.0, high=3600.0)
     rate: float = param(0.0, "Clouds a second that the sensor sends; 0 takes what the first 21 "
                         "say.", unit="Hz", low=0.0, high=1000.0)
     min_rate: float = param(0.7, "WARN below this share of the rate.", low=0.0, high=1.0)
@@ -58,18 +61,33 @@ class MarkerParams(Params):
 
 
 @dataclass(frozen=True)
-class CloudNodeParams:
+class CloudNodeParams(Params):
     """What a node that takes clouds has besides the numbers of its algorithm."""
 
     input: ReceptionParams = ReceptionParams()
+    autostart: bool = param(True, "Configure and activate at the start. false: a lifecycle manager "
+                            "does, as Nav2's, or `ros2 lifecycle`.", fixed=True)
 
 
 @dataclass(frozen=True)
-class BoxNodeParams:
+class BoxNodeParams(CloudNodeParams):
     """What a node that makes boxes of clouds has besides the numbers of its algorithm."""
 
-    input: ReceptionParams = ReceptionParams()
     output: MarkerParams = MarkerParams()
+
+
+@dataclass(frozen=True)
+class GroundRobotParams(CloudNodeParams):
+    """What ground_segmentation has besides."""
+
+    obstacles: ObstacleParams = ObstacleParams()
+
+
+@dataclass(frozen=True)
+class PerceptionRobotParams(BoxNodeParams):
+    """What perception has besides."""
+
+    obstacles: ObstacleParams = ObstacleParams()
 
 
 # Each node declares the groups of its own stages, under the same names.

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
@@ -22,6 +21,7 @@ from lidar_perception.data.bag_frames import BagFrames
 from lidar_perception.data.frame import BOXES
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
+from lidar_perception.groups import renumbered
 from lidar_perception.nodes.graph import cloud_topic, result_topics
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console, errors, track
@@ -126,7 +126,7 @@ def _draw_best(result: Path, picture: Path, single: bool) -> bool:
         for _, _, msg in bag.messages({cloud_topic(single)}):
             frame, indices = to_frame(msg)
             if frame.stamp_ns == best:
-                ids = column(msg, "cluster_id", indices).astype(np.int32)
+                ids, _ = renumbered(column(msg, "cluster_id", indices))
                 draw_frame(picture, frame.xyz, column(msg, "ground", indices) > 0, ids,
                            frames[best][TRUTH],
                            frames[best][final], title=f"{hits[best][0]} of {hits[best][1]} "

@@ -11,10 +11,11 @@ from std_msgs.msg import Float64
 
 from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import class_by_diagonal
-from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
+from lidar_perception.ground.above import obstacles
+from lidar_perception.nodes.runtime import CLOUD, MARKERS, OK, RELIABLE, WARN, LidarNode
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.messages import detection_markers
+from lidar_perception.wire.messages import detection_markers, thin_cloud
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys, to_marker_array
 from msg_utils.messages import message_class, ros_message
@@ -53,6 +54,23 @@ def _texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
             for i, c in zip(ids, class_by_diagonal(boxes), strict=True)]
 
 
+class Obstacles:
+    """~/output/obstacles for a costmap, made only while somebody subscribes: x y z, and intensity
+    where the cloud has one, of what is no ground and in the height band of the parameters. node
+    has the groups robot.obstacles and params.ground."""
+
+    def __init__(self, node: LidarNode):
+        self.node, self.publisher = node, node.output("obstacles", CLOUD)
+
+    def publish(self, msg: Any, xyz: np.ndarray, ground: np.ndarray, indices: np.ndarray) -> None:
+        """Of points (M, 3) that are ground (M,) or not, at indices (M,) in the cloud msg."""
+        if self.publisher.get_subscription_count():
+            chosen = obstacles(xyz, ground, self.node.robot.obstacles,
+                               self.node.params.ground.sensor_pose)
+            self.publisher.publish(encode(thin_cloud(
+                msg, xyz.compress(chosen, axis=0), indices.compress(chosen), bag_message)))
+
+
 class DetectionMarkers:
     """A topic with detections as markers."""
 
@@ -60,9 +78,10 @@ class DetectionMarkers:
         self.node, self.publisher = node, node.output(topic, MARKERS)
         self.shown: Any = ()
 
-    def publish(self, header: Any, detections: Detections) -> None:
+    def publish(self, header: Any, detections: Detections,
+                clusters: np.ndarray | None = None) -> None:
         message = detection_markers(detections, header, bag_message, self.shown,
-                                    lifetime_ns(self.node))
+                                    lifetime_ns(self.node), clusters)
         self.shown = marker_keys(message)
         self.publisher.publish(encode(message))
 
@@ -81,9 +100,11 @@ class DetectionOutputs:
         self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE)
                            for step in steps}
 
-    def publish(self, header: Any, detections: Detections, ms: Mapping[str, float]) -> None:
-        """Publish detections, and the times of the steps that are known."""
-        self.markers.publish(header, detections)
+    def publish(self, header: Any, detections: Detections, ms: Mapping[str, float],
+                clusters: np.ndarray | None = None) -> None:
+        """Publish detections, with the cluster_id of each where it is known, and the times of the
+        steps that are known."""
+        self.markers.publish(header, detections, clusters)
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             self.detections_3d.publish(to_detection_array(
                 detections.boxes, [CLASSES[i] for i in detections.class_ids], detections.scores,
@@ -115,7 +136,7 @@ class CandidateOutputs:
         for stage, markers in self.stages.items():
             if markers.publisher.get_subscription_count():
                 markers.publish(header, getattr(candidates, stage))
-        self.final.publish(header, candidates.final, candidates.ms)
+        self.final.publish(header, candidates.final, candidates.ms, candidates.clusters)
         self._diagnose(candidates, problem)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:

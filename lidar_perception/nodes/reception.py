@@ -15,6 +15,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
+from lidar_perception.nodes.main import SOCKET_BUFFER, socket_buffer
 from lidar_perception.params import ReceptionParams
 
 WARN, ERROR, STALE = DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE
@@ -35,7 +36,7 @@ class Arrivals:
     way, or, where the queue was full, what a newer cloud has pushed out of it.
     """
 
-    def __init__(self, depth: int):
+    def __init__(self, depth: int = DEPTH):
         self.depth = depth
         self.sent = self.dropped = self.lost = 0
         self.sequence: int | None = None  # of the last cloud
@@ -65,6 +66,18 @@ class Arrivals:
             period = np.median(intervals[:, 1] / intervals[:, 0])
             self.learned = 1e9 / period if period > 0 else None
 
+    def interrupted(self, dropped: int) -> None:
+        """Nothing is taken for a while; dropped is how many were waiting."""
+        self.dropped += dropped
+        self.sequence = None
+        self.stamps.clear()
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """What was dropped so far had a reason that is over: recent() begins here."""
+        self.window.clear()
+        self.window.append((self.sent, self.lost, self.dropped))
+
     def recent(self) -> tuple[int, int, int]:
         """Of the last SHARE_OF sent, or of more where one gap was longer: how many that are, how
         many were lost, how many dropped."""
@@ -84,14 +97,17 @@ class Arrivals:
 
 class Reception:
     """A subscription of clouds. deliver gets the newest ones that are waiting (as many as the
-    parameter input.queue says), as bytes, one at a time.
+    parameter input.queue says), as bytes, one at a time, and says what the cloud still needs, or
+    None. While it is patient (up to input.max_wait seconds) it does not work on a cloud that needs
+    something, and gets it again at try_again().
 
     It is RELIABLE where all publishers offer that, as of an ordinary driver's 2 MB a best-effort
     subscriber gets less than half; a BEST_EFFORT publisher, also one that comes later, makes it
     BEST_EFFORT, as else nothing at all would come from it. qos_overrides stand above that.
     """
 
-    def __init__(self, node: Node, kind: type, name: str, deliver: Callable[[bytes], None],
+    def __init__(self, node: Node, kind: type, name: str,
+                 deliver: Callable[[bytes, bool], str | None],
                  params: Callable[[], ReceptionParams]):
         self.node, self.kind, self.deliver, self.params = node, kind, deliver, params
         self.topic = node.resolve_topic_name(name)
@@ -102,9 +118,23 @@ class Reception:
         self.go_on = node.create_guard_condition(self._deliver_one)
         self.look_again = node.create_guard_condition(self.adapt)
         self.last_time: float | None = None  # monotonic, of the last cloud
+        self.needs: str | None = None  # by the cloud that waits, or the last one
+        self.needed_since: float | None = None  # monotonic
+        self.subscription: Any = None
+        self.arrivals = Arrivals()
+
+    def open(self) -> None:
+        """Subscribe."""
         self.subscription = self._subscribe()
-        self.arrivals = Arrivals(self.subscription.qos_profile.depth)
+        self.arrivals.depth = self.subscription.qos_profile.depth
         self.adapt()
+
+    def close(self) -> None:
+        """End the subscription. What waits is dropped; what is sent meanwhile is not missed."""
+        self.node.destroy_subscription(self.subscription)
+        self.subscription = self.last_time = self.needs = self.needed_since = None
+        self.arrivals.interrupted(len(self.waiting))
+        self.waiting.clear()
 
     def _subscribe(self) -> Any:
         kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH]
@@ -122,6 +152,8 @@ class Reception:
 
     def adapt(self) -> None:
         """Subscribe again if the publishers offer something else than before."""
+        if self.subscription is None:
+            return
         wanted = self.params().reliability
         offered = {info.qos_profile.reliability for info in self.publishers()}
         if wanted == "auto" and offered:
@@ -156,15 +188,28 @@ class Reception:
     def _deliver_one(self) -> None:
         if not self.waiting:
             return
-        try:
-            self.deliver(self.waiting.popleft())
-        finally:
-            self.last_time = monotonic()  # the work on a cloud is no silence
-            if self.waiting:
-                self.go_on.trigger()
+        since = self.needed_since
+        patient = since is None or monotonic() - since < self.params().max_wait
+        self.needs = self.deliver(self.waiting[0], patient)
+        self.last_time = monotonic()  # the work on a cloud is no silence
+        self.needed_since = None if self.needs is None else since or self.last_time
+        if since and self.needs is None:
+            self.arrivals.begin_anew()
+        if self.needs is not None and patient:
+            return
+        self.waiting.popleft()
+        if self.waiting:
+            self.go_on.trigger()
+
+    def try_again(self) -> None:
+        """What a cloud needs may have come, or it has waited for too long."""
+        if self.waiting and self.needs is not None:
+            self.go_on.trigger()
 
     def values(self) -> dict[str, Any]:
         """For the diagnostics."""
+        if self.subscription is None:
+            return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped}
         rate, learned = self.arrivals.rate(), self.params().rate or self.arrivals.learned
         return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped,
                 "reliability": self._how(),
@@ -173,12 +218,16 @@ class Reception:
 
     def problems(self) -> list[Problem]:
         """What is wrong with the topic now, each with its remedy."""
+        if self.subscription is None:
+            return []
         found, params = [], self.params()
         publishers = self.publishers()
         if len(publishers) > 1:
             names = ", ".join(sorted(_name(p) for p in publishers))
             found.append(("publishers", WARN, f"{len(publishers)} publishers on {self.topic} "
                           f"({names}): their clouds are mixed; remap all but one"))
+        if self.waiting and self.needs is not None:
+            return [*found, ("waiting", WARN, f"the cloud on {self.topic} waits for {self.needs}")]
         silent = monotonic() - (self.last_time or monotonic())
         if silent > params.error_after:
             stale = silent > params.stale_after
@@ -204,8 +253,10 @@ class Reception:
     def _remedy(self, publishers: list[Any]) -> str:
         offered = {p.qos_profile.reliability for p in publishers}
         if BEST_EFFORT in offered:
+            sysctl = (f", or set net.core.rmem_max to {2 * SOCKET_BUFFER} (sysctl) and start this "
+                      "node again") if socket_buffer() < SOCKET_BUFFER else ""
             return (f"let {_name(publishers[0])} publish reliable, or start it with "
-                    f"FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}")
+                    f"FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}{sysctl}")
         if self.subscription.qos_profile.reliability == BEST_EFFORT:
             return "receive it reliable: input.reliability auto, and no qos_overrides"
         return ("raise the depth of the publisher's queue; between machines also net.core.rmem_max "

@@ -38,6 +38,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 JUMP_NS = 10**9  # stamps that go back by more than this are a bag that starts again
+WAITING = "waiting for input"
 LOG_PERIOD = 60.0  # seconds before the same problem is logged again
 
 
@@ -56,13 +57,9 @@ class LidarNode(Node):
         self.add_pre_set_parameters_callback(self._before_set)
         self.add_on_set_parameters_callback(self._on_set)
         self.stop = Future()  # done when the node shall end; set from any thread
-        self.state = (WARN, "waiting for input")
-        self.counts: dict[str, Any] = {"frames": 0, "lost": 0}
-        self.last_stamp_ns = 0
-        self.times: list[float] = []
-        self.frame_id = ""  # of the last cloud
-        self._outputs: list[Any] = []
-        self._receptions: list[Reception] = []
+        self.state = (WARN, WAITING)
+        self.active = True  # listens to its inputs
+        self.forget()
         self._present: set[str] = set()  # kinds of problems
         self._logged: dict[str, float] = {}  # kind of problem -> when it was logged
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
@@ -70,6 +67,18 @@ class LidarNode(Node):
                                                       RELIABLE)
         self.create_timer(1.0, self._tick, clock=Clock(
             clock_type=ClockType.STEADY_TIME))
+
+    def forget(self) -> None:
+        """What is known of the input and output so far."""
+        self.counts: dict[str, Any] = {"frames": 0, "lost": 0}
+        self.last_stamp_ns = 0
+        self.times: list[float] = []
+        self.frame_id = ""  # of the last cloud
+        self.inputs: list[Any] = []  # with open() and close()
+        self._outputs: list[Any] = []
+
+    def start(self) -> None:
+        """Called once, when the node is made and before it spins."""
 
     def _before_set(self, changes: list[Parameter]) -> list[Parameter]:
         return [as_declared(c, self.get_parameter(c.name).type_)
@@ -86,38 +95,48 @@ class LidarNode(Node):
         return SetParametersResult(successful=True)
 
     def input(self, topic: str, type_name: str, callback: Callable,
-              qos: QoSProfile | None = None, private: bool = True) -> None:
+              qos: QoSProfile | None = None, private: bool = True,
+              needs: Callable[[Any], str | None] = lambda _: None) -> None:
         """Subscribe to ~/input/TOPIC, or with private=False to the name as it is. callback gets
         rosbags' class of the message, the one that offline code reads from bags: it views the
         received bytes, where rclpy's own class copies them several times. Without qos the topic
-        is received as reception.py does."""
+        is received as reception.py does: needs says what a cloud still waits for, which comes by
+        another input, and None if nothing."""
         name = f"~/input/{topic}" if private else topic
         _warm_up_type(type_name)
 
-        def guarded(data: bytes) -> None:
+        def guarded(data: bytes, patient: bool = False) -> str | None:
+            missing = None
             try:
                 msg = decode(data, type_name)
                 if type_name == CLOUD:
                     self.frame_id = msg.header.frame_id
-                callback(msg)
+                missing = needs(msg)
+                if missing is None or not patient:
+                    callback(msg)
             except InputError as error:
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {error}")
             except Exception as error:
                 self.get_logger().error(traceback.format_exc())
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {type(error).__name__}: "
                             f"{error}; this is a bug, please report it with the message")
+            if qos is not None:
+                for reception in self._receptions():
+                    reception.try_again()
+            return missing
 
         def lost(event: Any) -> None:
             self.counts["lost"] += event.total_count_change
 
-        if qos is None:
-            self._receptions.append(Reception(self, message_class(type_name), name, guarded,
-                                              lambda: self.robot.input))
-            return
-        self.create_subscription(
-            message_class(type_name), name, guarded, qos, raw=True,
-            event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        kind = message_class(type_name)
+        added = (Reception(self, kind, name, guarded, lambda: self.robot.input) if qos is None else
+                 Subscribed(self, lambda: self.create_subscription(
+                     kind, name, guarded, qos, raw=True,
+                     event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
+                     qos_overriding_options=QoSOverridingOptions.with_default_policies())))
+        self.inputs.append(added)
+        if self.active:
+            added.open()
 
     def output(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE):
         """Publisher of ~/output/TOPIC, or of any name that starts with ~ or /; it takes encode()d
@@ -166,7 +185,7 @@ class LidarNode(Node):
         """The state, and what is wrong with the inputs and with the node's name."""
         level, message = self.state
         values = dict(self.counts, last_stamp_ns=self.last_stamp_ns)
-        for reception in self._receptions:
+        for reception in self._receptions():
             values.update(reception.values())
         if self.times:
             values["processing_ms_median"] = f"{np.median(self.times):.1f}"
@@ -183,9 +202,12 @@ class LidarNode(Node):
         if rclpy.ok(context=self.context):
             self._diagnostics.publish(array)
 
+    def _receptions(self) -> list[Reception]:
+        return [made for made in self.inputs if isinstance(made, Reception)]
+
     def _problems(self) -> list[Problem]:
         """Each is logged when it comes up, at most once in LOG_PERIOD."""
-        found = [p for reception in self._receptions for p in reception.problems()]
+        found = [p for reception in self._receptions() for p in reception.problems()]
         name, namespace = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count((name, namespace)) > 1:
             found.append(("name", WARN, f"another node is called {self.get_fully_qualified_name()} "
@@ -205,8 +227,9 @@ class LidarNode(Node):
         return "/".join(filter(None, parts)) or "lidar_perception"
 
     def _tick(self) -> None:
-        for reception in self._receptions:
+        for reception in self._receptions():
             reception.adapt()  # where the middleware has no events that say so
+            reception.try_again()
         self.publish_diagnostics()
 
     def spin(self, executor: Executor) -> None:
@@ -215,6 +238,19 @@ class LidarNode(Node):
 
     def close(self) -> None:
         """Called once before the node is destroyed."""
+
+
+class Subscribed:
+    """An input other than clouds."""
+
+    def __init__(self, node: Node, subscribe: Callable[[], Any]):
+        self.node, self.subscribe = node, subscribe
+
+    def open(self) -> None:
+        self.subscription = self.subscribe()
+
+    def close(self) -> None:
+        self.node.destroy_subscription(self.subscription)
 
 
 def _warm_up_type(type_name: str) -> None:

@@ -19,7 +19,7 @@ from lidar_perception.types import (
 )
 from lidar_perception.wire.topics import CAMERA_FRAME
 from msg_utils.markers import MarkedObjects, to_marker_array
-from msg_utils.point_cloud2 import CloudError, columns, to_array, xyz
+from msg_utils.point_cloud2 import CloudError, columns, from_array, to_array, xyz
 from msg_utils.stamps import to_ns
 
 INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # the first that the cloud has
@@ -84,6 +84,19 @@ def column(msg: Any, name: str, indices: np.ndarray) -> np.ndarray | None:
     it holds more than one number a point."""
     points = to_array(msg)
     return _single(points, name).take(indices) if name in (points.dtype.names or ()) else None
+
+
+def thin_cloud(msg: Any, xyz: np.ndarray, indices: np.ndarray, make: Any) -> Any:
+    """PointCloud2 with the header of msg and x y z (M, 3), and intensity where msg has one, as it
+    is there at indices (M,); all of them float32."""
+    names = to_array(msg).dtype.names or ()
+    fields = {axis: xyz[:, i] for i, axis in enumerate("xyz")}
+    for name in [n for n in INTENSITY_FIELDS if n in names][:1]:
+        fields["intensity"] = _single(to_array(msg), name).take(indices)
+    points = np.empty(len(xyz), [(name, "<f4") for name in fields])
+    for name, values in fields.items():
+        points[name] = values
+    return from_array(points, msg.header, make)
 
 
 def cluster_column(msg: Any, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
@@ -152,10 +165,10 @@ def extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
 
 def truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()) -> Any:
     """MarkerArray of the labels. Objects keep the marker id of their track."""
-    ids = [extra.get("track_id") for extra in truth.extras]
-    if None in ids or len(set(zip(truth.labels, ids))) < len(ids):
-        ids = None
-    return to_marker_array(truth.boxes, truth.labels, header=header, make=make, ids=ids,
+    tracks: list[Any] = [extra.get("track_id") for extra in truth.extras]
+    unique = None not in tracks and len(set(zip(truth.labels, tracks))) == len(tracks)
+    return to_marker_array(truth.boxes, truth.labels, header=header, make=make,
+                           ids=tracks if unique else None,
                            extras=truth.extras, notes=truth.notes, previous=previous)
 
 
@@ -171,13 +184,16 @@ def to_detections(objects: MarkedObjects) -> Detections:
 
 
 def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
-                      lifetime_ns: int = 0) -> Any:
-    """MarkerArray of detections, with their ids in the text too; previous and lifetime_ns as in
-    to_marker_array."""
+                      lifetime_ns: int = 0, clusters: np.ndarray | None = None) -> Any:
+    """MarkerArray of K detections, with their ids in the text too, and the cluster_id (K,) of each
+    where it is one cluster of the cloud: a marker's own id has 32 bits, which not every cluster_id
+    fits. previous and lifetime_ns as in to_marker_array."""
     labels = [CLASSES[i] for i in detections.class_ids]
+    texts: list[dict[str, int]] = [{"id": i} for i in range(len(detections))]
+    for text, cluster in zip(texts, () if clusters is None else clusters):
+        text["cluster_id"] = int(cluster)
     return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
-                           extras=[{"id": i} for i in range(len(detections))], previous=previous,
-                           lifetime_ns=lifetime_ns)
+                           extras=texts, previous=previous, lifetime_ns=lifetime_ns)
 
 
 def _class_ids(labels: list[str]) -> list[int]:

@@ -236,7 +236,7 @@ def test_without_points_or_clusters_there_are_no_boxes_and_an_unused_id_has_zero
     noise = np.ones((5, 3), np.float32), np.zeros(5, np.int32)
     for cloud in (nothing, noise):
         assert (oriented_boxes(*cloud, shape).shape, ellipses(*cloud).shape) == ((0, 7), (0, 5))
-    xyz, labels = np.array([[1, 2, 3], [2, 2, 5]], np.float32), np.array([3, 3], np.int32)
+    xyz, labels = np.array([[1, 2, 3], [2, 2, 5], [9, 9, 9]], np.float32), np.array([3, 3, 0])
     assert not oriented_boxes(xyz, labels, shape)[:2].any() and not ellipses(xyz, labels)[:2].any()
     np.testing.assert_array_equal(oriented_boxes(xyz, labels, shape)[2], [1.5, 2, 4, 1, 0, 2, 0])
     with pytest.raises(ValueError, match="'round' must be one of axis_aligned, min_area, l_shape"):

@@ -1,0 +1,60 @@
+"""launch/perception.launch.py behind a driver of another package, a process without our Fast DDS
+profile: every cloud is accounted for, candidates come, all end with 0.
+
+Runs where launch_testing is installed (a full ROS 2); test_reception.py tests the same with plain
+processes everywhere.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import unittest
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("launch_testing", reason="needs launch_testing, which comes with ROS 2")
+pytest.importorskip("launch_ros", reason="needs launch_ros, which comes with ROS 2")
+
+import launch_testing
+import launch_testing.asserts
+
+from lidar_perception.nodes.main import PROFILE_VARIABLES
+from lidar_perception.testing.launching import description, launch_file
+from lidar_perception.testing.peer import Peer
+
+DRIVER = Path(__file__).resolve().parents[1] / "ros" / "driver.py"
+COUNT, POINTS = 20, 130_000  # clouds of 2 MB
+
+
+@pytest.mark.launch_test
+def generate_test_description():
+    return description(launch_file("perception", points="/driver_points", single=True))
+
+
+class TestDriver(unittest.TestCase):
+    def test_every_cloud_is_accounted_for(self):
+        environment = {k: v for k, v in os.environ.items() if k not in PROFILE_VARIABLES}
+        numbers = map(str, (COUNT, 10, POINTS, 1))
+        driver = subprocess.Popen([sys.executable, DRIVER, "/driver_points", "reliable", *numbers],
+                                  env=environment, stdin=subprocess.PIPE, text=True)
+        with Peer() as peer:
+            def value(key):
+                return int(peer.value_of("perception", key) or 0)
+
+            found = peer.listen("/perception/output/detections",
+                                "visualization_msgs/msg/MarkerArray")
+            peer.wait(lambda: found and value("frames") + value("dropped") == COUNT, "every cloud")
+            assert value("lost") == 0
+            assert peer.value_of("perception", "reliability") == "reliable"
+        driver.communicate("\n", timeout=20)
+        assert driver.returncode == 0
+
+
+@launch_testing.post_shutdown_test()
+class TestAfterwards(unittest.TestCase):
+    def test_all_nodes_ended_with_code_0(self, proc_info):
+        launch_testing.asserts.assertExitCodes(proc_info)
+        assert [name.split("-")[0] for name in proc_info.process_names()] == ["perception"]

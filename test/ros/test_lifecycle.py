@@ -1,0 +1,208 @@
+"""Managed nodes, driven over DDS as Nav2's lifecycle manager does: a change of state, then the
+state is asked for."""
+
+from __future__ import annotations
+
+import weakref
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.parameter import Parameter
+from test_bad_input import CLOUD, MARKERS
+from test_pointpillars_node import NODE, REMAP, assert_equal, message, offline, received, values
+
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
+from lidar_perception.nodes.ground_segmentation import GroundSegmentation
+from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
+from lidar_perception.wire.codec import encode
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+LEADS_TO = {"configure": State.PRIMARY_STATE_INACTIVE, "activate": State.PRIMARY_STATE_ACTIVE,
+            "deactivate": State.PRIMARY_STATE_INACTIVE, "cleanup": State.PRIMARY_STATE_UNCONFIGURED,
+            "unconfigured_shutdown": State.PRIMARY_STATE_FINALIZED}
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    from detection_samples import lively, tiny
+    path = tmp_path_factory.mktemp("weights") / "v4.safetensors"
+    save_checkpoint(path, lively(tiny("v4")), Header(tiny("v4")))
+    return path
+
+
+@pytest.fixture(scope="module")
+def peer(shared_peer):
+    return shared_peer
+
+
+@pytest.fixture(scope="module")
+def later(tmp_path_factory):
+    """Where the weights of two nodes are to be."""
+    return tmp_path_factory.mktemp("later") / "later.safetensors"
+
+
+@pytest.fixture(scope="module")
+def nodes(shared_processes, weights, later):
+    """All at once: with its weights, without, without and by itself, without their template."""
+    driven = {**values(weights), "autostart": False}
+    shared_processes.start(NODE, {}, driven, "ready")
+    shared_processes.start(NODE, {}, {**driven, "pointpillars.weights": str(later)}, "waits")
+    shared_processes.start(NODE, {}, {**values(weights), "pointpillars.weights": str(later)},
+                           "tries")
+    for name in ("perception", "candidate_refinement"):
+        shared_processes.start(name, {}, {"autostart": False, "seed.source": "file",
+                                          "seed.file": "/nowhere.json"}, "waits")
+    return shared_processes
+
+
+def state(peer, node):
+    return peer.call(f"/{node}/get_state", GetState, GetState.Request()).current_state.id
+
+
+def change(peer, node, name):
+    """Whether the node has done a transition, and is where that leads."""
+    number = getattr(Transition, f"TRANSITION_{name.upper()}")
+    request = ChangeState.Request(transition=Transition(id=number))
+    done = peer.call(f"/{node}/change_state", ChangeState, request).success
+    assert not done or state(peer, node) == LEADS_TO[name]
+    return done
+
+
+def drive(peer, node, *names):
+    for name in names:
+        assert change(peer, node, name), (name, peer.message_of(node))
+
+
+@pytest.fixture
+def here(peer):
+    """Nodes in the test's own process, so that it sees what they hold; the middleware between them
+    and the peer is the same."""
+    made = []
+
+    def make(kind, values, remap):
+        rules = [word for a, b in remap.items() for word in ("-r", f"{a}:={b}")]
+        node = kind(context=peer.context, cli_args=["--ros-args", *rules], parameter_overrides=[
+            Parameter(k, value=list(v) if isinstance(v, tuple) else v) for k, v in values.items()])
+        made.append(node)
+        node.start()
+        peer.executor.add_node(node)
+        return node
+
+    yield make
+    for node in made:
+        peer.executor.remove_node(node)
+        node.close()
+        node.destroy_node()
+
+
+def entities(node):
+    """How many of each kind a node has."""
+    return {kind: len(list(getattr(node, kind))) for kind in (
+        "publishers", "subscriptions", "timers", "guards", "services", "clients", "waitables")}
+
+
+def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
+    """Nothing is heard or said while it is not active; results are those of the offline detector
+    each time it is, on the newest cloud; a shutdown can be asked about afterwards."""
+    node = f"ready/{NODE}"
+    talker = peer.talker(f"/{node}/input/points", CLOUD)
+    found = peer.listen(f"/{node}/output/detections", MARKERS)
+    assert state(peer, node) == State.PRIMARY_STATE_UNCONFIGURED
+    peer.wait(lambda: peer.value_of(node, "lifecycle") == "unconfigured", "its diagnostics")
+    assert ord(peer.diagnostics[node].level) == 0 and peer.message_of(node) == "not configured"
+    drive(peer, node, "configure")
+    assert talker.get_subscription_count() == 0
+    for round_ in (10, 20):
+        talker.publish(encode(message(round_)))  # to nobody
+        drive(peer, node, "activate")
+        peer.send(talker, message(round_ + 1), lambda n=round_: received(found, n + 1),
+                  "detections")
+        assert_equal(received(found, round_ + 1), offline(weights, message(1)))
+        drive(peer, node, "deactivate")
+        peer.wait(lambda: not talker.get_subscription_count(), "the end of the subscription")
+        peer.wait(lambda: peer.value_of(node, "lifecycle") == "inactive"
+                  and peer.message_of(node) == "not active", "the state in the diagnostics")
+        assert received(found, round_) is None
+    drive(peer, node, "cleanup", "configure", "activate")
+    peer.send(talker, message(31), lambda: received(found, 31), "detections")
+    assert not change(peer, node, "configure")  # rclpy would end the node
+    drive(peer, node, "deactivate", "cleanup", "unconfigured_shutdown")
+    process = f"ready.{NODE}"
+    assert not nodes.ended(process) and nodes.end(process) == 0
+    assert "needs the parameter autostart false" in nodes.log(process)
+    assert "Traceback" not in nodes.log(process)
+
+
+def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
+    node = here(PointPillarsNode, {**values(weights), "autostart": False}, REMAP)
+    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
+    empty, names = entities(node), set(vars(node))
+    for stamp in (1, 2):
+        drive(peer, NODE, "configure")
+        held = [weakref.ref(thing) for thing in (
+            node.detector, node.detector.network, node.outputs, node.sensor)]
+        drive(peer, NODE, "activate")
+        peer.send(talker, message(stamp), lambda n=stamp: received(found, n), "detections")
+        assert all(thing() is not None for thing in held)
+        drive(peer, NODE, "deactivate")
+        assert all(thing() is not None for thing in held)
+        drive(peer, NODE, "cleanup")
+        assert [thing() for thing in held] == [None] * len(held)
+        assert entities(node) == empty and set(vars(node)) == names
+
+
+def test_a_node_without_its_network_waits_for_the_file_and_says_so(nodes, peer, later, weights):
+    """A manager is refused, and the reason is an ERROR; once the file is there it is not refused,
+    and a node that starts by itself takes it."""
+    reason = f"there is no checkpoint {later}"
+    driven, alone = f"waits/{NODE}", f"tries/{NODE}"
+    for _ in range(2):
+        assert not change(peer, driven, "configure")
+        assert state(peer, driven) == State.PRIMARY_STATE_UNCONFIGURED
+    for node in (driven, alone):
+        peer.wait_for_diagnostics(node, reason, level=2)
+    part = later.with_name("part")
+    part.write_bytes(weights.read_bytes())
+    part.rename(later)
+    drive(peer, driven, "configure", "activate")
+    for node in (driven, alone):
+        talker = peer.talker(f"/{node}/input/points", CLOUD)
+        found = peer.listen(f"/{node}/output/detections", MARKERS)
+        peer.send(talker, message(1), lambda f=found: received(f, 1), "detections")
+        assert_equal(received(found, 1), offline(weights, message(1)))
+    assert nodes.log(f"tries.{NODE}").count(reason) == 1
+
+
+def test_a_template_that_is_missing_is_known_before_the_first_cloud(nodes, peer):
+    for name in ("waits/perception", "waits/candidate_refinement"):
+        assert not change(peer, name, "configure")
+        peer.wait_for_diagnostics(name, "/nowhere.json", level=2)
+        peer.set_parameter(f"/{name}", "seed.source", "click")
+        drive(peer, name, "configure", "activate", "deactivate", "cleanup",
+              "unconfigured_shutdown")
+
+
+def test_what_waits_is_dropped_and_counted_and_the_pause_is_no_loss(here, peer, good_cloud):
+    """sent = frames + dropped + lost holds over a pause, for what is sent while active."""
+    node = here(GroundSegmentation, {"input.queue": 3}, {"~/input/points": "/in"})
+    talker = peer.talker("/in", CLOUD)
+    peer.send(talker, good_cloud, lambda: node.counts["frames"], "a frame")
+    name = "ground_segmentation"
+    reception, = node._receptions()
+    sent = reception.arrivals.sent
+    drive(peer, name, "deactivate")
+    for _ in range(5):
+        talker.publish(encode(good_cloud))
+    drive(peer, name, "activate")
+    before = node.counts["frames"]
+    peer.send(talker, good_cloud, lambda: node.counts["frames"] > before, "a frame")
+    arrivals = reception.arrivals
+    assert arrivals.lost == 0 and arrivals.sent > sent
+    assert node.counts["frames"] + arrivals.dropped + len(reception.waiting) == arrivals.sent
+    reception.waiting.extend([b"cloud"] * 2)
+    drive(peer, name, "deactivate")
+    assert not reception.waiting and reception.arrivals.dropped >= 2
