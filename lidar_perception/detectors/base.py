@@ -57,7 +57,7 @@ class NetworkDetector:
         other.params = with_values(self.params, {"ground.sensor_pose.height": height})
         return other
 
-    def place(self, device: torch.device) -> None:
+    def bring_to(self, device: torch.device) -> None:
         """Bring the network, and what it needs, to a device."""
         raise NotImplementedError
 
@@ -65,7 +65,7 @@ class NetworkDetector:
         """Run on another device from now on, or on the CPU if it is out of memory."""
         self.device = device
         try:
-            self.place(device)
+            self.bring_to(device)
         except torch.cuda.OutOfMemoryError as error:
             self._fall_back(error)
 

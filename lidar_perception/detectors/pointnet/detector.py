@@ -32,7 +32,7 @@ from lidar_perception.types import LidarFrame
 class PointNetDetector(NetworkDetector):
     """Paper C's detector, see contract.py. The whole cloud is looked at.
 
-    network: as loaded or trained; its norms are folded into its layers, in place.
+    network: as loaded or trained; its norms are folded into its layers, in where.
     """
 
     def __init__(self, network: PointNet, header: Header, device: torch.device = CPU,
@@ -104,7 +104,7 @@ class PointNetDetector(NetworkDetector):
             return "the cloud has no intensity, which the network was trained with; it reads zeros"
         return None
 
-    def place(self, device: torch.device) -> None:
+    def bring_to(self, device: torch.device) -> None:
         """Bring the network to a device."""
         self.network.to(device)
 
@@ -126,13 +126,13 @@ def load_pointnet_detector(path: str | Path = "", device: str = "auto",
     path = Path(path) if str(path) not in ("", ".") else weights_file(settings)
     if settings.threads:
         torch.set_num_threads(settings.threads)
-    place = chosen_device(device)
+    where = chosen_device(device)
     header, network = load_pointnet(path)
     if params is None:
         params = PointNetDetectorParams(ground=header.config.ground,
                                         clustering=header.config.clustering)
     detector = PointNetDetector(network, header, CPU, params)
-    detector.move(place)
+    detector.move(where)
     if settings.warm_up:
         detector.warm_up()
     return detector

@@ -15,7 +15,7 @@ STEPS = ("preprocess", "experts", "network", "postprocess")  # of which each has
 
 @dataclass(frozen=True)
 class PointPillarsParams(NetworkParams):
-    """Which PointPillars, where it runs, and what counts as found."""
+    """Which PointPillars, where it runs, and what counts as a detection."""
 
     weights: str = param("", "Checkpoint (.safetensors) or exported network (.onnx); empty: the "
                          "one that comes with the package.", fixed=True)
