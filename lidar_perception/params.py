@@ -21,6 +21,7 @@ from lidar_perception.candidates.params import (
 from lidar_perception.clustering.params import BoxParams, ClusteringParams
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import Params, param
+from lidar_perception.robot.params import CropParams
 from lidar_perception.wire.params import InputParams, ViewParams
 
 
@@ -78,6 +79,7 @@ class BoxNodeParams:
 @dataclass(frozen=True)
 class GroundNodeParams:
     input: InputParams = InputParams()
+    crop: CropParams = CropParams()
     view: ViewParams = ViewParams()
     ground: GroundParams = GroundParams()
 

@@ -14,7 +14,7 @@ from lidar_perception.nodes.runtime import CLOUD, ERROR, OK, WARN, LidarNode
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.params import BoxNodeParams
 from lidar_perception.types import InputError, LidarFrame
-from lidar_perception.wire.messages import cluster_column, column, to_frame
+from lidar_perception.wire.messages import cluster_column, column
 from msg_utils.stamps import to_ns
 
 
@@ -91,9 +91,9 @@ class DetectorNode(LidarNode):
         if self.detector is None:
             return
         with self.frame(to_ns(msg.header.stamp)):
-            frame, indices = to_frame(msg, self.params.input.intensity_max)
+            frame, indices, params = self.sensor.frame(msg, with_intensity=True)
             ground, clusters = column(msg, "ground", indices), cluster_column(msg, indices)
-            self.detector.params = self.params
+            self.detector.params = params
             found = self.detector(frame, ground=None if ground is None else ground > 0,
                                   cluster_ids=None if clusters is None else clusters[0])
             self.outputs.publish(msg.header, found.detections, found.ms)

@@ -35,10 +35,10 @@ class GroundSegmentation(LidarNode):
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, usable = self.sensor.frame(msg)
-            camera = self.camera.get(frame.frame_id, self.params.view)
-            indices, seen = points_in_view(frame, camera, self.params.view)
-            ground = segment_ground(seen, self.params.ground)
+            frame, usable, params = self.sensor.frame(msg)
+            camera = self.camera.get(frame.frame_id, params.view)
+            indices, seen = points_in_view(frame, camera, params.view)
+            ground = segment_ground(seen, params.ground)
             indices = usable.take(indices)
             self.points.publish(encode(add_columns(
                 msg, bag_message, ground=spread(ground, indices, msg, "u1"),
