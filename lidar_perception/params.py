@@ -47,6 +47,16 @@ class ReceptionParams(Params):
     max_dropped: float = param(
         0.5, "WARN when more than this share of the last 100 clouds was dropped because a newer "
         "one came before its turn.", low=0.0, high=1.0)
+    deskew: str = param(
+        "off", "Motion correction: points are moved to header.stamp, by the cloud's column of "
+        "times and, odometry: ~/input/odometry (nav_msgs/Odometry), or tf: TF, from "
+        "`input.fixed_frame`. off: they are used as they are.", choices=("off", "odometry", "tf"),
+        fixed=True)
+    fixed_frame: str = param("odom", "For `input.deskew` tf: a frame in which the robot moves "
+                             "without jumps.", fixed=True)
+    max_wait: float = param(0.2, "With `base_frame`, `target_frame` or `input.deskew`: a cloud "
+                            "waits so long for transforms or odometry as new as itself.", unit="s",
+                            low=0.0, high=10.0)
 
 
 @dataclass(frozen=True)
@@ -59,18 +69,22 @@ class MarkerParams(Params):
 
 
 @dataclass(frozen=True)
-class CloudNodeParams:
+class CloudNodeParams(Params):
     """What a node that takes clouds has besides the numbers of its algorithm."""
 
     input: ReceptionParams = ReceptionParams()
+    base_frame: str = param("", "A frame on the ground, such as base_footprint: height, roll and "
+                            "pitch of the sensor come from TF instead of ground.sensor_pose, and "
+                            "all is computed on the levelled cloud. Empty: off.", fixed=True)
 
 
 @dataclass(frozen=True)
-class BoxNodeParams:
+class BoxNodeParams(CloudNodeParams):
     """What a node that makes boxes of clouds has besides the numbers of its algorithm."""
 
-    input: ReceptionParams = ReceptionParams()
     output: MarkerParams = MarkerParams()
+    target_frame: str = param("", "The frame of the boxes that go out, by TF at the stamp of their "
+                              "cloud. Empty: the cloud's.", fixed=True)
 
 
 # Each node declares the groups of its own stages, under the same names.

@@ -22,8 +22,6 @@ from lidar_perception.ground import params as ground_params
 from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.param_fields import Params, flatten, parameter_fields, with_values
 from lidar_perception.params import (
-    BoxNodeParams,
-    CloudNodeParams,
     ClusteringNodeParams,
     GroundNodeParams,
     PlayerParams,
@@ -45,7 +43,7 @@ def groups_below(base: type) -> list[type]:
 
 GROUPS = [group for group in groups_below(Params)
           if group.__module__ in [each.__name__ for each in MODULES]]
-COMPOSITES = [BoxNodeParams, CloudNodeParams, PipelineParams, GroundNodeParams,
+COMPOSITES = [PipelineParams, GroundNodeParams,
               ClusteringNodeParams, RefinementNodeParams,
               DetectorParams, PointNetDetectorParams, PointPillarsTraining]
 FIELDS = [pytest.param(group, f, id=f"{group.__name__}.{f.name}")

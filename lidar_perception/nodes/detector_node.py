@@ -97,10 +97,10 @@ class DetectorNode(LidarNode):
             found = self.detector(frame, ground=None if ground is None else ground > 0,
                                   cluster_ids=None if clusters is None else clusters[0])
             self.outputs.publish(msg.header, found.detections, found.ms)
-        self._diagnose(frame, found)
+        self._diagnose(frame, found, params)
 
-    def _diagnose(self, frame: LidarFrame, found: Found) -> None:
-        problem = found.problem or self.sensor.problem(frame)
+    def _diagnose(self, frame: LidarFrame, found: Found, params: Any) -> None:
+        problem = found.problem or self.sensor.problem(frame, params)
         self.counts.update(detections=len(found.detections), device=str(self.detector.device))
         self.counts["best scores"] = " ".join(
             f"{name} {score:.2f}" for name, score in found.best.items())

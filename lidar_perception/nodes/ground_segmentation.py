@@ -36,7 +36,7 @@ class GroundSegmentation(LidarNode):
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable, params = self.sensor.frame(msg)
-            camera = self.camera.get(frame.frame_id, params.view)
+            camera = self.camera.get(msg.header, params.view)
             indices, seen = points_in_view(frame, camera, params.view)
             ground = segment_ground(seen, params.ground)
             indices = usable.take(indices)
@@ -52,5 +52,5 @@ class GroundSegmentation(LidarNode):
             self.counts.update(plane=" ".join(f"{v:.4f}" for v in plane),
                                plane_inlier_share=f"{inlier_share(seen.xyz, plane):.3f}",
                                ground_share=f"{ground.mean():.3f}")
-        problem = explain_nothing(len(frame), ground) or self.sensor.problem(frame)
+        problem = explain_nothing(len(frame), ground) or self.sensor.problem(frame, params)
         self.report(WARN if problem else OK, problem or "segmenting")

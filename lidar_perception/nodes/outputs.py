@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from std_msgs.msg import Float64
 from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import class_by_diagonal
 from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
+from lidar_perception.tracking.ego import moved_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import detection_markers
@@ -19,6 +21,16 @@ from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys, to_marker_array
 from msg_utils.messages import message_class, ros_message
 from msg_utils.stamps import SECOND, header_message, to_ns
+
+
+def placed(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[Any, np.ndarray]:
+    """header and boxes (K, 7), found in the levelled frame of a cloud with this header, in the
+    frame that the results go out in."""
+    placing = node.transforms.placing(header)
+    if placing.frame_id != header.frame_id:
+        header = header_message(to_ns(header.stamp), placing.frame_id, bag_message)
+    return header, boxes if placing.out is None else moved_boxes(boxes, placing.out).astype(
+        boxes.dtype)
 
 
 def lifetime_ns(node: LidarNode) -> int:
@@ -36,7 +48,7 @@ class ClusterBoxes:
 
     def publish(self, header: Any, boxes: Callable[[], np.ndarray]) -> None:
         if self.publisher.get_subscription_count():
-            found = boxes()
+            header, found = placed(self.node, header, boxes())
             ids = range(1, len(found) + 1)  # as in the column cluster_id
             markers = to_marker_array(found, ["cluster"] * len(found), header=header,
                                       make=bag_message, ids=ids, previous=self.shown,
@@ -61,6 +73,7 @@ class DetectionMarkers:
         self.shown: Any = ()
 
     def publish(self, header: Any, detections: Detections) -> None:
+        """In the frame of header, as they are."""
         message = detection_markers(detections, header, bag_message, self.shown,
                                     lifetime_ns(self.node))
         self.shown = marker_keys(message)
@@ -72,6 +85,7 @@ class DetectionOutputs:
     of each step."""
 
     def __init__(self, node: LidarNode, steps: tuple[str, ...]):
+        self.node = node
         self.markers = DetectionMarkers(node, "detections")
         self.detections_3d = None
         if importlib.util.find_spec("vision_msgs"):
@@ -83,6 +97,8 @@ class DetectionOutputs:
 
     def publish(self, header: Any, detections: Detections, ms: Mapping[str, float]) -> None:
         """Publish detections, and the times of the steps that are known."""
+        header, boxes = placed(self.node, header, detections.boxes)
+        detections = replace(detections, boxes=boxes)
         self.markers.publish(header, detections)
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             self.detections_3d.publish(to_detection_array(
@@ -114,7 +130,9 @@ class CandidateOutputs:
             candidates, problem = Candidates.none(), problem or str(error)
         for stage, markers in self.stages.items():
             if markers.publisher.get_subscription_count():
-                markers.publish(header, getattr(candidates, stage))
+                found = getattr(candidates, stage)
+                place, boxes = placed(self.node, header, found.boxes)
+                markers.publish(place, replace(found, boxes=boxes))
         self.final.publish(header, candidates.final, candidates.ms)
         self._diagnose(candidates, problem)
 

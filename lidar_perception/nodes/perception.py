@@ -39,9 +39,9 @@ class Perception(LidarNode):
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, usable, params = self.sensor.frame(msg)
-            segmented = segment(frame, self.camera.get(frame.frame_id, params.view), params)
+            segmented = segment(frame, self.camera.get(msg.header, params.view), params)
             problem = (explain_nothing(len(frame), segmented.ground, segmented.cluster_ids)
-                       or self.sensor.problem(frame))
+                       or self.sensor.problem(frame, params))
             self.outputs.publish(msg.header, lambda: refined(segmented, source, params), problem)
         if self.points.get_subscription_count():
             indices = usable.take(segmented.indices)

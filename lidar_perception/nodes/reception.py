@@ -89,11 +89,14 @@ class Reception:
     It is RELIABLE where all publishers offer that, as of an ordinary driver's 2 MB a best-effort
     subscriber gets less than half; a BEST_EFFORT publisher, also one that comes later, makes it
     BEST_EFFORT, as else nothing at all would come from it. qos_overrides stand above that.
+    A cloud for which ready(bytes) is False waits, up to input.max_wait, before it is one of those.
     """
 
     def __init__(self, node: Node, kind: type, name: str, deliver: Callable[[bytes], None],
-                 params: Callable[[], ReceptionParams]):
+                 params: Callable[[], ReceptionParams], ready: Callable[[bytes], bool]):
         self.node, self.kind, self.deliver, self.params = node, kind, deliver, params
+        self.ready = ready
+        self.early: deque[tuple[float, bytes]] = deque()  # until when, at most
         self.topic = node.resolve_topic_name(name)
         self.fixed = (f"qos_overrides.{self.topic}.subscription.reliability"
                       in node._parameter_overrides)
@@ -142,16 +145,30 @@ class Reception:
     def _received(self, data: bytes, info: dict) -> None:
         """Take all that wait at the middleware, where nobody counts what is pushed out."""
         infos, handle = [info], self.subscription.handle
-        self.waiting.append(data)
+        until = monotonic() + self.params().max_wait
+        self.early.append((until, data))
         with handle:
             while taken := handle.take_message(self.kind, True):
-                self.waiting.append(taken[0])
+                self.early.append((until, taken[0]))
                 infos.append(taken[1])
+        self.arrivals.add(infos, self._admit(), one_publisher=len(self.publishers()) < 2)
+        self._deliver_one()
+
+    def _admit(self) -> int:
+        """Let those wait for their turn that are ready, or have waited for long; how many were
+        dropped for that."""
+        while self.early and (self.ready(self.early[0][1]) or self.early[0][0] <= monotonic()):
+            self.waiting.append(self.early.popleft()[1])
         dropped = max(0, len(self.waiting) - self.params().queue)
         for _ in range(dropped):
             self.waiting.popleft()
-        self.arrivals.add(infos, dropped, one_publisher=len(self.publishers()) < 2)
-        self._deliver_one()
+        return dropped
+
+    def look(self) -> None:
+        """Something has come that clouds may have waited for, or time has gone by."""
+        if self.early:
+            self.arrivals.dropped += self._admit()
+            self._deliver_one()
 
     def _deliver_one(self) -> None:
         if not self.waiting:

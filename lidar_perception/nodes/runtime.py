@@ -24,6 +24,7 @@ from std_msgs.msg import Float64
 
 from lidar_perception.nodes.declared import as_declared, declare
 from lidar_perception.nodes.reception import Problem, Reception
+from lidar_perception.nodes.transforms import Transforms
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message, decode, encode, typestore
@@ -63,6 +64,7 @@ class LidarNode(Node):
         self.frame_id = ""  # of the last cloud
         self._outputs: list[Any] = []
         self._receptions: list[Reception] = []
+        self.transforms: Any = None  # of a node that takes clouds
         self._present: set[str] = set()  # kinds of problems
         self._logged: dict[str, float] = {}  # kind of problem -> when it was logged
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
@@ -70,6 +72,8 @@ class LidarNode(Node):
                                                       RELIABLE)
         self.create_timer(1.0, self._tick, clock=Clock(
             clock_type=ClockType.STEADY_TIME))
+        if robot:
+            self.transforms = Transforms(self)
 
     def _before_set(self, changes: list[Parameter]) -> list[Parameter]:
         return [as_declared(c, self.get_parameter(c.name).type_)
@@ -99,6 +103,7 @@ class LidarNode(Node):
                 msg = decode(data, type_name)
                 if type_name == CLOUD:
                     self.frame_id = msg.header.frame_id
+                    msg = self.transforms.corrected(msg)
                 callback(msg)
             except InputError as error:
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {error}")
@@ -112,7 +117,7 @@ class LidarNode(Node):
 
         if qos is None:
             self._receptions.append(Reception(self, message_class(type_name), name, guarded,
-                                              lambda: self.robot.input))
+                                              lambda: self.robot.input, self.transforms.ready))
             return
         self.create_subscription(
             message_class(type_name), name, guarded, qos, raw=True,
@@ -166,8 +171,8 @@ class LidarNode(Node):
         """The state, and what is wrong with the inputs and with the node's name."""
         level, message = self.state
         values = dict(self.counts, last_stamp_ns=self.last_stamp_ns)
-        for reception in self._receptions:
-            values.update(reception.values())
+        for source in self._sources():
+            values.update(source.values())
         if self.times:
             values["processing_ms_median"] = f"{np.median(self.times):.1f}"
         for publisher in self._outputs:
@@ -183,9 +188,13 @@ class LidarNode(Node):
         if rclpy.ok(context=self.context):
             self._diagnostics.publish(array)
 
+    def _sources(self) -> list[Any]:
+        """What has values and problems of its own."""
+        return [*self._receptions, *([self.transforms] if self.transforms else [])]
+
     def _problems(self) -> list[Problem]:
         """Each is logged when it comes up, at most once in LOG_PERIOD."""
-        found = [p for reception in self._receptions for p in reception.problems()]
+        found = [p for source in self._sources() for p in source.problems()]
         name, namespace = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count((name, namespace)) > 1:
             found.append(("name", WARN, f"another node is called {self.get_fully_qualified_name()} "

@@ -28,24 +28,26 @@ class SensorCheck:
         self.heights: list[float | None] = []
 
     def frame(self, msg: Any, with_intensity: bool = False) -> tuple[LidarFrame, np.ndarray, Any]:
-        """The cropped frame of a cloud, the indices (N,) of its points there, and the node's
-        parameters for the core, to which nothing is left to crop. The intensity is read where it
-        is asked for, or the ground method uses it."""
+        """The cropped and, with base_frame, levelled frame of a cloud; the indices (N,) of its
+        points in the cloud; and the node's parameters as they are for such a frame. The intensity
+        is read where it is asked for, or the ground method uses it."""
         params = self.node.params
         reads_intensity = with_intensity or params.ground.method == "patchwork"
         frame, indices = to_frame(msg, params.input.intensity_max if reads_intensity else None)
+        placing = self.node.transforms.placing(msg.header)
+        params, base = self.node.transforms.mounted(params, placing)
         if params.crop.enabled:
-            kept, frame = cropped(frame, params.crop)
+            kept, frame = cropped(frame, params.crop, base)
             self.node.counts["cropped"] = len(indices) - len(kept)
             indices, params = indices.take(kept), replace(params, crop=CropParams())
-        return frame, indices, params
+        return placing.levelled(frame), indices, params
 
-    def problem(self, frame: LidarFrame) -> str | None:
-        """What does not fit, with the remedy; None if nothing is known against the parameters."""
-        return self._height_problem(frame) or intensity_problem(frame)
+    def problem(self, frame: LidarFrame, params: Any) -> str | None:
+        """What does not fit the parameters that frame() gave, with the remedy; None if nothing is
+        known against them."""
+        return self._height_problem(frame, params.ground.sensor_pose) or intensity_problem(frame)
 
-    def _height_problem(self, frame: LidarFrame) -> str | None:
-        pose = self.node.params.ground.sensor_pose
+    def _height_problem(self, frame: LidarFrame, pose: SensorPoseParams) -> str | None:
         if pose != self.pose:
             self.pose, self.heights = pose, []
         if len(self.heights) < CLOUDS:
