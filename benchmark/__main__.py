@@ -13,6 +13,7 @@ import click
 import numpy as np
 
 from benchmark import clustering, ground, peers
+from benchmark.busy import measure_busy
 from benchmark.candidates import compare_candidates, print_comparison
 from benchmark.detection import measure_detection, print_detection
 from benchmark.graph import measure_graph, print_graph
@@ -83,6 +84,8 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
         print_detection(content["detection"])
         content["pointnet"] = measure_pointnet(scans, repeat)
         print_pointnet(content["pointnet"])
+        content["busy"] = measure_busy(scans, repeat)
+        print_measured(content["busy"])
     if labelled:
         content["ground_scores"] = ground.measure_labelled(labelled, repeat)
         print_ground(content["ground_scores"])

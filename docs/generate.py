@@ -31,13 +31,19 @@ CAMERA_IN = [
     ("~/input/camera_info", "sensor_msgs/CameraInfo", "P and the image size; latched. Only needed "
      "with `view.enabled`."),
     ("~/input/extrinsics", "geometry_msgs/TransformStamped", "The camera in the LiDAR frame or the "
-     "other way round; latched. /tf_static is read too where tf2_msgs is installed."),
+     "other way round; latched. TF is asked too where tf2_msgs is installed."),
 ]
 SEED_IN = [
     ("~/input/ground_truth", MARKERS, "Labels, for `seed.source` ground_truth; matched to the "
      "cloud by header.stamp."),
     ("/clicked_point", "geometry_msgs/PointStamped", "A point on a pedestrian, for `seed.source` "
-     "click, in the frame of the cloud."),
+     "click, in the frame of the cloud or, with TF, in any that is connected with it."),
+]
+ROBOT_IN = [
+    ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves; only with `input.deskew` "
+     "odometry."),
+    ("/tf, /tf_static", "tf2_msgs/TFMessage", "Where tf2_msgs is installed; /tf only with "
+     "`base_frame`, `target_frame`, `input.deskew` tf, or a click."),
 ]
 DETECTIONS_3D = ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, where "
                  "vision_msgs is installed.")
@@ -60,6 +66,16 @@ ALWAYS_OUT = [
     ("/diagnostics", "diagnostic_msgs/DiagnosticArray", "Once a second and at every change: state, "
      "reason, counts, rate, lost and dropped clouds, subscribers of the outputs."),
 ]
+MANAGED_OUT = [("~/transition_event", "lifecycle_msgs/TransitionEvent", "Each change of the state, "
+                "see [lifecycle](../lifecycle.md).")]
+MANAGED_SERVICES = [
+    ("~/change_state", "lifecycle_msgs/ChangeState", "Configure, activate, deactivate, clean up, "
+     "shut down."),
+    ("~/get_state", "lifecycle_msgs/GetState", "And the others of a managed node."),
+]
+OBSTACLES_OUT = ("~/output/obstacles", CLOUD, "x y z, and intensity where the cloud has one, of "
+                 "the points that are no ground and within the heights of `obstacles`, for a "
+                 "costmap ([nav2](../nav2.md)); made only while subscribed.")
 COLUMNS = "columns `ground` (uint8, 1 = ground) and `in_view` (uint8, 1 = processed)"
 
 PAGES: dict[str, dict[str, Any]] = {
@@ -71,7 +87,8 @@ PAGES: dict[str, dict[str, Any]] = {
         inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape."), *CAMERA_IN],
         outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS}."),
                  ("~/output/ground", CLOUD, "Ground points only; made only while subscribed."),
-                 ("~/output/nonground", CLOUD, "The other points in view; likewise.")]),
+                 ("~/output/nonground", CLOUD, "The other points in view; likewise."),
+                 OBSTACLES_OUT]),
     "clustering": dict(
         params=params.ClusteringNodeParams(),
         what="Clusters the points that are not ground: distance-aware DBSCAN, exact, or adaptive "
@@ -97,6 +114,7 @@ PAGES: dict[str, dict[str, Any]] = {
         outputs=[("~/output/points", CLOUD, f"The same cloud with the {COLUMNS} and `cluster_id`; "
                   "made only while subscribed."),
                  ("~/output/boxes", MARKERS, "Cluster boxes; made only while subscribed."),
+                 OBSTACLES_OUT,
                  *CANDIDATES_OUT]),
     "pointpillars_detector": dict(
         params=DetectorParams(),
@@ -156,12 +174,23 @@ PAGES: dict[str, dict[str, Any]] = {
 }
 
 
+def outputs(name: str) -> list[tuple[str, str, str]]:
+    """Rows of all that a node publishes."""
+    return PAGES[name]["outputs"] + ALWAYS_OUT + (MANAGED_OUT if _managed(name) else [])
+
+
+def _managed(name: str) -> bool:
+    return "autostart" in node_parameters(name)
+
+
 def page(name: str) -> str:
     node = PAGES[name]
     lines = [f"# {name}", "", node["what"], "",
              f"    ros2 run lidar_perception {name}      # or: lidar-perception run {name}", ""]
-    for title, rows in (("Subscribes", node["inputs"]), ("Publishes", node["outputs"] + ALWAYS_OUT),
-                        ("Services", node.get("services", []))):
+    robot = ROBOT_IN if "base_frame" in node_parameters(name) else []
+    for title, rows in (("Subscribes", node["inputs"] + robot), ("Publishes", outputs(name)),
+                        ("Services", MANAGED_SERVICES if _managed(name)
+                         else node.get("services", []))):
         if rows:
             lines += [f"## {title}", "", "| name | type | |", "|---|---|---|",
                       *(f"| `{a}` | {b} | {c} |" for a, b, c in rows), ""]

@@ -76,7 +76,7 @@ def generate_launch_description():
     pipeline = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(HERE / "perception.launch.py")),
         launch_arguments={"points": relative(POINTS), **{k: LaunchConfiguration(k) for k in (
-            "config", "single", "use_sim_time", "log_level")}}.items())
+            "config", "single", "rviz", "use_sim_time", "log_level")}}.items())
     return LaunchDescription([
         DeclareLaunchArgument("bag", description="Folder of the bag."),
         DeclareLaunchArgument("points", default_value="", description="The bag's topic of clouds; "
@@ -88,6 +88,8 @@ def generate_launch_description():
         DeclareLaunchArgument("config", default_value=str(CONFIG), description="Parameter file."),
         DeclareLaunchArgument("single", default_value="false", choices=["true", "false"],
                               description="All stages in one process."),
+        DeclareLaunchArgument("rviz", default_value="false", choices=["true", "false"],
+                              description="Start RViz with config/lidar_perception.rviz."),
         DeclareLaunchArgument("real_time", default_value="false", choices=["true", "false"],
                               description="Play as a sensor sends; false: a cloud is sent when "
                               "those before have their result."),

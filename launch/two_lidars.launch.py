@@ -14,8 +14,8 @@ from launch import LaunchDescription
 
 GRAPH = Path(__file__).resolve().parent / "detectors.launch.py"
 SIDES = ("left", "right")
-SHARED = {"detectors": "candidates", "single": "false", "use_sim_time": "false",
-          "log_level": "info"}
+SHARED = {"detectors": "candidates", "single": "false", "rviz": "false", "rviz_frame": "",
+          "use_sim_time": "false", "log_level": "info"}
 
 
 def generate_launch_description():

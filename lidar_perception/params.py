@@ -19,7 +19,7 @@ from lidar_perception.candidates.params import (
     StmParams,
 )
 from lidar_perception.clustering.params import BoxParams, ClusteringParams
-from lidar_perception.ground.params import GroundParams
+from lidar_perception.ground.params import GroundParams, ObstacleParams
 from lidar_perception.param_fields import Params, param
 from lidar_perception.robot.params import CropParams
 from lidar_perception.wire.params import InputParams, ViewParams
@@ -35,6 +35,9 @@ class ReceptionParams(Params):
         choices=("auto", "reliable", "best_effort"))
     queue: int = param(1, "Clouds that wait while one is worked on; older ones are dropped, and "
                           "counted. 1: the newest wins.", low=1, high=1000)
+    max_wait: float = param(10.0, "A cloud that needs what has not come yet, such as the camera's "
+                            "calibration with view.enabled, or a transform of its time, waits for "
+                            "this time.", unit="s", low=0.0, high=3600.0)
     rate: float = param(0.0, "Clouds a second that the sensor sends; 0 takes what the first 21 "
                         "say.", unit="Hz", low=0.0, high=1000.0)
     min_rate: float = param(0.7, "WARN below this share of the rate.", low=0.0, high=1.0)
@@ -54,9 +57,6 @@ class ReceptionParams(Params):
         fixed=True)
     fixed_frame: str = param("odom", "For `input.deskew` tf: a frame in which the robot moves "
                              "without jumps.", fixed=True)
-    max_wait: float = param(0.2, "With `base_frame`, `target_frame` or `input.deskew`: a cloud "
-                            "waits so long for transforms or odometry as new as itself.", unit="s",
-                            low=0.0, high=10.0)
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,8 @@ class CloudNodeParams(Params):
     base_frame: str = param("", "A frame on the ground, such as base_footprint: height, roll and "
                             "pitch of the sensor come from TF instead of ground.sensor_pose, and "
                             "all is computed on the levelled cloud. Empty: off.", fixed=True)
+    autostart: bool = param(True, "Configure and activate at the start. false: a lifecycle manager "
+                            "does, as Nav2's, or `ros2 lifecycle`.", fixed=True)
 
 
 @dataclass(frozen=True)
@@ -85,6 +87,20 @@ class BoxNodeParams(CloudNodeParams):
     output: MarkerParams = MarkerParams()
     target_frame: str = param("", "The frame of the boxes that go out, by TF at the stamp of their "
                               "cloud. Empty: the cloud's.", fixed=True)
+
+
+@dataclass(frozen=True)
+class GroundRobotParams(CloudNodeParams):
+    """What ground_segmentation has besides."""
+
+    obstacles: ObstacleParams = ObstacleParams()
+
+
+@dataclass(frozen=True)
+class PerceptionRobotParams(BoxNodeParams):
+    """What perception has besides."""
+
+    obstacles: ObstacleParams = ObstacleParams()
 
 
 # Each node declares the groups of its own stages, under the same names.

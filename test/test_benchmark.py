@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 
 import numpy as np
@@ -12,6 +13,7 @@ from click.testing import CliRunner
 from samples import object_folder, scene, walker_label
 
 from benchmark import ground, peers, plain_euclidean
+from benchmark.busy import measure_busy
 from benchmark.clustering import dbscan_times, measure_dbscan, same_clusters
 from benchmark.detection import measure_detection, print_detection
 from benchmark.plain_pointnet2 import ball, farthest
@@ -124,6 +126,16 @@ def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsy
         assert found["ms"]["network"] > 0 and found["ms"]["postprocess"] > 0
         assert name in shown and found["to_v0"] == found["total_ms"] / versions["v0"]["total_ms"]
     assert versions["v4"]["ms"]["experts"] > versions["v0"]["ms"]["experts"]  # v0 has none
+
+
+def test_a_frame_is_timed_beside_busy_processes(monkeypatch, capsys):
+    monkeypatch.setenv("GOMP_SPINCOUNT", "7")
+    points = scene()
+    content = measure_busy([LidarFrame(points[:, :3], points[:, 3])], 1)
+    print_measured(json.loads(json.dumps(content)))
+    assert "beside 2 busy processes" in capsys.readouterr().out
+    assert all(r["value"] > 0 for r in content["rows"]) and len(content["rows"]) == 3
+    assert os.environ["GOMP_SPINCOUNT"] == "7" and "OMP_WAIT_POLICY" not in os.environ
 
 
 def test_the_cluster_network_is_timed_beside_a_plain_one(one_thread, capsys):

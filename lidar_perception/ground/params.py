@@ -98,3 +98,20 @@ class GroundParams(Params):
     threshold: ThresholdParams = ThresholdParams()
     patchwork: PatchworkParams = PatchworkParams()
     cloth: ClothParams = ClothParams()
+
+
+@dataclass(frozen=True)
+class ObstacleParams(Params):
+    """What of the points that are no ground is an obstacle, by its height above the ground around
+    it."""
+
+    min_height: float = param(0.0, "Obstacles are at least this high above the ground around them; "
+                              "0: points below it too.", unit="m", low=0.0, high=100.0)
+    max_height: float = param(0.0, "Obstacles are at most this high above the ground around them, "
+                              "such as what the robot passes under; 0: no limit.", unit="m",
+                              low=0.0, high=100.0)
+
+    def check(self) -> None:
+        if 0.0 < self.max_height <= self.min_height:
+            raise ValueError(f"max_height = {self.max_height} must be above min_height = "
+                             f"{self.min_height}, or 0")

@@ -11,8 +11,9 @@ from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import Segmented, grounded_boxes
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.inputs import SeedInput
+from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import CandidateOutputs
-from lidar_perception.nodes.runtime import CLOUD, LidarNode
+from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.params import BoxNodeParams, RefinementNodeParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import cluster_column, column, to_frame
@@ -21,12 +22,14 @@ from msg_utils.stamps import to_ns
 __all__ = ["CandidateRefinement", "warm_up"]
 
 
-class CandidateRefinement(LidarNode):
+class CandidateRefinement(ManagedNode):
     """Ground snapping, height filter, STM and CPA."""
 
     def __init__(self, **options: Any):
         super().__init__("candidate_refinement", RefinementNodeParams(), BoxNodeParams(),
                          **options)
+
+    def configure(self) -> None:
         self.outputs = CandidateOutputs(self)
         self.seed = SeedInput(self, self.on_cloud)
         self.input("points", CLOUD, self.seed.add_cloud)

@@ -9,8 +9,9 @@ import numpy as np
 from lidar_perception.candidates.segmented import explain_nothing, grounded_boxes
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import ClusterBoxes
-from lidar_perception.nodes.runtime import CLOUD, OK, WARN, LidarNode
+from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.params import BoxNodeParams, ClusteringNodeParams
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import column, spread, to_frame
@@ -20,12 +21,14 @@ from msg_utils.stamps import to_ns
 __all__ = ["Clustering", "warm_up"]
 
 
-class Clustering(LidarNode):
+class Clustering(ManagedNode):
     """Distance-aware DBSCAN or adaptive Euclidean clustering of the points that are not ground.
     Boxes are made only while somebody subscribes."""
 
     def __init__(self, **options: Any):
         super().__init__("clustering", ClusteringNodeParams(), BoxNodeParams(), **options)
+
+    def configure(self) -> None:
         self.points = self.output("points", CLOUD)
         self.boxes = ClusterBoxes(self)
         self.input("points", CLOUD, self.on_points)

@@ -3,37 +3,39 @@
 from __future__ import annotations
 
 import os
-import traceback
 from pathlib import Path
 from typing import Any, ClassVar
 
 from lidar_perception.detectors.contract import Found
 from lidar_perception.nodes.main import one_at_a_time
+from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import DetectionOutputs
-from lidar_perception.nodes.runtime import CLOUD, ERROR, OK, WARN, LidarNode
+from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.params import BoxNodeParams
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.messages import cluster_column, column
 from msg_utils.stamps import to_ns
 
 
-class DetectorNode(LidarNode):
+class DetectorNode(ManagedNode):
     """~/input/points -> ~/output/detections. A node names its network's group of parameters, finds
     its weights and loads the detector.
 
-    It loads the network before it subscribes. Without one it says why and publishes nothing, as an
-    empty array would mean that nothing is there.
+    Without a network it publishes nothing, as an empty array would mean that nothing is there.
     """
 
     group: ClassVar[str]  # of the parameters, a NetworkParams
+    steps: ClassVar[tuple[str, ...]]  # that are timed
 
-    def __init__(self, name: str, params: Any, steps: tuple[str, ...], **options: Any):
-        super().__init__(name, params, BoxNodeParams(), **options)
+    def configure(self) -> None:
         self.sensor = SensorCheck(self)
-        self.outputs = DetectionOutputs(self, steps)
-        self.report(WARN, "loading the network", expected=True)
+        self.outputs = DetectionOutputs(self, self.steps)
         self.detector = self._loaded()
+        config = self.detector.config
+        self.counts.update(network=f"{self.name_of(config)}, {' '.join(config.classes)}",
+                           device=str(self.detector.device))
+        if self.detector.fallback:
+            self.report(WARN, self.detector.fallback)
         self.input("points", CLOUD, self.on_points)
 
     def weights(self) -> Path:
@@ -49,24 +51,6 @@ class DetectorNode(LidarNode):
         raise NotImplementedError
 
     def _loaded(self) -> Any:
-        try:
-            detector = self._load()
-        except InputError as error:
-            self.report(ERROR, f"nothing is detected: {error}")
-            return None
-        except Exception as error:  # of torch and its drivers: the node lives to tell
-            self.get_logger().error(traceback.format_exc())
-            self.report(ERROR, "nothing is detected, as the network cannot be loaded: "
-                        f"{type(error).__name__}: {error}")
-            return None
-        config = detector.config
-        self.counts.update(network=f"{self.name_of(config)}, {' '.join(config.classes)}",
-                           device=str(detector.device))
-        self.report(WARN, detector.fallback or "waiting for input",
-                    expected=not detector.fallback)
-        return detector
-
-    def _load(self) -> Any:
         """The detector that the parameters ask for; on the CPU if CUDA is asked for and not there,
         and the CPU may take over."""
         chosen, missing = getattr(self.params, self.group), None
@@ -88,8 +72,6 @@ class DetectorNode(LidarNode):
         return detector
 
     def on_points(self, msg: Any) -> None:
-        if self.detector is None:
-            return
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices, params = self.sensor.frame(msg, with_intensity=True)
             ground, clusters = column(msg, "ground", indices), cluster_column(msg, indices)

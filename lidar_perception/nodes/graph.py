@@ -105,16 +105,12 @@ def outputs_in_use(graph: Graph) -> dict[str, set[str]]:
     return {node: {t for t in heard if t.startswith(f"/{node}/")} for node in graph}
 
 
-def wait_for(single: bool = False, points: int = 1, truth: int = 2,
-             camera: int = 0) -> list[str]:
+def wait_for(single: bool = False, points: int = 1, truth: int = 2) -> list[str]:
     """bag_player's wait_for: subscribers of the clouds, of the labels (the seed input and an
-    evaluator), of the camera, without which a cropped cloud is lost, and one of each topic between
-    the nodes."""
+    evaluator), and one of each topic between the nodes."""
     graph = SINGLE if single else STAGES
     between = sorted(set().union(*outputs_in_use(graph).values()))
     topics = [f"{POINTS}:={points}", f"{TRUTH}:={truth}", *between, result_topics(single)["final"]]
-    if camera:
-        topics += [f"{CAMERA_INFO}:={camera}", f"{EXTRINSICS}:={camera}"]
     return [*map(relative, topics)]
 
 
@@ -129,7 +125,9 @@ def chosen_clouds(bag: str, types: Mapping[str, str], wanted: str = "") -> str:
     clouds = cloud_topics(types)
     if wanted in clouds or (not wanted and len(clouds) == 1):
         return wanted or clouds[0]
-    has = f"it has {', '.join(clouds)}" if clouds else "it has none at all"
+    if not clouds:
+        raise InputError(f"{bag} has no clouds: none of its topics is a sensor_msgs/PointCloud2")
+    has = f"it has {', '.join(clouds)}"
     raise InputError(f"{bag} has no cloud on {wanted}; {has}" if wanted else
                      f"{bag}: give the topic of the clouds with points:=TOPIC; {has}")
 

@@ -9,9 +9,11 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import fit_plane, inlier_share
 from lidar_perception.nodes.inputs import CameraInput
-from lidar_perception.nodes.runtime import CLOUD, OK, WARN, LidarNode
+from lidar_perception.nodes.managed import ManagedNode
+from lidar_perception.nodes.outputs import Obstacles
+from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.params import CloudNodeParams, GroundNodeParams
+from lidar_perception.params import GroundNodeParams, GroundRobotParams
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import spread
 from msg_utils.point_cloud2 import add_columns, from_array, to_array
@@ -20,18 +22,21 @@ from msg_utils.stamps import to_ns
 __all__ = ["GroundSegmentation", "warm_up"]
 
 
-class GroundSegmentation(LidarNode):
-    """One plane, Patchwork++ or cloth simulation. ~/output/ground and ~/output/nonground are made
+class GroundSegmentation(ManagedNode):
+    """One plane, Patchwork++ or cloth simulation. ~/output/ground, nonground and obstacles are made
     only while somebody subscribes."""
 
     def __init__(self, **options: Any):
-        super().__init__("ground_segmentation", GroundNodeParams(), CloudNodeParams(), **options)
+        super().__init__("ground_segmentation", GroundNodeParams(), GroundRobotParams(), **options)
+
+    def configure(self) -> None:
         self.camera = CameraInput(self)
         self.sensor = SensorCheck(self)
         self.points = self.output("points", CLOUD)
         self.ground = self.output("ground", CLOUD)
         self.nonground = self.output("nonground", CLOUD)
-        self.input("points", CLOUD, self.on_points)
+        self.obstacles = Obstacles(self)
+        self.input("points", CLOUD, self.on_points, needs=self.camera.missing)
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
@@ -47,6 +52,7 @@ class GroundSegmentation(LidarNode):
             if publisher.get_subscription_count():
                 publisher.publish(encode(from_array(to_array(msg).take(indices[chosen]), msg.header,
                                                     bag_message)))
+        self.obstacles.publish(msg, seen.xyz, ground, indices)
         plane = fit_plane(seen.xyz.compress(ground, axis=0))
         if plane is not None:
             self.counts.update(plane=" ".join(f"{v:.4f}" for v in plane),

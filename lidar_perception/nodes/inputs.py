@@ -38,7 +38,8 @@ class CameraInput:
     """The camera from ~/input/camera_info and ~/input/extrinsics, or from TF."""
 
     def __init__(self, node: LidarNode):
-        self.node, self.info = node, None
+        self.node = node
+        self.info: Any = None
         self.transforms: dict[tuple[str, str], Any] = {}
         node.input("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED)
         node.input("extrinsics", "geometry_msgs/msg/TransformStamped", self._on_transform,
@@ -49,6 +50,13 @@ class CameraInput:
 
     def _on_transform(self, msg: Any) -> None:
         self.transforms[msg.header.frame_id, msg.child_frame_id] = msg
+
+    def missing(self, cloud: Any) -> str | None:
+        """What a cloud waits for; None if it can be cropped, or is not to be."""
+        params = self.node.params.view
+        if not params.enabled or self.get(cloud.header, params) is not None:
+            return None
+        return "the camera's calibration: CameraInfo, and the transform from the LiDAR"
 
     def get(self, header: Any, params: ViewParams) -> Camera | None:
         """The camera for the levelled points of a cloud with this header; None until it is known
@@ -130,6 +138,17 @@ class SeedInput:
         node.input("ground_truth", MARKERS, self._on_truth, RELIABLE)
         node.input(relative(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE,
                    private=False)
+        node.inputs.append(self)
+        if self.params.source in ("file", "automatic"):
+            self._template()  # a missing one is known before the first cloud
+
+    def open(self) -> None:
+        """The node is active."""
+
+    def close(self) -> None:
+        """The node is not active any more: what waits is too old when it is again."""
+        self.paired.clouds.clear()
+        self.paired.partners.clear()
 
     @property
     def params(self) -> SeedParams:
@@ -141,11 +160,14 @@ class SeedInput:
         elif self.params.source == "click":
             self.deliver(msg, partial(self._from_click, msg.header))
         else:
-            if self.loaded is None or self.loaded[0] != self.params.file:
-                self.loaded = (self.params.file, load_seed(self.params.file))
-            template = self.loaded[1]
+            template = self._template()
             self.deliver(msg, fixed_seed(template) if self.params.source == "file"
                          else automatic_seed(template, self.node.params))
+
+    def _template(self) -> Seed:
+        if self.loaded is None or self.loaded[0] != self.params.file:
+            self.loaded = (self.params.file, load_seed(self.params.file))
+        return self.loaded[1]
 
     def _on_truth(self, msg: Any) -> None:
         objects = from_marker_array(msg)

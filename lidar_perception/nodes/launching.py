@@ -5,12 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from launch.actions import DeclareLaunchArgument, OpaqueFunction
+import yaml
+from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
-from lidar_perception.nodes.graph import BEHIND, graph_of, prefixed, relative
+from lidar_perception.nodes.graph import (
+    ALONE,
+    BEHIND,
+    EXPERTS,
+    SINGLE,
+    STAGES,
+    graph_of,
+    prefixed,
+    relative,
+)
+from lidar_perception.param_fields import flatten
+from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS
 
@@ -26,8 +38,9 @@ ARGUMENTS = {
     "reliability": dict(default_value="", description="auto, reliable or best_effort, for the "
                         "parameter input.reliability; empty: that of the parameter file."),
     "config": dict(default_value="", description="Parameter file of all nodes; empty: "
-                   "config/*.param.yaml of each detector, and of the first for ground and "
-                   "clusters."),
+                   "config/*.param.yaml of each detector."),
+    "experts": dict(default_value="", description="Of ground and clusters: a parameter file, or "
+                    "the detector whose file it is; empty: config, or that of the first."),
     "weights": dict(default_value="", description="Checkpoint of the network, with several "
                     "networks NAME=FILE,NAME=FILE; empty: that of the parameter file, or the one "
                     "that comes with the package."),
@@ -35,6 +48,10 @@ ARGUMENTS = {
                    "that of the parameter file."),
     "single": dict(**SWITCHES, description="Each detector in one process, which finds ground and "
                    "clusters itself."),
+    "rviz": dict(**SWITCHES, description="Start RViz with config/lidar_perception.rviz, in the "
+                 "same namespace."),
+    "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: that of its "
+                       "file, velodyne."),
     "use_sim_time": dict(**SWITCHES, description="Take the time from /clock."),
     "log_level": dict(default_value="info", description="debug, info, ..."),
 }
@@ -44,9 +61,11 @@ def graph_launch(config_folder: Path, detectors: str) -> LaunchDescription:
     """Ground and clusters, once, and the detectors behind them: a list with commas, the default of
     the argument `detectors`. ARGUMENTS are the others."""
 
-    def nodes(context: Any) -> list[Node]:
-        return started({k: context.perform_substitution(LaunchConfiguration(k))
-                        for k in ("detectors", *ARGUMENTS)}, config_folder)
+    def nodes(context: Any) -> list[Any]:
+        value = {k: context.perform_substitution(LaunchConfiguration(k))
+                 for k in ("detectors", *ARGUMENTS)}
+        processes = started(value, config_folder)
+        return [*(LogInfo(msg=line) for line in conflicts(value, config_folder)), *processes]
 
     return LaunchDescription([
         DeclareLaunchArgument("detectors", default_value=detectors,
@@ -58,29 +77,118 @@ def graph_launch(config_folder: Path, detectors: str) -> LaunchDescription:
 
 def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     """The nodes that the values of the arguments ask for."""
-    detectors = [name.strip() for name in value["detectors"].split(",") if name.strip()]
-    if not detectors:
-        raise InputError(f"detectors is empty; give one or several of {','.join(BEHIND)}")
-    single, prefix = value["single"] == "true", value["name_prefix"]
+    detectors, single = _detectors(value), value["single"] == "true"
+    prefix = value["name_prefix"]
     graph = prefixed(graph_of(detectors, single), prefix)
-    owner = {prefix + node: name for name in reversed(detectors)
-             for node in graph_of([name], single)}
-    return [Node(
+    files = {node: value["config"] or _own_file(name, config_folder) for name in detectors
+             for node in (ALONE if single else BEHIND)[name]}
+    files |= dict.fromkeys(EXPERTS, _expert_file(value, config_folder))
+    viewer = [_viewer(value, config_folder)] if value["rviz"] == "true" else []
+    return viewer + [Node(
         package="lidar_perception", executable=node.removeprefix(prefix), name=node,
         namespace=value["namespace"] or None, output="screen",
-        parameters=[value["config"] or str(config_folder / f"{CONFIGS[owner[node]]}.param.yaml"),
-                    _given(value, owner[node], detectors)],
+        parameters=[files[node.removeprefix(prefix)],
+                    _given(value, node.removeprefix(prefix), detectors)],
         remappings=[(a, value["points"] if b == relative(POINTS) else b)
                     for a, b in remap.items()],
         ros_arguments=["--log-level", value["log_level"]],
     ) for node, remap in graph.items()]
 
 
-def _given(value: dict[str, str], detector: str, detectors: list[str]) -> dict[str, Any]:
+def conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
+    """What to say about the parameter file of ground and clusters: a line for each detector whose
+    own file has other numbers; none where the user chose the file."""
+    detectors, given = _detectors(value), value["experts"]
+    if value["single"] == "true":
+        return ["experts has no effect, as with single:=true each detector finds ground and "
+                "clusters itself"] if given else []
+    if given not in ("", *CONFIGS) or (value["config"] and not given):
+        return []
+    chosen = given or detectors[0]
+    numbers = {name: _expert_numbers(_own_file(name, config_folder))
+               for name in (chosen, *detectors)}
+    lines = []
+    for name in detectors:
+        others = [f"{key} {number}" for key, number in numbers[name].items()
+                  if number != numbers[chosen][key]]
+        if others:
+            lines.append(f"ground and clusters are started with the numbers of {chosen}; those of "
+                         f"{name} are others: {', '.join(others)}. experts:=NAME or experts:=FILE "
+                         "chooses")
+    return lines
+
+
+def _own_file(detector: str, config_folder: Path) -> str:
+    return str(config_folder / f"{CONFIGS[detector]}.param.yaml")
+
+
+def _expert_file(value: dict[str, str], config_folder: Path) -> str:
+    """The parameter file of ground and clusters."""
+    given = value["experts"]
+    if given in CONFIGS:
+        return _own_file(given, config_folder)
+    if given and not Path(given).is_file():
+        raise InputError(f"experts: there is no parameter file {given}, nor a detector of that "
+                         f"name ({', '.join(CONFIGS)})")
+    return given or value["config"] or _own_file(_detectors(value)[0], config_folder)
+
+
+def _expert_numbers(file: str) -> dict[str, Any]:
+    """The numbers of ground and clusters by a parameter file of ours."""
+    def dotted(section: dict, prefix: str = "") -> dict[str, Any]:
+        return {k: v for key, inner in section.items() for k, v in (
+            dotted(inner, f"{prefix}{key}.") if isinstance(inner, dict)
+            else {prefix + key: inner}).items()}
+
+    known = {key: list(v) if isinstance(v, tuple) else v
+             for group in (GroundNodeParams(), ClusteringNodeParams())
+             for key, v in flatten(group).items() if key.startswith(("ground.", "clustering."))}
+    given = dotted(yaml.safe_load(Path(file).read_text())["/**"]["ros__parameters"])
+    return known | {k: v for k, v in given.items() if k in known}
+
+
+def _detectors(value: dict[str, str]) -> list[str]:
+    detectors = [name.strip() for name in value["detectors"].split(",") if name.strip()]
+    if not detectors:
+        raise InputError(f"detectors is empty; give one or several of {','.join(BEHIND)}")
+    return detectors
+
+
+def _viewer(value: dict[str, str], config_folder: Path) -> Node:
+    """RViz, its topics renamed as those of the nodes are."""
+    file = config_folder / "lidar_perception.rviz"
+    frame = ["-f", value["rviz_frame"]] if value["rviz_frame"] else []
+    renamed = {topic: _shown(topic, value) for _, topic in rviz_topics(file)}
+    return Node(
+        package="rviz2", executable="rviz2", name=value["name_prefix"] + "rviz",
+        namespace=value["namespace"] or None, arguments=["-d", str(file), *frame], output="screen",
+        parameters=[{"use_sim_time": value["use_sim_time"] == "true"}],
+        remappings=[(a, b) for a, b in renamed.items() if a != b])
+
+
+def rviz_topics(file: Path) -> list[tuple[str, str]]:
+    """(class, topic) of each display and tool of an RViz file that has a topic."""
+    manager = yaml.safe_load(file.read_text())["Visualization Manager"]
+    return [(each["Class"], each["Topic"]["Value"])
+            for each in [*manager["Displays"], *manager["Tools"]] if "Topic" in each]
+
+
+def _shown(topic: str, value: dict[str, str]) -> str:
+    node, slash, rest = topic.partition("/")
+    if topic == relative(POINTS):
+        return value["points"]
+    if value["single"] == "true" and node in STAGES:
+        node = next(iter(SINGLE))
+    ours = node in {*graph_of([*BEHIND]), *SINGLE}
+    return (value["name_prefix"] if ours else "") + node + slash + rest
+
+
+def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, Any]:
     """Parameters that arguments set."""
     given: dict[str, Any] = {"use_sim_time": value["use_sim_time"] == "true"}
     if value["reliability"]:
         given["input.reliability"] = value["reliability"]
+    detector = node.removesuffix("_detector")
     if detector in NETWORKS:
         weights = _weights(value["weights"], [d for d in detectors if d in NETWORKS])
         for name, chosen in (("weights", weights.get(detector)), ("device", value["device"])):

@@ -117,6 +117,7 @@ def _spin(node_class: type, rclpy, arguments: list[str], seconds: float, stop: S
     node, code = None, 0
     try:
         node = node_class()
+        node.start()
         stop.react = lambda: node.stop.set_result(None)
         node.get_logger().info(f"ready: code loaded and warmed up in {seconds:.1f} s")
         executor = SingleThreadedExecutor()

@@ -12,11 +12,12 @@ from std_msgs.msg import Float64
 
 from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import class_by_diagonal
-from lidar_perception.nodes.runtime import MARKERS, OK, RELIABLE, WARN, LidarNode
+from lidar_perception.ground.above import obstacles
+from lidar_perception.nodes.runtime import CLOUD, MARKERS, OK, RELIABLE, WARN, LidarNode
 from lidar_perception.tracking.ego import moved_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message, encode
-from lidar_perception.wire.messages import detection_markers
+from lidar_perception.wire.messages import detection_markers, thin_cloud
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys, to_marker_array
 from msg_utils.messages import message_class, ros_message
@@ -63,6 +64,26 @@ def _texts(boxes: np.ndarray, ids: Sequence[int]) -> list[dict]:
     alone."""
     return [{"id": i, **({"size_class": CLASSES[c]} if c >= 0 else {})}
             for i, c in zip(ids, class_by_diagonal(boxes), strict=True)]
+
+
+class Obstacles:
+    """~/output/obstacles for a costmap, made only while somebody subscribes: x y z, and intensity
+    where the cloud has one, of what is no ground and in the height band of the parameters. node
+    has the groups robot.obstacles and params.ground."""
+
+    def __init__(self, node: LidarNode):
+        self.node, self.publisher = node, node.output("obstacles", CLOUD)
+
+    def publish(self, msg: Any, xyz: np.ndarray, ground: np.ndarray, indices: np.ndarray) -> None:
+        """Of levelled points (M, 3) that are ground (M,) or not, at indices (M,) in the cloud
+        msg, in whose frame they are published."""
+        if self.publisher.get_subscription_count():
+            placing = self.node.transforms.placing(msg.header)
+            params, _ = self.node.transforms.mounted(self.node.params, placing)
+            chosen = obstacles(xyz, ground, self.node.robot.obstacles, params.ground.sensor_pose)
+            self.publisher.publish(encode(thin_cloud(
+                msg, placing.in_cloud(xyz.compress(chosen, axis=0)), indices.compress(chosen),
+                bag_message)))
 
 
 class DetectionMarkers:

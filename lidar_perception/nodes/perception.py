@@ -10,10 +10,11 @@ from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import explain_nothing
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.inputs import CameraInput, SeedInput
-from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes
-from lidar_perception.nodes.runtime import CLOUD, LidarNode
+from lidar_perception.nodes.managed import ManagedNode
+from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes, Obstacles
+from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.params import BoxNodeParams
+from lidar_perception.params import PerceptionRobotParams
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import spread
 from msg_utils.point_cloud2 import add_columns
@@ -22,19 +23,22 @@ from msg_utils.stamps import to_ns
 __all__ = ["Perception", "warm_up"]
 
 
-class Perception(LidarNode):
+class Perception(ManagedNode):
     """Same stages, parameters and results as the graph of single nodes, without the copies
-    between them. ~/output/points and ~/output/boxes are made only while somebody subscribes."""
+    between them. ~/output/points, boxes and obstacles are made only while somebody subscribes."""
 
     def __init__(self, **options: Any):
-        super().__init__("perception", PipelineParams(), BoxNodeParams(), **options)
+        super().__init__("perception", PipelineParams(), PerceptionRobotParams(), **options)
+
+    def configure(self) -> None:
         self.camera = CameraInput(self)
         self.sensor = SensorCheck(self)
         self.outputs = CandidateOutputs(self, STEPS)
         self.points = self.output("points", CLOUD)
         self.boxes = ClusterBoxes(self)
+        self.obstacles = Obstacles(self)
         self.seed = SeedInput(self, self.on_cloud)
-        self.input("points", CLOUD, self.seed.add_cloud)
+        self.input("points", CLOUD, self.seed.add_cloud, needs=self.camera.missing)
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
@@ -43,10 +47,11 @@ class Perception(LidarNode):
             problem = (explain_nothing(len(frame), segmented.ground, segmented.cluster_ids)
                        or self.sensor.problem(frame, params))
             self.outputs.publish(msg.header, lambda: refined(segmented, source, params), problem)
+        indices = usable.take(segmented.indices)
         if self.points.get_subscription_count():
-            indices = usable.take(segmented.indices)
             self.points.publish(encode(add_columns(
                 msg, bag_message, ground=spread(segmented.ground, indices, msg, "u1"),
                 in_view=spread(1, indices, msg, "u1"),
                 cluster_id=spread(segmented.cluster_ids, indices, msg, "u4"))))
         self.boxes.publish(msg.header, lambda: segmented.boxes)
+        self.obstacles.publish(msg, segmented.xyz, segmented.ground, indices)

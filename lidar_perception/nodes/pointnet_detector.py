@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.nodes.detector_node import DetectorNode
+from lidar_perception.params import BoxNodeParams
 
 if TYPE_CHECKING:
     from lidar_perception.detectors.pointnet.config import PointNetConfig
@@ -18,9 +19,10 @@ class PointNetNode(DetectorNode):
     """Reads the column `cluster_id`; without it the node finds ground and clusters itself."""
 
     group = "pointnet"
+    steps = STEPS
 
     def __init__(self, **options: Any):
-        super().__init__("pointnet_detector", PointNetDetectorParams(), STEPS, **options)
+        super().__init__("pointnet_detector", PointNetDetectorParams(), BoxNodeParams(), **options)
 
     def weights(self) -> Path:
         return weights_file(self.params.pointnet)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.nodes.detector_node import DetectorNode
+from lidar_perception.params import BoxNodeParams
 
 if TYPE_CHECKING:
     from lidar_perception.detectors.pointpillars.config import NetworkConfig
@@ -18,9 +19,10 @@ class PointPillarsNode(DetectorNode):
     """Reads the columns of its experts where the cloud has them."""
 
     group = "pointpillars"
+    steps = STEPS
 
     def __init__(self, **options: Any):
-        super().__init__("pointpillars_detector", DetectorParams(), STEPS, **options)
+        super().__init__("pointpillars_detector", DetectorParams(), BoxNodeParams(), **options)
 
     def weights(self) -> Path:
         return weights_file(self.params.pointpillars)

@@ -35,7 +35,7 @@ class Arrivals:
     way, or, where the queue was full, what a newer cloud has pushed out of it.
     """
 
-    def __init__(self, depth: int):
+    def __init__(self, depth: int = DEPTH):
         self.depth = depth
         self.sent = self.dropped = self.lost = 0
         self.sequence: int | None = None  # of the last cloud
@@ -65,6 +65,18 @@ class Arrivals:
             period = np.median(intervals[:, 1] / intervals[:, 0])
             self.learned = 1e9 / period if period > 0 else None
 
+    def interrupted(self, dropped: int) -> None:
+        """Nothing is taken for a while; dropped is how many were waiting."""
+        self.dropped += dropped
+        self.sequence = None
+        self.stamps.clear()
+        self.begin_anew()
+
+    def begin_anew(self) -> None:
+        """What was dropped so far had a reason that is over: recent() begins here."""
+        self.window.clear()
+        self.window.append((self.sent, self.lost, self.dropped))
+
     def recent(self) -> tuple[int, int, int]:
         """Of the last SHARE_OF sent, or of more where one gap was longer: how many that are, how
         many were lost, how many dropped."""
@@ -84,19 +96,19 @@ class Arrivals:
 
 class Reception:
     """A subscription of clouds. deliver gets the newest ones that are waiting (as many as the
-    parameter input.queue says), as bytes, one at a time.
+    parameter input.queue says), as bytes, one at a time, and says what the cloud still needs, or
+    None. While it is patient (up to input.max_wait seconds) it does not work on a cloud that needs
+    something, and gets it again at try_again().
 
     It is RELIABLE where all publishers offer that, as of an ordinary driver's 2 MB a best-effort
     subscriber gets less than half; a BEST_EFFORT publisher, also one that comes later, makes it
     BEST_EFFORT, as else nothing at all would come from it. qos_overrides stand above that.
-    A cloud for which ready(bytes) is False waits, up to input.max_wait, before it is one of those.
     """
 
-    def __init__(self, node: Node, kind: type, name: str, deliver: Callable[[bytes], None],
-                 params: Callable[[], ReceptionParams], ready: Callable[[bytes], bool]):
+    def __init__(self, node: Node, kind: type, name: str,
+                 deliver: Callable[[bytes, bool], str | None],
+                 params: Callable[[], ReceptionParams]):
         self.node, self.kind, self.deliver, self.params = node, kind, deliver, params
-        self.ready = ready
-        self.early: deque[tuple[float, bytes]] = deque()  # until when, at most
         self.topic = node.resolve_topic_name(name)
         self.fixed = (f"qos_overrides.{self.topic}.subscription.reliability"
                       in node._parameter_overrides)
@@ -105,9 +117,23 @@ class Reception:
         self.go_on = node.create_guard_condition(self._deliver_one)
         self.look_again = node.create_guard_condition(self.adapt)
         self.last_time: float | None = None  # monotonic, of the last cloud
+        self.needs: str | None = None  # by the cloud that waits, or the last one
+        self.needed_since: float | None = None  # monotonic
+        self.subscription: Any = None
+        self.arrivals = Arrivals()
+
+    def open(self) -> None:
+        """Subscribe."""
         self.subscription = self._subscribe()
-        self.arrivals = Arrivals(self.subscription.qos_profile.depth)
+        self.arrivals.depth = self.subscription.qos_profile.depth
         self.adapt()
+
+    def close(self) -> None:
+        """End the subscription. What waits is dropped; what is sent meanwhile is not missed."""
+        self.node.destroy_subscription(self.subscription)
+        self.subscription = self.last_time = self.needs = self.needed_since = None
+        self.arrivals.interrupted(len(self.waiting))
+        self.waiting.clear()
 
     def _subscribe(self) -> Any:
         kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH]
@@ -125,6 +151,8 @@ class Reception:
 
     def adapt(self) -> None:
         """Subscribe again if the publishers offer something else than before."""
+        if self.subscription is None:
+            return
         wanted = self.params().reliability
         offered = {info.qos_profile.reliability for info in self.publishers()}
         if wanted == "auto" and offered:
@@ -145,43 +173,42 @@ class Reception:
     def _received(self, data: bytes, info: dict) -> None:
         """Take all that wait at the middleware, where nobody counts what is pushed out."""
         infos, handle = [info], self.subscription.handle
-        until = monotonic() + self.params().max_wait
-        self.early.append((until, data))
+        self.waiting.append(data)
         with handle:
             while taken := handle.take_message(self.kind, True):
-                self.early.append((until, taken[0]))
+                self.waiting.append(taken[0])
                 infos.append(taken[1])
-        self.arrivals.add(infos, self._admit(), one_publisher=len(self.publishers()) < 2)
-        self._deliver_one()
-
-    def _admit(self) -> int:
-        """Let those wait for their turn that are ready, or have waited for long; how many were
-        dropped for that."""
-        while self.early and (self.ready(self.early[0][1]) or self.early[0][0] <= monotonic()):
-            self.waiting.append(self.early.popleft()[1])
         dropped = max(0, len(self.waiting) - self.params().queue)
         for _ in range(dropped):
             self.waiting.popleft()
-        return dropped
-
-    def look(self) -> None:
-        """Something has come that clouds may have waited for, or time has gone by."""
-        if self.early:
-            self.arrivals.dropped += self._admit()
-            self._deliver_one()
+        self.arrivals.add(infos, dropped, one_publisher=len(self.publishers()) < 2)
+        self._deliver_one()
 
     def _deliver_one(self) -> None:
         if not self.waiting:
             return
-        try:
-            self.deliver(self.waiting.popleft())
-        finally:
-            self.last_time = monotonic()  # the work on a cloud is no silence
-            if self.waiting:
-                self.go_on.trigger()
+        since = self.needed_since
+        patient = since is None or monotonic() - since < self.params().max_wait
+        self.needs = self.deliver(self.waiting[0], patient)
+        self.last_time = monotonic()  # the work on a cloud is no silence
+        self.needed_since = None if self.needs is None else since or self.last_time
+        if since and self.needs is None:
+            self.arrivals.begin_anew()
+        if self.needs is not None and patient:
+            return
+        self.waiting.popleft()
+        if self.waiting:
+            self.go_on.trigger()
+
+    def try_again(self) -> None:
+        """What a cloud needs may have come, or it has waited for too long."""
+        if self.waiting and self.needs is not None:
+            self.go_on.trigger()
 
     def values(self) -> dict[str, Any]:
         """For the diagnostics."""
+        if self.subscription is None:
+            return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped}
         rate, learned = self.arrivals.rate(), self.params().rate or self.arrivals.learned
         return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped,
                 "reliability": self._how(),
@@ -190,12 +217,16 @@ class Reception:
 
     def problems(self) -> list[Problem]:
         """What is wrong with the topic now, each with its remedy."""
+        if self.subscription is None:
+            return []
         found, params = [], self.params()
         publishers = self.publishers()
         if len(publishers) > 1:
             names = ", ".join(sorted(_name(p) for p in publishers))
             found.append(("publishers", WARN, f"{len(publishers)} publishers on {self.topic} "
                           f"({names}): their clouds are mixed; remap all but one"))
+        if self.waiting and self.needs is not None:
+            return [*found, ("waiting", WARN, f"the cloud on {self.topic} waits for {self.needs}")]
         silent = monotonic() - (self.last_time or monotonic())
         if silent > params.error_after:
             stale = silent > params.stale_after

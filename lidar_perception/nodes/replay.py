@@ -64,8 +64,7 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
             raise InputError(f"the nodes did not find each other in {START_TIMEOUT:.0f} s: "
                              f"{list(watch.diagnostics) or 'none'} reported; see {out}/logs")
         # The watch hears the clouds too, and the recorder the labels.
-        rules = wait_for(single, points=2, truth=2 + record,
-                         camera=(1 + record) * params.view.enabled)
+        rules = wait_for(single, points=2, truth=2 + record)
         processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
                                            "wait_for": rules,
                                            "follow": [] if real_time else [topics["final"]],

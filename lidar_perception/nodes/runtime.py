@@ -24,7 +24,6 @@ from std_msgs.msg import Float64
 
 from lidar_perception.nodes.declared import as_declared, declare
 from lidar_perception.nodes.reception import Problem, Reception
-from lidar_perception.nodes.transforms import Transforms
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message, decode, encode, typestore
@@ -39,6 +38,7 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 JUMP_NS = 10**9  # stamps that go back by more than this are a bag that starts again
+WAITING = "waiting for input"
 LOG_PERIOD = 60.0  # seconds before the same problem is logged again
 
 
@@ -47,8 +47,10 @@ class LidarNode(Node):
 
     params is a dataclass of params.py; its fields are declared as ROS parameters, and a change at
     run time goes through the same checks. So is robot, what the node has besides its algorithm's
-    numbers: CloudNodeParams or BoxNodeParams where it takes clouds.
+    numbers: CloudNodeParams or BoxNodeParams where it takes clouds; transforms are its frames then.
     """
+
+    transforms: Any = None  # of transforms.py
 
     def __init__(self, name: str, params: Any, robot: Any = None, **options: Any):
         super().__init__(name, **options)
@@ -57,14 +59,9 @@ class LidarNode(Node):
         self.add_pre_set_parameters_callback(self._before_set)
         self.add_on_set_parameters_callback(self._on_set)
         self.stop = Future()  # done when the node shall end; set from any thread
-        self.state = (WARN, "waiting for input")
-        self.counts: dict[str, Any] = {"frames": 0, "lost": 0}
-        self.last_stamp_ns = 0
-        self.times: list[float] = []
-        self.frame_id = ""  # of the last cloud
-        self._outputs: list[Any] = []
-        self._receptions: list[Reception] = []
-        self.transforms: Any = None  # of a node that takes clouds
+        self.state = (WARN, WAITING)
+        self.active = True  # listens to its inputs
+        self.forget()
         self._present: set[str] = set()  # kinds of problems
         self._logged: dict[str, float] = {}  # kind of problem -> when it was logged
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
@@ -72,8 +69,18 @@ class LidarNode(Node):
                                                       RELIABLE)
         self.create_timer(1.0, self._tick, clock=Clock(
             clock_type=ClockType.STEADY_TIME))
-        if robot:
-            self.transforms = Transforms(self)
+
+    def forget(self) -> None:
+        """What is known of the input and output so far."""
+        self.counts: dict[str, Any] = {"frames": 0, "lost": 0}
+        self.last_stamp_ns = 0
+        self.times: list[float] = []
+        self.frame_id = ""  # of the last cloud
+        self.inputs: list[Any] = []  # with open() and close()
+        self._outputs: list[Any] = []
+
+    def start(self) -> None:
+        """Called once, when the node is made and before it spins."""
 
     def _before_set(self, changes: list[Parameter]) -> list[Parameter]:
         return [as_declared(c, self.get_parameter(c.name).type_)
@@ -90,39 +97,49 @@ class LidarNode(Node):
         return SetParametersResult(successful=True)
 
     def input(self, topic: str, type_name: str, callback: Callable,
-              qos: QoSProfile | None = None, private: bool = True) -> None:
+              qos: QoSProfile | None = None, private: bool = True,
+              needs: Callable[[Any], str | None] = lambda _: None) -> None:
         """Subscribe to ~/input/TOPIC, or with private=False to the name as it is. callback gets
         rosbags' class of the message, the one that offline code reads from bags: it views the
         received bytes, where rclpy's own class copies them several times. Without qos the topic
-        is received as reception.py does."""
+        is received as reception.py does: needs says what a cloud still waits for, which comes by
+        another input, and None if nothing."""
         name = f"~/input/{topic}" if private else topic
         _warm_up_type(type_name)
 
-        def guarded(data: bytes) -> None:
+        def guarded(data: bytes, patient: bool = False) -> str | None:
+            missing = None
             try:
                 msg = decode(data, type_name)
                 if type_name == CLOUD:
                     self.frame_id = msg.header.frame_id
-                    msg = self.transforms.corrected(msg)
-                callback(msg)
+                    missing = self.transforms.missing(msg)
+                missing = missing or needs(msg)
+                if missing is None or not patient:
+                    callback(self.transforms.corrected(msg) if type_name == CLOUD else msg)
             except InputError as error:
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {error}")
             except Exception as error:
                 self.get_logger().error(traceback.format_exc())
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {type(error).__name__}: "
                             f"{error}; this is a bug, please report it with the message")
+            if qos is not None:
+                for reception in self._receptions():
+                    reception.try_again()
+            return missing
 
         def lost(event: Any) -> None:
             self.counts["lost"] += event.total_count_change
 
-        if qos is None:
-            self._receptions.append(Reception(self, message_class(type_name), name, guarded,
-                                              lambda: self.robot.input, self.transforms.ready))
-            return
-        self.create_subscription(
-            message_class(type_name), name, guarded, qos, raw=True,
-            event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies())
+        kind = message_class(type_name)
+        added = (Reception(self, kind, name, guarded, lambda: self.robot.input) if qos is None else
+                 Subscribed(self, lambda: self.create_subscription(
+                     kind, name, guarded, qos, raw=True,
+                     event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
+                     qos_overriding_options=QoSOverridingOptions.with_default_policies())))
+        self.inputs.append(added)
+        if self.active:
+            added.open()
 
     def output(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE):
         """Publisher of ~/output/TOPIC, or of any name that starts with ~ or /; it takes encode()d
@@ -188,9 +205,12 @@ class LidarNode(Node):
         if rclpy.ok(context=self.context):
             self._diagnostics.publish(array)
 
+    def _receptions(self) -> list[Reception]:
+        return [made for made in self.inputs if isinstance(made, Reception)]
+
     def _sources(self) -> list[Any]:
         """What has values and problems of its own."""
-        return [*self._receptions, *([self.transforms] if self.transforms else [])]
+        return [*self._receptions(), *([self.transforms] if self.transforms else [])]
 
     def _problems(self) -> list[Problem]:
         """Each is logged when it comes up, at most once in LOG_PERIOD."""
@@ -214,8 +234,9 @@ class LidarNode(Node):
         return "/".join(filter(None, parts)) or "lidar_perception"
 
     def _tick(self) -> None:
-        for reception in self._receptions:
+        for reception in self._receptions():
             reception.adapt()  # where the middleware has no events that say so
+            reception.try_again()
         self.publish_diagnostics()
 
     def spin(self, executor: Executor) -> None:
@@ -224,6 +245,19 @@ class LidarNode(Node):
 
     def close(self) -> None:
         """Called once before the node is destroyed."""
+
+
+class Subscribed:
+    """An input other than clouds."""
+
+    def __init__(self, node: Node, subscribe: Callable[[], Any]):
+        self.node, self.subscribe = node, subscribe
+
+    def open(self) -> None:
+        self.subscription = self.subscribe()
+
+    def close(self) -> None:
+        self.node.destroy_subscription(self.subscription)
 
 
 def _warm_up_type(type_name: str) -> None:

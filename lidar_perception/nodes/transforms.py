@@ -6,7 +6,6 @@ The tree is our own, over /tf and /tf_static, so that it is the same with and wi
 from __future__ import annotations
 
 import importlib.util
-import struct
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -31,7 +30,6 @@ from msg_utils.stamps import SECOND, to_ns
 TF_QOS = QoSProfile(depth=100)
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 ODOMETRY_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)  # takes any
-WAIT_PERIOD = 0.05  # seconds between looks for clouds that have waited long enough
 MOVING, STILL = "moving", "still"  # frames of the odometry, whatever the message calls them
 
 
@@ -46,7 +44,7 @@ class Transforms:
         self.target_frame = getattr(robot, "target_frame", "").lstrip("/")
         self.carrier = ""  # the frame that the odometry is of
         self.sweep = 0.0  # seconds from the stamp to the last point of a cloud
-        self.missing: dict[str, str] = {}  # what asked for it -> what is not there
+        self.lacking: dict[str, str] = {}  # what asked for it -> what is not there
         self.known: dict[str, Any] = {}  # for the diagnostics
         self._last: tuple[tuple[str, int], Placing] = (("", -1), Placing(""))
         self._listening = False
@@ -57,10 +55,6 @@ class Transforms:
             self.listen()
         if robot.input.deskew == "odometry":
             node.input("odometry", "nav_msgs/msg/Odometry", self.on_odometry, ODOMETRY_QOS)
-        if self.in_use:
-            from rclpy.clock import Clock, ClockType
-            node.create_timer(WAIT_PERIOD, self._look, clock=Clock(
-                clock_type=ClockType.STEADY_TIME))
 
     @property
     def in_use(self) -> bool:
@@ -76,7 +70,7 @@ class Transforms:
         if self._installed:
             self._subscribe(TF, TF_QOS, static=False)
         else:
-            self.missing["TF"] = ("tf2_msgs is not installed, so nothing is known of TF; install "
+            self.lacking["TF"] = ("tf2_msgs is not installed, so nothing is known of TF; install "
                                   "ROS 2's tf2_msgs")
 
     def _subscribe(self, topic: str, qos: QoSProfile, static: bool) -> None:
@@ -107,32 +101,22 @@ class Transforms:
 
     def _changed(self) -> None:
         self._last = (("", -1), Placing(""))
-        self._look()
-
-    def _look(self) -> None:
-        for reception in self.node._receptions:
-            reception.look()
 
     # What a cloud needs
 
-    def ready(self, data: bytes) -> bool:
-        """Whether a cloud (CDR) has what it needs; False while what is missing may still come."""
-        if not self.in_use or len(data) < 16:
-            return True
-        order = "<" if data[1] & 1 else ">"
-        seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
-        frame_id = data[16:16 + max(length, 1) - 1].decode(errors="replace")
-        stamp = seconds * SECOND + nanoseconds
+    def missing(self, cloud: Any) -> str | None:
+        """What a cloud waits for, as it may still come; None if nothing."""
+        if not self.in_use:
+            return None
+        frame_id, stamp = cloud.header.frame_id, to_ns(cloud.header.stamp)
         try:
-            if self.base_frame:
-                self.tree.lookup(self.base_frame, frame_id, stamp)
-            if self.target_frame:
-                self.tree.lookup(self.target_frame, frame_id, stamp)
+            for frame in filter(None, (self.base_frame, self.target_frame)):
+                self.tree.lookup(frame, frame_id, stamp)
             if self.node.robot.input.deskew != "off":
                 self.sensor_poses(frame_id, np.array([stamp + round(self.sweep * SECOND)]))
         except Missing as error:
-            return not error.late
-        return True
+            return str(error) if error.late else None
+        return None
 
     def placing(self, header: Any) -> Placing:
         """Of a cloud with this header."""
@@ -146,7 +130,7 @@ class Transforms:
     def _placing(self, frame_id: str, stamp_ns: int) -> Placing:
         base = self._looked_up("base_frame", self.base_frame, frame_id, stamp_ns)
         if base is not None and not 0.0 <= base[2, 3] <= 50.0:
-            self.missing["base_frame"] = (
+            self.lacking["base_frame"] = (
                 f"'{frame_id}' is {base[2, 3]:.2f} m above '{self.base_frame}', which is to be on "
                 "the ground (as base_footprint is); ground.sensor_pose stands")
             base = None
@@ -160,7 +144,7 @@ class Transforms:
     def _looked_up(self, what: str, frame: str, frame_id: str, stamp_ns: int) -> np.ndarray | None:
         """The pose of frame_id in the frame that the parameter `what` names; None where there is
         none, which problems() then says."""
-        self.missing.pop(what, None)
+        self.lacking.pop(what, None)
         if not frame:
             return None
         try:
@@ -168,7 +152,7 @@ class Transforms:
         except Missing as error:
             instead = {"base_frame": "ground.sensor_pose stands",
                        "target_frame": f"results are in '{frame_id}'"}[what]
-            self.missing[what] = f"{what} '{frame}': {error}; {instead}"
+            self.lacking[what] = f"{what} '{frame}': {error}; {instead}"
             return None
 
     def mounted(self, params: Any, placing: Placing) -> tuple[Any, np.ndarray | None]:
@@ -225,11 +209,11 @@ class Transforms:
         if self.node.robot.input.deskew == "off":
             return msg
         begin, counts = perf_counter(), self.node.counts
-        self.missing.pop("deskew", None)
+        self.lacking.pop("deskew", None)
         try:
             moved = self._moved(msg)
         except InputError as error:
-            self.missing["deskew"] = f"input.deskew: {error}; clouds are used as they are"
+            self.lacking["deskew"] = f"input.deskew: {error}; clouds are used as they are"
             counts["not_deskewed"] = counts.get("not_deskewed", 0) + 1
             return msg
         counts["deskewed"] = counts.get("deskewed", 0) + 1
@@ -263,4 +247,4 @@ class Transforms:
 
     def problems(self) -> list[Problem]:
         """What is asked for and not there, each with what stands instead."""
-        return [(kind, WARN, message) for kind, message in self.missing.items()]
+        return [(kind, WARN, message) for kind, message in self.lacking.items()]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidar_perception.robot.poses import moved_points
+from lidar_perception.robot.poses import inverse, moved_points
 from lidar_perception.types import LidarFrame
 
 STRAIGHT = 1e-9  # rad; a smaller tilt is rounding
@@ -28,6 +28,10 @@ class Placing:
         """The frame as of a level sensor at the same place; itself where it is level."""
         return frame if self.level is None else replace(
             frame, xyz=moved_points(frame.xyz, self.level))
+
+    def in_cloud(self, xyz: np.ndarray) -> np.ndarray:
+        """Points (N, 3) of the level frame in the cloud's; xyz itself where these are the same."""
+        return xyz if self.level is None else moved_points(xyz, inverse(self.level))
 
 
 def roll_pitch(base: np.ndarray) -> tuple[float, float]:

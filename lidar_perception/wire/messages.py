@@ -19,7 +19,7 @@ from lidar_perception.types import (
 )
 from lidar_perception.wire.topics import CAMERA_FRAME
 from msg_utils.markers import MarkedObjects, to_marker_array
-from msg_utils.point_cloud2 import CloudError, columns, to_array, xyz
+from msg_utils.point_cloud2 import CloudError, columns, from_array, to_array, xyz
 from msg_utils.stamps import to_ns
 
 INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # the first that the cloud has
@@ -84,6 +84,19 @@ def column(msg: Any, name: str, indices: np.ndarray) -> np.ndarray | None:
     it holds more than one number a point."""
     points = to_array(msg)
     return _single(points, name).take(indices) if name in (points.dtype.names or ()) else None
+
+
+def thin_cloud(msg: Any, xyz: np.ndarray, indices: np.ndarray, make: Any) -> Any:
+    """PointCloud2 with the header of msg and x y z (M, 3), and intensity where msg has one, as it
+    is there at indices (M,); all of them float32."""
+    names = to_array(msg).dtype.names or ()
+    fields = {axis: xyz[:, i] for i, axis in enumerate("xyz")}
+    for name in [n for n in INTENSITY_FIELDS if n in names][:1]:
+        fields["intensity"] = column(msg, name, indices)
+    points = np.empty(len(xyz), [(name, "<f4") for name in fields])
+    for name, values in fields.items():
+        points[name] = values
+    return from_array(points, msg.header, make)
 
 
 def cluster_column(msg: Any, indices: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

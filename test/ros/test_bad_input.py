@@ -184,7 +184,7 @@ def test_without_camera_and_seed_the_diagnostics_say_so_and_a_click_helps(
     from lidar_perception.data.open import open_recording
     from lidar_perception.scoring.centres.report import pedestrians
     processes.start("perception", {"~/input/points": "/in", "~/output/detections": "/found"},
-                    {"view.enabled": True, "seed.source": "click"})
+                    {"view.enabled": True, "seed.source": "click", "input.max_wait": 0.5})
     talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
     peer.send(talker, good_cloud, lambda: "camera calibration" in peer.message_of("perception"),
               "no camera yet")

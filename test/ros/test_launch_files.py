@@ -15,7 +15,7 @@ from lidar_perception.types import InputError
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = "lidar_perception.nodes.launching"
 STAND_INS = {"launch": ["LaunchDescription"],
-             "launch.actions": ["DeclareLaunchArgument", "OpaqueFunction"],
+             "launch.actions": ["DeclareLaunchArgument", "LogInfo", "OpaqueFunction"],
              "launch.substitutions": ["LaunchConfiguration"], "launch_ros": [],
              "launch_ros.actions": ["Node"]}
 
@@ -52,7 +52,11 @@ def launched(monkeypatch):
             assert set(given) <= set(arguments)
             context = SimpleNamespace(
                 perform_substitution=lambda s: {**arguments, **given}[s.args[0]])
-            return {n.executable: n for n in start(context)}
+            actions = start(context)
+            said[:] = [a.msg for a in actions if hasattr(a, "msg")]
+            return {n.executable: n for n in actions if hasattr(n, "executable")}
+        said: list[str] = []
+        nodes.said = said  # by the last call
         return arguments, nodes
     return load
 
@@ -81,12 +85,32 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
     assert nodes(config="mine.yaml")["clustering"].parameters[0] == "mine.yaml"
 
 
-def test_every_detector_has_its_numbers_and_the_first_those_of_ground_and_clusters(launched):
+def test_ground_and_clusters_have_one_file_and_what_others_would_take_is_said(launched, tmp_path):
+    """That of the first detector, of the one that is named, or one of the user's."""
     _, nodes = launched("detectors")
-    started = nodes(detectors="pointnet,pointpillars")
-    files = {name: Path(node.parameters[0]).name.split(".")[0] for name, node in started.items()}
-    assert files == {"ground_segmentation": "pointnet", "clustering": "pointnet",
-                     "pointnet_detector": "pointnet", "pointpillars_detector": "pointpillars"}
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("")
+    for detectors, experts, stem, words in (
+            ("pointnet,pointpillars", "", "pointnet", ["ground.method patchwork"]),
+            ("pointpillars,pointnet", "", "pointpillars", ["clustering.euclidean.gamma 0.0"]),
+            ("pointpillars,pointnet", "pointnet", "pointnet", ["ground.method patchwork"]),
+            ("pointpillars,pointnet", str(mine), "mine", []),
+            ("candidates,pointnet,pointpillars", "", "perception",
+             ["ground.method cloth", "clustering.dbscan.eps [0.5, 0.7, 1.0]"]),
+            ("pointnet", "", "pointnet", [])):
+        started = nodes(detectors=detectors, experts=experts)
+        files = {name: Path(node.parameters[0]).name.split(".")[0]
+                 for name, node in started.items()}
+        assert files["ground_segmentation"] == files["clustering"] == stem
+        assert all(files[f"{name}_detector"] == name for name in detectors.split(",")
+                   if name != "candidates")
+        assert len(nodes.said) == len(words)
+        assert all(word in line for word, line in zip(words, nodes.said, strict=True))
+    started = nodes(detectors="pointnet,pointpillars", config="all.yaml", experts="pointpillars")
+    assert started["pointnet_detector"].parameters[0] == "all.yaml"
+    assert started["clustering"].parameters[0].endswith("pointpillars.param.yaml")
+    nodes(single="true", experts="pointnet")
+    assert "has no effect" in nodes.said[0]
 
 
 def test_a_second_sensor_has_names_of_its_own(launched):
@@ -99,6 +123,21 @@ def test_a_second_sensor_has_names_of_its_own(launched):
     assert started["clustering"].remappings == [
         ("~/input/points", "left_ground_segmentation/output/points")]
     assert ("~/input/points", "points") in started["ground_segmentation"].remappings
+
+
+def test_rviz_follows_the_names_of_the_graph(launched):
+    _, nodes = launched("detectors")
+    assert "rviz2" not in nodes()
+    plain = nodes(rviz="true", points="/cloud", rviz_frame="base_link", namespace="left")["rviz2"]
+    assert plain.remappings == [("points", "/cloud")] and plain.namespace == "left"
+    assert plain.arguments == ["-d", str(ROOT / "config/lidar_perception.rviz"), "-f", "base_link"]
+    prefixed = dict(nodes(rviz="true", name_prefix="left_")["rviz2"].remappings)
+    assert prefixed["clustering/output/points"] == "left_clustering/output/points"
+    assert not {"points", "clicked_point"} & set(prefixed)  # of no node of ours
+    single = dict(nodes(rviz="true", single="true")["rviz2"].remappings)
+    assert single["clustering/output/points"] == "perception/output/points"
+    assert single["candidate_refinement/output/detections"] == "perception/output/detections"
+    assert "pointnet_detector/output/detections" not in single
 
 
 @pytest.mark.parametrize("name", ["pointpillars", "pointnet"])
@@ -114,6 +153,7 @@ def test_weights_and_device_of_a_detector_are_arguments(name, launched):
     ({"detectors": "candidates,dream"}, "'dream' is none of candidates, pointpillars, pointnet"),
     ({"detectors": ""}, "detectors is empty"),
     ({"weights": "w.safetensors"}, "NAME=FILE"), ({"weights": "v5=w"}, "'v5' is none of"),
+    ({"experts": "pointnets"}, "no parameter file pointnets, nor a detector"),
 ])
 def test_what_cannot_be_started_is_refused_by_name(given, words, launched):
     with pytest.raises(InputError, match=words):

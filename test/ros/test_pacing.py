@@ -81,7 +81,7 @@ def test_the_clouds_of_a_bag_are_found_or_those_it_has_are_named():
     for types, wanted, words in [
             ({"/a": cloud, "/b": cloud}, "", "points:=TOPIC; it has /a, /b"),
             ({"/a": cloud}, "/points", "bag has no cloud on /points; it has /a"),
-            ({"/note": "std_msgs/msg/String"}, "", "it has none at all")]:
+            ({"/note": "std_msgs/msg/String"}, "", "bag has no clouds")]:
         with pytest.raises(InputError, match=words):
             chosen_clouds("bag", types, wanted)
 

@@ -48,6 +48,8 @@ def start(domain):
                      for k, v in values.items() if v != ()]
         node = kind(context=context, parameter_overrides=overrides)
         nodes.append(node)
+        node.start()
+        assert node.active
         node.sent = {}
         for publisher in node._outputs:
             publisher.publish = node.sent.setdefault(
@@ -62,7 +64,7 @@ def start(domain):
 
 def give(node, msg):
     """The cloud as it comes from the middleware."""
-    node._receptions[0].deliver(encode(msg))
+    node._receptions()[0].deliver(encode(msg), False)
 
 
 def message(xyz, stamp=START, intensity=None, frame_id="lidar", **columns):
@@ -221,22 +223,19 @@ def test_without_the_frames_the_parameters_stand_and_the_names_are_said(start):
 
 def test_a_cloud_waits_for_a_transform_that_is_late_and_not_for_one_that_is_missing(start):
     xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
-    node = start(Perception, **{"target_frame": "odom", "input.max_wait": 10.0})
-    reception, data = node._receptions[0], encode(message(xyz))
-    assert node.transforms.ready(data)  # nothing is known of odom
+    node = start(Perception, target_frame="odom")
+    deliver, msg = node._receptions()[0].deliver, encode(message(xyz))
+    assert deliver(msg, True) is None and boxes_of(node)[1] == "lidar"  # nothing is known of odom
     node.transforms.on_tf(transforms(("odom", "lidar", np.eye(4), START - PERIOD)), static=False)
-    assert not node.transforms.ready(data)
-    assert node.transforms.ready(encode(message(xyz, START - PERIOD)))
-    reception.early.append((float("inf"), data))
-    reception.look()
-    assert node.sent["detections"] == []
+    assert "0.100 s older than needed" in deliver(msg, True)
+    assert deliver(encode(message(xyz, START - PERIOD)), True) is None
+    assert len(node.sent["detections"]) == 2 and boxes_of(node)[1] == "odom"
     node.transforms.on_tf(transforms(("odom", "lidar", np.eye(4), START + PERIOD)), static=False)
-    assert len(node.sent["detections"]) == 1 and boxes_of(node)[1] == "odom"
-    late = encode(message(xyz, START + 2 * PERIOD))
-    reception.early.append((0.0, late))  # it has waited for as long as it may
-    reception.look()
-    assert len(node.sent["detections"]) == 2 and boxes_of(node)[1] == "lidar"
-    assert "0.100 s older than needed" in problems(node)
+    assert deliver(msg, True) is None and boxes_of(node)[1:] == ("odom", START)
+    assert "odom" not in problems(node)
+    deliver(encode(message(xyz, START + 2 * PERIOD)), False)  # it has waited for long enough
+    assert boxes_of(node)[1] == "lidar" and "0.100 s older than needed" in problems(node)
+    assert deliver(encode(message(xyz, START + 20 * PERIOD)), True) is None  # odom has stopped
 
 
 def drive(at_ns):

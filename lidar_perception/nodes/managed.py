@@ -1,0 +1,177 @@
+"""Managed nodes: a lifecycle manager, such as Nav2's, configures, activates and ends them."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import sys
+import traceback
+from collections.abc import Callable
+from time import monotonic
+from typing import Any
+
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
+
+from lidar_perception.nodes.runtime import ERROR, OK, WAITING, WARN, LidarNode
+from lidar_perception.nodes.transforms import Transforms
+from lidar_perception.types import InputError
+
+SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
+RETRY_PERIOD = 5.0  # seconds at least, and RETRY_SHARE times as long as an attempt takes
+RETRY_SHARE = 10.0
+UNCONFIGURED, INACTIVE = "not configured", "not active"
+ENTITIES = {"publishers": Node.destroy_publisher, "subscriptions": Node.destroy_subscription,
+            "clients": Node.destroy_client, "services": Node.destroy_service,
+            "timers": Node.destroy_timer, "guards": Node.destroy_guard_condition}
+
+
+class ManagedNode(LifecycleNodeMixin, LidarNode):
+    """A LidarNode with the states of a managed node
+    (https://design.ros2.org/articles/node_lifecycle.html).
+
+    A node says in configure() what it needs, and knows nothing else of its states: its inputs are
+    subscribed to while it is active, and a cleanup forgets every attribute that configure() has
+    set and destroys every publisher, timer and so on that it has made, so that the memory of a
+    network is free again. With the parameter autostart the node goes to active by itself, and
+    where configure() fails tries again, as a file that is missing may appear.
+    """
+
+    def __init__(self, name: str, params: Any, robot: Any, **options: Any):
+        LidarNode.__init__(self, name, params, robot, **options)
+        LifecycleNodeMixin.__init__(self)
+        self.active = False
+        self.state = (OK, UNCONFIGURED)
+        self._retry_at: float | None = None
+        self._own: set[str] = set()  # attributes that a cleanup leaves
+        self._kept: list[Any] = []  # publishers and so on, likewise
+        change = self._service_change_state.callback
+        self._service_change_state.callback = lambda *call: self._change(change, *call)
+
+    def configure(self) -> None:
+        """Make outputs and inputs, and load what is needed. InputError if it is not to be had."""
+        raise NotImplementedError
+
+    def _configure(self) -> None:
+        self.transforms = Transforms(self)
+        self.configure()
+
+    def start(self) -> None:
+        if not self.robot.autostart:
+            self.get_logger().info(f"{UNCONFIGURED}: waits for a lifecycle manager, as autostart "
+                                   "is false")
+            return
+        begin = monotonic()
+        if self.trigger_configure() == SUCCESS:
+            self._retry_at = None
+            self.trigger_activate()
+        else:
+            now = monotonic()
+            self._retry_at = now + max(RETRY_PERIOD, RETRY_SHARE * (now - begin))
+
+    def _tick(self) -> None:
+        if self._retry_at is not None and monotonic() > self._retry_at:
+            self.start()
+        super()._tick()
+
+    def _change(self, change: Callable, request: Any, response: Any) -> Any:
+        """A change that the present state does not allow is refused; rclpy would end the node."""
+        possible = [key for number, label, *_ in self._state_machine.available_transitions
+                    for key in (number, label)]
+        wanted = request.transition.label or request.transition.id
+        if wanted in possible:
+            self._retry_at = None
+            return change(request, response)
+        self.get_logger().error(
+            f"transition {wanted} is asked for, but the node is {self.state_label()}; a node that "
+            "a lifecycle manager is to drive needs the parameter autostart false")
+        response.success = False
+        return response
+
+    def state_label(self) -> str:
+        """unconfigured, inactive, active or finalized; configuring and so on in between."""
+        return self._state_machine.current_state[1]
+
+    def publish_diagnostics(self) -> None:
+        self.counts["lifecycle"] = self.state_label()
+        super().publish_diagnostics()
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._own = set(vars(self))
+        self._kept = [entity for kind in ENTITIES for entity in getattr(self, kind)]
+        if self._retry_at is None:
+            self.report(WARN, "configuring", expected=True)
+        before = self.state
+        if problem := self._problem_of(self._configure):
+            self._forget_configuration()
+            self.report(ERROR, f"{UNCONFIGURED}, so nothing comes of this node: {problem}")
+            return FAILURE
+        if self.state == before:
+            self.state = (OK, INACTIVE)
+        return SUCCESS
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self.active = True
+        if problem := self._problem_of(lambda: [made.open() for made in self.inputs]):
+            self._deactivate()
+            self.report(ERROR, f"{INACTIVE}: {problem}")
+            return FAILURE
+        if self.state[0] == OK:
+            self.report(WARN, WAITING, expected=True)
+        return SUCCESS
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._deactivate()
+        self.report(OK, INACTIVE)
+        return SUCCESS
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._forget_configuration()
+        self.report(OK, UNCONFIGURED)
+        return SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        if self.active:
+            self._deactivate()
+        if self.inputs:
+            self._forget_configuration()
+        self.report(OK, "shut down; the process ends at SIGINT or SIGTERM")
+        return SUCCESS
+
+    def _problem_of(self, step: Callable[[], Any]) -> str | None:
+        """What step() fails for; what is no InputError is logged in full, once."""
+        try:
+            step()
+        except InputError as error:
+            return str(error)
+        except Exception as error:  # of torch and its drivers, say: the node lives to tell
+            problem = f"{type(error).__name__}: {error}"
+            if not self.state[1].endswith(problem):
+                self.get_logger().error(traceback.format_exc())
+            return problem
+        return None
+
+    def _deactivate(self) -> None:
+        self.active = False
+        for made in self.inputs:
+            made.close()
+
+    def _forget_configuration(self) -> None:
+        for name in set(vars(self)) - self._own:
+            delattr(self, name)
+        self.forget()
+        for kind, destroy in ENTITIES.items():
+            for entity in [e for e in getattr(self, kind) if e not in self._kept]:
+                destroy(self, entity)
+        give_back_memory()
+
+
+def give_back_memory() -> None:
+    """What Python, torch and the C library have free, to the operating system and to CUDA."""
+    gc.collect()
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.cuda.is_initialized():
+        torch.cuda.empty_cache()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc
+    if trim is not None:
+        trim(0)

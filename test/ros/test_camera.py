@@ -1,0 +1,57 @@
+"""A cloud that is to be cropped waits for its camera."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from test_bad_input import CLOUD, MARKERS
+from test_graph import PAPER
+
+from lidar_perception.candidates.pipeline import find_candidates
+from lidar_perception.data.bag import Bag
+from lidar_perception.data.open import open_recording
+from lidar_perception.nodes.graph import SINGLE, STAGES
+from lidar_perception.nodes.runtime import LATCHED
+from lidar_perception.param_fields import flatten
+from lidar_perception.scoring.centres.report import pedestrians, seed_source
+from lidar_perception.wire.codec import encode
+from lidar_perception.wire.messages import to_detections
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
+from msg_utils.markers import from_marker_array
+from msg_utils.stamps import to_ns
+
+
+@pytest.mark.parametrize("graph", [STAGES, SINGLE], ids=["three nodes", "one node"])
+def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, processes, peer, drive_bag):
+    frame = next(f for f in open_recording(drive_bag) if len(pedestrians(f.truth())))
+    with Bag(drive_bag) as bag:
+        sent = {topic: msg for topic, _, msg in bag.messages({POINTS, TRUTH})
+                if to_ns((msg.header if topic == POINTS else msg.markers[0].header).stamp)
+                == frame.stamp_ns}
+        camera = {topic: msg for topic, _, msg in bag.messages({CAMERA_INFO, EXTRINSICS})}
+        types = dict(bag.topics)
+    first, last = (list(graph)[i] for i in (0, -1))
+    for node, remap in graph.items():
+        processes.start(node, remap, {**flatten(PAPER), "input.max_wait": 3600.0})
+    found = peer.listen(f"/{last}/output/detections", MARKERS)
+    truth, cloud = peer.talker(TRUTH, MARKERS), peer.talker(POINTS, CLOUD)
+    peer.wait(truth.get_subscription_count, "the node that takes labels")
+    truth.publish(encode(sent[TRUTH]))
+    peer.send(cloud, sent[POINTS], lambda: "waits for the camera's calibration"
+              in peer.message_of(first), "the reason why it waits")
+    assert not found
+    assert len(camera) == 2
+    for topic, msg in camera.items():
+        assert not found
+        peer.talker(topic, types[topic], LATCHED).publish(encode(msg))
+    peer.wait(lambda: found, "the detections")
+    expected = find_candidates(frame.load(), seed_source(pedestrians(frame.truth()), None, PAPER),
+                               frame.camera(), PAPER)[1].final
+    received = to_detections(from_marker_array(found[-1]))
+    np.testing.assert_array_equal(received.boxes, expected.boxes)
+    np.testing.assert_array_equal(received.scores, expected.scores)
+    assert len(expected)
+    peer.wait(lambda: peer.message_of(first) in ("detecting", "segmenting"), "a good state")
