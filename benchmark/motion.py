@@ -60,7 +60,7 @@ def turns(seed: int) -> Iterator[tuple]:
         since = rays(HDL64E, motion).since.astype(np.float32)
         order = np.argsort(since)
         solid = hits.solid[order[np.searchsorted(since[order], met.time)], met.ring]
-        boxes = 1 + int(met.owner.max(initial=0))
+        boxes = 1 + int(moment.track_ids.max(initial=0))
         thing = np.where((met.semantic == POLE) & (solid >= 0), boxes + solid, met.owner)
         standing = np.zeros(boxes, bool)
         standing[moment.track_ids[moment.speeds == 0]] = True
