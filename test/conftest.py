@@ -1,4 +1,4 @@
-"""Fixtures of more than one file: bags, data sets, and a peer on a private ROS domain."""
+"""Fixtures of more than one file: bags and data sets. Those of ROS are the package's own plugin."""
 
 from __future__ import annotations
 
@@ -8,11 +8,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from lidar_perception.nodes.main import use_large_shared_memory
-
-FRAMES = 8
+pytest_plugins = ["lidar_perception.testing"]
 os.environ.pop("COLUMNS", None)  # pytest-xdist sets 80 for its workers; some tests set their own
-use_large_shared_memory()  # Fast DDS reads its profile once: before any test that imports rclpy
 
 settings.register_profile("any machine", deadline=None)  # no test measures time
 settings.load_profile("any machine")
@@ -46,17 +43,6 @@ def streets():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(drive, "_street", cache(drive._street.__wrapped__))
         yield
-
-
-@pytest.fixture(scope="session")
-def drive_bag(streets, tmp_path_factory) -> Path:
-    """A bag of a simulated drive: clouds, labels, camera."""
-    from lidar_perception.data.to_bag import write_bag
-    from lidar_perception.simulation.scene import CROWDED
-    from lidar_perception.simulation.to_bag import simulated_scans
-    path = tmp_path_factory.mktemp("drive") / "drive"
-    write_bag(path, simulated_scans(33, FRAMES, streets=CROWDED))
-    return path
 
 
 @pytest.fixture(scope="session")
@@ -120,32 +106,3 @@ def few(tmp_path) -> Path:
     """Five scans for the small experiment."""
     from samples import object_folder
     return object_folder(tmp_path / "few", count=5)
-
-
-@pytest.fixture(scope="session")
-def domain() -> int:
-    """A ROS domain of this test session's own, reached by this machine only."""
-    from lidar_perception.candidates.warm_up import warm_up
-    from lidar_perception.nodes.graph import private_domain
-    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-    number = private_domain()
-    warm_up()  # what nodes compile is cached then; on a fresh machine that can outlast a wait
-    os.environ["ROS_DOMAIN_ID"] = str(number)
-    return number
-
-
-@pytest.fixture
-def peer(domain):
-    pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
-    from ros_peer import Peer
-    with Peer(domain) as peer:
-        yield peer
-
-
-@pytest.fixture
-def processes(domain, tmp_path):
-    """Starts node processes; what still runs at the end of the test is ended."""
-    pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
-    from lidar_perception.nodes.graph import Processes
-    with Processes(tmp_path / "logs", domain) as running:
-        yield running

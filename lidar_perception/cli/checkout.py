@@ -13,6 +13,7 @@ from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 MAX_WORKERS = 4  # each holds torch and compiles what it runs
+WITH_PROCESSES = ("test/ros", "test/launch", "test/testing")
 PASS_ON = dict(ignore_unknown_options=True, help_option_names=[])
 
 
@@ -33,14 +34,9 @@ def test(arguments: tuple[str, ...]) -> None:
         sys.exit(_run("test", ["-m", "pytest", *arguments]))
     workers = min(os.cpu_count() or 1, MAX_WORKERS)
     core = _run("test", ["-m", "pytest", "-n", str(workers), "--dist", "loadfile",
-                         *(f"--ignore=test/{path.name}" for path in _with_processes())])
-    rest = _run("test", ["-m", "pytest", *map(str, _with_processes())])
+                         *(f"--ignore={folder}" for folder in WITH_PROCESSES)])
+    rest = _run("test", ["-m", "pytest", *WITH_PROCESSES])
     sys.exit(core or rest)
-
-
-def _with_processes() -> list[Path]:
-    folder = ROOT / "test/ros"
-    return sorted([*folder.glob("test_ros_*.py"), *folder.glob("test_stopping.py")])
 
 
 @click.command(context_settings=PASS_ON)

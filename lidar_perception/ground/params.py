@@ -112,6 +112,6 @@ class ObstacleParams(Params):
                               low=0.0, high=100.0)
 
     def check(self) -> None:
-        if 0.0 < self.max_height <= self.min_height:
-            raise ValueError(f"max_height = {self.max_height} must be above min_height = "
+        if 0.0 < self.max_height < self.min_height:
+            raise ValueError(f"max_height = {self.max_height} must not be below min_height = "
                              f"{self.min_height}, or 0")

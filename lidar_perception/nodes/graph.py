@@ -171,11 +171,14 @@ class Processes:
         file.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}))
         rules = {**remap, **({"__ns": f"/{namespace}"} if namespace else {})}
         remapping = [word for rule in rules.items() for word in ("-r", ":=".join(rule))]
+        self.run(name, [sys.executable, "-m", "lidar_perception.nodes.main", node, "--ros-args",
+                        "--params-file", str(file), *remapping])
+
+    def run(self, name: str, command: Sequence[str]) -> None:
+        """Start any program; what it writes goes to the log."""
         with open(self.logs / f"{name}.log", "w") as log:
             self.running[name] = subprocess.Popen(
-                [sys.executable, "-m", "lidar_perception.nodes.main", node, "--ros-args",
-                 "--params-file", str(file), *remapping],
-                env=self.environment, stdin=subprocess.DEVNULL, stdout=log,
+                command, env=self.environment, stdin=subprocess.DEVNULL, stdout=log,
                 stderr=subprocess.STDOUT)
 
     def check(self, *finished: str) -> None:

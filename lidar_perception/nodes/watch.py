@@ -25,9 +25,10 @@ DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
 class Outside:
     """A node of a program that starts other nodes: a ROS context of its own, spun by hand, no
-    signal handlers. A context manager. diagnostics holds the last status of every node."""
+    signal handlers; on a domain, None for that of the environment. A context manager. diagnostics
+    holds the last status of every node."""
 
-    def __init__(self, domain: int, name: str):
+    def __init__(self, domain: int | None, name: str):
         self.context = Context()
         rclpy.init(context=self.context, domain_id=domain,
                    signal_handler_options=SignalHandlerOptions.NO)
@@ -57,6 +58,13 @@ class Outside:
         """A value of the node's last diagnostic; None where there is none."""
         status = self.diagnostics.get(node)
         return next((v.value for v in status.values if v.key == key), None) if status else None
+
+    def connected(self, outputs: Mapping[str, set[str]]) -> bool:
+        """True once every node has said by its diagnostics that somebody listens to each of its
+        outputs in use."""
+        return all(node in self.diagnostics and all(
+            int(self.value_of(node, f"subscribers of {topic}") or 0) for topic in topics)
+            for node, topics in outputs.items())
 
     def until(self, condition: Callable[[], Any], timeout: float,
               each: Callable[[], None] = lambda: None) -> bool:
@@ -92,13 +100,6 @@ class Watch(Outside):
         sent = stamp and self.sent.pop(struct.pack("<iI", stamp.sec, stamp.nanosec), None)
         if sent:
             self.latencies_ms.append((monotonic() - sent) * 1e3)
-
-    def connected(self, outputs: Mapping[str, set[str]]) -> bool:
-        """True once every node has said by its diagnostics that somebody listens to each of its
-        outputs in use."""
-        return all(node in self.diagnostics and all(
-            int(self.value_of(node, f"subscribers of {topic}") or 0) for topic in topics)
-            for node, topics in outputs.items())
 
 
 @contextmanager

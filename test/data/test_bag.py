@@ -8,15 +8,14 @@ import yaml
 from bag_samples import LATCHED, cloud_frame, message_bytes, same_cloud, scans
 from mcap.reader import make_reader
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from samples import STAMP, png_header, scene, write
 
 from lidar_perception.data.bag import LATCHED_QOS, Bag, BagWriter
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
+from lidar_perception.testing.bags import copy_bag
 from lidar_perception.types import GroundTruth, InputError
-from lidar_perception.wire.codec import typestore
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, IMAGE, POINTS, TRUTH
 from msg_utils.point_cloud2 import to_array
 
@@ -149,12 +148,7 @@ def test_a_bag_without_messages_can_be_written_and_has_no_frame(tmp_path):
 
 
 def test_bags_of_sqlite_are_read_alike(written, tmp_path):
-    with Writer(tmp_path / "sql", version=9, storage_plugin=StoragePlugin.SQLITE3) as bag, \
-            Reader(written) as reader:
-        copies = {c.topic: bag.add_connection(c.topic, c.msgtype, typestore=typestore())
-                  for c in reader.connections}
-        for connection, stamp, data in reader.messages():
-            bag.write(copies[connection.topic], stamp, data)
+    copy_bag(written, tmp_path / "sql", "sqlite3")
     for a, b in zip(open_recording(written), open_recording(tmp_path / "sql"), strict=True):
         assert same_cloud(a.load().xyz, b.load().xyz)
         assert np.array_equal(a.camera().projection, b.camera().projection)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from bag_samples import cloud_frame, message_bytes, same_cloud, scans
 from mcap.reader import make_reader
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from samples import STAMP, header, scene, write
 
 from lidar_perception.data import bag as bag_module
@@ -18,8 +17,9 @@ from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
+from lidar_perception.testing.bags import copy_bag
 from lidar_perception.types import InputError
-from lidar_perception.wire.codec import bag_message, typestore
+from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.topics import POINTS
 from msg_utils.point_cloud2 import from_array
 
@@ -219,12 +219,7 @@ def test_a_damaged_byte_never_changes_what_is_read_without_a_word(written, tmp_p
 
 
 def test_an_index_without_a_checksum_is_compared_with_the_data(written, tmp_path):
-    with Writer(tmp_path / "plain", version=9, storage_plugin=StoragePlugin.MCAP) as bag, \
-            Reader(written) as reader:
-        copies = {c.topic: bag.add_connection(c.topic, c.msgtype, typestore=typestore())
-                  for c in reader.connections}
-        for connection, stamp, data in reader.messages():
-            bag.write(copies[connection.topic], stamp, data)
+    copy_bag(written, tmp_path / "plain", "mcap")
     source = tmp_path / "plain/plain.mcap"
     raw = source.read_bytes()
     with open(source, "rb") as stream:

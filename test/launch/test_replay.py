@@ -10,7 +10,6 @@ import json
 import tempfile
 import unittest
 from pathlib import Path
-from time import monotonic
 
 import pytest
 
@@ -18,47 +17,33 @@ pytest.importorskip("launch_testing", reason="needs launch_testing, which comes 
 pytest.importorskip("launch_ros", reason="needs launch_ros, which comes with ROS 2")
 
 import launch_testing
-import launch_testing.actions
 import launch_testing.asserts
-import rclpy
-from launch.actions import IncludeLaunchDescription
-from launch.launch_description_sources import PythonLaunchDescriptionSource
-from visualization_msgs.msg import MarkerArray
 
-from launch import LaunchDescription
-from lidar_perception.data.to_bag import write_bag
 from lidar_perception.nodes.graph import STAGES, result_topics
 from lidar_perception.simulation.scene import CROWDED
 from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.testing.bags import bag_of
+from lidar_perception.testing.detections import objects_of
+from lidar_perception.testing.launching import description, launch_file
+from lidar_perception.testing.peer import Peer
 
-LAUNCH = Path(__file__).resolve().parents[2] / "launch" / "replay.launch.py"
 FOLDER = Path(tempfile.mkdtemp())
 FRAMES = 6
-TIMEOUT = 120.0  # seconds; the first start compiles
 
 
 @pytest.mark.launch_test
 def generate_test_description():
-    write_bag(FOLDER / "drive", simulated_scans(33, FRAMES, streets=CROWDED), force=True)
-    replay = IncludeLaunchDescription(PythonLaunchDescriptionSource(str(LAUNCH)), launch_arguments={
-        "bag": str(FOLDER / "drive"), "scores": str(FOLDER / "scores.json"), "loop": "true",
-    }.items())
-    return LaunchDescription([replay, launch_testing.actions.ReadyToTest()])
+    bag = bag_of(FOLDER / "drive", simulated_scans(33, FRAMES, streets=CROWDED))
+    return description(launch_file("replay", bag=bag, scores=FOLDER / "scores.json", loop=True))
 
 
 class TestReplay(unittest.TestCase):
     def test_candidates_arrive(self):
-        rclpy.init()
-        node = rclpy.create_node("listener")
-        heard = []
-        node.create_subscription(MarkerArray, result_topics()["final"], heard.append, 10)
-        end = monotonic() + TIMEOUT
-        while len(heard) < 2 * FRAMES and monotonic() < end:
-            rclpy.spin_once(node, timeout_sec=0.1)
-        node.destroy_node()
-        rclpy.try_shutdown()
-        assert len(heard) >= 2 * FRAMES  # the bag is played in a loop
-        assert any(m.type == m.CUBE and m.action == m.ADD for a in heard for m in a.markers)
+        """The bag is played in a loop."""
+        with Peer() as peer:
+            heard = peer.wait_for_messages(result_topics()["final"],
+                                           "visualization_msgs/msg/MarkerArray", 2 * FRAMES)
+        assert any(len(objects_of(message).boxes) for message in heard)
 
 
 @launch_testing.post_shutdown_test()

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import shutil
+
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import SetParameters
 from std_srvs.srv import Trigger
 
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
@@ -22,16 +22,17 @@ CLOUD, TEXT, INFO = ("sensor_msgs/msg/PointCloud2", "std_msgs/msg/String",
 START, STEP = 10**18, 10**8
 
 
-@pytest.fixture
-def text_bag(tmp_path):
+@pytest.fixture(scope="module")
+def text_bag(tmp_path_factory):
     """20 messages 'n' on /text every 0.1 s, 'latched' on /note at the start."""
-    with BagWriter(tmp_path / "texts") as bag:
+    path = tmp_path_factory.mktemp("bag") / "texts"
+    with BagWriter(path) as bag:
         bag.add_topic("/text", TEXT, SENSOR_QOS)
         bag.add_topic("/note", TEXT, LATCHED_QOS)
         bag.write("/note", START, bag_message(TEXT, data="latched"))
         for i in range(20):
             bag.write("/text", START + i * STEP, bag_message(TEXT, data=str(i)))
-    return tmp_path / "texts"
+    return path
 
 
 def texts(messages):
@@ -90,10 +91,7 @@ def test_pause_step_resume_and_rate(processes, peer, text_bag):
         assert texts(heard) == expected
     assert peer.call("/bag_player/resume", Trigger, request).success
     assert not peer.call("/bag_player/step", Trigger, request).success  # only while paused
-    rate = Parameter(name="rate", value=ParameterValue(type=ParameterType.PARAMETER_DOUBLE,
-                                                       double_value=5.0))
-    set_rate = SetParameters.Request(parameters=[rate])
-    assert peer.call("/bag_player/set_parameters", SetParameters, set_rate).results[0].successful
+    peer.set_parameter("/bag_player", "rate", 5.0)
     peer.wait(lambda: len(heard) == 20, "the rest")
     assert texts(heard) == [str(i) for i in range(20)]
 
@@ -136,29 +134,35 @@ def test_it_waits_for_its_subscribers(processes, peer, text_bag):
     peer.wait(lambda: len(first) == 20 and len(second) == 20, "all messages at both")
 
 
-@pytest.mark.parametrize("bad, words", [
-    ({"bag": ""}, "'bag' is empty"),
-    ({"bag": "/nowhere"}, "no bag /nowhere"),
-    ({"topics": ["/other"]}, "no topic /other"),
-    ({"remap": ["/text"]}, "OLD:=NEW"),
-    ({"rate": -1.0}, "rate"),
-])
-def test_what_cannot_be_played_is_one_line_and_exit_code_2(processes, peer, text_bag, bad, words):
-    processes.start("bag_player", {}, {"bag": str(text_bag), **bad})
-    peer.wait(lambda: processes.ended("bag_player"), "the end")
-    assert processes.running["bag_player"].returncode == 2
-    log = (processes.logs / "bag_player.log").read_text()
-    assert words in log.splitlines()[-1] and "Traceback" not in log
+BAD = {
+    "nothing": ({"bag": ""}, "'bag' is empty"),
+    "nowhere": ({"bag": "/nowhere"}, "no bag /nowhere"),
+    "topic": ({"topics": ["/other"]}, "no topic /other"),
+    "remap": ({"remap": ["/text"]}, "OLD:=NEW"),
+    "rate": ({"rate": -1.0}, "rate"),
+    "truncated": ({}, "truncated"),
+}
 
 
-def test_a_truncated_bag_names_the_file(processes, peer, text_bag):
-    storage = next(text_bag.glob("*.mcap"))
+@pytest.fixture(scope="module")
+def refused(shared_processes, text_bag, tmp_path_factory):
+    """A player for each, in a namespace of its own, all at once; and the truncated bag."""
+    cut = tmp_path_factory.mktemp("cut") / "texts"
+    shutil.copytree(text_bag, cut)
+    storage = next(cut.glob("*.mcap"))
     storage.write_bytes(storage.read_bytes()[:-300])
-    processes.start("bag_player", {}, {"bag": str(text_bag)})
-    peer.wait(lambda: processes.ended("bag_player"), "the end")
-    log = (processes.logs / "bag_player.log").read_text()
-    assert processes.running["bag_player"].returncode == 2
-    assert "truncated" in log and str(text_bag) in log and "Traceback" not in log
+    for case, (bad, _) in BAD.items():
+        bag = cut if case == "truncated" else text_bag
+        shared_processes.start("bag_player", {}, {"bag": str(bag), **bad}, namespace=case)
+    return cut
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_cannot_be_played_is_one_line_and_exit_code_2(refused, shared_processes, case):
+    assert shared_processes.running[f"{case}.bag_player"].wait(timeout=60) == 2
+    log = shared_processes.log(f"{case}.bag_player")
+    assert BAD[case][1] in log.splitlines()[-1] and "Traceback" not in log
+    assert case != "truncated" or str(refused) in log
 
 
 def test_the_recorder_writes_what_the_player_plays(processes, peer, text_bag, tmp_path):

@@ -13,9 +13,8 @@ from detection_samples import frame
 from detection_samples import lively as lively_pointpillars
 from detection_samples import tiny as tiny_pointpillars
 from pointnet_samples import eager, lively, small
-from std_msgs.msg import Float64
-from test_bad_input import BAD, CLOUD, MARKERS, RELIABLE_IN, cloud
-from test_pointpillars_node import assert_equal, message, received
+from test_bad_input import BAD, CLOUD, MARKERS, QUIET, cloud
+from test_pointpillars_node import REMAP, assert_equal, message, received
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
@@ -32,7 +31,7 @@ from lidar_perception.wire.topics import POINTS
 
 NODE = "pointnet_detector"
 SHARED = Path(__file__).resolve().parents[2] / "config" / "pointnet.param.yaml"
-REMAP = {"~/input/points": "/in", "~/output/detections": "/found"}
+BETWEEN, FOUND = POINTNET[NODE]["~/input/points"], f"/{NODE}/output/detections"
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -59,24 +58,38 @@ def offline(weights, msg, cluster_ids=None):
     return detector(scan, cluster_ids=cluster_ids).detections
 
 
-def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, weights):
-    """The graph of three nodes with the detector's numbers, and a plain cloud straight to the
-    detector, which then finds ground and clusters itself."""
-    shared = read_config(SHARED, PipelineParams())
+@pytest.fixture(scope="module")
+def peer(shared_peer):
+    return shared_peer
+
+
+@pytest.fixture(scope="module")
+def found(shared_processes, peer, weights):
+    """What the graph of three nodes detects, with the detector's numbers."""
     for node, remap in POINTNET.items():
-        extra = {"~/output/detections": "/found"} if node == NODE else {}
-        processes.start(node, {**remap, **extra}, {**shared, **(
-            values(weights) if node == NODE else {})})
-    found, between = peer.listen("/found", MARKERS), POINTNET[NODE]["~/input/points"]
-    points = peer.listen(between, CLOUD)
-    times = {step: [] for step in STEPS}
-    for step, heard in times.items():
-        peer.node.create_subscription(Float64, f"/{NODE}/debug/{step}_ms", heard.append, 10)
-    peer.wait(lambda: peer.message_of(NODE) == "waiting for input", "the network")
+        shared_processes.start(node, remap, {**read_config(SHARED, PipelineParams()), **(
+            {**values(weights), **QUIET} if node == NODE else {})})
+    return peer.listen(FOUND, MARKERS)
+
+
+@pytest.fixture(scope="module")
+def talker(peer, found):
+    """Straight to the detector."""
+    return peer.talker(BETWEEN, CLOUD)
+
+
+def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, peer, weights):
+    """A cloud through all three, and a plain one straight to the detector, which then finds ground
+    and clusters itself."""
+    points = peer.listen(BETWEEN, CLOUD)
+    times = {step: peer.listen(f"/{NODE}/debug/{step}_ms", "std_msgs/msg/Float64")
+             for step in STEPS}
+    peer.wait_for_diagnostics(NODE, "waiting for input")
     peer.send(peer.talker(POINTS, CLOUD), message(1), lambda: points and received(found, 1),
               "detections")
     scan = to_frame(message(1), 0.0)[0]
-    segmented = segment(scan, None, with_values(PipelineParams(), shared))
+    segmented = segment(scan, None, with_values(PipelineParams(),
+                                                read_config(SHARED, PipelineParams())))
     assert segmented.ground.any() and segmented.cluster_ids.max() >= 5
     np.testing.assert_array_equal(column(points[-1], "cluster_id", np.arange(len(scan))),
                                   segmented.cluster_ids)
@@ -84,7 +97,6 @@ def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, 
     assert_equal(received(found, 1), expected)
     assert received(found, 1).frame_id == "lidar"
 
-    talker = peer.talker(between, CLOUD)
     peer.send(talker, message(2), lambda: received(found, 2), "detections of a plain cloud")
     assert_equal(received(found, 2), expected)
     # Columns that say something else are believed.
@@ -100,12 +112,10 @@ def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, 
     assert times["network"][-1].data > 0
     peer.wait(lambda: peer.value_of(NODE, "detections"), "counts")
     assert peer.value_of(NODE, "network").startswith("improved, Car")
-    processes.check()
 
 
-def test_no_cloud_ends_the_detector_and_each_has_its_reason(processes, peer, weights):
-    processes.start(NODE, REMAP, {**RELIABLE_IN, **values(weights)})
-    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
+def test_no_cloud_ends_the_detector_and_each_has_its_reason(talker, found, shared_processes, peer,
+                                                            weights):
     count = np.zeros(len(frame()))
     strange = {
         **{name: bad for name, bad in BAD.items() if name != "one point"},
@@ -126,17 +136,16 @@ def test_no_cloud_ends_the_detector_and_each_has_its_reason(processes, peer, wei
     for name, (msg, words) in strange.items():
         peer.diagnostics.clear()
         peer.send(talker, msg, lambda w=words: w in peer.message_of(NODE), f"'{words}': {name}")
-        processes.check()
     peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
     assert_equal(received(found, 7), offline(weights, message(7)))
 
-    for name in ("car", "pedestrian", "cyclist"):
-        peer.set_parameter(f"/{NODE}", f"pointnet.scores.{name}", 1.0)
-    peer.send(talker, message(8), lambda: received(found, 8) is not None, "no detections")
-    assert len(received(found, 8)) == 0
-    peer.wait(lambda: "threshold in pointnet.scores" in peer.message_of(NODE), "the reason")
-    peer.wait(lambda: "Car 0." in (peer.value_of(NODE, "best scores") or ""), "the best scores")
-    log = (processes.logs / f"{NODE}.log").read_text()
+    with peer.parameters(f"/{NODE}", {f"pointnet.scores.{name}": 1.0
+                                      for name in ("car", "pedestrian", "cyclist")}):
+        peer.send(talker, message(8), lambda: received(found, 8) is not None, "no detections")
+        assert len(received(found, 8)) == 0
+        peer.wait_for_diagnostics(NODE, "threshold in pointnet.scores")
+        peer.wait(lambda: "Car 0." in (peer.value_of(NODE, "best scores") or ""), "the scores")
+    log = shared_processes.log(NODE)
     assert "Traceback" not in log and "Warning" not in log
 
 
@@ -157,17 +166,19 @@ UNUSABLE = {  # weights made in a folder; words of the diagnostic
 }
 
 
-@pytest.mark.parametrize("make, words", UNUSABLE.values(), ids=UNUSABLE)
-def test_weights_that_cannot_be_used_are_a_diagnostic(make, words, processes, peer, tmp_path):
-    processes.start(NODE, REMAP, {**RELIABLE_IN, "pointnet.weights": str(make(tmp_path))})
+def test_weights_that_cannot_be_used_are_a_diagnostic(shared_processes, peer, tmp_path):
+    for i, (make, _) in enumerate(UNUSABLE.values()):
+        shared_processes.start(NODE, REMAP, {"pointnet.weights": str(make(tmp_path))}, f"bad{i}")
     talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
-    peer.send(talker, message(1), lambda: words in peer.message_of(NODE), words)
-    assert ord(peer.diagnostics[NODE].level) == 2 and not found
-    maps = Path(f"/proc/{processes.running[NODE].pid}/maps")
-    if make is missing_weights and maps.is_file():
-        assert "libtorch" not in maps.read_text()  # which takes seconds and 200 MB
-    processes.check()
-    assert "Traceback" not in (processes.logs / f"{NODE}.log").read_text()
+    for i, (make, words) in enumerate(UNUSABLE.values()):
+        peer.send(talker, message(1), lambda n=f"bad{i}/{NODE}", w=words: w in peer.message_of(n),
+                  words)
+        assert ord(peer.diagnostics[f"bad{i}/{NODE}"].level) == 2 and not found
+        node = f"bad{i}.{NODE}"
+        maps = Path(f"/proc/{shared_processes.running[node].pid}/maps")
+        if make is missing_weights and maps.is_file():
+            assert "libtorch" not in maps.read_text()  # which takes seconds and 200 MB
+        assert not shared_processes.ended(node) and "Traceback" not in shared_processes.log(node)
 
 
 def test_help_knows_the_node(capsys):

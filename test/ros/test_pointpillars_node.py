@@ -10,10 +10,8 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from detection_samples import eager, frame, lively, tiny
-from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-from rcl_interfaces.srv import DescribeParameters, SetParameters
-from std_msgs.msg import Float64
-from test_bad_input import BAD, CLOUD, MARKERS, RELIABLE_IN, cloud
+from rcl_interfaces.srv import DescribeParameters
+from test_bad_input import BAD, CLOUD, MARKERS, QUIET, cloud
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
@@ -25,17 +23,16 @@ from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.graph import POINTPILLARS
 from lidar_perception.nodes.main import run
 from lidar_perception.param_fields import flatten, with_values
+from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import column, to_detections, to_frame
 from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import box_pose, from_marker_array, pose_yaw
-from msg_utils.point_cloud2 import from_array
-from msg_utils.stamps import header_message
 
 NODE = "pointpillars_detector"
 EXPERTS = Path(__file__).resolve().parents[2] / "config" / "pointpillars.param.yaml"
-FIELDS = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 REMAP = {"~/input/points": "/in", "~/output/detections": "/found"}
+BETWEEN, FOUND = POINTPILLARS[NODE]["~/input/points"], f"/{NODE}/output/detections"
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -58,15 +55,7 @@ def values(weights, **changes):
 
 def message(stamp, **columns):
     """The scan of detection_samples, with columns of its own."""
-    scan = frame()
-    kinds = [(name, values.dtype.str, values.shape[1:]) for name, values in columns.items()]
-    points = np.zeros(len(scan), np.dtype([*FIELDS.descr, *kinds]))
-    for i, name in enumerate("xyz"):
-        points[name] = scan.xyz[:, i]
-    points["intensity"] = scan.intensity
-    for name, column_values in columns.items():
-        points[name] = column_values
-    return from_array(points, header_message(stamp, "lidar", bag_message), bag_message)
+    return cloud_message(np.column_stack([frame().xyz, frame().intensity]), stamp, **columns)
 
 
 def received(messages, stamp):
@@ -91,24 +80,37 @@ def assert_equal(objects, expected):
     np.testing.assert_array_equal(found.class_ids, expected.class_ids)
 
 
-def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, weights):
-    """The graph of three nodes with the experts' numbers, and a plain cloud straight to the
-    detector, which then computes ground and clusters itself."""
-    shared = read_config(EXPERTS, PipelineParams())
+@pytest.fixture(scope="module")
+def peer(shared_peer):
+    return shared_peer
+
+
+@pytest.fixture(scope="module")
+def found(shared_processes, peer, weights):
+    """What the graph of three nodes detects, with the experts' numbers."""
     for node, remap in POINTPILLARS.items():
-        extra = {"~/output/detections": "/found"} if node == NODE else {}
-        processes.start(node, {**remap, **extra}, {**shared, **(
-            values(weights) if node == NODE else {})})
-    found, between = peer.listen("/found", MARKERS), POINTPILLARS[NODE]["~/input/points"]
-    points = peer.listen(between, CLOUD)
-    times = {step: [] for step in STEPS}
-    for step, heard in times.items():
-        peer.node.create_subscription(Float64, f"/{NODE}/debug/{step}_ms", heard.append, 10)
-    peer.wait(lambda: peer.message_of(NODE) == "waiting for input", "the network")
+        shared_processes.start(node, remap, {**read_config(EXPERTS, PipelineParams()), **(
+            {**values(weights), **QUIET} if node == NODE else {})})
+    return peer.listen(FOUND, MARKERS)
+
+
+@pytest.fixture(scope="module")
+def talker(peer, found):
+    """Straight to the detector."""
+    return peer.talker(BETWEEN, CLOUD)
+
+
+def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, peer, weights):
+    """A cloud through all three, and a plain one straight to the detector, which then computes
+    ground and clusters itself."""
+    points = peer.listen(BETWEEN, CLOUD)
+    times = {step: peer.listen(f"/{NODE}/debug/{step}_ms", "std_msgs/msg/Float64")
+             for step in STEPS}
+    peer.wait_for_diagnostics(NODE, "waiting for input")
     peer.send(peer.talker(POINTS, CLOUD), message(1), lambda: points and received(found, 1),
               "detections")
 
-    params = with_values(PipelineParams(), shared)
+    params = with_values(PipelineParams(), read_config(EXPERTS, PipelineParams()))
     scan = to_frame(message(1), 0.0)[0]
     segmented = segment(scan, None, params)
     columns = segmented.ground, segmented.cluster_ids
@@ -119,7 +121,6 @@ def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, 
     assert_equal(received(found, 1), offline(weights, message(1), *columns))
     assert received(found, 1).frame_id == "lidar"
 
-    talker = peer.talker(between, CLOUD)
     peer.send(talker, message(2), lambda: received(found, 2), "detections of a plain cloud")
     assert_equal(received(found, 2), offline(weights, message(2)))
     # Columns that say something else are believed: no ground, and clusters of that.
@@ -135,12 +136,10 @@ def test_detections_over_dds_are_those_of_the_offline_detector(processes, peer, 
     assert times["network"][-1].data > 0
     peer.wait(lambda: peer.value_of(NODE, "detections"), "counts")
     assert peer.value_of(NODE, "network").startswith("v4 compact")
-    processes.check()
 
 
-def test_no_cloud_ends_the_detector_and_each_has_its_reason(processes, peer, weights):
-    processes.start(NODE, REMAP, {**RELIABLE_IN, **values(weights)})
-    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
+def test_no_cloud_ends_the_detector_and_each_has_its_reason(talker, found, shared_processes, peer,
+                                                            weights):
     xyz, rng = frame().xyz, np.random.default_rng(0)
     count = np.zeros(len(xyz))
     strange = {
@@ -166,44 +165,33 @@ def test_no_cloud_ends_the_detector_and_each_has_its_reason(processes, peer, wei
     for name, (msg, words) in strange.items():
         peer.diagnostics.clear()
         peer.send(talker, msg, lambda w=words: w in peer.message_of(NODE), f"'{words}': {name}")
-        processes.check()
     peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
     assert_equal(received(found, 7), offline(weights, message(7)))
-    log = (processes.logs / f"{NODE}.log").read_text()
+    log = shared_processes.log(NODE)
     assert "Traceback" not in log and "Warning" not in log
 
 
-def test_thresholds_change_at_run_time_and_what_cannot_is_refused(processes, peer, weights):
-    processes.start(NODE, REMAP, {**RELIABLE_IN, **values(weights)})
-    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
-    peer.send(talker, message(1), lambda: received(found, 1), "detections")
-
-    def change(name, **value):
-        request = SetParameters.Request(parameters=[
-            Parameter(name=name, value=ParameterValue(**value))])
-        return peer.call(f"/{NODE}/set_parameters", SetParameters, request).results[0]
-
-    text, double = ParameterType.PARAMETER_STRING, ParameterType.PARAMETER_DOUBLE
-    for name, value in ("weights", "other.safetensors"), ("device", "cuda"), ("version", "v0"):
-        refused = change(f"pointpillars.{name}", type=text, string_value=value)
-        assert not refused.successful and "read-only" in refused.reason
-    refused = change("pointpillars.scores.car", type=double, double_value=1.5)
-    assert not refused.successful and refused.reason
-    refused = change("ground.method", type=text, string_value="dream")
-    assert not refused.successful and "patchwork" in refused.reason
+def test_thresholds_change_at_run_time_and_what_cannot_is_refused(talker, found, peer):
+    for name, value, words in [("pointpillars.weights", "other.safetensors", "read-only"),
+                               ("pointpillars.device", "cuda", "read-only"),
+                               ("pointpillars.version", "v0", "read-only"),
+                               ("pointpillars.scores.car", 1.5, ""),
+                               ("ground.method", "dream", "patchwork")]:
+        reason, = peer.change(f"/{NODE}", {name: value})
+        assert reason and words in reason
     described, = peer.call(f"/{NODE}/describe_parameters", DescribeParameters,
                            DescribeParameters.Request(names=["pointpillars.scores.car"])).descriptors
     assert described.floating_point_range[0].to_value == 1.0 and "Car" in described.description
 
-    for name in ("car", "pedestrian", "cyclist"):
-        peer.set_parameter(f"/{NODE}", f"pointpillars.scores.{name}", 1.0)
-    peer.send(talker, message(2), lambda: received(found, 2) is not None, "no detections")
-    assert len(received(found, 2)) == 0
-    peer.wait(lambda: "below its threshold" in peer.message_of(NODE), "the reason")
-    peer.wait(lambda: "Car 0." in (peer.value_of(NODE, "best scores") or ""), "the best scores")
-    peer.set_parameter(f"/{NODE}", "ground.sensor_pose.height", 1.2)
-    peer.send(talker, message(3), lambda: "ground.sensor_pose.height is 1.2"
-              in peer.message_of(NODE), "the wrong height")
+    with peer.parameters(f"/{NODE}", {f"pointpillars.scores.{name}": 1.0
+                                      for name in ("car", "pedestrian", "cyclist")}):
+        peer.send(talker, message(12), lambda: received(found, 12) is not None, "no detections")
+        assert len(received(found, 12)) == 0
+        peer.wait(lambda: "below its threshold" in peer.message_of(NODE), "the reason")
+        peer.wait(lambda: "Car 0." in (peer.value_of(NODE, "best scores") or ""), "the scores")
+    with peer.parameters(f"/{NODE}", {"ground.sensor_pose.height": 1.2}):
+        peer.send(talker, message(13), lambda: "ground.sensor_pose.height is 1.2"
+                  in peer.message_of(NODE), "the wrong height")
 
 
 def checkpoint_of_another_size(folder):
@@ -242,37 +230,50 @@ UNUSABLE = {  # parameters made in a folder; level, words of the diagnostic
 }
 
 
-@pytest.mark.parametrize("make, level, words", UNUSABLE.values(), ids=UNUSABLE)
-def test_weights_that_cannot_be_used_are_a_diagnostic(make, level, words, processes, peer,
-                                                      tmp_path):
-    processes.start(NODE, REMAP, {**RELIABLE_IN, **make(tmp_path)})
-    talker = peer.talker("/in", CLOUD)
-    peer.send(talker, message(1), lambda: words in peer.message_of(NODE), words)
-    assert ord(peer.diagnostics[NODE].level) == level
+@pytest.fixture(scope="module")
+def unusable(shared_processes, tmp_path_factory):
+    """A node for each, in a namespace of its own, all started at once."""
+    for i, (make, _, _) in enumerate(UNUSABLE.values()):
+        shared_processes.start(NODE, REMAP, make(tmp_path_factory.mktemp("weights")), f"bad{i}")
+    return {case: f"bad{i}/{NODE}" for i, case in enumerate(UNUSABLE)}
+
+
+@pytest.fixture(scope="module")
+def to_unusable(peer):
+    return peer.talker("/in", CLOUD)
+
+
+@pytest.mark.parametrize("case", UNUSABLE)
+def test_weights_that_cannot_be_used_are_a_diagnostic(case, unusable, to_unusable,
+                                                      shared_processes, peer):
+    (_, level, words), node = UNUSABLE[case], unusable[case]
+    peer.send(to_unusable, message(1), lambda: words in peer.message_of(node), words)
+    assert ord(peer.diagnostics[node].level) == level
     peer.diagnostics.clear()
-    peer.wait(lambda: words in peer.message_of(NODE), "the diagnostic again")
-    processes.check()
-    assert "Traceback" not in (processes.logs / f"{NODE}.log").read_text()
+    peer.wait(lambda: words in peer.message_of(node), "the diagnostic again")
+    log = node.replace("/", ".")
+    assert not shared_processes.ended(log) and "Traceback" not in shared_processes.log(log)
 
 
-def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, peer, weights):
+def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, shared_peer,
+                                                                  to_unusable):
     from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
     missing = next((f"{v} {s}" for v in ("v4", "v3", "v2", "v1", "v0") for s in ("compact", "full")
                     if not (WEIGHTS / f"pointpillars_{v}_{s}.safetensors").is_file()), None)
     if missing is None:
         pytest.skip("weights of all versions and sizes come with the package")
     version, size = missing.split()
-    processes.start(NODE, REMAP, {**RELIABLE_IN, "pointpillars.version": version,
-                                  "pointpillars.size": size})
-    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
-    peer.send(talker, message(1), lambda: f"no weights for {missing}" in peer.message_of(NODE),
-              "the diagnostic")
-    peer.until(lambda: False, 1.0)
-    assert not found and f"no weights for {missing}" in peer.message_of(NODE)
-    maps = Path(f"/proc/{processes.running[NODE].pid}/maps")
+    processes.start(NODE, REMAP, {"pointpillars.version": version, "pointpillars.size": size},
+                    "none")
+    peer, node, found = shared_peer, f"none/{NODE}", shared_peer.listen("/found", MARKERS)
+    peer.send(to_unusable, message(1), lambda: f"no weights for {missing}" in
+              peer.message_of(node), "the diagnostic")
+    peer.diagnostics.clear()
+    peer.wait(lambda: f"no weights for {missing}" in peer.message_of(node), "it again")
+    assert not found and not processes.ended(f"none.{NODE}")
+    maps = Path(f"/proc/{processes.running[f'none.{NODE}'].pid}/maps")
     if maps.is_file():
         assert "libtorch" not in maps.read_text()  # which takes seconds and 200 MB
-    processes.check()
 
 
 def test_help_and_run_know_the_node(capsys):

@@ -107,25 +107,22 @@ def test_the_newest_cloud_wins_and_the_others_are_counted(processes, peer):
     peer.wait(lambda: "publishers" not in peer.message_of(NODE), "no warning")
 
 
-def test_two_nodes_of_one_name_say_so(processes, peer, tmp_path):
-    from lidar_perception.nodes.graph import Processes
-    processes.start("clustering", {}, {})
-    peer.wait(lambda: peer.message_of("clustering") == "waiting for input", "the first")
-    with Processes(tmp_path / "second", int(os.environ["ROS_DOMAIN_ID"])) as others:
-        others.start("clustering", {}, {})
-        peer.wait(lambda: "another node is called /clustering" in peer.message_of("clustering")
-                  and ord(peer.diagnostics["clustering"].level) == WARN, "a warning")
+SIDES = "left", "right"
 
 
-def test_two_sensors_in_namespaces(processes, peer):
+@pytest.fixture(scope="module")
+def two_sensors(shared_processes):
+    for side in SIDES:
+        shared_processes.start_graph(["candidates"], {"seed.source": "click"}, namespace=side)
+    return shared_processes
+
+
+def test_two_sensors_in_namespaces(two_sensors, shared_peer):
     """The same graph twice: no topic is shared, and the diagnostics tell which sensor it is."""
-    seeds = {"seed.source": "click"}
-    for side in ("left", "right"):
-        for node, remap in STAGES.items():
-            processes.start(node, remap, seeds, namespace=side)
-    talkers = {side: peer.talker(f"/{side}/points", CLOUD) for side in ("left", "right")}
+    peer = shared_peer
+    talkers = {side: peer.talker(f"/{side}/points", CLOUD) for side in SIDES}
     found = {side: peer.listen(f"/{side}/candidate_refinement/output/detections", MARKERS)
-             for side in talkers}
+             for side in SIDES}
     click = peer.talker("/right/clicked_point", "geometry_msgs/msg/PointStamped")
     peer.wait(click.get_subscription_count, "the clicked points of one")
     street = np.random.default_rng(0).uniform(-20, 20, (5000, 3)) * [1, 1, 1e-3] - [0, 0, 1.73]
@@ -134,15 +131,21 @@ def test_two_sensors_in_namespaces(processes, peer):
         peer.send(talker, cloud(street, stamp), lambda s=side: found[s], f"the result of {side}")
         assert {to_ns(m.markers[0].header.stamp) for m in found[side]} == {stamp}
         assert found[side][0].markers[0].lifetime.sec == 2  # and then a dead node's boxes go
-    own = {f"{side}/{node}": (side, f"{side}/lidar") for side in talkers for node in STAGES}
+    own = {f"{side}/{node}": (side, f"{side}/lidar") for side in SIDES for node in STAGES}
     peer.wait(lambda: own.keys() <= peer.diagnostics.keys(), "diagnostics of all")
     assert all(peer.diagnostics[name].hardware_id in ids for name, ids in own.items())
     peer.wait(lambda: all(peer.diagnostics[f"{side}/clustering"].hardware_id == f"{side}/lidar"
-                          for side in talkers), "the sensors' frames")
+                          for side in SIDES), "the sensors' frames")
     names = {name for name, _ in peer.node.get_topic_names_and_types()}
     ours = {t for t in names if not t.startswith(("/left/", "/right/"))}
     assert ours <= {"/diagnostics", "/parameter_events", "/rosout", "/tf_static", "/clock"}
-    processes.check()
+    two_sensors.check()
+
+
+def test_two_nodes_of_one_name_say_so(two_sensors, shared_peer, processes):
+    processes.start("clustering", {}, {}, namespace="left")
+    shared_peer.wait_for_diagnostics("left/clustering", "another node is called /left/clustering",
+                                     WARN)
 
 
 def infos(numbers, period=10**8):

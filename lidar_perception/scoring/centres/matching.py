@@ -14,14 +14,17 @@ def match_centres(found: np.ndarray, truth: np.ndarray,
                   max_distance: float = MAX_CENTRE_DISTANCE) -> tuple[np.ndarray, np.ndarray]:
     """Pairs (P,), (P,) of row numbers of found (K, >=3) and truth (M, >=3) whose 3D centres are at
     most max_distance apart, one to one: as many pairs as possible, then the least distance."""
-    if len(found) == 0 or len(truth) == 0:
-        return np.zeros(0, int), np.zeros(0, int)
     distance = np.linalg.norm(found[:, None, :3].astype(float) - truth[None, :, :3], axis=2)
-    too_far = ~(distance <= max_distance)  # a centre that is NaN is far from all
+    return one_to_one(distance, distance <= max_distance)  # a centre that is NaN is far from all
+
+
+def one_to_one(cost: np.ndarray, allowed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (P,) and columns (P,) of pairs for cost (K, M), none negative, of which only those
+    under allowed (K, M) bool can be: as many pairs as possible, then the least sum."""
     # One forbidden pair costs more than all allowed ones together.
-    rows, columns = linear_sum_assignment(np.where(too_far, max_distance * distance.size + 1.0,
-                                                   distance))
-    keep = ~too_far[rows, columns]
+    forbidden = cost[allowed].max(initial=0.0) * cost.size + 1.0
+    rows, columns = linear_sum_assignment(np.where(allowed, cost, forbidden))
+    keep = allowed[rows, columns]
     return rows[keep], columns[keep]
 
 

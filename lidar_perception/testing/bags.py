@@ -1,0 +1,85 @@
+"""Bags for tests, of arrays or of simulated frames, in the bytes of another program: rosbags."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+
+from lidar_perception.data.frame import Frame
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.testing.detections import objects_of
+from lidar_perception.types import CLASSES, GroundTruth, InputError, LidarFrame
+from lidar_perception.wire.codec import typestore
+from lidar_perception.wire.topics import LIDAR_FRAME
+
+START_NS = 1_700_000_000 * 10**9
+STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
+
+
+def recording(clouds: Iterable[Any], labels: Iterable[Any] | None = None, *,
+              frame_id: str = LIDAR_FRAME, hz: float = 10.0, start_ns: int = START_NS
+              ) -> list[Frame]:
+    """Frames of clouds (N, 3) [x y z] metres or (N, 4) with the intensity 0..1, in the sensor's
+    frame. labels: for each cloud GroundTruth, pairs (class name, [x y z l w h yaw]), or None for a
+    cloud that has none. InputError for arrays of another shape, or of another number."""
+    clouds = [np.asarray(cloud, np.float32) for cloud in clouds]
+    truths = [None] * len(clouds) if labels is None else [*map(_truth, labels)]
+    if len(truths) != len(clouds):
+        raise InputError(f"{len(clouds)} clouds and labels of {len(truths)}; give one each")
+    frames = []
+    for i, (cloud, truth) in enumerate(zip(clouds, truths)):
+        if cloud.ndim != 2 or cloud.shape[1] not in (3, 4):
+            raise InputError(f"cloud {i} has shape {cloud.shape}; it must be (N, 3) or (N, 4)")
+        intensity = cloud[:, 3].copy() if cloud.shape[1] == 4 else None
+        frames.append(Frame.of(str(i), LidarFrame(
+            np.ascontiguousarray(cloud[:, :3]), intensity, start_ns + round(i * 1e9 / hz),
+            frame_id), truth))
+    return frames
+
+
+def _truth(given: Any) -> GroundTruth | None:
+    if given is None or isinstance(given, GroundTruth):
+        return given
+    objects = objects_of(given)
+    if unknown := [name for name in objects.labels if name not in CLASSES]:
+        raise InputError(f"labels: '{unknown[0]}' is none of {', '.join(CLASSES)}")
+    if np.isnan(objects.boxes).any():
+        raise InputError("labels need whole boxes [x y z l w h yaw]")
+    return GroundTruth.of(objects.boxes, [CLASSES.index(name) for name in objects.labels])
+
+
+def bag_of(path: Path, frames: Iterable[Frame], storage: str = "mcap",
+           names: Mapping[str, str] = {}) -> Path:
+    """Write frames as a bag with the topics of lidar_perception.wire.topics, or other names for
+    some of them. InputError for an unknown storage."""
+    with tempfile.TemporaryDirectory() as folder:
+        write_bag(Path(folder) / "bag", frames)
+        return copy_bag(Path(folder) / "bag", path, storage, names)
+
+
+def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = {}) -> Path:
+    """The same messages in a bag that rosbags writes: storage is mcap or sqlite3."""
+    if storage not in STORAGES:
+        raise InputError(f"storage '{storage}' is none of {', '.join(STORAGES)}")
+    with Reader(source) as reader, Writer(path, version=9,
+                                          storage_plugin=STORAGES[storage]) as bag:
+        copies = {c.id: bag.add_connection(
+            names.get(c.topic, c.topic), c.msgtype, typestore=typestore(),
+            offered_qos_profiles=c.ext.offered_qos_profiles) for c in reader.connections}
+        for connection, stamp, data in reader.messages():
+            bag.write(copies[connection.id], stamp, data)
+    return path
+
+
+def frames_of(given: Sequence[Any] | Iterable[Frame], labels: Any = None, **options: Any
+              ) -> list[Frame]:
+    """Frames as they are, or recording() of clouds."""
+    given = list(given)
+    if given and isinstance(given[0], Frame):
+        return given
+    return recording(given, labels, **options)

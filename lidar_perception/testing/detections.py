@@ -1,0 +1,116 @@
+"""Detections of any kind against those that are expected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidar_perception.geometry import iou_3d
+from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_to_one
+from lidar_perception.types import CLASSES, InputError
+from msg_utils.detections import from_detection_array
+from msg_utils.markers import from_marker_array
+
+__tracebackhide__ = True  # pytest shows the line of the test that asserts
+
+SHOWN = 20  # of what is missing, and of what is extra
+
+
+class Objects(NamedTuple):
+    """boxes (K, 7) float64 [x y z l w h yaw], NaN where only a centre is given; labels K class
+    names; scores (K,) float64, 1 where there is none."""
+
+    boxes: np.ndarray
+    labels: list[str]
+    scores: np.ndarray
+
+
+def objects_of(given: Any) -> Objects:
+    """The objects of a MarkerArray, a Detection3DArray (of rclpy or of rosbags), Detections,
+    GroundTruth, or pairs (class name, box), where a box is [x y z l w h yaw] or only [x y z].
+    InputError for anything else."""
+    if hasattr(given, "markers"):
+        given = from_marker_array(given)
+    elif hasattr(given, "detections"):
+        given = from_detection_array(given)
+    if hasattr(given, "class_ids"):
+        labels = [CLASSES[i] for i in given.class_ids]
+    elif hasattr(given, "labels"):
+        labels = list(given.labels)
+    else:
+        return _of_pairs(given)
+    boxes = np.asarray(given.boxes, np.float64).reshape(-1, 7)
+    return Objects(boxes, labels, np.asarray(getattr(given, "scores", np.ones(len(boxes))), float))
+
+
+def _of_pairs(pairs: Any) -> Objects:
+    try:
+        labels = [str(label) for label, _ in pairs]
+        boxes = np.full((len(labels), 7), np.nan)
+        for row, (_, box) in zip(boxes, pairs):
+            if len(box) not in (3, 7):
+                raise ValueError
+            row[:len(box)] = box
+    except (TypeError, ValueError):
+        raise InputError(f"{type(pairs).__name__} is no MarkerArray, Detection3DArray, Detections, "
+                         "GroundTruth or list of (class name, [x y z l w h yaw] or [x y z])"
+                         ) from None
+    return Objects(boxes, labels, np.ones(len(boxes)))
+
+
+def assert_detections(found: Any, expected: Any, *, max_distance: float = MAX_CENTRE_DISTANCE,
+                      min_iou: float | None = None, same_class: bool = True,
+                      max_missing: int = 0, max_extra: int | None = 0
+                      ) -> list[tuple[int, int]]:
+    """Pair what was found with what is expected, both as objects_of() takes them, one to one: as
+    many pairs as possible, then the closest. Returns (row of found, row of expected) of each pair.
+
+    Two are a pair if their centres are at most max_distance metres apart or, with min_iou, if their
+    overlap in space is at least that; and of the same class, unless same_class is False.
+    AssertionError, which lists what is missing and what is extra, if more than max_missing or
+    max_extra are (None: any number).
+    """
+    a, b = objects_of(found), objects_of(expected)
+    if min_iou is not None and not np.isfinite(b.boxes).all():
+        raise InputError("min_iou needs whole boxes; some of what is expected has only a centre")
+    distance = np.linalg.norm(a.boxes[:, None, :3] - b.boxes[None, :, :3], axis=2)
+    if min_iou is None:
+        cost, close = distance, distance <= max_distance
+    else:
+        overlap = iou_3d(a.boxes, b.boxes)
+        cost, close = 1 - overlap, (overlap >= min_iou) & (overlap > 0)
+    if same_class:
+        close &= np.array([[x == y for y in b.labels] for x in a.labels], bool).reshape(close.shape)
+    rows, columns = one_to_one(cost, close)
+    missing = sorted(set(range(len(b.boxes))) - set(columns.tolist()))
+    extra = sorted(set(range(len(a.boxes))) - set(rows.tolist()))
+    if len(missing) > max_missing or (max_extra is not None and len(extra) > max_extra):
+        rule = (f"centres at most {max_distance:g} m apart" if min_iou is None else
+                f"overlap at least {min_iou:g}")
+        raise AssertionError("\n".join([
+            f"{len(rows)} of {len(b.boxes)} expected objects were found, {len(extra)} more were "
+            f"found ({rule}{', of the same class' if same_class else ''})",
+            *_listed("missing", b, missing, a, distance.T),
+            *_listed("extra", a, extra, b, distance)]))
+    return list(zip(rows.tolist(), columns.tolist()))
+
+
+def _listed(word: str, objects: Objects, rows: Sequence[int], others: Objects,
+            distance: np.ndarray) -> list[str]:
+    """A line for each of the rows, with the nearest of the others."""
+    lines = []
+    for i in rows[:SHOWN]:
+        box = objects.boxes[i]
+        size = "" if np.isnan(box[3]) else " size {:.2f} {:.2f} {:.2f}, yaw {:.2f}".format(*box[3:])
+        nearest = ""
+        if len(others.boxes):
+            j = int(np.argmin(np.nan_to_num(distance[i], nan=np.inf)))
+            nearest = f"; nearest: {others.labels[j]}, {distance[i, j]:.2f} m away"
+        score = f", score {objects.scores[i]:.2f}" if word == "extra" else ""
+        lines.append(f"  {word}: {objects.labels[i]} at ({box[0]:.2f}, {box[1]:.2f}, "
+                     f"{box[2]:.2f}){size}{score}{nearest}")
+    if len(rows) > SHOWN:
+        lines.append(f"  ... and {len(rows) - SHOWN} more {word}")
+    return lines

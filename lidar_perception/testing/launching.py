@@ -1,0 +1,61 @@
+"""launch_testing: our launch files beside the nodes under test, on a domain of their own.
+
+Needs launch_testing and launch_ros, which come with ROS 2. In the tests, Peer() waits and asserts.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from lidar_perception.nodes.graph import private_domain
+from lidar_perception.nodes.main import use_large_shared_memory
+from lidar_perception.types import InputError
+
+
+def launch_file(name: str = "detectors", **arguments: Any) -> Any:
+    """The action that includes one of our launch files, launch/NAME.launch.py, with its arguments:
+    launch_file(detectors="pointpillars", points="/front/points"). InputError where launch is not
+    installed, or the package is not where ROS finds it, or has no such file."""
+    try:
+        from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
+        from launch.actions import IncludeLaunchDescription
+        from launch.launch_description_sources import PythonLaunchDescriptionSource
+    except ModuleNotFoundError as error:
+        raise _missing(error) from None
+    try:
+        share = Path(get_package_share_directory("lidar_perception"))
+    except PackageNotFoundError:
+        raise InputError("ROS does not find the package lidar_perception; source the workspace it "
+                         "was built in, or add where pip installed it to AMENT_PREFIX_PATH"
+                         ) from None
+    path = share / "launch" / f"{name}.launch.py"
+    if not path.is_file():
+        have = ", ".join(sorted(p.name.split(".")[0] for p in path.parent.glob("*.launch.py")))
+        raise InputError(f"there is no launch file '{name}'; there are {have}")
+    return IncludeLaunchDescription(PythonLaunchDescriptionSource(str(path)), launch_arguments=[
+        (key, str(value).lower() if isinstance(value, bool) else str(value))
+        for key, value in arguments.items()])
+
+
+def description(*actions: Any) -> Any:
+    """What generate_test_description() returns: the actions, then ReadyToTest. From now on this
+    process and what it starts are on a ROS domain that nobody else uses, and on this machine only,
+    so that no test ever talks to a robot. InputError where launch_testing is not installed."""
+    try:
+        from launch_testing.actions import ReadyToTest
+
+        from launch import LaunchDescription
+    except ModuleNotFoundError as error:
+        raise _missing(error) from None
+    os.environ.update(ROS_DOMAIN_ID=str(private_domain()),
+                      ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
+    use_large_shared_memory()
+    return LaunchDescription([*actions, ReadyToTest()])
+
+
+def _missing(error: ModuleNotFoundError) -> InputError:
+    package = str(error.name).partition(".")[0].replace("_", "-")
+    return InputError(f"{error.name} is not installed; it comes with ROS 2 (ros-jazzy-{package}); "
+                      "with pytest alone see docs/testing.md")

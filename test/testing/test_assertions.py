@@ -1,0 +1,143 @@
+"""What is paired, what is said of the rest, and bags in the bytes of another program."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+from samples import each_make, header, scene, walker_truth
+
+from lidar_perception.data.bag import Bag
+from lidar_perception.data.open import open_recording
+from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.testing.detections import assert_detections, objects_of
+from lidar_perception.testing.launching import description, launch_file
+from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.messages import detection_markers, to_frame, truth_markers
+from msg_utils.detections import to_detection_array
+from msg_utils.point_cloud2 import to_array
+
+NAMES = ("Car", "Pedestrian", "Cyclist")
+
+
+def some(rng, count):
+    boxes = np.column_stack([rng.uniform(-30, 30, (count, 2)), rng.uniform(-2, 0, count),
+                             rng.uniform(0.5, 4, (count, 3)), rng.uniform(-3, 3, count)])
+    return Detections.of(boxes, [CLASSES.index(n) for n in rng.choice(NAMES, count)],
+                         rng.uniform(0, 1, count))
+
+
+def pairs_of(objects):
+    return [(label, box) for label, box in zip(objects.labels, objects.boxes)]
+
+
+@each_make
+def test_every_kind_of_detections_says_the_same(make):
+    found = some(np.random.default_rng(0), 7)
+    expected = objects_of(found)
+    truth = GroundTruth.of(found.boxes, found.class_ids)
+    kinds = [detection_markers(found, header(make), make), truth_markers(truth, header(make), make),
+             truth, expected, pairs_of(expected)]
+    if make is not bag_message and importlib.util.find_spec("vision_msgs"):
+        kinds.append(to_detection_array(found.boxes, expected.labels, found.scores,
+                                        header=header(make), make=make))
+    for kind in kinds:
+        objects = objects_of(kind)
+        assert objects.labels == expected.labels
+        np.testing.assert_allclose(objects.boxes, expected.boxes, atol=1e-6)
+        for limit in {"max_distance": 1e-3}, {"min_iou": 0.99}:
+            assert assert_detections(kind, found, **limit) == [(i, i) for i in range(7)]
+
+
+@pytest.mark.parametrize("limit", [{"max_distance": 0.5}, {"min_iou": 0.3}])
+def test_order_does_not_matter_and_what_was_taken_away_is_missing(limit):
+    """Found and expected are each other's mirror: what is missing of the one is extra of the
+    other."""
+    rng = np.random.default_rng(1)
+    for _ in range(30):
+        expected = some(rng, int(rng.integers(1, 20)))
+        order = rng.permutation(len(expected))
+        found = expected[order]
+        assert sorted(assert_detections(found, expected, **limit)) == [
+            (i, int(j)) for i, j in enumerate(order)]
+        gone = int(rng.integers(len(found)))
+        fewer = found[np.arange(len(found)) != gone]
+        place = "at ({:.2f}, {:.2f}".format(*found.boxes[gone, :2])
+        for a, b, word, allowed in ((fewer, expected, "missing", "max_missing"),
+                                    (expected, fewer, "extra", "max_extra")):
+            with pytest.raises(AssertionError) as error:
+                assert_detections(a, b, **limit)
+            lines = [line for line in str(error.value).splitlines()[1:]]
+            assert len(lines) == 1 and f"{word}: " in lines[0] and place in lines[0]
+            assert len(assert_detections(a, b, **limit, **{allowed: 1})) == len(fewer)
+
+
+def test_as_many_pairs_as_possible_and_a_class_is_a_class():
+    """The nearest of the first would leave the second without any."""
+    found = [("Car", [0, 0, 0]), ("Car", [0.9, 0, 0])]
+    assert assert_detections(found, [("Car", [0.8, 0, 0]), ("Car", [1.7, 0, 0])]) == [
+        (0, 0), (1, 1)]
+    cyclist = [("Cyclist", [0, 0, 0]), ("Car", [0.9, 0, 0])]
+    with pytest.raises(AssertionError, match=r"missing: Car .*nearest: Cyclist, 0\.00 m"):
+        assert_detections(cyclist, found)
+    assert_detections(cyclist, found, same_class=False)
+    assert_detections([], [])
+    assert_detections(found, [], max_extra=None)
+
+
+@pytest.mark.parametrize("found, words", [
+    (3, "int is no MarkerArray"), ([("Car", [1, 2])], "list is no MarkerArray"),
+    (["Car"], "is no MarkerArray"),
+])
+def test_what_is_no_detection_is_refused(found, words):
+    with pytest.raises(InputError, match=words):
+        assert_detections(found, [])
+    with pytest.raises(InputError, match="min_iou needs whole boxes"):
+        assert_detections([], [("Car", [1, 2, 3])], min_iou=0.5)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_bag_gives_back_its_arrays(make_bag, storage):
+    truths = [walker_truth(), None, [("Pedestrian", walker_truth().boxes[0])]]
+    path = make_bag([scene(i) for i in range(3)], truths, storage=storage, points="/front", hz=5.0)
+    assert [p.suffix for p in path.iterdir() if p.name != "metadata.yaml"] == [
+        {"mcap": ".mcap", "sqlite3": ".db3"}[storage]]
+    with Bag(path) as bag:
+        clouds = [to_frame(m, 1.0)[0] for _, _, m in bag.messages({"/front"})]
+    assert [np.array_equal(c.xyz, scene(i)[:, :3]) for i, c in enumerate(clouds)] == [True] * 3
+    assert np.array_equal(clouds[0].intensity, scene(0)[:, 3])
+    assert np.diff([c.stamp_ns for c in clouds]).tolist() == [2 * 10**8] * 2
+    frames = open_recording(make_bag([scene(0)[:, :3]] * 3, truths, storage=storage))
+    assert [frame.truth() is not None for frame in frames] == [True, False, True]
+    np.testing.assert_allclose(frames.frames[2].truth().boxes, walker_truth().boxes)
+
+
+@pytest.mark.parametrize("clouds, labels, options, words", [
+    ([np.zeros((5, 2))], None, {}, r"cloud 0 has shape \(5, 2\)"),
+    ([scene()], [], {}, "1 clouds and labels of 0"),
+    ([scene()], [[("Dragon", [0] * 7)]], {}, "'Dragon' is none of Car"),
+    ([scene()], [[("Car", [0] * 3)]], {}, "whole boxes"),
+    ([scene()], None, {"storage": "tape"}, "'tape' is none of mcap, sqlite3"),
+])
+def test_a_bag_that_cannot_be_made_is_refused_by_name(make_bag, clouds, labels, options, words):
+    with pytest.raises(InputError, match=words):
+        make_bag(clouds, labels, **options)
+
+
+def test_a_cloud_message_holds_its_columns():
+    ring = np.arange(3400, dtype=np.uint16) % 64
+    points = to_array(cloud_message(scene(), 7, ring=ring))
+    assert np.array_equal(points["ring"], ring) and points.dtype["ring"] == np.uint16
+    assert np.array_equal(points["intensity"], scene()[:, 3])
+    with pytest.raises(InputError, match="must be"):
+        cloud_message(np.zeros(3))
+
+
+def test_without_launch_it_says_what_is_missing(monkeypatch):
+    for module in ("launch", "launch_testing", "launch_testing.actions", "launch.actions"):
+        monkeypatch.setitem(__import__("sys").modules, module, None)
+    for call in description, launch_file:
+        with pytest.raises(InputError, match=r"launch.* is not installed; it comes with ROS 2"):
+            call()
