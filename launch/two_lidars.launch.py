@@ -15,6 +15,7 @@ from launch import LaunchDescription
 GRAPH = Path(__file__).resolve().parent / "detectors.launch.py"
 SIDES = ("left", "right")
 SHARED = {"detectors": "candidates", "single": "false", "rviz": "false", "rviz_frame": "",
+          "base_frame": "", "target_frame": "", "odometry": "",
           "use_sim_time": "false", "log_level": "info"}
 
 

@@ -184,7 +184,6 @@ class SeedInput:
                                            else moved_boxes(people, level)))
 
     def _on_click(self, msg: Any) -> None:
-        self.node.transforms.listen()  # it may be in any frame
         self.click, self.clicked = msg, None
 
     def _from_click(self, header: Any, segmented: Segmented) -> Seed:

@@ -37,6 +37,12 @@ ARGUMENTS = {
     "points": dict(default_value=relative(POINTS), description="The cloud's topic."),
     "reliability": dict(default_value="", description="auto, reliable or best_effort, for the "
                         "parameter input.reliability; empty: that of the parameter file."),
+    "base_frame": dict(default_value="", description="Parameter base_frame: the mounting comes "
+                       "from TF; empty: that of the parameter file."),
+    "target_frame": dict(default_value="", description="Parameter target_frame: of the boxes that "
+                         "go out; empty: that of the parameter file."),
+    "odometry": dict(default_value="", description="Topic of a nav_msgs/Odometry by which clouds "
+                     "are moved to their stamp (input.deskew); empty: that of the parameter file."),
     "config": dict(default_value="", description="Parameter file of all nodes; empty: "
                    "config/*.param.yaml of each detector."),
     "experts": dict(default_value="", description="Of ground and clusters: a parameter file, or "
@@ -89,8 +95,9 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
         namespace=value["namespace"] or None, output="screen",
         parameters=[files[node.removeprefix(prefix)],
                     _given(value, node.removeprefix(prefix), detectors)],
-        remappings=[(a, value["points"] if b == relative(POINTS) else b)
-                    for a, b in remap.items()],
+        remappings=[*((a, value["points"] if b == relative(POINTS) else b)
+                      for a, b in remap.items()),
+                    *([("~/input/odometry", value["odometry"])] if value["odometry"] else [])],
         ros_arguments=["--log-level", value["log_level"]],
     ) for node, remap in graph.items()]
 
@@ -188,6 +195,9 @@ def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, 
     given: dict[str, Any] = {"use_sim_time": value["use_sim_time"] == "true"}
     if value["reliability"]:
         given["input.reliability"] = value["reliability"]
+    if value["odometry"]:
+        given["input.deskew"] = "odometry"
+    given |= {name: value[name] for name in ("base_frame", "target_frame") if value[name]}
     detector = node.removesuffix("_detector")
     if detector in NETWORKS:
         weights = _weights(value["weights"], [d for d in detectors if d in NETWORKS])

@@ -168,6 +168,8 @@ class Transforms:
     def to_level(self, header: Any, frame_id: str) -> np.ndarray:
         """(4, 4): takes points of a frame to the level frame of a cloud with this header. Missing
         where TF does not connect them."""
+        if frame_id not in ("", header.frame_id):
+            self.listen()
         pose = self.tree.lookup(header.frame_id, frame_id or header.frame_id, to_ns(header.stamp))
         level = self.placing(header).level
         return pose if level is None else level @ pose
@@ -230,6 +232,8 @@ class Transforms:
         if not len(indices):
             return msg
         times = point_times(msg, indices)
+        if not times.seconds.any():
+            return msg  # corrected already
         if np.isnan(times.seconds).any():
             kept = np.flatnonzero(np.isfinite(times.seconds))
             indices, frame = indices.take(kept), frame.take(kept)

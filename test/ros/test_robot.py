@@ -29,7 +29,7 @@ def cloud(drive_bag):
 def test_a_cropped_cloud_over_dds_is_the_cropped_frame_offline(processes, peer, cloud):
     """Candidates equal those of the offline pipeline with the same parameters; what is cropped is
     not in view. A parameter that was empty can be set while the node runs, with whole numbers."""
-    values = {"crop.body": [-2, -1, -1.6, 3, 1, 0.5], "crop.min_range": 3.0,
+    values = {"crop.body": [-2, -1, -2, 3, 1, 1], "crop.min_range": 3.0,
               "crop.sectors": [60.0, 300.0], "crop.max_range": 40.0}
     params = with_values(PipelineParams(), values)
     processes.start("perception", {"~/input/points": "/in"}, values)
