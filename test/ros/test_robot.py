@@ -1,4 +1,4 @@
-"""What belongs to the robot, over DDS: the crop before everything."""
+"""What belongs to the robot, over DDS: the crop before everything, and TF as others publish it."""
 
 from __future__ import annotations
 
@@ -7,16 +7,22 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from test_robot_frames import PERIOD, START, WALKING, message, mounted, transforms, walker
+
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import fixed_seed
 from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.data.bag import Bag
+from lidar_perception.nodes.transforms import STATIC_QOS
 from lidar_perception.param_fields import with_values
+from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import column, to_detections, to_frame
 from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import from_marker_array
+from msg_utils.stamps import header_message
 
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
 
 
@@ -55,3 +61,34 @@ def test_a_cropped_cloud_over_dds_is_the_cropped_frame_offline(processes, peer, 
     peer.send(talker, cloud, lambda: not column(clouds[-1], "in_view", everything).any(),
               "a cloud of which nothing is left")
     peer.wait(lambda: "crop.* leaves none" in peer.message_of("ground_segmentation"), "the reason")
+
+
+def test_a_tilted_sensor_gets_its_mounting_from_tf(processes, peer):
+    """By /tf_static and /tf as others publish them: the network's boxes in odom are those of a
+    level sensor, moved as the robot has moved; the cloud waits for a transform that is late."""
+    pytest.importorskip("tf2_msgs", reason="the wheels of the pip environment lack tf2_msgs")
+    base, moved = mounted(0.5, 0.2, 1.7, 0.0, 0.3, -0.2), mounted(30.0, -4.0, 0.0, 0.0, 0.0, 0.0)
+    xyz, person = walker(base)
+    processes.start("perception", {"~/input/points": "/in"}, {
+        **WALKING, "base_frame": "base", "target_frame": "odom"})
+    static = peer.talker("/tf_static", TF_MESSAGE, STATIC_QOS)
+    static.publish(encode(transforms(("base", "lidar", base, 0))))
+    moving = peer.talker("/tf", TF_MESSAGE)
+    click = peer.talker("/clicked_point", "geometry_msgs/msg/PointStamped")
+    found = peer.listen("/perception/output/detections", MARKERS)
+    talker = peer.talker("/in", CLOUD)
+    at = (person + moved[:3, 3]).tolist()
+    peer.send(click, bag_message(
+        "geometry_msgs/msg/PointStamped", header=header_message(START, "odom", bag_message),
+        point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at)))),
+        click.get_subscription_count, "a subscriber of the click")
+    early, late = (transforms(("odom", "base", moved, START + i * PERIOD)) for i in (-1, 1))
+    peer.send(moving, early, moving.get_subscription_count, "a subscriber of /tf")
+    peer.send(talker, message(xyz), lambda: "waits for the newest transform of 'odom' -> 'base'"
+              in peer.message_of("perception") or found, "the cloud to wait")
+    peer.send(moving, late, lambda: found and len(from_marker_array(found[-1])) == 1,
+              "the person, in a cloud that has waited")
+    objects = from_marker_array(found[-1])
+    assert (objects.frame_id, objects.stamp_ns) == ("odom", START)
+    np.testing.assert_allclose(objects.boxes[0, :2], at[:2], atol=0.3)
+    assert abs(objects.boxes[0, 2] - objects.boxes[0, 5] / 2) < 0.1  # it stands on the floor
