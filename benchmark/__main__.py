@@ -21,6 +21,7 @@ from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, print_planes
 from benchmark.simulation import measure_simulation
 from benchmark.timing import spread
+from benchmark.tracking import measure_recording, print_tracking
 from lidar_perception.candidates.segmented import points_in_view
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, Frame, Recording
@@ -41,7 +42,8 @@ FEW = 3              # frames with a pedestrian, below which those without serve
 @click.command(context_settings=dict(help_option_names=["-h", "--help"]))
 @click.option("--data", type=click.Path(path_type=Path), required=True, metavar="PATH",
               multiple=True, help="A recording with Pedestrian labels and a camera, such as KITTI. "
-              "A second one, with labelled points (SemanticKITTI), scores the ground methods too.")
+              "A second one, with labelled points (SemanticKITTI), scores the ground methods too, "
+              "and one with track ids (KITTI tracking) the trackers.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Write the figures to this file.")
 @click.option("--repeat", type=click.IntRange(1), default=5, show_default=True,
@@ -89,6 +91,10 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     if labelled:
         content["ground_scores"] = ground.measure_labelled(labelled, repeat)
         print_ground(content["ground_scores"])
+    for each in recordings:
+        if drives := measure_recording(each):
+            content["tracking"] = drives
+            print_tracking(drives)
     content["simulation"] = measure_simulation(count, repeat)
     print_measured(content["simulation"])
     if graph:

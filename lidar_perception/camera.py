@@ -8,6 +8,10 @@ import numpy as np
 from numba import njit
 from scipy.spatial.transform import Rotation
 
+from lidar_perception.types import InputError
+
+MOST_PIXELS = 1 << 20  # of a side of an image
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -17,6 +21,12 @@ class Camera:
     projection: np.ndarray
     width: int
     height: int
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.projection).all() and 0 < self.width < MOST_PIXELS
+                and 0 < self.height < MOST_PIXELS):
+            raise InputError("the camera's calibration has a number that is not finite, or an "
+                             f"image of {self.width} x {self.height} pixels; calibrate it again")
 
     @staticmethod
     def of(intrinsics: np.ndarray, rotation: np.ndarray, translation: np.ndarray, width: int,
@@ -35,8 +45,9 @@ class Camera:
         lidar_to_camera = np.eye(4)
         lidar_to_camera[:3, :3] = Rotation.from_quat(rotation).as_matrix()
         lidar_to_camera[:3, 3] = translation
-        return Camera(np.asarray(intrinsics, float).reshape(3, 4) @ lidar_to_camera, int(width),
-                      int(height))
+        with np.errstate(invalid="ignore", over="ignore"):  # Camera checks it
+            projection = np.asarray(intrinsics, float).reshape(3, 4) @ lidar_to_camera
+        return Camera(projection, int(width), int(height))
 
     def in_view(self, xyz: np.ndarray) -> np.ndarray:
         """(N,) bool: points (N, 3) in front of the camera that fall into the image."""

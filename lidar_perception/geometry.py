@@ -6,9 +6,10 @@ import math
 
 import numpy as np
 from numba import njit
+from numpy.typing import ArrayLike
 
 
-def wrap_angle(angle):
+def wrap_angle(angle: ArrayLike) -> np.ndarray:
     """The same angle in [-pi, pi)."""
     wrapped = (np.asarray(angle) + np.pi) % (2 * np.pi) - np.pi
     return np.where(wrapped >= np.pi, -np.pi, wrapped)[()]  # a hair below -pi rounds to pi

@@ -39,11 +39,21 @@ def groups_of(ids: np.ndarray, min_points: int = 1) -> Groups:
                   ordered[first[kept]].astype(np.int64))
 
 
+def cluster_count(labels: np.ndarray) -> int:
+    """K of labels (N,), 1..K for the clusters, where arrays of K rows are made. InputError if K is
+    larger than N, which renumbered() prevents: an id must not say how much memory is taken."""
+    count = int(labels.max(initial=0))
+    if count > len(labels):
+        raise InputError(f"a cluster has the id {count}, but there are {len(labels)} points; "
+                         "number the clusters 1, 2, ... without gaps")
+    return count
+
+
 def group_points(xyz: np.ndarray, labels: np.ndarray,
                  wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """points (M, 3) of the clusters `wanted` (K,), each named once, one cluster after the other,
     and start (K + 1,) where each begins. labels (N,) are 0 for none, 1..N at most."""
-    place = np.full(int(labels.max(initial=0)) + 1, -1)
+    place = np.full(cluster_count(labels) + 1, -1)
     place[wanted] = np.arange(len(wanted))
     group = place[labels]
     members = np.flatnonzero(group >= 0)

@@ -46,6 +46,7 @@ def param(default: Any, doc: str, *, unit: str = "", low: float | None = None,
     return field(default=default, metadata=metadata)
 
 
+@dataclasses.dataclass(frozen=True)
 class Params:
     """Base of all parameter groups: checks types and ranges on construction."""
 
@@ -59,7 +60,7 @@ class Params:
         """Conditions between fields; raise ValueError."""
 
 
-def _checked(f: dataclasses.Field, value: Any) -> Any:
+def _checked(f: dataclasses.Field[Any], value: Any) -> Any:
     """value with the type of the field's default, or ValueError naming field, value and range."""
     default, limits = f.default, f.metadata
     if isinstance(default, tuple):
@@ -72,7 +73,7 @@ def _checked(f: dataclasses.Field, value: Any) -> Any:
     return value
 
 
-def _scalar(f: dataclasses.Field, kind: type, value: Any) -> Any:
+def _scalar(f: dataclasses.Field[Any], kind: type[Any], value: Any) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**63 else math.copysign(math.inf, value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
@@ -87,7 +88,7 @@ def _scalar(f: dataclasses.Field, kind: type, value: Any) -> Any:
     return value
 
 
-def _walk(params: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field]]:
+def _walk(params: Any, prefix: str = "") -> Iterator[tuple[str, Any, dataclasses.Field[Any]]]:
     """(dotted name, value, field) of every number in a group, or a dataclass of groups."""
     for f in fields(params):
         value = getattr(params, f.name)
@@ -102,13 +103,13 @@ def flatten(params: Any) -> dict[str, Any]:
     return {name: value for name, value, _ in _walk(params)}
 
 
-def parameter_fields(params: Any) -> dict[str, dataclasses.Field]:
+def parameter_fields(params: Any) -> dict[str, dataclasses.Field[Any]]:
     """{'clustering.dbscan.eps': Field, ...}: metadata, and params' values as defaults, named as in
     flatten."""
     return {name: _with_default(f, value) for name, value, f in _walk(params)}
 
 
-def _with_default(f: dataclasses.Field, value: Any) -> dataclasses.Field:
+def _with_default(f: dataclasses.Field[Any], value: Any) -> dataclasses.Field[Any]:
     if f.default == value:
         return f
     changed = copy.copy(f)

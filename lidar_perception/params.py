@@ -9,6 +9,8 @@ dataclass is made, with the name, the value and the range in the message.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Self
 
 from lidar_perception.candidates.params import (
     ConfidenceParams,
@@ -22,6 +24,7 @@ from lidar_perception.clustering.params import BoxParams, ClusteringParams
 from lidar_perception.ground.params import GroundParams, ObstacleParams
 from lidar_perception.param_fields import Params, param
 from lidar_perception.robot.params import CropParams
+from lidar_perception.tracking.params import EgoParams, TrackingParams, tracking_of
 from lidar_perception.wire.params import InputParams, ViewParams
 
 
@@ -69,6 +72,22 @@ class MarkerParams(Params):
 
 
 @dataclass(frozen=True)
+class TrackMarkerParams(MarkerParams):
+    """Boxes, and the ways of tracks."""
+
+    trail: float = param(2.0, "The way of a track is drawn for this time; 0 draws none.", unit="s",
+                         low=0.0, high=60.0)
+
+
+@dataclass(frozen=True)
+class OptionalTracking(TrackingParams):
+    """Tracks in one process with a detector."""
+
+    enabled: bool = param(False, "Publish tracks of what is detected, too, on ~/output/tracks.",
+                          fixed=True)
+
+
+@dataclass(frozen=True)
 class CloudNodeParams(Params):
     """What a node that takes clouds has besides the numbers of its algorithm."""
 
@@ -97,10 +116,38 @@ class GroundRobotParams(CloudNodeParams):
 
 
 @dataclass(frozen=True)
-class PerceptionRobotParams(BoxNodeParams):
+class DetectionNodeParams(BoxNodeParams):
+    """What a node that detects objects in clouds has besides."""
+
+    output: TrackMarkerParams = TrackMarkerParams()
+    tracking: OptionalTracking = OptionalTracking()
+    ego: EgoParams = EgoParams()
+
+    @classmethod
+    def of(cls, detector: str) -> Self:
+        """With the tracker's numbers for a detector."""
+        return cls(tracking=OptionalTracking(**vars(tracking_of(detector))))
+
+
+@dataclass(frozen=True)
+class PerceptionRobotParams(DetectionNodeParams):
     """What perception has besides."""
 
     obstacles: ObstacleParams = ObstacleParams()
+
+
+CANDIDATES, POINTPILLARS, POINTNET = (partial(DetectionNodeParams.of, name)
+                                      for name in ("candidates", "pointpillars", "pointnet"))
+PERCEPTION = partial(PerceptionRobotParams.of, "candidates")
+
+
+@dataclass(frozen=True)
+class TrackInputParams(CloudNodeParams):
+    """What the tracker has besides its numbers. Each detection counts, so some may wait, and each
+    waits a little for its pose."""
+
+    input: ReceptionParams = ReceptionParams(queue=10, max_wait=0.2)
+    output: TrackMarkerParams = TrackMarkerParams()
 
 
 # Each node declares the groups of its own stages, under the same names.
@@ -129,6 +176,12 @@ class RefinementNodeParams:
     resolution: ResolutionParams = ResolutionParams()
     confidence: ConfidenceParams = ConfidenceParams()
     seed: SeedParams = SeedParams()
+
+
+@dataclass(frozen=True)
+class TrackerNodeParams:
+    tracking: TrackingParams = TrackingParams()
+    ego: EgoParams = EgoParams()
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,12 @@ Frames follow REP-103 (x forward, y left, z up; metres, radians); boxes are
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidar_perception.classes import CLASSES, PEDESTRIAN
 
@@ -70,7 +73,8 @@ class Detections:
     scores: np.ndarray
 
     @staticmethod
-    def of(boxes, class_ids=PEDESTRIAN, scores=1.0) -> Detections:
+    def of(boxes: ArrayLike, class_ids: ArrayLike = PEDESTRIAN,
+           scores: ArrayLike = 1.0) -> Detections:
         """Detections with dtypes and shapes put right; class_ids and scores may be scalars."""
         boxes = np.ascontiguousarray(boxes, np.float32).reshape(-1, 7)
         count = len(boxes)
@@ -84,7 +88,7 @@ class Detections:
     def __len__(self) -> int:
         return len(self.boxes)
 
-    def __getitem__(self, index) -> Detections:
+    def __getitem__(self, index: np.ndarray | slice) -> Detections:
         """The detections under a mask, slice or index array."""
         return Detections(self.boxes[index], self.class_ids[index], self.scores[index])
 
@@ -100,11 +104,12 @@ class GroundTruth:
 
     boxes: np.ndarray
     class_ids: np.ndarray
-    extras: tuple[dict, ...]
-    notes: tuple[tuple[str, dict], ...] = ()
+    extras: tuple[dict[str, Any], ...]
+    notes: tuple[tuple[str, dict[str, Any]], ...] = ()
 
     @staticmethod
-    def of(boxes, class_ids, extras=None, notes=()) -> GroundTruth:
+    def of(boxes: ArrayLike, class_ids: ArrayLike, extras: Iterable[dict[str, Any]] | None = None,
+           notes: Iterable[tuple[str, dict[str, Any]]] = ()) -> GroundTruth:
         boxes = np.asarray(boxes, np.float64).reshape(-1, 7)
         extras = tuple({} for _ in boxes) if extras is None else tuple(extras)
         return GroundTruth(boxes, np.asarray(class_ids, np.int32).reshape(len(boxes)), extras,

@@ -39,8 +39,8 @@ class MarkedObjects:
     labels: list[str]
     scores: np.ndarray
     ids: np.ndarray
-    extras: list[dict]
-    notes: list[tuple[str, dict]] = field(default_factory=list)
+    extras: list[dict[str, Any]]
+    notes: list[tuple[str, dict[str, Any]]] = field(default_factory=list)
     stamp_ns: int = 0
     frame_id: str = ""
 
@@ -48,11 +48,13 @@ class MarkedObjects:
         return len(self.boxes)
 
 
-def to_marker_array(boxes: np.ndarray, labels: Sequence[str], scores: Sequence[float] | None = None,
-                    *, header: Any, make: Any, ids: Sequence[int] | None = None,
-                    extras: Sequence[dict] | None = None,
-                    notes: Iterable[tuple[str, dict]] = (),
-                    previous: Iterable[tuple[str, int]] = (), color: tuple | None = None,
+def to_marker_array(boxes: np.ndarray, labels: Sequence[str],
+                    scores: Sequence[float] | np.ndarray | None = None, *, header: Any, make: Any,
+                    ids: Sequence[int] | np.ndarray | None = None,
+                    extras: Sequence[dict[str, Any]] | None = None,
+                    notes: Iterable[tuple[str, dict[str, Any]]] = (),
+                    previous: Iterable[tuple[str, int]] = (),
+                    color: tuple[float, float, float] | None = None,
                     lifetime_ns: int = 0) -> Any:
     """MarkerArray of K boxes. ids default to 0..K-1; previous is marker_keys() of the array
     before this one; color (r, g, b) overrides the label's; lifetime 0 means for ever."""
@@ -61,7 +63,9 @@ def to_marker_array(boxes: np.ndarray, labels: Sequence[str], scores: Sequence[f
     lifetime = duration_message(lifetime_ns, make)
     empty = box_pose(np.zeros(7), make)  # with a unit quaternion
 
-    def marker(ns, index, action, text, pose=empty, scale=(0, 0, 0), rgb=OTHER_COLOR):
+    def marker(ns: str, index: int, action: int, text: str, pose: Any = empty,
+               scale: Iterable[float] = (0, 0, 0),
+               rgb: tuple[float, float, float] = OTHER_COLOR) -> Any:
         x, y, z = map(float, scale)
         r, g, b = rgb
         return make("visualization_msgs/msg/Marker", header=header, ns=ns, id=int(index),
@@ -127,7 +131,7 @@ def _box(m: Any) -> list[float]:
     return [p.x, p.y, p.z, s.x, s.y, s.z, pose_yaw(m.pose)]
 
 
-def _content(text: str) -> dict:
+def _content(text: str) -> dict[str, Any]:
     try:
         content = json.loads(text) if text else {}
     except json.JSONDecodeError:

@@ -11,7 +11,7 @@ import numpy as np
 
 
 @functools.cache
-def message_class(type_name: str) -> type:
+def message_class(type_name: str) -> type[Any]:
     """'sensor_msgs/msg/PointCloud2' -> class. ModuleNotFoundError where ROS has no such package."""
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)

@@ -3,7 +3,7 @@ count, endianness and row padding."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -107,18 +107,17 @@ def from_array(points: np.ndarray, header: Any, make: Any, *, height: int = 1,
     if width * height != len(points):
         raise ValueError(f"{len(points)} points do not make {height} rows")
     data = np.ascontiguousarray(points).view(np.uint8).reshape(-1)
-    orders = {points.dtype[n].base.byteorder for n in points.dtype.names} - {"|"}
+    orders = {points.dtype[n].base.byteorder for n in points.dtype.names or ()} - {"|"}
     if len(orders) > 1:
         raise ValueError("fields of both byte orders do not fit into one cloud")
     return _cloud(header, make, point_fields(points.dtype, make), data, height=height, width=width,
                   point_step=points.dtype.itemsize, is_bigendian=">" in orders, is_dense=is_dense)
 
 
-def point_fields(dtype: np.dtype, make: Any) -> list:
+def point_fields(dtype: np.dtype, make: Any) -> list[Any]:
     """PointField messages of a structured dtype."""
     fields = []
-    for name in dtype.names:
-        kind, offset = dtype.fields[name][:2]
+    for name, (kind, offset, *_) in (dtype.fields or {}).items():
         code = CODES.get(f"{kind.base.kind}{kind.base.itemsize}")
         if code is None:
             raise ValueError(f"field '{name}' of type {kind} has no PointField datatype")
@@ -134,7 +133,7 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
     already with the same datatype is overwritten. Shape, density and byte order stay as they are.
     """
     old = to_array(msg)
-    order = ">" if msg.is_bigendian else "<"
+    order: Literal[">", "<"] = ">" if msg.is_bigendian else "<"
     fields, offset = list(msg.fields), msg.point_step
     names = {f.name: f for f in fields}
     places = {}
@@ -166,7 +165,7 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
                   point_step=step, is_bigendian=msg.is_bigendian, is_dense=msg.is_dense)
 
 
-def _cloud(header: Any, make: Any, fields: list, data: np.ndarray, *, height: int, width: int,
+def _cloud(header: Any, make: Any, fields: list[Any], data: np.ndarray, *, height: int, width: int,
            point_step: int, is_bigendian: bool, is_dense: bool) -> Any:
     return make("sensor_msgs/msg/PointCloud2", header=header, height=height, width=width,
                 fields=fields, is_bigendian=is_bigendian, point_step=point_step,

@@ -27,7 +27,7 @@ from lidar_perception.candidates.seed_sources import truth_seed
 from lidar_perception.candidates.seeds import Seed
 from lidar_perception.candidates.silhouette import silhouettes, similarity
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.groups import group_points
 from lidar_perception.runs.files import write_text
 from lidar_perception.scoring.centres.matching import match_centres, range_bins
@@ -59,7 +59,7 @@ def samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | None:
 
 def seed_of(job: tuple[str, int]) -> Seed | None:
     """The nearest pedestrian of a frame, as in the paper's protocol."""
-    frame = open_kitti(job[0])[job[1]]
+    frame = open_recording(job[0]).frames[job[1]]
     try:
         segmented = segment(frame.load(), frame.camera(), BEST)
         return truth_seed(frame.truth().of_class(PEDESTRIAN))(segmented)
@@ -100,11 +100,11 @@ def fit(features: dict[str, np.ndarray], hit: np.ndarray, weight: np.ndarray,
 def work(job: tuple[tuple[str, int], Seed]) -> dict | None:
     """samples() of one frame, in a process of its own."""
     (root, number), seed = job
-    return samples(open_kitti(root)[number], seed, BEST)
+    return samples(open_recording(root).frames[number], seed, BEST)
 
 
 def main(roots: list[str]) -> None:
-    jobs = [(root, i) for root in roots for i in range(len(open_kitti(root)))]
+    jobs = [(root, i) for root in roots for i in range(len(open_recording(root).frames))]
     with Pool() as pool:
         seeds = pool.map(seed_of, jobs, chunksize=8)
         others = [next(s for s in seeds[i + 1:] + seeds[:i + 1] if s is not None)

@@ -45,8 +45,8 @@ ROWS = (("bev_relaxed", "from above"), ("bev", "from above"), ("3d_relaxed", "in
 def scores_of(weights: Path, folder: Path) -> dict[str, Any]:
     """What evaluate detection finds, as JSON."""
     report = DetectionReport()
-    fill(report, open_recording(folder), by_detector(partial(open_detector, weights,
-                                                             min_score=MIN_SCORE)))
+    open_ = partial(open_detector, weights, min_score=MIN_SCORE)
+    fill(report, open_recording(folder), partial(by_detector, open_, 1.0, None))
     return report.compute()
 
 

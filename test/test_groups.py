@@ -10,7 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from samples import each_make, header
 
-from lidar_perception.groups import group_points, groups_of, renumbered
+from lidar_perception.candidates.accumulation import Accumulated, velocities
+from lidar_perception.clustering.shapes import ellipses, oriented_boxes
+from lidar_perception.groups import cluster_count, group_points, groups_of, renumbered
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import cluster_column
 from msg_utils.point_cloud2 import from_array
@@ -85,3 +87,18 @@ def test_the_column_of_a_cloud_is_read_at_the_places_asked_for(make):
     labels, numbers = cluster_column(msg, np.array([1, 2, 3]))
     assert labels.tolist() == [2, 0, 1] and numbers.tolist() == [9, 4_000_000_000]
     assert cluster_column(from_array(cloud[["x"]].copy(), header(make), make), np.arange(5)) is None
+
+
+@pytest.mark.parametrize("size_by_id", [
+    cluster_count, lambda ids: oriented_boxes(np.zeros((len(ids), 3), np.float32), ids, "min_area"),
+    lambda ids: ellipses(np.zeros((len(ids), 3), np.float32), ids),
+    lambda ids: group_points(np.zeros((len(ids), 3)), ids, np.array([1])),
+    lambda ids: velocities(Accumulated(np.zeros((len(ids), 3)), np.zeros(len(ids))), ids)],
+    ids=["cluster_count", "oriented_boxes", "ellipses", "group_points", "velocities"])
+def test_where_rows_are_counted_by_the_largest_id_it_takes_no_memory(size_by_id):
+    size_by_id(np.array([0, 1, 2, 3, 3], np.int32))
+    tracemalloc.start()
+    with pytest.raises(InputError, match="without gaps"):
+        size_by_id(np.array([0, 1, 2, 3, 2**31 - 1], np.int32))
+    assert tracemalloc.get_traced_memory()[1] < 1e6
+    tracemalloc.stop()

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lidar_perception.groups import cluster_count
+
 MIN_SCANS = 3       # in which a cluster is seen, before its motion is measured
 STILL_SPEED = 0.5   # m/s; slower is standing
 MAX_SPEED = 4.0     # m/s; faster is no person, and rather a wrong match
@@ -41,7 +43,7 @@ def velocities(points: Accumulated, labels: np.ndarray) -> np.ndarray:
     """(K, 2) velocity over the ground in x and y, m/s, of clusters 1..K of labels (M,): the slope
     of their centroids over time, which fits whatever part of them is seen. 0 where a cluster is in
     fewer than three scans, stands, or is faster than a person."""
-    clusters = int(labels.max(initial=0))
+    clusters = cluster_count(labels)
     ages, scan = np.unique(points.age, return_inverse=True)
     cell = (labels - 1) * len(ages) + scan
     inside = labels > 0

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import json
 from importlib.resources import files
+from typing import Any
 
 import numpy as np
 from numba import njit
@@ -81,7 +82,7 @@ def confidence(shape: dict[str, np.ndarray], similarity: np.ndarray | None = Non
     seed and height_difference (K,) in metres, from these too. The probability is that of the
     simulated scans, where pedestrians are as far away as in KITTI's labels (paper A, Table 1)."""
     features = dict(shape)
-    if similarity is not None:
+    if similarity is not None and height_difference is not None:
         features.update(similarity=similarity, height_difference_m=np.abs(height_difference))
     model = _models()["shape" if similarity is None else "seed"]
     odds = np.full(len(shape["range_m"]), model["bias"])
@@ -91,7 +92,7 @@ def confidence(shape: dict[str, np.ndarray], similarity: np.ndarray | None = Non
 
 
 @functools.cache
-def _models() -> dict:
+def _models() -> dict[str, Any]:
     return json.loads((files("lidar_perception.candidates") / "confidence.json").read_text())
 
 

@@ -70,7 +70,7 @@ def refine(xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray, seed: Seed,
                         for alike in (plain, final))
     t4 = perf_counter()
 
-    def detections(scores, accepted):
+    def detections(scores: np.ndarray, accepted: np.ndarray) -> Detections:
         return Detections.of(boxes[accepted], PEDESTRIAN, scores[accepted])
 
     return Candidates(detections(plain, np.ones(len(kept), bool)),

@@ -96,9 +96,10 @@ def save_seed(seed: Seed, path: str | Path) -> None:
 def load_seed(path: str | Path = "") -> Seed:
     """Read a template; an empty path gives the one that comes with the package (a simulated
     pedestrian). InputError names the file and what is wrong with it."""
-    source = Path(path) if path else files("lidar_perception.candidates") / "pedestrian.json"
+    own = files("lidar_perception.candidates") / "pedestrian.json"
+    source = path or own
     try:
-        content = json.loads(read_text(source, MAX_BYTES) if path else source.read_text())
+        content = json.loads(read_text(path, MAX_BYTES) if path else own.read_text())
         with np.errstate(over="ignore"):  # beyond float32 is inf
             xyz = np.array(content["points_m"], np.float32)
         floor, height = float(content["floor_m"]), float(content["height_m"])

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import click
 
+from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -22,8 +24,9 @@ PASS_ON = dict(ignore_unknown_options=True, help_option_names=[])
 def test(arguments: tuple[str, ...]) -> None:
     """Run the tests of this checkout; ARGUMENTS go to pytest.
 
-    Without ARGUMENTS all of them: first those of the core, on all cores, then those with processes
-    that talk to each other, which would disturb each other, one by one.
+    Without ARGUMENTS ruff, mypy, and all tests: those of the core on all cores, and beside them,
+    one by one, those with processes that talk to each other. The lines that they run are measured,
+    in all processes, and at least as many as setup.cfg says must be.
 
     \b
     Examples:
@@ -32,11 +35,41 @@ def test(arguments: tuple[str, ...]) -> None:
     """
     if arguments:
         sys.exit(_run("test", ["-m", "pytest", *arguments]))
+    failed = [name for name in ("ruff check", "mypy")
+              if _run("test", ["-m", *name.split()])]
+    with tempfile.TemporaryDirectory() as folder:
+        failed += _tests(Path(folder))
+    if failed:
+        errors.print(f"[red]failed:[/] {', '.join(failed)}")
+    sys.exit(bool(failed))
+
+
+def _tests(folder: Path) -> list[str]:
+    """Run all tests, those of nodes beside the others, since they mostly wait. What failed; the
+    measured coverage lies in folder for a while."""
+    environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
+    if sys.version_info >= (3, 12):
+        environment["COVERAGE_CORE"] = "sysmon"  # lines are noticed once, and then cost nothing
+    pytest = [sys.executable, "-m", "pytest", "--cov", "--cov-report="]
+    nodes = [name for name in WITH_PROCESSES if (ROOT / name).is_dir()]
     workers = min(os.cpu_count() or 1, MAX_WORKERS)
-    core = _run("test", ["-m", "pytest", "-n", str(workers), "--dist", "loadfile",
-                         *(f"--ignore={folder}" for folder in WITH_PROCESSES)])
-    rest = _run("test", ["-m", "pytest", *WITH_PROCESSES])
-    sys.exit(core or rest)
+    with (folder / "said").open("w+") as said:
+        beside = subprocess.Popen([*pytest, *nodes], cwd=ROOT, stdout=said,
+                                  stderr=subprocess.STDOUT,
+                                  env={**environment, "COVERAGE_FILE": str(folder / "nodes")})
+        core = subprocess.run([*pytest, "-n", str(workers), "--dist", "loadfile",
+                               *(f"--ignore={name}" for name in nodes)], cwd=ROOT, env=environment)
+        beside.wait()
+        said.seek(0)
+        print(said.read())
+    coverage = [sys.executable, "-m", "coverage"]
+    subprocess.run([*coverage, "combine", "--quiet", "--keep", str(folder / "coverage"),
+                    str(folder / "nodes")], cwd=ROOT, env={**environment, "COVERAGE_FILE":
+                                                           str(folder / "all")})
+    covered = subprocess.run([*coverage, "report"], cwd=ROOT, env={
+        **environment, "COVERAGE_FILE": str(folder / "all")})
+    return [name for name, done in (("tests", core), ("tests of nodes", beside),
+                                    ("coverage", covered)) if done.returncode]
 
 
 @click.command(context_settings=PASS_ON)

@@ -8,29 +8,17 @@ from pathlib import Path
 
 import click
 
-from lidar_perception.cli.data import (
-    a_path,
-    device_option,
-    frame_options,
-    json_option,
-    no_labels,
-    one_way,
-    opened,
-    write_json,
-)
+from lidar_perception.cli.data import Walk, a_path, device_option, no_labels, walk_options
 from lidar_perception.runs.terminal import console, errors
 
 
 @click.command()
-@frame_options
+@walk_options()
 @a_path("--weights", "One more network, PointPillars or PointNet; may be given several times.",
         multiple=True)
-@json_option
 @a_path("--png", "Draw F1 and mean AP against time.")
 @device_option
-def compare(data: Path, split: Path | None, limit: int | None, jobs: int, dask: str | None,
-            weights: tuple[Path, ...], json_file: Path | None, png: Path | None,
-            device: str) -> None:
+def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, device: str) -> None:
     """Run all detectors on the same frames, in turns, and print scores and times side by side.
 
     STM-CPA (`paper` and `best`), PointPillars V0 to V4 in both sizes, PointNet, and their hybrids:
@@ -49,28 +37,23 @@ def compare(data: Path, split: Path | None, limit: int | None, jobs: int, dask: 
     from lidar_perception.scoring.comparison.outcomes import ComparisonReport, by_contenders
     from lidar_perception.scoring.comparison.report import draw_comparison, print_comparison
     from lidar_perception.scoring.kitti.tables import CENTRE_F1
-    from lidar_perception.scoring.run import fill
 
-    where = one_way(jobs, dask)
-    recording = opened(data, split=split)
-    recording.require(BOXES, "compare")
+    recording = walk.opened(BOXES)
     with errors.status("loading detectors"):
         height = recording.frames[0].sensor_height
         found, missing = contenders(weights, device, height)
-    here = jobs == 1 and dask is None
-    start = by_contenders((lambda: found) if here else partial(opened_in_a_process, weights,
-                                                               device, height))
+    open_ = (lambda: found) if walk.here else partial(opened_in_a_process, weights, device, height)
     report = ComparisonReport(found)
-    fill(report, recording, start, limit=limit, title="comparing", **where)
+    walk.fill(report, recording, partial(by_contenders, open_), title="comparing")
     if not report.first.frames:
         raise no_labels(recording, report.skipped)
     centres = report.first.pedestrians.compute()
     content = {
-        "source": str(data), "machine": cpu_name(), "device": device,
+        "source": str(walk.data), "machine": cpu_name(), "device": device,
         "python": platform.python_version(), **report.compute(),
         "pedestrians": {key: centres[key] for key in ("frames", "ground_truth")},
         "missing": [vars(each) for each in missing], "paper_f1": CENTRE_F1}
-    write_json(json_file, content)
+    walk.write(content)
     print_comparison(content, console)
     if png is not None:
         draw_comparison(png, content)

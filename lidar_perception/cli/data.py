@@ -1,9 +1,11 @@
-"""The options of every verb that walks over labelled frames, and how it opens them."""
+"""The options of every verb that walks over labelled frames, and how it opens and scores them."""
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,24 +30,71 @@ split_option = a_path("--split", "Only the frames, or whole sequences, named in 
                       "line.")
 limit_option = click.option("--limit", type=click.IntRange(1), metavar="N",
                             help="Only the first N frames.")
-device_option = click.option("--device", default="auto", help="Where networks run: auto, cpu, "
-                             "cuda. Default: auto.")
+device_option = click.option("--device", default="auto", show_default=True,
+                             help="Where networks run: auto, cpu, cuda or cuda:N.")
 jobs_option = click.option("--jobs", type=click.IntRange(1), default=1, show_default=True,
-                           metavar="N", help="Processes.")
-dask_option = click.option("--dask", metavar="ADDRESS", help="Measure on the workers of the Dask "
-                           "scheduler at this address, such as tcp://10.0.0.1:8786, which see PATH "
-                           "under the same name.")
-
-
+                           metavar="N", help="Number of processes.")
+dask_option = click.option("--dask", metavar="ADDRESS", help="Run on the workers of the Dask "
+                           "scheduler at this address, such as tcp://10.0.0.1:8786. They must see "
+                           "PATH under the same name.")
 json_option = click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
                            help="Write the scores to this file.")
+weights_option = a_path("--weights", "Run the detector of this checkpoint, or one by its name: "
+                        "pointpillars or pointnet, with the weights that come with the package.",
+                        "FILE|NAME")
 
 
-def frame_options(function: Callable) -> Callable:
-    """--data, --split, --limit, --jobs and --dask."""
-    for option in (dask_option, jobs_option, limit_option, split_option, data_option):
-        function = option(function)
-    return function
+@dataclass(frozen=True)
+class Walk:
+    """What the options say of a walk over frames: which ones, where they are measured, and where
+    the scores go."""
+
+    data: Any  # a path, or several
+    split: Path | None
+    limit: int | None
+    jobs: int
+    dask: str | None
+    json_file: Path | None
+
+    @property
+    def here(self) -> bool:
+        """Whether all is done in this process."""
+        return self.jobs == 1 and self.dask is None
+
+    def opened(self, needs: str | None, data: Path | None = None, **how: Any) -> Any:
+        """The recording, or another one at `data`; see opened(). InputError where it has not what
+        the verb needs, of data.frame.BOXES and so on."""
+        recording = opened(data or self.data, split=self.split, **how)
+        if needs is not None:
+            recording.require(needs, click.get_current_context().command_path.partition(" ")[2])
+        return recording
+
+    def fill(self, report: Any, recording: Any, start: Any, title: str = "evaluating") -> None:
+        """See scoring.run.fill."""
+        from lidar_perception.scoring.run import fill
+        fill(report, recording, start, limit=self.limit, jobs=self.jobs, dask=self.dask,
+             title=title)
+
+    def write(self, content: dict) -> None:
+        """Write what was measured, if a file was asked for."""
+        write_json(self.json_file, content)
+
+
+def walk_options(data: Callable = data_option) -> Callable:
+    """Decorator: --data, --split, --limit, --jobs, --dask and --json, which the function gets as
+    walk=Walk(...)."""
+    def decorate(function: Callable) -> Callable:
+        @functools.wraps(function)
+        def wrapper(*args: Any, data, split, limit, jobs, dask, json_file, **kwargs: Any) -> Any:
+            if dask and jobs > 1:
+                raise click.UsageError("--jobs is for this machine, --dask for others: give one of "
+                                       "them")
+            return function(*args, walk=Walk(data, split, limit, jobs, dask, json_file), **kwargs)
+
+        for option in (json_option, dask_option, jobs_option, limit_option, split_option, data):
+            wrapper = option(wrapper)
+        return wrapper
+    return decorate
 
 
 def opened(data: Path, **how: Any) -> Any:
@@ -54,13 +103,6 @@ def opened(data: Path, **how: Any) -> Any:
     recording = open_recording(data, **how)
     errors.print(escape(str(recording)), soft_wrap=True, style="dim")
     return recording
-
-
-def one_way(jobs: int, dask: str | None) -> dict[str, Any]:
-    """jobs and dask as scoring.run takes them; only one of them says where."""
-    if dask and jobs > 1:
-        raise click.UsageError("--jobs is for this machine, --dask for others: give one of them")
-    return {"jobs": jobs, "dask": dask}
 
 
 def write_json(path: Path | None, content: dict) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-import numpy as np
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
@@ -19,9 +18,10 @@ from lidar_perception.cli.evaluate.candidates import view_as_recorded
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.bag_frames import BagFrames
-from lidar_perception.data.frame import BOXES
+from lidar_perception.data.frame import BOXES, Recording
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
+from lidar_perception.groups import renumbered
 from lidar_perception.nodes.graph import cloud_topic, result_topics
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console, errors, track
@@ -29,6 +29,7 @@ from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.wire.messages import column, to_detections, to_frame
 from lidar_perception.wire.topics import TRUTH
+from lidar_perception.wire.track_markers import drawn_trails
 from msg_utils.markers import from_marker_array
 
 
@@ -48,7 +49,8 @@ from msg_utils.markers import from_marker_array
 @parameter_options(PAPER)
 def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float, single: bool,
          real_time: bool, params: PipelineParams) -> None:
-    """Replay a drive through the real nodes over DDS and score the pedestrian candidates.
+    """Replay a drive through the real nodes over DDS and score the pedestrian candidates, and the
+    tracks of them.
 
     Without options: makes a simulated drive with walking pedestrians, writes it as a rosbag2 bag,
     replays it into the nodes, each a process of its own on a private ROS domain, and prints the
@@ -72,7 +74,6 @@ def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float
         warm_up()
     content = replay(drive, clouds, out, params, rate=rate, single=single,
                      real_time=real_time)
-    write_text(out / "scores.json", json.dumps(content, indent=1))
     print_candidate_report(content, console)
     latency = content["latency_ms"]
     slower = content["slower"]
@@ -81,6 +82,8 @@ def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float
     console.print(f"{clouds} clouds replayed at {pace}; {content['results']} results; latency "
                   f"cloud to candidates median {latency['median']:.0f} ms, 95 % under "
                   f"{latency['p95']:.0f} ms; memory of the graph {content['memory_mb']:.0f} MB")
+    content["tracks"] = _print_tracks(out / "result", played)
+    write_text(out / "scores.json", json.dumps(content, indent=1))
     picture = _draw_best(out / "result", out / "birdseye.png", single)
     console.print(f"results in {out}: result (bag), scores.json, logs"
                   + (", birdseye.png" if picture else ""))
@@ -106,13 +109,34 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     return path
 
 
+def _print_tracks(result: Path, played: Recording) -> dict:
+    """Say how many pedestrians were tracked, and how well; the scores."""
+    from lidar_perception.nodes.replay import TRACKS
+    from lidar_perception.scoring.tracking.from_bag import recorded_tracks
+    person = CLASSES[PEDESTRIAN]
+    count, scores, problem = recorded_tracks(result, TRACKS, person,
+                                             next(iter(played)).calibration())
+    text = f"HOTA is not known: {problem}" if scores is None else (
+        f"{scores['true_tracks']} labelled; {scores['switches']} identity switches, HOTA "
+        f"{100 * scores['HOTA']:.1f} (detection {100 * scores['DetA']:.1f}, association "
+        f"{100 * scores['AssA']:.1f})")
+    console.print(f"tracks: {count} of pedestrians, {text}")
+    return {"found": count, "scores": scores}
+
+
 def _draw_best(result: Path, picture: Path, single: bool) -> bool:
-    """Draw the recorded frame with most hits; False if none has a labelled pedestrian."""
+    """Draw the recorded frame with most hits, and the ways of tracks; False if none has a labelled
+    pedestrian."""
+    from lidar_perception.nodes.replay import TRACKS
     from lidar_perception.scoring.pictures import draw_frame
     final = result_topics(single)["final"]
     frames: dict[int, dict] = {}
+    trails: dict[int, dict] = {}
     with Bag(result) as bag:
-        for topic, _, msg in bag.messages({TRUTH, final} & set(bag.topics)):
+        for topic, _, msg in bag.messages({TRUTH, final, TRACKS} & set(bag.topics)):
+            if topic == TRACKS:
+                trails[from_marker_array(msg).stamp_ns] = drawn_trails(msg)
+                continue
             objects = from_marker_array(msg)
             boxes = (to_detections(objects).boxes if topic == final
                      else objects.boxes[[x == CLASSES[PEDESTRIAN] for x in objects.labels]])
@@ -125,10 +149,11 @@ def _draw_best(result: Path, picture: Path, single: bool) -> bool:
         for _, _, msg in bag.messages({cloud_topic(single)}):
             frame, indices = to_frame(msg)
             if frame.stamp_ns == best:
-                ids = column(msg, "cluster_id", indices).astype(np.int32)
+                ids, _ = renumbered(column(msg, "cluster_id", indices))
                 draw_frame(picture, frame.xyz, column(msg, "ground", indices) > 0, ids,
                            frames[best][TRUTH],
-                           frames[best][final], title=f"{hits[best][0]} of {hits[best][1]} "
-                           f"pedestrians found, stamp {best / 1e9:.1f} s")
+                           frames[best][final], trails=trails.get(best, {}),
+                           title=f"{hits[best][0]} of {hits[best][1]} pedestrians found, stamp "
+                           f"{best / 1e9:.1f} s")
                 return True
     return False

@@ -2,54 +2,90 @@
 
 from __future__ import annotations
 
+import functools
 import subprocess
 import sys
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from lidar_perception import __version__
+from lidar_perception.cli.data import a_path, device_option
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.runs.terminal import console
 from lidar_perception.training.params import PointNetTraining, PointPillarsTraining
 
-if TYPE_CHECKING:
-    from lidar_perception.training.data import Batches
-    from lidar_perception.training.run import Progress
-
 PAPER_ABLATION = (75.52, 80.15, 81.33, 83.44, 85.10, 86.33, 86.89, 88.96)  # paper C, Table 5
 
-SCENES_AND_RUN = (
-    click.option("--data", multiple=True, required=True, metavar="DIR|sim",
-                 help="What to train on: a data set or bag, or simulated streets; may be repeated "
-                 "to mix them."),
-    click.option("--val", multiple=True, metavar="DIR|sim",
+OPTIONS = (
+    click.option("--data", multiple=True, required=True, metavar="PATH|sim",
+                 help="What to train on: a data set or bag, or `sim` for simulated streets; may be "
+                 "repeated to mix them."),
+    click.option("--val", multiple=True, metavar="PATH|sim",
                  help="What to validate on. Default: frames held out of --data, and other "
                  "simulated streets."),
-    click.option("--split", type=click.Path(path_type=Path), metavar="FILE",
-                 help="Train on the frames of --data, or whole sequences, that are named in this "
-                 "file, one a line."),
-    click.option("--val-split", type=click.Path(path_type=Path), metavar="FILE",
-                 help="Likewise the frames to validate on."),
-    click.option("--out", type=click.Path(path_type=Path), required=True, metavar="DIR",
-                 help="Folder for best.safetensors, last.safetensors, logs and the state."),
+    a_path("--split", "Train on the frames of --data, or whole sequences, that are named in this "
+           "file, one a line."),
+    a_path("--val-split", "Likewise the frames to validate on."),
+    a_path("--out", "Folder for best.safetensors, last.safetensors, logs and the state.", "DIR",
+           required=True),
     click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one."),
-    click.option("--init", type=click.Path(path_type=Path), metavar="FILE",
-                 help="Start from the weights of this checkpoint, as far as they fit."),
-    click.option("--device", default="auto", show_default=True, help="auto, cpu, cuda or cuda:N."),
+    a_path("--init", "Start from the weights of this checkpoint, as far as they fit."),
+    device_option,
     click.option("--jobs", type=click.IntRange(0), default=2, show_default=True,
-                 help="Processes that prepare scenes; 0: only this one. The result is the "
-                 "same."),
+                 help="Processes that prepare scenes; 0: only this one. The result is the same."),
 )
 
 
-def scene_options(command):
-    """The options of scenes and runs that all networks share."""
-    for option in reversed(SCENES_AND_RUN):
-        command = option(command)
-    return command
+@dataclass(frozen=True)
+class Asked:
+    """What every network is told: what to train and to validate on, and where the run goes."""
+
+    data: tuple[str, ...]
+    val: tuple[str, ...]
+    split: Path | None
+    val_split: Path | None
+    out: Path
+    resume: bool
+    init: Path | None
+    device: str
+    jobs: int
+
+    def scenes(self, params: Any) -> tuple[tuple, tuple]:
+        """Sources to train on and to validate on."""
+        from lidar_perception.training.sources import training_scenes
+        return training_scenes(self.data, self.val, self.split, self.val_split, params.data,
+                               params.seed)
+
+    def train(self, make_task: Callable, config: Any, params: Any, stream: Any, held_out: Any,
+              out: Path, place: Any) -> None:
+        """Train a network on a stream of samples and say how it ended. make_task: the one of its
+        room; held_out: ReadScenes."""
+        from lidar_perception.training.data import Batches
+        from lidar_perception.training.loop import train
+        from lidar_perception.training.ranks import rank, world
+        from lidar_perception.training.sources import about_data
+        batches = Batches(stream, params.batch, self.jobs, rank(), world())
+        about = about_data(self.data, self.val, stream, held_out.sources, self.init)
+        task = make_task(config, params, batches, held_out, out, place, about, commit(), self.init)
+        progress = train(task, params, out, place, self.resume)
+        if rank() == 0:
+            tell(progress, batches, out)
+
+
+def shared_options(function: Callable) -> Callable:
+    """Decorator: the options that all networks share, which the function gets as asked=Asked()."""
+    @functools.wraps(function)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        asked = Asked(**{f.name: kwargs.pop(f.name) for f in fields(Asked)})
+        return function(*args, asked=asked, **kwargs)
+
+    for option in reversed(OPTIONS):
+        wrapper = option(wrapper)
+    return wrapper
 
 
 @click.group()
@@ -58,11 +94,9 @@ def train() -> None:
 
 
 @train.command()
-@scene_options
+@shared_options
 @parameter_options(PointPillarsTraining())
-def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
-                 val_split: Path | None, out: Path, resume: bool, init: Path | None, device: str,
-                 jobs: int, params: PointPillarsTraining) -> None:
+def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
     """PointPillars and EG-PointPillars, on labelled frames, simulated streets, or both.
 
     OUT/best.safetensors holds the weights with the best validation AP so far. Ctrl-C saves and
@@ -79,52 +113,38 @@ def pointpillars(data: tuple[str, ...], val: tuple[str, ...], split: Path | None
     from lidar_perception.detectors.devices import chosen_device
     from lidar_perception.detectors.pointpillars.config import network_config
     from lidar_perception.training.cut_objects import cut_objects
-    from lidar_perception.training.data import Batches, JudgedScenes, RawScenes, Stream
+    from lidar_perception.training.data import ReadScenes, Stream, some_scenes
     from lidar_perception.training.loop import may_begin
-    from lidar_perception.training.loop import train as run
     from lidar_perception.training.pointpillars.task import (
         Preparation,
-        frame_to_judge,
+        frame_to_validate,
         make_task,
         narrowed,
     )
-    from lidar_perception.training.ranks import joined, rank, wait, world
-    from lidar_perception.training.sources import about_data, training_scenes
-    may_begin(out, resume)
-    config = network_config(params.version, params.size)
-    sources, held_out = training_scenes(data, val, split, val_split, params.data, params.seed)
-    with joined(chosen_device(device)) as place:
-        database = None
-        wanted = params.augment
+    from lidar_perception.training.ranks import joined, rank, wait
+    may_begin(asked.out, asked.resume)
+    config, wanted, database = network_config(params.version, params.size), params.augment, None
+    sources, held_out = asked.scenes(params)
+    with joined(chosen_device(asked.device)) as place:
         if wanted.database_scans and wanted.crowded and (
                 wanted.cars or wanted.pedestrians or wanted.cyclists or wanted.things):
-            database = out / "objects.npz"
-            if rank() == 0 and not (resume and database.is_file()):
-                raw = Stream(sources, None, params.seed)
-                scenes = RawScenes(raw).some(wanted.database_scans, jobs)
+            database = asked.out / "objects.npz"
+            if rank() == 0 and not (asked.resume and database.is_file()):
+                scenes = some_scenes(sources, wanted.database_scans, params.seed, asked.jobs)
                 cut_objects(scenes, config.classes, params.data.min_points).save(database)
             wait()
-        seen = narrowed(config, params.ahead, params.aside)
-        stream = Stream(sources, Preparation(seen, params.augment, params.data.min_points,
-                                             database), params.seed)
-        batches = Batches(stream, params.batch, jobs, rank(), world())
-        about = about_data(data, val, stream, held_out, init)
-        task = make_task(config, params, batches, JudgedScenes(held_out, frame_to_judge), out,
-                         place, about, commit(), init)
-        progress = run(task, params, out, place, resume)
-        if rank() > 0:
-            return
-    tell(progress, batches, out)
+        prepare = Preparation(narrowed(config, params.ahead, params.aside), wanted,
+                              params.data.min_points, database)
+        asked.train(make_task, config, params, Stream(sources, prepare, params.seed),
+                    ReadScenes(held_out, frame_to_validate), asked.out, place)
 
 
 @train.command()
-@scene_options
+@shared_options
 @click.option("--ablation", is_flag=True, help="Train every row of the paper's ablation, each into "
               "a folder in --out, and compare them.")
 @parameter_options(PointNetTraining())
-def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
-             val_split: Path | None, out: Path, resume: bool, init: Path | None, device: str,
-             jobs: int, ablation: bool, params: PointNetTraining) -> None:
+def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
     """The cluster network of paper C, on labelled frames, simulated streets, or both.
 
     Scenes are cut into clusters by the package's own ground and clustering; with --data-cache the
@@ -140,70 +160,54 @@ def pointnet(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
           --out ablation
     """
     from lidar_perception.detectors.devices import chosen_device
-    from lidar_perception.detectors.pointnet.config import ABLATIONS
+    from lidar_perception.detectors.pointnet.config import ABLATIONS, pointnet_config
     from lidar_perception.runs.files import make_folder
-    from lidar_perception.training.ranks import joined, rank
-    from lidar_perception.training.sources import training_scenes
-    make_folder(out)  # or say that it cannot be, before the data are prepared
-    scenes = training_scenes(data, val, split, val_split, params.data, params.seed)
-    with joined(chosen_device(device)) as place:
-        for name in ABLATIONS if ablation else (params.network,):
-            folder = out / name if ablation else out
-            if rank() == 0 and ablation:
-                console.print(f"{name}:", style="bold")
-            _train_pointnet(replace(params, network=name), data, val, scenes, folder, resume,
-                            init, place, jobs)
-        if ablation and rank() == 0:
-            print_ablation(out)
-
-
-def _train_pointnet(params: PointNetTraining, data: tuple[str, ...], val: tuple[str, ...],
-                    scenes: tuple[tuple, tuple], out: Path, resume: bool,
-                    init: Path | None, place: Any, jobs: int) -> None:
-    from lidar_perception.detectors.pointnet.config import pointnet_config
-    from lidar_perception.training.data import Batches, JudgedScenes, Stream
+    from lidar_perception.training.data import ReadScenes, Stream
     from lidar_perception.training.loop import may_begin
-    from lidar_perception.training.loop import train as run
     from lidar_perception.training.pointnet.cut_scenes import CutScenes
     from lidar_perception.training.pointnet.task import (
         ClusterPreparation,
-        judged_clusters,
+        clusters_to_validate,
         make_task,
     )
-    from lidar_perception.training.ranks import rank, world
-    from lidar_perception.training.sources import about_data
-    may_begin(out, resume)
-    config = pointnet_config(params.network)
+    from lidar_perception.training.ranks import joined, rank
+    make_folder(asked.out)  # or say that it cannot be, before the data are prepared
+    scenes = asked.scenes(params)
     cache = Path(params.data.cache) / "clusters" if params.data.cache else None
-    sources, held_out = (tuple(CutScenes(source, config, params.data.min_points, cache)
-                               for source in part) for part in scenes)
-    stream = Stream(sources, ClusterPreparation(config, params.augment), params.seed)
-    batches = Batches(stream, params.batch, jobs, rank(), world())
-    task = make_task(config, params, batches, JudgedScenes(held_out, judged_clusters), out,
-                     place, about_data(data, val, stream, held_out, init), commit(), init)
-    progress = run(task, params, out, place, resume)
-    if rank() == 0:
-        tell(progress, batches, out)
+    with joined(chosen_device(asked.device)) as place:
+        for name in ABLATIONS if ablation else (params.network,):
+            out = asked.out / name if ablation else asked.out
+            if rank() == 0 and ablation:
+                console.print(f"{name}:", style="bold")
+            may_begin(out, asked.resume)
+            config = pointnet_config(name)
+            sources, held_out = (tuple(CutScenes(source, config, params.data.min_points, cache)
+                                       for source in part) for part in scenes)
+            prepare = ClusterPreparation(config, params.augment)
+            asked.train(make_task, config, replace(params, network=name),
+                        Stream(sources, prepare, params.seed),
+                        ReadScenes(held_out, clusters_to_validate), out, place)
+        if ablation and rank() == 0:
+            print_ablation(asked.out)
 
 
 def print_ablation(out: Path) -> None:
     """The best of each row beside the paper's mAP on KITTI (Table 5)."""
     from lidar_perception.detectors.checkpoint import read_header
     from lidar_perception.detectors.pointnet.config import ABLATIONS
-    from lidar_perception.scoring.tables import narrow_table
+    from lidar_perception.scoring.tables import narrow_table, number
     table = narrow_table("Ablation, simulated or KITTI frames validated on", "network", "paper mAP",
                          "AP from above", "accuracy", "of objects")
     for name, paper in zip(ABLATIONS, PAPER_ABLATION):
         metrics = read_header(out / name / "best.safetensors").metrics
-        table.add_row(name, f"{paper:.2f}", *(
-            "-" if metrics.get(key) is None else f"{metrics[key]:.1f}"
-            for key in ("score", "accuracy", "object_accuracy")))
+        table.add_row(name, f"{paper:.2f}", *(number(metrics.get(key), digits=1) for key in
+                                              ("score", "accuracy", "object_accuracy")))
     table.caption = ("AP from above: mean of Car, Pedestrian and Cyclist at the overlaps 0.5 / "
                      "0.25 / 0.25, moderate, R40; best weights of each run.")
     console.print(table)
 
 
-def tell(progress: Progress, batches: Batches, out: Path) -> None:
+def tell(progress: Any, batches: Any, out: Path) -> None:
     """Say how a run ended; a stopped one ends the process."""
     if batches.skipped:
         console.print(f"{len(batches.skipped)} scenes could not be used, such as: "

@@ -15,6 +15,7 @@ from scipy.sparse.csgraph import connected_components
 from lidar_perception.clustering.dense import dbscan_by_cells
 from lidar_perception.clustering.growing import dbscan_by_growing
 from lidar_perception.clustering.params import DbscanParams
+from lidar_perception.clustering.thinned import SLACK, patience, thinned
 from lidar_perception.clustering.tree import touching, tree_of
 from lidar_perception.geometry import horizontal_range
 
@@ -95,10 +96,17 @@ def _touching(xyz: np.ndarray, labels: np.ndarray, inner: np.ndarray, outer: np.
     if len(inner) == 0 or len(outer) == 0:
         return np.zeros((0, 2), np.int64)
     rows = np.concatenate([inner, outer])
+    known, label = np.unique(labels[rows], return_inverse=True)
+    side = (np.arange(len(rows)) >= len(inner)).astype(np.int64)
     tree = tree_of(xyz[rows])
-    side = (tree.order >= len(inner)).astype(np.int64)
-    known, label = np.unique(labels[rows[tree.order]], return_inverse=True)
-    return known[touching(tree, label, side, reach * reach)[0]]
+    most_work = patience(len(rows))
+    pairs, work = touching(tree, label[tree.order], side[tree.order], reach * reach, most_work)
+    if work > most_work:
+        kept, _ = thinned(xyz[rows], reach, label)
+        tree = tree_of(xyz[rows[kept]])
+        pairs, _ = touching(tree, label[kept][tree.order], side[kept][tree.order],
+                            (reach * (1 + SLACK)) ** 2)
+    return known[pairs]
 
 
 def dbscan(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray:

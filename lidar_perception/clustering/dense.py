@@ -11,6 +11,7 @@ import numpy as np
 from numba import njit
 
 from lidar_perception.clustering.grid import grid, grown, in_order, near, number_clusters, root
+from lidar_perception.clustering.thinned import SLACK, patience, thinned
 
 
 def dbscan_by_cells(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray:
@@ -20,7 +21,13 @@ def dbscan_by_cells(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarray
     first, second = _neighbour_cells(cell_z, column_start, neighbours)
     x, y, z = in_order(xyz, order)
     core = _core_points(x, y, z, start, first, second, eps * eps, min_samples)
-    return _labels(x, y, z, order, start, first, second, core, eps * eps)
+    cells, most_work = (x, y, z, start, first, second), patience(len(xyz))
+    parent, work = _joined(*cells, core, eps * eps, most_work)
+    if work > most_work:
+        rows, few = np.flatnonzero(core), np.zeros(len(core), bool)
+        few[rows[thinned(np.column_stack([x, y, z])[rows], eps, _cell_of(start)[rows])[0]]] = True
+        parent, _ = _joined(*cells, few, (eps * (1 + SLACK)) ** 2, np.inf)
+    return _labels(*cells, order, core, parent, eps * eps)
 
 
 @njit(cache=True, nogil=True)
@@ -120,8 +127,9 @@ def _core_extents(x, y, z, start, core):
 
 @njit(cache=True, nogil=True)
 def _touch(x, y, z, core, extents, start, a, b, eps2):
-    """True if a core point of cell a lies within eps of a core point of cell b."""
-    box = extents[b]
+    """True if a core point of cell a lies within eps of a core point of cell b; and how many
+    distances were computed."""
+    box, work = extents[b], start[a + 1] - start[a]
     for i in range(start[a], start[a + 1]):
         # Far from all of cell b at once: keeps two dense cells that do not touch linear.
         dx = max(box[0] - x[i], 0.0, x[i] - box[3])
@@ -130,28 +138,47 @@ def _touch(x, y, z, core, extents, start, a, b, eps2):
         if core[i] and dx * dx + dy * dy + dz * dz <= eps2:
             for j in range(start[b], start[b + 1]):
                 if core[j] and near(x, y, z, i, j, eps2):
-                    return True
-    return False
+                    return True, work + j - start[b]
+            work += start[b + 1] - start[b]
+    return False, work
 
 
 @njit(cache=True, nogil=True)
-def _labels(x, y, z, order, start, first, second, core, eps2):
-    n, cells = len(x), len(start) - 1
-    cores = np.zeros(cells, np.int32)
-    cell_of = np.empty(n, np.int32)
-    for c in range(cells):
-        for k in range(start[c], start[c + 1]):
-            cores[c] += core[k]
-            cell_of[k] = c
+def _cell_of(start):
+    """(N,) the cell of each point, in grid order."""
+    cell_of = np.empty(start[-1], np.int32)
+    for c in range(len(start) - 1):
+        cell_of[start[c]:start[c + 1]] = c
+    return cell_of
 
-    parent = np.arange(cells).astype(np.int32)
+
+@njit(cache=True, nogil=True)
+def _joined(x, y, z, start, first, second, core, eps2, most_work):
+    """Union-find forest of the cells, and how many distances it took; if more than most_work, it
+    is not complete."""
+    parent, work = np.arange(len(start) - 1).astype(np.int32), 0
     extents = _core_extents(x, y, z, start, core)
     for p in range(len(first)):
         a, b = first[p], second[p]
-        if cores[a] and cores[b]:
+        if extents[a, 0] <= extents[a, 3] and extents[b, 0] <= extents[b, 3]:  # both have cores
             root_a, root_b = root(parent, a), root(parent, b)
-            if root_a != root_b and _touch(x, y, z, core, extents, start, a, b, eps2):
-                parent[max(root_a, root_b)] = min(root_a, root_b)
+            if root_a != root_b:
+                found, more = _touch(x, y, z, core, extents, start, a, b, eps2)
+                if found:
+                    parent[max(root_a, root_b)] = min(root_a, root_b)
+                work += more
+                if work > most_work:
+                    break
+    return parent, work
+
+
+@njit(cache=True, nogil=True)
+def _labels(x, y, z, start, first, second, order, core, parent, eps2):
+    n, cells = len(x), len(start) - 1
+    cores, cell_of = np.zeros(cells, np.int32), _cell_of(start)
+    for c in range(cells):
+        for k in range(start[c], start[c + 1]):
+            cores[c] += core[k]
 
     cluster = number_clusters(order, core, cell_of, parent)
     # A point of a cell with core points belongs to their cluster, unless it is a border point

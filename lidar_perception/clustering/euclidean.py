@@ -27,6 +27,7 @@ import numpy as np
 from numba import njit
 
 from lidar_perception.clustering.cells import (
+    Cells,
     around,
     cells_of,
     crowded,
@@ -36,12 +37,13 @@ from lidar_perception.clustering.cells import (
 )
 from lidar_perception.clustering.grid import number_clusters
 from lidar_perception.clustering.params import EuclideanParams
-from lidar_perception.clustering.tree import connected, nearest, nearest_leaders, tree_of
+from lidar_perception.clustering.thinned import PATIENCE, SLACK, thinned
+from lidar_perception.clustering.thinned import patience as budget
+from lidar_perception.clustering.tree import Tree, connected, nearest, nearest_leaders, tree_of
 from lidar_perception.clustering.tree import crowded as count_crowded
 
 SAMPLE, SIDES = 64, 5  # the first cells are 5 medians of a sample's nearest distances wide
 BUDGET = 20_000_000    # distances that are rather computed than to sort points into larger cells
-PATIENCE = 2_000       # distances a point, beyond which a tree finds the rest
 WORK = 2**32           # distances for local thresholds
 
 
@@ -83,7 +85,7 @@ def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
     return labels.astype(np.int32)
 
 
-def _mean_nearest(xyz, patience):
+def _mean_nearest(xyz: np.ndarray, patience: float) -> tuple[float, Cells]:
     """Mean distance to the nearest other point, 0 for one point; and cells. Points with none
     within reach of the cells wait for larger ones."""
     n, columns = len(xyz), xyz.T.astype(np.float64, order="C")
@@ -185,10 +187,19 @@ def _means_of_sample(cells, sample, radius2):
     return means
 
 
-def _components_by_tree(tree, reach2, enough):
+def _components_by_tree(tree: Tree, reach2: np.ndarray, enough: float) -> np.ndarray:
     """As _components, in the order of the tree."""
     leads = count_crowded(tree, reach2, enough)[0]
-    component = connected(tree, reach2, leads, 0.0)[0]
+    component, work = connected(tree, reach2, leads, 0.0, budget(len(leads)))
+    if work > budget(len(leads)):
+        kept, group = thinned(tree.points[leads], np.sqrt(reach2[leads]))
+        widest = np.zeros(len(kept))
+        np.maximum.at(widest, group, reach2[leads])
+        thin = tree_of(tree.points[leads][kept])
+        found = np.empty(len(kept), np.int64)
+        found[thin.order] = connected(thin, widest[thin.order] * (1 + SLACK) ** 2,
+                                      np.ones(len(kept), bool), 0.0)[0]
+        component[leads] = found[group]
     leader = nearest_leaders(tree, reach2, leads)[0]
     return np.where(leader >= 0, component[leader], component)
 
@@ -249,7 +260,7 @@ def _components(cells, points, leads, work):
     return component, work
 
 
-def _merged(xyz, labels, gamma):
+def _merged(xyz: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
     """Union-find forest of the labels after Eq. 9."""
     centre, diameter = _centres(xyz, labels)
     parent = np.arange(len(centre), dtype=np.int32)

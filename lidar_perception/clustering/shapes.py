@@ -12,10 +12,12 @@ from numba import njit
 from lidar_perception.classes import BY_SIZE, CLASSES, DETECTED, MAX_DIAGONAL
 from lidar_perception.clustering.params import BOX_SHAPES
 from lidar_perception.clustering.rectangles import grouped, rectangles
+from lidar_perception.groups import cluster_count
 
 
 @njit(cache=True, nogil=True)
-def extents(xyz: np.ndarray, labels: np.ndarray, count: int):
+def extents(xyz: np.ndarray, labels: np.ndarray,
+            count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """low (K, 3), high (K, 3) float32 of the points of clusters 1..K, and sizes (K,) int64.
     A cluster without points has low = inf, high = -inf."""
     low = np.full((count, 3), np.inf, np.float32)
@@ -43,14 +45,15 @@ def oriented_boxes(xyz: np.ndarray, labels: np.ndarray, shape: str) -> np.ndarra
     if shape not in BOX_SHAPES:
         raise ValueError(f"shape = {shape!r} must be one of {', '.join(BOX_SHAPES)}")
     xyz = np.ascontiguousarray(xyz, np.float32)
-    count = int(labels.max(initial=0))
+    count = cluster_count(labels)
     low, high, sizes = extents(xyz, labels, count)
     low[sizes == 0] = high[sizes == 0] = 0
     boxes = np.zeros((count, 7), np.float32)
     boxes[:, :3] = (low + high) / 2
     boxes[:, 3:6] = high - low
     if shape != "axis_aligned" and count:
-        found = rectangles(*grouped(xyz, labels, sizes), shape == "l_shape")
+        x, y, start = grouped(xyz, labels, sizes)
+        found = rectangles(x, y, start, shape == "l_shape")
         boxes[:, [0, 1, 3, 4]] = found[:, :4]
         boxes[:, 6] = _folded(found[:, 4])
     return boxes
@@ -65,10 +68,10 @@ def ellipses(xyz: np.ndarray, labels: np.ndarray) -> np.ndarray:
     ellipse filled evenly. It covers most of a cluster; a few stray points may lie outside.
     """
     members = np.flatnonzero(labels > 0)
-    cluster, count = labels[members] - 1, int(labels.max(initial=0))
+    cluster, count = labels[members] - 1, cluster_count(labels)
     sizes = np.maximum(np.bincount(cluster, minlength=count), 1)
 
-    def mean(values):
+    def mean(values: np.ndarray) -> np.ndarray:
         return np.bincount(cluster, values, count) / sizes
 
     x, y = xyz[members, :2].T.astype(np.float64)
@@ -93,7 +96,7 @@ def class_by_diagonal(boxes: np.ndarray) -> np.ndarray:
     return ids
 
 
-def _folded(yaw):
+def _folded(yaw: np.ndarray) -> np.ndarray:
     """Directions of lines as float32 in [-pi/2, pi/2)."""
     half = np.float32(np.pi / 2)
     folded = ((yaw + np.pi / 2) % np.pi - np.pi / 2).astype(np.float32)

@@ -195,10 +195,10 @@ def _linked(squared, a, b, gamma):
 
 
 @njit(cache=True, nogil=True)
-def connected(tree, size, among, gamma):
+def connected(tree, size, among, gamma, most_work=np.inf):
     """(N,) the connected set of each of the points chosen, among (N,) bool, -1 of the others: sets
     of points that are linked by their sizes (N,), see _linked, all in the order of the tree. And
-    how many distances were computed."""
+    how many distances were computed; if more than most_work, the sets are not complete."""
     most, left = _largest(tree, size, among)
     leaf, component = _leaf_of(tree), np.full(len(tree.points), -1)
     stack, found, count, work = np.empty(DEPTH, np.int64), np.empty(len(leaf), np.int64), 0, 0
@@ -211,6 +211,8 @@ def connected(tree, size, among, gamma):
             # The last found is the farthest: it reaches most of what is not found yet.
             last -= 1
             i = found[last]
+            if work > most_work:
+                return component, work
             p, waiting = tree.points[i], 1
             stack[0] = 1
             while waiting:
@@ -279,11 +281,11 @@ def _before(p, q):
 
 
 @njit(cache=True, nogil=True)
-def touching(tree, label, side, reach2):
+def touching(tree, label, side, reach2, most_work=np.inf):
     """(P, 2) pairs of labels that connect what all pairs would: of points, one of either side,
     within reach of each other. label (N,) from 0 on, side (N,) 0 or 1, in the order of the tree;
     points of one label are connected. P is less than the number of labels. And how many distances
-    were computed."""
+    were computed; if more than most_work, pairs are missing."""
     n = len(label)
     sides = np.empty((2, 2 * tree.leaves), np.int64)
     for s in range(2):
@@ -303,7 +305,7 @@ def touching(tree, label, side, reach2):
                     _take(sides[side[m]], leaf[m])
                     queue[last] = m
                     last += 1
-            if first == last:
+            if first == last or work > most_work:
                 break
             i, arrived = queue[first], -1
             p, other, waiting = tree.points[i], sides[1 - side[i]], 1

@@ -9,13 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from zlib import crc32
 
+from lidar_perception.data.unpacking import MAX_CHUNK
+
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, CHUNK, CHUNK_INDEX, DATA_END = 0x02, 0x06, 0x08, 0x0F
 FOOTER_BYTES = 9 + 20
 RECORD = struct.Struct("<BQ")  # of each: its kind, and how many bytes follow
 NO_INDEX = (RECORD.pack(DATA_END, 4) + bytes(4) + RECORD.pack(FOOTER, 20) + bytes(20)
             + MAGIC)  # the end of a file that has none
-MAX_CHUNK = 2**30  # bytes that a chunk may unpack to; recorders write some megabytes
 
 
 def check_index(path: Path) -> None:

@@ -12,7 +12,8 @@ from lidar_perception.data.frame import POINT_LABELS, POSES, Frame, PointTruth, 
 from lidar_perception.data.kitti.calibration import homogeneous, matrices, matrix
 from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS, load_velodyne, read_velodyne
 from lidar_perception.data.kitti.write import numbers, write_velodyne
-from lidar_perception.runs.files import write_bytes
+from lidar_perception.data.records import read_records
+from lidar_perception.runs.files import regular, write_bytes
 from lidar_perception.types import InputError, usable_returns
 
 UNLABELLED = (0, 1)  # unlabelled; outlier, such as a reflection: nobody knows what these points are
@@ -33,28 +34,16 @@ def recognises(path: Path) -> bool:
 
 
 def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """The frames of open_semantic_kitti."""
-    frames = open_semantic_kitti(path)
-    posed = any(frame.native.is_file() for frame in frames)
-    return Recording(path, "SemanticKITTI", frames,
-                     frozenset({POINT_LABELS} | ({POSES} if posed else set())))
-
-
-def open_semantic_kitti(root: str | Path) -> list[Frame]:
-    """The labelled scans of ROOT/sequences/NN or ROOT/dataset/sequences/NN, in order; only the
-    file lists are read. ROOT may also be sequences/ or one sequence. Sequences without a labels
-    folder, as the test ones, are left out.
-    InputError says what is missing."""
-    root = Path(root)
-    if not root.is_dir():
-        raise InputError(f"{root} is not a folder; give the folder of a SemanticKITTI download")
-    scans = [(sequence, i, scan) for sequence in _sequences(root.absolute())
+    """The labelled scans of PATH/sequences/NN or PATH/dataset/sequences/NN, in order; only the
+    file lists are read. PATH may also be sequences/ or one sequence. Sequences without a labels
+    folder, as the test ones, are left out. InputError says what is missing."""
+    found = [(sequence, i, scan) for sequence in _sequences(path.absolute())
              for i, scan in enumerate(sorted(sequence.glob("velodyne/*.bin")))]
-    if not scans:
-        raise InputError(f"{root} has no SemanticKITTI scans: expected "
+    if not found:
+        raise InputError(f"{path} has no SemanticKITTI scans: expected "
                          "sequences/00/velodyne/*.bin beside sequences/00/labels/*.label")
     frames = []
-    for number, (sequence, i, scan) in enumerate(scans):
+    for number, (sequence, i, scan) in enumerate(found):
         if (sequence / "labels").is_dir():
             stamp = START_NS + number * PERIOD_NS
             frames.append(Frame(
@@ -63,9 +52,11 @@ def open_semantic_kitti(root: str | Path) -> list[Frame]:
                 pose=partial(_pose, sequence, i), sequence=sequence.name, index=i, points=scan,
                 native=sequence / "poses.txt"))
     if not frames:
-        raise InputError(f"{root} has scans but no labels: expected "
+        raise InputError(f"{path} has scans but no labels: expected "
                          "sequences/00/labels/*.label; download the labels of SemanticKITTI too")
-    return frames
+    posed = any(frame.native.is_file() for frame in frames)
+    return Recording(path, "SemanticKITTI", frames,
+                     frozenset({POINT_LABELS} | ({POSES} if posed else set())))
 
 
 def _sequences(root: Path) -> list[Path]:
@@ -77,7 +68,8 @@ def _sequences(root: Path) -> list[Path]:
 
 def _point_truth(scan: Path, path: Path) -> PointTruth:
     """Labels of the usable points. InputError where a file is missing, cut or of another scan."""
-    cloud, labels = read_velodyne(scan), _read_labels(path)
+    cloud = read_velodyne(scan)
+    labels = read_records(path, "label", np.uint32)[:, 0]  # class below, instance in the upper half
     if len(labels) != len(cloud):
         raise InputError(f"{path} has {len(labels)} labels for the {len(cloud)} points of {scan}; "
                          "download both again")
@@ -93,25 +85,11 @@ def _pose(sequence: Path, i: int) -> np.ndarray | None:
         return None
     lidar_to_camera = matrix(matrices(calibration), calibration, "Tr", (3, 4))
     try:
-        moved = np.array(poses.read_text().splitlines()[i].split(), float).reshape(3, 4)
+        moved = np.array(regular(poses).read_text().splitlines()[i].split(), float).reshape(3, 4)
     except (OSError, ValueError, IndexError) as error:
         raise InputError(f"cannot read pose {i} of {poses} ({error}); download it again") from None
     to_camera = homogeneous(lidar_to_camera)
     return np.linalg.inv(to_camera) @ homogeneous(moved) @ to_camera
-
-
-def _read_labels(path: Path) -> np.ndarray:
-    """(N,) uint32 of a .label file: class in the lower half, instance in the upper."""
-    try:
-        raw = np.fromfile(path, np.uint32)
-        size = path.stat().st_size
-    except OSError as error:
-        raise InputError(f"cannot read the labels {path}: {error.strerror}; download them "
-                         "again") from None
-    if size % 4:
-        raise InputError(f"{path} has {size} bytes, not a multiple of 4 (one uint32 a point); it "
-                         "was cut, download it again")
-    return raw
 
 
 def write_scan(folder: Path, number: int, cloud: np.ndarray, semantic: np.ndarray,

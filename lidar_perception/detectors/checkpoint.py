@@ -7,12 +7,13 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, Self
+from typing import Any, ClassVar, Protocol
 
 import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
+from lidar_perception.detectors.config_json import config_of
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.runs.files import write_bytes
@@ -22,17 +23,18 @@ KEY = "lidar_perception"  # of the metadata, whose values are strings
 FORMAT = 1
 
 
-
 class Config(Protocol):
     """What a network looks like, a dataclass. network: its name in NETWORKS."""
 
     network: ClassVar[str]
-    classes: Any  # tuple of names
-    title: Any    # which one of its network, a str
 
-    @classmethod
-    def of_json(cls, content: dict[str, Any], source: str) -> Self:
-        """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
+    @property
+    def classes(self) -> tuple[str, ...]:
+        """The names of what it detects."""
+
+    @property
+    def title(self) -> str:
+        """Which one of its network it is."""
 
 
 POINTPILLARS, POINTNET = NetworkConfig.network, PointNetConfig.network
@@ -75,29 +77,31 @@ class Header:
             wanted, own_use, _ = NETWORKS[kind.network]
             raise InputError(f"{source} holds a {title}, which is for {use}; {own_use} take a "
                              f"{wanted}")
-        return Header(config.of_json(content["config"], source), content["training"],
+        return Header(config_of(config, content["config"], source), content["training"],
                       content["metrics"], content["commit"])
+
+
+PARTS = {"config": dict, "training": dict, "metrics": dict, "commit": str}
 
 
 def _content(text: str | None, source: str) -> dict[str, Any]:
     """The header's parts, all there, of a network that is known."""
     try:
-        content = json.loads(text)
-        if content["format"] != FORMAT:
-            raise InputError(f"{source} has format {content['format']}, this version reads "
-                             f"{FORMAT}")
-        # The first files had no such key.
-        parts = {"network": content.get("network", POINTPILLARS),
-                 **{name: content[name] for name in ("config", "training", "metrics", "commit")}}
-        if parts["network"] not in NETWORKS:
-            raise InputError(f"{source} holds a network {parts['network']!r}, this version knows "
-                             f"{' and '.join(NETWORKS)}")
-        return parts
-    except InputError:
-        raise
-    except (TypeError, ValueError, KeyError, AttributeError):
+        content = json.loads(text or "")
+        parts = {name: content[name] for name in ("format", *PARTS)}
+        network = content.get("network", POINTPILLARS)  # the first files had no such key
+        if not all(isinstance(parts[name], kind) for name, kind in PARTS.items()):
+            raise TypeError
+    except (TypeError, ValueError, KeyError, AttributeError, RecursionError):
         raise InputError(f"{source} has no header of this package; use import-weights for "
                          "weights of other projects") from None
+    if parts["format"] != FORMAT:
+        raise InputError(f"{source} has format {str(parts['format'])[:40]}, this version reads "
+                         f"{FORMAT}")
+    if not isinstance(network, str) or network not in NETWORKS:
+        raise InputError(f"{source} holds a network {str(network)[:40]!r}, this version knows "
+                         f"{' and '.join(NETWORKS)}")
+    return {"network": network, **parts}
 
 
 def network_of(path: str | Path) -> str:
@@ -140,16 +144,24 @@ def load(path: str | Path, kind: type[Config], make: Callable[[Any], torch.nn.Mo
     header, tensors = read(path, kind)
     if expected is not None:
         require_same(header.config, expected, str(path))
+    with torch.device("meta"):  # shapes alone: the header takes no memory before they fit
+        wanted = make(header.config).state_dict()
+    for name in sorted({*wanted, *tensors}, key=str):
+        ours, theirs = (_described(state.get(name)) for state in (wanted, tensors))
+        if ours != theirs:
+            raise InputError(f"the weights in {path} do not fit its header: {name[:80]} is "
+                             f"{theirs}, and should be {ours}")
     network = make(header.config)
-    state = {name: value.float() if value.is_floating_point() else value
-             for name, value in tensors.items()}
-    try:
-        network.load_state_dict(state)
-    except RuntimeError as error:
-        reason = str(error).splitlines()[1:2] or [str(error)]
-        raise InputError(f"the weights in {path} do not fit its header: {reason[0].strip()}"
-                         ) from None
+    network.load_state_dict({name: value.to(wanted[name].dtype)
+                             for name, value in tensors.items()})
     return header, network
+
+
+def _described(value: torch.Tensor | None) -> str:
+    if value is None:
+        return "not there"
+    kind = "floats" if value.is_floating_point() else str(value.dtype).removeprefix("torch.")
+    return f"{kind} of shape {tuple(value.shape)}"
 
 
 def adopt(network: torch.nn.Module, path: str | Path, kind: type[Config]) -> tuple[int, int]:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from lidar_perception.param_fields import Params, param
+from lidar_perception.types import CLASSES, Detections
 
 MIN_SCORE = 0.05  # of the boxes that average precision is made of: more than a robot would act on
 
@@ -23,9 +26,18 @@ class ScoreParams(Params):
         """One threshold for every class."""
         return ScoreParams(score, score, score, score)
 
+    def at_most(self, score: float) -> ScoreParams:
+        """These thresholds, but none above score."""
+        return ScoreParams(*(min(value, score) for value in vars(self).values()))
+
     def of_class(self, name: str) -> float:
         """The threshold of a class of types.CLASSES."""
         return getattr(self, name.lower(), self.other)
+
+    def passed(self, detections: Detections) -> np.ndarray:
+        """(K,) bool: which of K detections reach the threshold of their class."""
+        least = np.array([self.of_class(name) for name in CLASSES], np.float32)
+        return detections.scores >= least[detections.class_ids]
 
 
 @dataclass(frozen=True)

@@ -31,11 +31,11 @@ def at_rest(obstacle: np.ndarray, lift: float, tolerance: float, levels: int) ->
     while len(obstacles) < levels:
         rows, columns = obstacles[-1].shape
         obstacles.append(obstacles[-1].reshape(rows // 2, 2, columns // 2, 2).min(axis=(1, 3)))
-    sheet = None
+    sheet = np.zeros(0, np.float32)
     for level in range(levels - 1, -1, -1):
         above = np.pad(obstacles[level], 1, constant_values=np.inf)
         loads = np.where(np.isfinite(above), np.float32(lift * 4**level), np.float32(0))
-        if sheet is None:
+        if level == levels - 1:
             sheet = np.minimum(np.float32(obstacles[-1].min()), above)
         else:
             sheet = _refined(sheet, above)

@@ -38,7 +38,7 @@ def segment_ground(frame: LidarFrame, params: GroundParams = GroundParams()) -> 
     return ground
 
 
-def _segment(xyz, intensity, params: GroundParams) -> np.ndarray:
+def _segment(xyz: np.ndarray, intensity: np.ndarray | None, params: GroundParams) -> np.ndarray:
     return METHODS[params.method](level(xyz, params.sensor_pose), intensity, params)
 
 

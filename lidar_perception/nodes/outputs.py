@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -14,6 +13,8 @@ from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import class_by_diagonal
 from lidar_perception.ground.above import obstacles
 from lidar_perception.nodes.runtime import CLOUD, MARKERS, OK, RELIABLE, WARN, LidarNode
+from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, has_detections_3d
+from lidar_perception.robot.poses import inverse
 from lidar_perception.tracking.ego import moved_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message, encode
@@ -93,34 +94,42 @@ class DetectionMarkers:
         self.node, self.publisher = node, node.output(topic, MARKERS)
         self.shown: Any = ()
 
-    def publish(self, header: Any, detections: Detections) -> None:
+    def publish(self, header: Any, detections: Detections,
+                clusters: np.ndarray | None = None) -> None:
         """In the frame of header, as they are."""
         message = detection_markers(detections, header, bag_message, self.shown,
-                                    lifetime_ns(self.node))
+                                    lifetime_ns(self.node), clusters)
         self.shown = marker_keys(message)
         self.publisher.publish(encode(message))
 
 
 class DetectionOutputs:
-    """~/output/detections (and ~/output/detections_3d where vision_msgs is installed), and the time
-    of each step."""
+    """~/output/detections (and ~/output/detections_3d where vision_msgs is installed), the time
+    of each step, and with the parameter tracking.enabled the tracks."""
 
     def __init__(self, node: LidarNode, steps: tuple[str, ...]):
         self.node = node
         self.markers = DetectionMarkers(node, "detections")
         self.detections_3d = None
-        if importlib.util.find_spec("vision_msgs"):
+        if has_detections_3d():
             self.detections_3d = node.create_publisher(
-                message_class("vision_msgs/msg/Detection3DArray"), "~/output/detections_3d",
-                RELIABLE)
+                message_class(DETECTIONS_3D), "~/output/detections_3d", RELIABLE)
         self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE)
                            for step in steps}
+        self.tracks = (TrackOutputs(node, lambda: node.robot, clouds=True)
+                       if node.robot.tracking.enabled else None)
 
-    def publish(self, header: Any, detections: Detections, ms: Mapping[str, float]) -> None:
-        """Publish detections, and the times of the steps that are known."""
+    def publish(self, header: Any, detections: Detections, ms: Mapping[str, float],
+                xyz: np.ndarray, *, weak: Detections | None = None,
+                clusters: np.ndarray | None = None) -> str | None:
+        """Publish detections of the scan xyz (N, 3), with the cluster_id of each where it is known,
+        the times of the steps that are known, and where there is a tracker the tracks; it is given
+        `weak`, with those below the thresholds too, if there are any. All are of the levelled
+        cloud; tracks are in the cloud's frame. Returns what was wrong for the tracker."""
+        cloud, found = header, detections if weak is None else weak
         header, boxes = placed(self.node, header, detections.boxes)
         detections = replace(detections, boxes=boxes)
-        self.markers.publish(header, detections)
+        self.markers.publish(header, detections, clusters)
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             self.detections_3d.publish(to_detection_array(
                 detections.boxes, [CLASSES[i] for i in detections.class_ids], detections.scores,
@@ -129,6 +138,12 @@ class DetectionOutputs:
         for step, publisher in self.step_times.items():
             if step in ms:
                 publisher.publish(Float64(data=ms[step]))
+        if self.tracks is None:
+            return None
+        placing = self.node.transforms.placing(cloud)
+        if placing.level is not None:
+            found = replace(found, boxes=moved_boxes(found.boxes, inverse(placing.level)))
+        return self.tracks.publish(cloud, found, placing.in_cloud(xyz))
 
 
 class CandidateOutputs:
@@ -141,10 +156,10 @@ class CandidateOutputs:
                        for stage in ("stage1", "stage2")}
         self.final = DetectionOutputs(node, steps)
 
-    def publish(self, header: Any, find: Callable[[], Candidates],
+    def publish(self, header: Any, xyz: np.ndarray, find: Callable[[], Candidates],
                 problem: str | None = None) -> None:
-        """Publish what find() gives; where it raises InputError, no candidates and the reason.
-        problem is what is known to be wrong with the frame already."""
+        """Publish what find() gives for the scan xyz (N, 3); where it raises InputError, no
+        candidates and the reason. problem is what is known to be wrong with the frame already."""
         try:
             candidates = find()
         except InputError as error:
@@ -154,8 +169,9 @@ class CandidateOutputs:
                 found = getattr(candidates, stage)
                 place, boxes = placed(self.node, header, found.boxes)
                 markers.publish(place, replace(found, boxes=boxes))
-        self.final.publish(header, candidates.final, candidates.ms)
-        self._diagnose(candidates, problem)
+        untracked = self.final.publish(header, candidates.final, candidates.ms, xyz,
+                                       clusters=candidates.clusters)
+        self._diagnose(candidates, problem or untracked)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:
         self.node.counts["candidates"] = len(candidates.final)

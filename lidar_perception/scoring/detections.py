@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -12,7 +11,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.results import read_results, write_results
 from lidar_perception.detectors.contract import Detector
-from lidar_perception.scoring.run import RunError, Start
+from lidar_perception.scoring.run import RunError
 from lidar_perception.scoring.thinning import thinned
 from lidar_perception.types import Detections, GroundTruth, InputError
 
@@ -45,15 +44,11 @@ def detected(detector: Detector, frame: Frame, truth: GroundTruth | None,
                     (perf_counter() - begin) * 1e3)
 
 
-def by_detector(open_: Callable[[], Detector], keep: float = 1.0,
-                folder: Path | None = None) -> Start:
-    """Run the detector that open_() gives on every frame with labels; with a folder on all frames,
-    and write what it says there as KITTI result files."""
-    return partial(_by_detector, open_, keep, folder)
-
-
-def _by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
-                 recording: Recording) -> Callable[[Frame], Detected | None]:
+def by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
+                recording: Recording) -> Callable[[Frame], Detected | None]:
+    """Runs the detector that open_() gives on every frame with labels; with a folder on all frames,
+    and writes what it says there as KITTI result files. All but the recording given, a Start of
+    scoring.run."""
     detector = open_()
 
     def measure(frame: Frame) -> Detected | None:
@@ -73,12 +68,9 @@ def _by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None
     return measure
 
 
-def by_files(folder: Path) -> Start:
-    """Read KITTI result files, folder/NAME.txt, of every frame with labels."""
-    return partial(_by_files, folder)
-
-
-def _by_files(folder: Path, recording: Recording) -> Callable[[Frame], Detected | None]:
+def by_files(folder: Path, recording: Recording) -> Callable[[Frame], Detected | None]:
+    """Reads KITTI result files, folder/NAME.txt, of every frame with labels. With a folder a Start
+    of scoring.run."""
     def measure(frame: Frame) -> Detected | None:
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None:

@@ -2,25 +2,51 @@
 
 from __future__ import annotations
 
+import math
+
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+SHOWN = 5  # reasons why frames were skipped
 
-def narrow_table(title: str, first: str, *others: str, width: int = 0) -> Table:
-    """A table whose columns fit into 80 characters: the first one of words, the others, each at
-    least width wide, of numbers."""
+
+def narrow_table(title: str, first: str, *others: str, width: int = 0,
+                 fold: bool = False) -> Table:
+    """A table whose columns fit into 80 characters: the first one of words, which may fold, the
+    others, each at least width wide, of numbers."""
     table = Table(title=title, box=SIMPLE_HEAD, padding=0, caption_justify="left")
-    table.add_column(first, no_wrap=True)
+    table.add_column(escape(first), no_wrap=not fold, overflow="fold" if fold else "ellipsis")
     for name in others:
-        table.add_column(name, justify="right", no_wrap=True, min_width=width)
+        table.add_column(escape(name), justify="right", no_wrap=True, min_width=width)
     return table
 
 
-def print_skipped(lines: list[str], console: Console, most: int = 5) -> None:
+def number(value: float | None, digits: int = 2, width: int = 5) -> str:
+    """In at most width characters: 84.00, 100.0; a dash for None and infinity."""
+    return "-" if value is None or math.isinf(value) else f"{value:.{digits}f}"[:width].rstrip(".")
+
+
+def percent(row: dict, *keys: str) -> list[str]:
+    """Shares of a row of scores, 0 .. 1, in percent."""
+    return [f"{100 * row[key]:.1f}" for key in keys]
+
+
+def counts(row: dict, *keys: str) -> list[str]:
+    """Whole numbers of a row of scores."""
+    return [str(row[key]) for key in keys]
+
+
+def print_time(ms: float | None, console: Console) -> None:
+    """Of the detector, if one was run."""
+    if ms is not None:
+        console.print(f"detector: {ms:.1f} ms a frame (median)")
+
+
+def print_skipped(lines: list[str], console: Console) -> None:
     """The first reasons why frames were left out."""
-    for line in lines[:most]:
-        console.print(f"[yellow]skipped[/]: {escape(line)}")
-    if len(lines) > most:
-        console.print(f"[yellow]skipped[/]: {len(lines) - most} more, see the JSON file")
+    for line in lines[:SHOWN]:
+        console.print(f"[yellow]skipped[/]: {escape(line)}", soft_wrap=True)
+    if len(lines) > SHOWN:
+        console.print(f"[yellow]skipped[/]: {len(lines) - SHOWN} more, see the JSON file")

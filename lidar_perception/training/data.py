@@ -50,48 +50,43 @@ class Stream:
         """Scenes of an epoch."""
         return sum(map(len, self.sources))
 
-    def scene(self, place: int) -> TrainingScene:
-        """TrainingScene `place` of all sources behind one another."""
-        source, i = source_of(self.sources, place)
-        return source.scene(i)
-
     def __getitem__(self, n: int) -> Item:
-        epoch, place = divmod(n, len(self))
+        epoch, first = divmod(n, len(self))
         order = np.random.default_rng([self.seed, epoch]).permutation(len(self))
         skipped = []
         for offset in range(len(self)):
             rng = np.random.default_rng([self.seed, n, offset])
             try:
-                sample = self.prepare(self.scene(int(order[(place + offset) % len(self)])), rng)
-                return Item(sample, tuple(skipped))
+                source, i = source_of(self.sources, int(order[(first + offset) % len(self)]))
+                return Item(self.prepare(source.scene(i), rng), tuple(skipped))
             except InputError as error:
                 skipped.append(str(error))
         raise InputError(f"none of the {len(self)} scenes can be used ({skipped[0]})")
 
 
-def source_of(sources: Sequence[Any], place: int) -> tuple[Any, int]:
-    """The source, and which of its scenes, that scene `place` of all behind one another is."""
+def source_of(sources: Sequence[Any], n: int) -> tuple[Any, int]:
+    """Of the n-th scene of all sources, one behind the other: its source, and its number there."""
     for source in sources:
-        if place < len(source):
-            return source, place
-        place -= len(source)
-    raise IndexError(place)
+        if n < len(source):
+            return source, n
+        n -= len(source)
+    raise IndexError(n)
 
 
 @dataclass(frozen=True)
-class JudgedScenes:
-    """scenes[n]: an Item of what validation reads of the n-th scene of all sources, None if it
-    cannot be read. judged(source, i) reads one, or raises InputError."""
+class ReadScenes:
+    """scenes[n]: an Item of what is read of the n-th scene of all sources, None if it cannot be
+    read. read(source, i) reads one, or raises InputError."""
 
     sources: tuple[Any, ...]
-    judged: Callable[[Any, int], Any]
+    read: Callable[[Any, int], Any]
 
     def __len__(self) -> int:
         return sum(map(len, self.sources))
 
     def __getitem__(self, n: int) -> Item:
         try:
-            return Item(self.judged(*source_of(self.sources, n)))
+            return Item(self.read(*source_of(self.sources, n)))
         except InputError as error:
             return Item(None, (str(error),))
 
@@ -155,22 +150,16 @@ def _end_with_parent() -> None:
     os._exit(1)
 
 
-@dataclass(frozen=True)
-class RawScenes:
-    """scenes[n]: an Item of the n-th scene of all sources as it is, None if it cannot be used."""
+def some_scenes(sources: tuple[Any, ...], most: int, seed: int,
+                jobs: int) -> Iterator[TrainingScene]:
+    """At most so many scenes of the sources as they are, drawn by the seed; what cannot be used is
+    left out."""
+    scenes = ReadScenes(sources, _scene)
+    chosen = np.random.default_rng(seed).permutation(len(scenes))[:most]
+    for item, in islice(loaded(scenes, ([int(n)] for n in chosen), jobs), len(chosen)):
+        if item.sample is not None:
+            yield item.sample
 
-    stream: Stream
 
-    def __getitem__(self, n: int) -> Item:
-        try:
-            return Item(self.stream.scene(n))
-        except InputError as error:
-            return Item(None, (str(error),))
-
-    def some(self, most: int, jobs: int) -> Iterator[TrainingScene]:
-        """At most so many, drawn by the stream's seed; what cannot be used is left out."""
-        chosen = np.random.default_rng(self.stream.seed).permutation(len(self.stream))[:most]
-        numbers = ([int(n)] for n in chosen)
-        for item, in islice(loaded(self, numbers, jobs), len(chosen)):
-            if item.sample is not None:
-                yield item.sample
+def _scene(source: Any, i: int) -> TrainingScene:
+    return source.scene(i)

@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from lidar_perception.types import InputError
 
 
 @functools.cache
-def typestore():
+def typestore() -> Typestore:
     """ROS 2 Jazzy's message types, as rosbags knows them."""
     return get_typestore(Stores.ROS2_JAZZY)
 
@@ -41,7 +42,7 @@ def decode(data: bytes, type_name: str) -> Any:
         raise InputError(f"{len(data)} bytes are no {type_name} ({error})") from None
 
 
-def _zero(kind: tuple) -> Any:
+def _zero(kind: tuple[Any, Any]) -> Any:
     node, detail = kind
     if node == Nodetype.BASE:
         name = detail[0]

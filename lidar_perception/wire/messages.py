@@ -92,7 +92,7 @@ def thin_cloud(msg: Any, xyz: np.ndarray, indices: np.ndarray, make: Any) -> Any
     names = to_array(msg).dtype.names or ()
     fields = {axis: xyz[:, i] for i, axis in enumerate("xyz")}
     for name in [n for n in INTENSITY_FIELDS if n in names][:1]:
-        fields["intensity"] = column(msg, name, indices)
+        fields["intensity"] = _single(to_array(msg), name).take(indices)
     points = np.empty(len(xyz), [(name, "<f4") for name in fields])
     for name, values in fields.items():
         points[name] = values
@@ -171,10 +171,10 @@ def extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
 
 def truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()) -> Any:
     """MarkerArray of the labels. Objects keep the marker id of their track."""
-    ids = [extra.get("track_id") for extra in truth.extras]
-    if None in ids or len(set(zip(truth.labels, ids))) < len(ids):
-        ids = None
-    return to_marker_array(truth.boxes, truth.labels, header=header, make=make, ids=ids,
+    tracks: list[Any] = [extra.get("track_id") for extra in truth.extras]
+    unique = None not in tracks and len(set(zip(truth.labels, tracks))) == len(tracks)
+    return to_marker_array(truth.boxes, truth.labels, header=header, make=make,
+                           ids=tracks if unique else None,
                            extras=truth.extras, notes=truth.notes, previous=previous)
 
 
@@ -190,14 +190,39 @@ def to_detections(objects: MarkedObjects) -> Detections:
 
 
 def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
-                      lifetime_ns: int = 0) -> Any:
-    """MarkerArray of detections, with their ids in the text too; previous and lifetime_ns as in
-    to_marker_array."""
+                      lifetime_ns: int = 0, clusters: np.ndarray | None = None) -> Any:
+    """MarkerArray of K detections, with their ids in the text too, and the cluster_id (K,) of each
+    where it is one cluster of the cloud: a marker's own id has 32 bits, which not every cluster_id
+    fits. previous and lifetime_ns as in to_marker_array."""
     labels = [CLASSES[i] for i in detections.class_ids]
+    texts: list[dict[str, int]] = [{"id": i} for i in range(len(detections))]
+    for text, cluster in zip(texts, () if clusters is None else clusters):
+        text["cluster_id"] = int(cluster)
     return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
-                           extras=[{"id": i} for i in range(len(detections))], previous=previous,
-                           lifetime_ns=lifetime_ns)
+                           extras=texts, previous=previous, lifetime_ns=lifetime_ns)
 
 
 def _class_ids(labels: list[str]) -> list[int]:
     return [CLASSES.index(x if x in CLASSES else "Misc") for x in labels]
+
+
+def odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -> Any:
+    """nav_msgs/Odometry: the pose (4, 4) of moving_frame in the frame of header."""
+    x, y, z = map(float, pose[:3, 3])
+    qx, qy, qz, qw = map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
+    place = make("geometry_msgs/msg/Pose", position=make("geometry_msgs/msg/Point", x=x, y=y, z=z),
+                 orientation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw))
+    return make("nav_msgs/msg/Odometry", header=header, child_frame_id=moving_frame,
+                pose=make("geometry_msgs/msg/PoseWithCovariance", pose=place))
+
+
+def pose_of(pose: Any) -> np.ndarray:
+    """(4, 4) float64 of a geometry_msgs/Pose. InputError if it is not finite, or its quaternion is
+    no rotation."""
+    p, q = pose.position, pose.orientation
+    place, turn = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
+    if not np.isfinite(place).all() or not abs(np.linalg.norm(turn) - 1) < 1e-2:
+        raise InputError("a pose is not finite, or has no unit quaternion")
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(turn).as_matrix(), place
+    return matrix

@@ -15,7 +15,7 @@ from lidar_perception.candidates.refine import refine
 from lidar_perception.candidates.seed_sources import clicked_seed, fixed_seed, truth_seed
 from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.clustering.shapes import oriented_boxes
-from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.groups import group_points
 from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
 
@@ -151,7 +151,7 @@ def test_refining_without_clusters_finds_none():
 @needs_data
 def test_on_a_real_frame_the_seeds_own_cluster_passes_every_stage():
     checked = 0
-    for frame in open_kitti(DATA / "kitti_object")[:12]:
+    for frame in open_recording(DATA / "kitti_object").frames[:12]:
         truth = frame.truth().of_class(PEDESTRIAN)
         if len(truth) == 0:
             continue

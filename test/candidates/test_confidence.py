@@ -33,7 +33,7 @@ from lidar_perception.candidates.silhouette import (
     similarity,
     to_pixels,
 )
-from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import PEDESTRIAN, LidarFrame
 
@@ -283,7 +283,7 @@ def test_an_automatic_seed_is_the_likeliest_cluster_or_the_template():
 @needs_data
 def test_best_finds_more_of_the_real_pedestrians_than_paper():
     hits = dict.fromkeys(("paper", "best"), 0)
-    for frame in open_kitti(DATA / "kitti_object"):
+    for frame in open_recording(DATA / "kitti_object"):
         truth = frame.truth().of_class(PEDESTRIAN)
         if len(truth) == 0:
             continue

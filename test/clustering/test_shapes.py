@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 from lidar_perception.clustering.params import BOX_SHAPES
 from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
-from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.geometry import box_corners, points_in_box
 from lidar_perception.types import CLASSES
 
@@ -236,7 +236,7 @@ def test_without_points_or_clusters_there_are_no_boxes_and_an_unused_id_has_zero
     noise = np.ones((5, 3), np.float32), np.zeros(5, np.int32)
     for cloud in (nothing, noise):
         assert (oriented_boxes(*cloud, shape).shape, ellipses(*cloud).shape) == ((0, 7), (0, 5))
-    xyz, labels = np.array([[1, 2, 3], [2, 2, 5]], np.float32), np.array([3, 3], np.int32)
+    xyz, labels = np.array([[1, 2, 3], [2, 2, 5], [9, 9, 9]], np.float32), np.array([3, 3, 0])
     assert not oriented_boxes(xyz, labels, shape)[:2].any() and not ellipses(xyz, labels)[:2].any()
     np.testing.assert_array_equal(oriented_boxes(xyz, labels, shape)[2], [1.5, 2, 4, 1, 0, 2, 0])
     with pytest.raises(ValueError, match="'round' must be one of axis_aligned, min_area, l_shape"):
@@ -289,7 +289,7 @@ def test_the_diagonal_is_that_of_length_and_width_and_no_box_has_no_class():
 @needs_data
 def test_most_boxes_of_real_cars_lie_along_the_cars():
     errors = {"min_area": [], "l_shape": []}
-    for frame in open_kitti(DATA / "kitti_object"):
+    for frame in open_recording(DATA / "kitti_object"):
         xyz = frame.load().xyz
         for car in frame.truth().of_class(CLASSES.index("Car")):
             inside = xyz[points_in_box(xyz, car)]

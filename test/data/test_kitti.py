@@ -17,12 +17,13 @@ from samples import (
 )
 
 from lidar_perception.data.kitti.calibration import IMAGE_SIZES, read_calibration
-from lidar_perception.data.kitti.folder import START_NS, open_kitti, read_velodyne
+from lidar_perception.data.kitti.folder import START_NS, read_velodyne
+from lidar_perception.data.open import open_recording
 
 
 @pytest.mark.parametrize("layout, count", [("object", 2), ("tracking", 5), ("raw", 3)])
 def test_every_scan_is_read_as_it_is_in_the_file(tmp_path, layout, count):
-    frames = open_kitti(LAYOUTS[layout](tmp_path))
+    frames = open_recording(LAYOUTS[layout](tmp_path)).frames
     assert len(frames) == count
     for frame in frames:
         expected = scene(int(frame.points.stem))
@@ -35,7 +36,7 @@ def test_every_scan_is_read_as_it_is_in_the_file(tmp_path, layout, count):
 
 @each_layout
 def test_the_calibration_is_the_product_of_its_matrices(tmp_path, layout):
-    for frame in open_kitti(LAYOUTS[layout](tmp_path)):
+    for frame in open_recording(LAYOUTS[layout](tmp_path)):
         calibration = frame.calibration()
         np.testing.assert_allclose(calibration.lidar_to_camera, LIDAR_TO_CAMERA, atol=1e-12)
         assert np.array_equal(calibration.intrinsics, INTRINSICS)
@@ -44,15 +45,15 @@ def test_the_calibration_is_the_product_of_its_matrices(tmp_path, layout):
 
 @each_layout
 def test_frames_have_ascending_stamps_and_names_of_their_own(tmp_path, layout):
-    frames = open_kitti(LAYOUTS[layout](tmp_path))
+    frames = open_recording(LAYOUTS[layout](tmp_path)).frames
     stamps = [f.stamp_ns for f in frames]
     assert stamps == sorted({*stamps}) and len({f.name for f in frames}) == len(frames)
 
 
 def test_object_and_tracking_frames_come_at_10_hz(tmp_path):
-    assert [f.stamp_ns - START_NS for f in open_kitti(object_folder(tmp_path / "o", count=3))] == [
-        0, 10**8, 2 * 10**8]
-    frames = open_kitti(tracking_folder(tmp_path / "t"))
+    frames = open_recording(object_folder(tmp_path / "o", count=3))
+    assert [f.stamp_ns - START_NS for f in frames] == [0, 10**8, 2 * 10**8]
+    frames = open_recording(tracking_folder(tmp_path / "t")).frames
     first, second = ([f for f in frames if f.name.startswith(s)] for s in ("0000/", "0007/"))
     assert [f.stamp_ns - first[0].stamp_ns for f in first] == [0, 10**8, 2 * 10**8]
     assert [f.stamp_ns - second[0].stamp_ns for f in second] == [0, 10**8]
@@ -62,12 +63,12 @@ def test_object_and_tracking_frames_come_at_10_hz(tmp_path):
 def test_a_frame_that_is_missing_leaves_its_time_empty(tmp_path):
     root = tracking_folder(tmp_path)
     (root / "training/velodyne/0000/000001.bin").unlink()
-    assert [f.stamp_ns - START_NS for f in open_kitti(root)[:2]] == [0, 2 * 10**8]
+    assert [f.stamp_ns - START_NS for f in open_recording(root).frames[:2]] == [0, 2 * 10**8]
 
 
 def test_raw_stamps_are_read_to_the_nanosecond(tmp_path):
     second = 1317042145 * 10**9  # date -u -d '2011-09-26 13:02:25' +%s
-    assert [f.stamp_ns - second for f in open_kitti(raw_folder(tmp_path))] == [
+    assert [f.stamp_ns - second for f in open_recording(raw_folder(tmp_path))] == [
         594360375, 700000000, 1000000001]
 
 
@@ -77,22 +78,22 @@ def test_a_folder_may_be_given_from_outside_or_inside(tmp_path, inner):
     folders = {layout: make(tmp_path / layout) for layout, make in LAYOUTS.items()}
     for root in folders.values():
         if (root / inner).is_dir():
-            assert [f.points for f in open_kitti(root / inner)] == [
-                f.points for f in open_kitti(root)]
+            assert [f.points for f in open_recording(root / inner)] == [
+                f.points for f in open_recording(root)]
 
 
 def test_the_full_scan_wins_over_the_reduced_one(tmp_path):
     root = object_folder(tmp_path)
     for i in (1, 2):
         write(root / f"training/velodyne_reduced/{i:06}.bin", scene(i)[:50].tobytes())
-    assert [len(f.load()) for f in open_kitti(root)] == [len(scene()), len(scene()), 50]
+    assert [len(f.load()) for f in open_recording(root)] == [len(scene()), len(scene()), 50]
 
 
 def test_a_scan_keeps_only_returns_that_can_be_used(tmp_path):
     root = object_folder(tmp_path)
     cloud = np.array([[1, 2, 3, 0.5], [0, 0, 0, 0.1], [np.nan, 1, 1, 0.2], [4, 5, 6, 0.7]], "f4")
     write(root / "training/velodyne/000000.bin", cloud.tobytes())
-    frame = open_kitti(root)[0]
+    frame = open_recording(root).frames[0]
     assert frame.load().xyz.tolist() == [[1, 2, 3], [4, 5, 6]]
     assert frame.load().intensity.tolist() == [0.5, np.float32(0.7)]
     assert read_velodyne(frame.points).tobytes() == cloud.tobytes()
@@ -105,7 +106,7 @@ def test_an_empty_scan_is_a_scan(tmp_path):
 def test_the_image_says_its_size(tmp_path):
     root = object_folder(tmp_path)
     write(root / "training/image_2/000001.png", png_header(640, 480))
-    sizes = [(f.calibration().width, f.calibration().height) for f in open_kitti(root)]
+    sizes = [(f.calibration().width, f.calibration().height) for f in open_recording(root)]
     assert sizes == [(1242, 375), (640, 480)]
 
 

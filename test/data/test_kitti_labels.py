@@ -17,7 +17,6 @@ from kitti_samples import (
 from samples import AXES, LABELS, LIDAR_TO_CAMERA, object_folder, write
 
 from lidar_perception.data.kitti.calibration import read_calibration
-from lidar_perception.data.kitti.folder import open_kitti
 from lidar_perception.data.kitti.labels import (
     format_label,
     parse,
@@ -26,6 +25,7 @@ from lidar_perception.data.kitti.labels import (
     to_ground_truth,
     to_labels,
 )
+from lidar_perception.data.open import open_recording
 from lidar_perception.geometry import box_corners
 from lidar_perception.types import CLASSES, GroundTruth
 
@@ -90,13 +90,13 @@ def test_boxes_have_the_corners_of_the_development_kit(line):
 def test_object_labels_are_those_of_the_frame(tmp_path):
     root = object_folder(tmp_path)
     write(root / "training/label_2/000001.txt", "")
-    first, second = open_kitti(root)
+    first, second = open_recording(root).frames
     assert text_of(first.truth()) == LABELS.splitlines()
     assert len(second.truth()) == 0 and second.truth().notes == ()
 
 
 def test_tracking_labels_are_those_of_the_sequence_and_frame(tmp_path):
-    first, second, third, *other = [f.truth() for f in open_kitti(tracking_folder(tmp_path))]
+    first, second, third, *other = [f.truth() for f in open_recording(tracking_folder(tmp_path))]
     assert first.labels == ["Pedestrian"] and first.extras[0]["track_id"] == 3
     assert [name for name, _ in first.notes] == ["DontCare"]
     assert len(second) == 0
@@ -106,7 +106,7 @@ def test_tracking_labels_are_those_of_the_sequence_and_frame(tmp_path):
 
 
 def test_tracklets_are_boxes_on_their_bottom_face(tmp_path):
-    first, second, third = [f.truth() for f in open_kitti(raw_folder(tmp_path))]
+    first, second, third = [f.truth() for f in open_recording(raw_folder(tmp_path))]
     assert len(first) == 0
     np.testing.assert_allclose(second.boxes, [[8, -1, -0.8, 0.9, 0.5, 1.8, 0.5]])
     assert second.extras[0] == {"track_id": 0, "occluded": 1, "truncated": 0.0}
@@ -122,7 +122,7 @@ def test_folders_without_labels_have_none(tmp_path, layout):
     root = LAYOUTS[layout](tmp_path)
     for path in [*root.rglob("label_*/*.txt"), *root.rglob("tracklet_labels.xml")]:
         path.unlink()
-    assert [f.truth() for f in open_kitti(root)] == [None] * len(open_kitti(root))
+    assert [f.truth() for f in open_recording(root)] == [None] * len(open_recording(root))
 
 
 def test_real_object_labels_come_back_as_the_same_text(data):

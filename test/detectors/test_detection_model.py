@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lidar_perception.detectors.checkpoint import require_same
+from lidar_perception.detectors.config_json import config_of
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.box_coder import decode
 from lidar_perception.detectors.pointpillars.config import (
@@ -57,7 +58,7 @@ def some_map(config, seed=0) -> torch.Tensor | None:
 @pytest.mark.parametrize("size", SIZES)
 def test_a_config_survives_json(version, size):
     config = network_config(version, size, classes=("Cyclist", "Car"))
-    assert NetworkConfig.of_json(dataclasses.asdict(config)) == config
+    assert config_of(NetworkConfig, dataclasses.asdict(config), "") == config
     assert config.classes == ("Cyclist", "Car") and config.grid == (496, 432)
 
 

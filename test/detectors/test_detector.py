@@ -266,8 +266,8 @@ def test_a_device_that_is_not_there_is_refused(name, words):
 
 
 def test_real_scans_of_any_version_go_through(data):
-    from lidar_perception.data.kitti.folder import open_kitti
-    scan = open_kitti(data / "kitti_object")[0].load()
+    from lidar_perception.data.open import open_recording
+    scan = open_recording(data / "kitti_object").frames[0].load()
     for version in VERSIONS:
         config = network_config(version, "compact")
         found = PointPillarsDetector(TorchNetwork(lively(config)), Header(config), CPU)(scan)

@@ -32,7 +32,6 @@ from lidar_perception.detectors.pointnet.params import (
     STEPS,
     PointNetDetectorParams,
 )
-from lidar_perception.detectors.pointnet.predict import CHUNK
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector
 from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.detectors.view import in_sensor_frame
@@ -128,26 +127,6 @@ def test_a_frame_without_clusters_has_no_detections_and_a_reason(ids):
         assert found.best == {} and list(found.ms) == list(STEPS)
         found = detector(scan, cluster_ids=ids)
         assert found.problem is None and found.ms["network"] > 0
-
-
-def test_small_and_large_clusters_and_many_are_no_trouble(ids):
-    rng = np.random.default_rng(0)
-    detector = random_detector(with_values(eager(), {"pointnet.min_points": 1}))
-    batches = []
-    detector.network.register_forward_hook(lambda net, given, _: batches.append(len(given[0])))
-    one = LidarFrame(np.float32([[9, 0, -1]]), np.ones(1, np.float32))
-    assert len(detector(one, cluster_ids=np.ones(1, int)).detections) == 1
-    xyz = rng.uniform([5, -3, -1.7], [9, 3, 2], (50_000, 3)).astype(np.float32)
-    big = LidarFrame(xyz, rng.uniform(0, 1, len(xyz)).astype(np.float32))
-    assert len(detector(big, cluster_ids=np.ones(len(xyz), int)).detections) == 1
-    spots = rng.uniform(-80, 80, (5000, 1, 3)) * [1, 1, 0.01]
-    xyz = (spots + rng.normal(0, 0.2, (5000, 6, 3))).reshape(-1, 3).astype(np.float32)
-    batches.clear()
-    found = detector(LidarFrame(xyz, np.zeros(len(xyz), np.float32)),
-                     cluster_ids=np.repeat(np.arange(5000), 6) + 1)
-    assert sum(batches) == 5000 and max(batches) <= CHUNK
-    assert len(found.detections) == detector.params.pointnet.nms.max_boxes
-    assert found.problem is None
 
 
 # where the sensor is
@@ -400,8 +379,8 @@ def test_weights_that_do_not_come_with_the_package_are_asked_for(saved, tmp_path
 
 
 def test_real_scans_of_any_network_go_through(data):
-    from lidar_perception.data.kitti.folder import open_kitti
-    scan = open_kitti(data / "kitti_object")[0].load()
+    from lidar_perception.data.open import open_recording
+    scan = open_recording(data / "kitti_object").frames[0].load()
     for name in "improved", "pointnet", "pointnet2":
         config = small(name)
         found = PointNetDetector(lively(config), Header(config), CPU,

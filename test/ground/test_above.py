@@ -81,5 +81,5 @@ def test_without_ground_all_is_an_obstacle_and_without_points_nothing():
 
 
 def test_a_band_that_holds_nothing_is_refused():
-    with pytest.raises(ValueError, match="must be above min_height"):
+    with pytest.raises(ValueError, match="must not be below min_height"):
         ObstacleParams(min_height=2.0, max_height=1.0)

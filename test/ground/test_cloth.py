@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 
-from lidar_perception.data.semantickitti import open_semantic_kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.ground.climbing import REACH, STEP, UNOBSERVED, climbed_cells
 from lidar_perception.ground.cloth import lay_cloth, segment_by_cloth
 from lidar_perception.ground.obstacle import at_rest
@@ -256,7 +256,7 @@ def silent():
 @needs_data
 def test_on_the_real_scan_it_is_as_good_as_the_falling_cloth_of_the_wheel():
     CSF = pytest.importorskip("CSF")
-    labelled = open_semantic_kitti(DATA / "semantickitti")[0]
+    labelled = open_recording(DATA / "semantickitti").frames[0]
     frame, semantic = labelled.load(), labelled.point_truth().classes
     params = ClothParams()
     with silent():

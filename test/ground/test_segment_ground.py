@@ -7,7 +7,7 @@ import pytest
 from samples import DATA, needs_data
 from test_cloth import f1, street
 
-from lidar_perception.data.semantickitti import open_semantic_kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.ground.params import (
     GROUND_METHODS,
     GroundParams,
@@ -152,7 +152,7 @@ def bare_patchwork(xyz, intensity, height=1.73, rnr=True):
 
 @needs_data
 def test_patchwork_is_the_library_on_the_first_cloud_and_silent(capfd):
-    frame = open_semantic_kitti(DATA / "semantickitti")[0].load()
+    frame = open_recording(DATA / "semantickitti").frames[0].load()
     params = GroundParams(method="patchwork")
     found = [segment_ground(frame, params) for _ in range(3)]  # no memory from cloud to cloud
     assert capfd.readouterr().out == ""
@@ -169,7 +169,7 @@ def test_patchwork_is_the_library_on_the_first_cloud_and_silent(capfd):
 @needs_data
 @each_method
 def test_on_the_real_scan_permuting_points_permutes_the_ground(method):
-    frame = open_semantic_kitti(DATA / "semantickitti")[0].load()
+    frame = open_recording(DATA / "semantickitti").frames[0].load()
     order = np.random.default_rng(0).permutation(len(frame))
     found = ground_of(frame.xyz, method)
     assert (ground_of(frame.xyz[order], method) == found[order]).mean() > 0.99

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,7 +15,6 @@ from lidar_perception.candidates.params import StmParams
 from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.refine import STAGES, refine
 from lidar_perception.clustering.params import DbscanParams
-from lidar_perception.data.kitti.folder import open_kitti
 from lidar_perception.data.open import open_recording
 from lidar_perception.reproduction import runner
 from lidar_perception.reproduction.experiment import Cell
@@ -63,7 +63,7 @@ def measured(records):
 def refined(kitti):
     """(labelled, segmented, seed, candidates of the paper) of each frame with pedestrians."""
     found = []
-    for frame in open_kitti(kitti)[:-1]:
+    for frame in open_recording(kitti).frames[:-1]:
         labelled = load_labelled(frame)
         segmented = segment(labelled.frame, labelled.camera, PAPER)
         seed = nearest_seed(segmented, labelled)
@@ -95,13 +95,13 @@ def test_there_is_something_to_count(measured):
 
 
 def test_frames_come_in_order_and_the_one_without_pedestrians_is_skipped(kitti, records):
-    assert [r["frame"] for r in records] == [frame.name for frame in open_kitti(kitti)]
+    assert [r["frame"] for r in records] == [frame.name for frame in open_recording(kitti)]
     assert ["skipped" in r for r in records] == [False] * (COUNT - 1) + [True]
     assert "no Pedestrian" in records[-1]["skipped"]
 
 
 def test_hits_and_misses_are_the_truth_in_every_part_of_a_record(kitti, measured):
-    for frame, record in zip(open_kitti(kitti), measured):
+    for frame, record in zip(open_recording(kitti).frames, measured):
         truth = load_labelled(frame).pedestrians
         assert record["pedestrians"] == np.bincount(range_bins(truth), minlength=5).tolist()
         for counts in (*record["stages"].values(), *record["cpa"]):
@@ -117,7 +117,7 @@ def test_hits_and_misses_are_the_truth_in_every_part_of_a_record(kitti, measured
 
 def test_the_stages_are_those_of_evaluate_candidates(kitti, measured):
     report = CandidateReport()
-    fill(report, open_recording(kitti), by_pipeline(PAPER))
+    fill(report, open_recording(kitti), partial(by_pipeline, PAPER))
     assert report.frames == len(measured)
     for stage, score in report.scores.items():
         for key in ("tp", "fp", "fn"):
@@ -205,7 +205,7 @@ def test_a_seed_in_empty_space_or_on_a_car_leaves_misses_and_its_reason(kitti, t
     shutil.copytree(kitti, tmp_path / "kitti")
     label = tmp_path / "kitti/training/label_2/000002.txt"
     label.write_text(change(label.read_text()))
-    frames = open_kitti(tmp_path / "kitti")
+    frames = open_recording(tmp_path / "kitti").frames
     record = measure(frames, 2)
     assert words in record["no_seed"] and record["ms"] is None
     assert sum(record["pedestrians"]) == 4
@@ -219,7 +219,7 @@ def test_a_seed_in_empty_space_or_on_a_car_leaves_misses_and_its_reason(kitti, t
 
 
 def test_a_record_does_not_depend_on_what_was_measured_before(kitti, measured):
-    frames = open_kitti(kitti)
+    frames = open_recording(kitti).frames
     for number in (3, 1):
         assert untimed(measure(frames, number)) == untimed(measured[number])
 
@@ -309,7 +309,7 @@ def test_published_figures_are_those_of_the_digest():
 
 
 def test_real_frames_have_a_record_or_a_reason(data):
-    frames = open_kitti(data / "kitti_object")
+    frames = open_recording(data / "kitti_object").frames
     names = [frame.name for frame in frames]
     for number in [names.index("000134"), names.index("000000"), 1]:
         labels = frames[number].points.parents[1] / f"label_2/{names[number]}.txt"

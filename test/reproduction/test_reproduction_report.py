@@ -13,7 +13,6 @@ from click.testing import CliRunner
 from reproduction_samples import SMALL, command, points_table
 
 from lidar_perception.cli.main import cli
-from lidar_perception.data.kitti.folder import open_kitti
 from lidar_perception.data.open import open_recording
 from lidar_perception.reproduction import journal, runner
 from lidar_perception.reproduction.experiment import Cell, Experiment, Figure, Line, Panel, Table
@@ -119,7 +118,7 @@ def test_a_study_runs_by_its_name(few, tmp_path, monkeypatch):
     out = tmp_path / "out"
     text = command("stm-cpa", "--study", "points", "--data", few, "--out", out, "--jobs", 1)
     assert "skipped 1: three is not liked" in text
-    expected = [len(frame.load()) for frame in open_kitti(few)]
+    expected = [len(frame.load()) for frame in open_recording(few)]
     rows = list(csv.DictReader((out / "tables/points.csv").open()))
     assert [float(r["points"]) for r in rows] == np.delete(expected, 3).tolist()
 

@@ -14,7 +14,7 @@ from samples import crowd_folder
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.silhouette import covered, cpa_scales, silhouettes
 from lidar_perception.cli.simulate import simulate
-from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.param_fields import with_values
 from lidar_perception.reproduction import stm_cpa
 from lidar_perception.reproduction.studies import STUDIES, adaptive, confidence, far
@@ -35,7 +35,7 @@ def kitti(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def frames(kitti):
-    return open_kitti(kitti)
+    return open_recording(kitti).frames
 
 
 def study(name):
@@ -95,7 +95,7 @@ def test_far_on_a_drive(streets, tmp_path):
                                          "33", "--street", "zone", "--people", "3", "--jobs", "1",
                                          "--out", str(tmp_path / "drive")])
     assert made.exit_code == 0, made.output
-    frames = open_kitti(tmp_path / "drive")
+    frames = open_recording(tmp_path / "drive").frames
     with pytest.raises(InputError, match="fewer than 4 scans"):
         far.measure(frames, 3)
     record = far.measure(frames, 4)

@@ -15,12 +15,10 @@ from rclpy.parameter import Parameter
 from test_bad_input import CLOUD, MARKERS
 from test_pointpillars_node import NODE, REMAP, assert_equal, message, offline, received, values
 
-from lidar_perception.data.bag import Bag
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
 from lidar_perception.wire.codec import encode
-from lidar_perception.wire.topics import POINTS
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 LEADS_TO = {"configure": State.PRIMARY_STATE_INACTIVE, "activate": State.PRIMARY_STATE_ACTIVE,
@@ -37,9 +35,28 @@ def weights(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def good_cloud(drive_bag):
-    with Bag(drive_bag) as bag:
-        return next(m for _, _, m in bag.messages({POINTS}))
+def peer(shared_peer):
+    return shared_peer
+
+
+@pytest.fixture(scope="module")
+def later(tmp_path_factory):
+    """Where the weights of two nodes are to be."""
+    return tmp_path_factory.mktemp("later") / "later.safetensors"
+
+
+@pytest.fixture(scope="module")
+def nodes(shared_processes, weights, later):
+    """All at once: with its weights, without, without and by itself, without their template."""
+    driven = {**values(weights), "autostart": False}
+    shared_processes.start(NODE, {}, driven, "ready")
+    shared_processes.start(NODE, {}, {**driven, "pointpillars.weights": str(later)}, "waits")
+    shared_processes.start(NODE, {}, {**values(weights), "pointpillars.weights": str(later)},
+                           "tries")
+    for name in ("perception", "candidate_refinement"):
+        shared_processes.start(name, {}, {"autostart": False, "seed.source": "file",
+                                          "seed.file": "/nowhere.json"}, "waits")
+    return shared_processes
 
 
 def state(peer, node):
@@ -88,35 +105,36 @@ def entities(node):
         "publishers", "subscriptions", "timers", "guards", "services", "clients", "waitables")}
 
 
-def test_a_manager_takes_a_detector_through_its_states(processes, peer, weights):
+def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
     """Nothing is heard or said while it is not active; results are those of the offline detector
     each time it is, on the newest cloud; a shutdown can be asked about afterwards."""
-    processes.start(NODE, REMAP, {**values(weights), "autostart": False})
-    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
-    assert state(peer, NODE) == State.PRIMARY_STATE_UNCONFIGURED
-    peer.wait(lambda: peer.value_of(NODE, "lifecycle") == "unconfigured", "its diagnostics")
-    assert ord(peer.diagnostics[NODE].level) == 0 and peer.message_of(NODE) == "not configured"
-    drive(peer, NODE, "configure")
+    node = f"ready/{NODE}"
+    talker = peer.talker(f"/{node}/input/points", CLOUD)
+    found = peer.listen(f"/{node}/output/detections", MARKERS)
+    assert state(peer, node) == State.PRIMARY_STATE_UNCONFIGURED
+    peer.wait(lambda: peer.value_of(node, "lifecycle") == "unconfigured", "its diagnostics")
+    assert ord(peer.diagnostics[node].level) == 0 and peer.message_of(node) == "not configured"
+    drive(peer, node, "configure")
     assert talker.get_subscription_count() == 0
-    for round_ in (1, 2):
-        talker.publish(encode(message(10 * round_)))  # to nobody
-        drive(peer, NODE, "activate")
-        peer.send(talker, message(10 * round_ + 1), lambda n=round_: received(found, 10 * n + 1),
+    for round_ in (10, 20):
+        talker.publish(encode(message(round_)))  # to nobody
+        drive(peer, node, "activate")
+        peer.send(talker, message(round_ + 1), lambda n=round_: received(found, n + 1),
                   "detections")
-        assert_equal(received(found, 10 * round_ + 1), offline(weights, message(1)))
-        drive(peer, NODE, "deactivate")
+        assert_equal(received(found, round_ + 1), offline(weights, message(1)))
+        drive(peer, node, "deactivate")
         peer.wait(lambda: not talker.get_subscription_count(), "the end of the subscription")
-        peer.wait(lambda: peer.value_of(NODE, "lifecycle") == "inactive"
-                  and peer.message_of(NODE) == "not active", "the state in the diagnostics")
-        assert received(found, 10 * round_) is None
-    drive(peer, NODE, "cleanup", "configure", "activate")
+        peer.wait(lambda: peer.value_of(node, "lifecycle") == "inactive"
+                  and peer.message_of(node) == "not active", "the state in the diagnostics")
+        assert received(found, round_) is None
+    drive(peer, node, "cleanup", "configure", "activate")
     peer.send(talker, message(31), lambda: received(found, 31), "detections")
-    assert not change(peer, NODE, "configure")  # rclpy would end the node
-    drive(peer, NODE, "deactivate", "cleanup", "unconfigured_shutdown")
-    processes.check()
-    assert processes.stop(timeout=15) == {NODE: 0}
-    log = (processes.logs / f"{NODE}.log").read_text()
-    assert "needs the parameter autostart false" in log and "Traceback" not in log
+    assert not change(peer, node, "configure")  # rclpy would end the node
+    drive(peer, node, "deactivate", "cleanup", "unconfigured_shutdown")
+    process = f"ready.{NODE}"
+    assert not nodes.ended(process) and nodes.end(process) == 0
+    assert "needs the parameter autostart false" in nodes.log(process)
+    assert "Traceback" not in nodes.log(process)
 
 
 def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
@@ -137,32 +155,35 @@ def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
         assert entities(node) == empty and set(vars(node)) == names
 
 
-def test_a_node_without_its_network_cannot_be_configured(processes, peer, tmp_path, weights):
-    """A manager is refused and the reason is an ERROR; once the file is there, it is not."""
-    file = tmp_path / "later.safetensors"
-    processes.start(NODE, REMAP, {**values(weights), "pointpillars.weights": str(file),
-                                  "autostart": False})
+def test_a_node_without_its_network_waits_for_the_file_and_says_so(nodes, peer, later, weights):
+    """A manager is refused, and the reason is an ERROR; once the file is there it is not refused,
+    and a node that starts by itself takes it."""
+    reason = f"there is no checkpoint {later}"
+    driven, alone = f"waits/{NODE}", f"tries/{NODE}"
     for _ in range(2):
-        assert not change(peer, NODE, "configure")
-        assert state(peer, NODE) == State.PRIMARY_STATE_UNCONFIGURED
-        peer.wait(lambda: f"there is no checkpoint {file}" in peer.message_of(NODE), "the reason")
-        assert ord(peer.diagnostics[NODE].level) == 2
-    file.write_bytes(weights.read_bytes())
-    drive(peer, NODE, "configure", "activate")
-    processes.check()
+        assert not change(peer, driven, "configure")
+        assert state(peer, driven) == State.PRIMARY_STATE_UNCONFIGURED
+    for node in (driven, alone):
+        peer.wait_for_diagnostics(node, reason, level=2)
+    part = later.with_name("part")
+    part.write_bytes(weights.read_bytes())
+    part.rename(later)
+    drive(peer, driven, "configure", "activate")
+    for node in (driven, alone):
+        talker = peer.talker(f"/{node}/input/points", CLOUD)
+        found = peer.listen(f"/{node}/output/detections", MARKERS)
+        peer.send(talker, message(1), lambda f=found: received(f, 1), "detections")
+        assert_equal(received(found, 1), offline(weights, message(1)))
+    assert nodes.log(f"tries.{NODE}").count(reason) == 1
 
 
-def test_a_node_that_starts_by_itself_takes_a_network_that_comes_later(processes, peer, tmp_path,
-                                                                       weights):
-    file = tmp_path / "later.safetensors"
-    processes.start(NODE, REMAP, {**values(weights), "pointpillars.weights": str(file)})
-    talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
-    peer.wait(lambda: f"there is no checkpoint {file}" in peer.message_of(NODE), "the reason")
-    assert ord(peer.diagnostics[NODE].level) == 2
-    (tmp_path / "part").write_bytes(weights.read_bytes())
-    (tmp_path / "part").rename(file)
-    peer.send(talker, message(1), lambda: received(found, 1), "detections")
-    processes.check()
+def test_a_template_that_is_missing_is_known_before_the_first_cloud(nodes, peer):
+    for name in ("waits/perception", "waits/candidate_refinement"):
+        assert not change(peer, name, "configure")
+        peer.wait_for_diagnostics(name, "/nowhere.json", level=2)
+        peer.set_parameter(f"/{name}", "seed.source", "click")
+        drive(peer, name, "configure", "activate", "deactivate", "cleanup",
+              "unconfigured_shutdown")
 
 
 def test_what_waits_is_dropped_and_counted_and_the_pause_is_no_loss(here, peer, good_cloud):
@@ -185,14 +206,3 @@ def test_what_waits_is_dropped_and_counted_and_the_pause_is_no_loss(here, peer, 
     reception.waiting.extend([b"cloud"] * 2)
     drive(peer, name, "deactivate")
     assert not reception.waiting and reception.arrivals.dropped >= 2
-
-
-@pytest.mark.parametrize("name", ["perception", "candidate_refinement"])
-def test_a_template_that_is_missing_is_known_before_the_first_cloud(processes, peer, name):
-    processes.start(name, {}, {"autostart": False, "seed.source": "file",
-                               "seed.file": "/nowhere.json"})
-    assert not change(peer, name, "configure")
-    peer.wait(lambda: "/nowhere.json" in peer.message_of(name), "the reason")
-    peer.set_parameter(f"/{name}", "seed.source", "click")
-    drive(peer, name, "configure", "activate", "deactivate", "cleanup", "unconfigured_shutdown")
-    processes.check()

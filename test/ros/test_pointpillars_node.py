@@ -263,9 +263,10 @@ def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, sha
     if missing is None:
         pytest.skip("weights of all versions and sizes come with the package")
     version, size = missing.split()
-    processes.start(NODE, REMAP, {"pointpillars.version": version, "pointpillars.size": size},
-                    "none")
-    peer, node, found = shared_peer, f"none/{NODE}", shared_peer.listen("/found", MARKERS)
+    processes.start(NODE, {"~/input/points": "/in"},
+                    {"pointpillars.version": version, "pointpillars.size": size}, "none")
+    peer, node = shared_peer, f"none/{NODE}"
+    found = peer.listen(f"/{node}/output/detections", MARKERS)
     peer.send(to_unusable, message(1), lambda: f"no weights for {missing}" in
               peer.message_of(node), "the diagnostic")
     peer.diagnostics.clear()

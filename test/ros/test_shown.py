@@ -64,6 +64,7 @@ def graph(domain):
         module = importlib.import_module(f"lidar_perception.nodes.{name}")
         rules = [word for rule in remap.items() for word in ("-r", ":=".join(rule))]
         node = getattr(module, NODES[name][0])(context=context, cli_args=["--ros-args", *rules])
+        node.start()  # managed nodes have their topics then
         nodes.append(node)
         types.update((t, kinds[0]) for t, kinds in node.get_subscriber_names_and_types_by_node(
             name, "/"))

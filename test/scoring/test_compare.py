@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import detection_samples
 import numpy as np
@@ -25,7 +26,7 @@ from lidar_perception.scoring.comparison.outcomes import (
     by_contenders,
     in_turn,
 )
-from lidar_perception.scoring.comparison.report import spread
+from lidar_perception.scoring.comparison.report import kept_apart
 from lidar_perception.scoring.kitti.protocol import SCORED
 from lidar_perception.scoring.run import fill
 from lidar_perception.types import Detections, InputError
@@ -68,7 +69,7 @@ def taken(root, *detectors) -> dict:
     """The report of detectors: functions of a frame to a detector, or None."""
     contenders = [Contender(str(i), each) for i, each in enumerate(detectors)]
     report = ComparisonReport(contenders)
-    fill(report, open_recording(root), by_contenders(lambda: contenders))
+    fill(report, open_recording(root), partial(by_contenders, lambda: contenders))
     return report.compute()
 
 
@@ -188,14 +189,14 @@ def test_names_in_the_figure_keep_their_distance():
     rng = np.random.default_rng(0)
     for count in (1, 2, 5, 20, 60):
         values = rng.choice([rng.uniform(0, 100), 0, 50, 100], count) + rng.normal(0, 2, count)
-        places = spread(values, 0, 100, 4)
+        places = kept_apart(values, 0, 100, 4)
         gaps = np.diff(np.sort(places))
         assert (gaps > min(4, 100 / max(count - 1, 1)) - 1e-9).all()
         assert places.min() >= -1e-9 and places.max() <= 100 + 1e-9
         order = np.argsort(values, kind="stable")
         assert (np.diff(places[order]) > 0).all()
     apart = np.array([80.0, 10, 30])
-    np.testing.assert_allclose(spread(apart, 0, 100, 4), apart)
+    np.testing.assert_allclose(kept_apart(apart, 0, 100, 4), apart)
 
 
 @pytest.mark.parametrize("case", ["labels", "weights", "folder"])

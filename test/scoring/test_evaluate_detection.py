@@ -11,8 +11,8 @@ from cli_samples import error_line, exit_of
 from cli_samples import evaluate_detection as evaluate
 from samples import CALIBRATION, LABELS, object_folder, write
 
-from lidar_perception.data.kitti.folder import open_kitti
 from lidar_perception.data.kitti.results import read_results, write_results
+from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
@@ -73,7 +73,7 @@ def detector(monkeypatch):
 
 
 def truth_of(kitti):
-    truth = open_kitti(kitti)[0].truth()
+    truth = open_recording(kitti).frames[0].truth()
     return Detections.of(truth.boxes, truth.class_ids, [0.9, 0.8])
 
 
@@ -99,7 +99,7 @@ def test_scans_are_not_needed_for_result_files(kitti, found, tmp_path):
     after, _ = evaluate(tmp_path, "--data", kitti / "training", "--results", found)
     assert after == before
     with pytest.raises(InputError, match="no KITTI scans"):
-        open_kitti(kitti)
+        open_recording(kitti)
 
 
 def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
@@ -108,7 +108,7 @@ def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
                              "--device", "cpu")
     assert detector.asked == [("v4.safetensors", "cpu", MIN_SCORE, SENSOR_HEIGHT)]
     assert len(detector.scans) == 2
-    assert len(detector.scans[0]) == len(open_kitti(kitti)[0].load())
+    assert len(detector.scans[0]) == len(open_recording(kitti).frames[0].load())
     assert content["ms"] >= 0 and "ms a frame" in text
     for (_, row, _), cell in cells(content).items():
         if row not in ("image", "aos"):  # the made-up 2D boxes of the labels are no projections
@@ -125,7 +125,7 @@ def test_a_share_of_the_points_is_kept_and_always_the_same(kitti, detector, tmp_
         for now, before in zip(points, kept.get(share, points), strict=True):
             np.testing.assert_array_equal(now, before)
         kept[share] = points
-    for frame, whole, tenth in zip(open_kitti(kitti), kept[1], kept[0.1], strict=True):
+    for frame, whole, tenth in zip(open_recording(kitti).frames, kept[1], kept[0.1], strict=True):
         np.testing.assert_array_equal(whole[:, :3], frame.load().xyz)
         assert abs(len(tenth) / len(whole) - 0.1) < 0.03
         assert set(map(tuple, tenth)) < set(map(tuple, whole))
@@ -133,7 +133,7 @@ def test_a_share_of_the_points_is_kept_and_always_the_same(kitti, detector, tmp_
 
 
 def test_a_smaller_share_is_part_of_a_larger_one(kitti):
-    frame = open_kitti(kitti)[0].load()
+    frame = open_recording(kitti).frames[0].load()
     before = frame
     for share in (1.0, 0.5, 0.2, 0.1, 0.0):
         now = thinned(frame, share, "000000")
@@ -289,7 +289,7 @@ def test_real_labels_as_their_own_results_score_100(data, tmp_path):
 def test_real_boxes_without_2d_boxes_are_projected_onto_the_labels(data, detector, tmp_path):
     """Boxes, and nothing else, score 100 from above and in space. In the image a person's limbs
     and what hides him make his label differ from the projection of his box."""
-    truths = iter([f.truth() for f in open_kitti(data / "kitti_object")])
+    truths = iter([f.truth() for f in open_recording(data / "kitti_object")])
 
     def find(frame):
         truth = next(truths)
@@ -302,7 +302,7 @@ def test_real_boxes_without_2d_boxes_are_projected_onto_the_labels(data, detecto
 
 def test_real_tracks_are_scored_by_what_is_outside_the_image(data, tmp_path):
     root = data / "kitti_tracking"
-    frames = open_kitti(root)
+    frames = open_recording(root).frames
     for frame in frames:
         truth = frame.truth()
         write_results(tmp_path / f"found/{frame.name}.txt",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from itertools import permutations
 from pathlib import Path
 from types import NoneType
@@ -196,7 +197,7 @@ def truth_of(*centres, label="Pedestrian"):
 
 def run(frames, source="ground_truth"):
     report, recording = CandidateReport(), Recording(Path("here"), "memory", frames)
-    start = by_pipeline(PipelineParams(seed=SeedParams(source=source)))
+    start = partial(by_pipeline, PipelineParams(seed=SeedParams(source=source)))
     fill(report, recording, start)
     found = [result for _, result in results(recording, start)]
     assert len(found) == len(frames)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import pytest
 from cli_samples import error_line, exit_of
@@ -100,7 +101,7 @@ def test_a_command_whose_run_ends_says_so_in_one_line(root, tmp_path, monkeypatc
                        tmp_path / "found", "--jobs", jobs) == 2
         assert "no result file" in error_line(capsys)
     with pytest.raises(RunError):
-        [*results(open_recording(root), by_files(tmp_path / "found"))]
+        [*results(open_recording(root), partial(by_files, tmp_path / "found"))]
 
 
 def test_a_mistake_is_no_skipped_frame_and_names_it(root):

@@ -15,7 +15,8 @@ from samples import DATA, needs_data, object_folder, walker_label, write
 
 from lidar_perception.cli.evaluate.segmentation import segmentation
 from lidar_perception.clustering.params import CLUSTERING_METHODS
-from lidar_perception.data.semantickitti import GROUND, MOVING, THINGS, open_semantic_kitti
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.semantickitti import GROUND, MOVING, THINGS
 from lidar_perception.ground.params import GROUND_METHODS
 from lidar_perception.scoring.points.segmentation import (
     PROTOCOLS,
@@ -269,9 +270,9 @@ def semantic_folder(root, scans=("00/000000", "00/000001", "05/000000")):
 def test_a_folder_is_read_in_order_without_unusable_returns(tmp_path):
     semantic_folder(tmp_path / "dataset")
     write(tmp_path / "dataset/sequences/11/velodyne/000000.bin", b"")  # a test sequence
-    frames = open_semantic_kitti(tmp_path)
+    frames = open_recording(tmp_path).frames
     assert [f.name for f in frames] == ["00/000000", "00/000001", "05/000000"]
-    assert [f.name for f in open_semantic_kitti(tmp_path / "dataset")] == [f.name for f in frames]
+    assert [f.name for f in open_recording(tmp_path / "dataset")] == [f.name for f in frames]
     frame, labels = frames[0].load(), frames[0].point_truth()
     semantic, instance = labels.classes, labels.instances
     assert len(frame) == len(semantic) == len(instance) == 4400
@@ -281,9 +282,9 @@ def test_a_folder_is_read_in_order_without_unusable_returns(tmp_path):
 
 
 @pytest.mark.parametrize("root, file, content, text", [
-    ("nowhere", None, None, "is not a folder"), (".", None, None, "has no SemanticKITTI scans"),
+    ("nowhere", None, None, "there is no"), (".", None, None, "is no recording"),
     ("unlabelled", "velodyne/000000.bin", b"", "scans but no labels"),
-    ("kitti", "velodyne/000001.bin", b"", "cannot read the labels"),
+    ("kitti", "velodyne/000001.bin", b"", "cannot read .*label"),
     ("kitti", "labels/000000.label", bytes(40), "has 10 labels for the 4402 points"),
     ("kitti", "labels/000000.label", bytes(41), "not a multiple of 4"),
     ("kitti", "velodyne/000000.bin", bytes(41), "not a multiple of 16")])
@@ -292,7 +293,7 @@ def test_a_broken_folder_gives_one_line_with_a_remedy(tmp_path, root, file, cont
     if file:
         write(tmp_path / root / "sequences/00" / file, content)
     with pytest.raises(InputError, match=text) as error:
-        for frame in open_semantic_kitti(tmp_path / root):
+        for frame in open_recording(tmp_path / root):
             frame.load()
             frame.point_truth()
     assert "\n" not in str(error.value) and re.search("give|expected|again", str(error.value))
@@ -300,7 +301,7 @@ def test_a_broken_folder_gives_one_line_with_a_remedy(tmp_path, root, file, cont
 
 @needs_data
 def test_the_real_scan_has_a_label_for_every_point():
-    first = open_semantic_kitti(DATA / "semantickitti")[0]
+    first = open_recording(DATA / "semantickitti").frames[0]
     frame, labels = first.load(), first.point_truth()
     semantic, instance = labels.classes, labels.instances
     assert len(frame) == len(semantic) == len(instance) > 100_000

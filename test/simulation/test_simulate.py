@@ -17,7 +17,7 @@ from click.testing import CliRunner
 from simulate_samples import arguments, content, run
 
 from lidar_perception.cli.simulate import simulate
-from lidar_perception.data.kitti.folder import open_kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.simulation import dataset
 from lidar_perception.simulation.dataset import LAYOUTS
 from lidar_perception.simulation.drive import scan_at
@@ -121,7 +121,7 @@ def test_after_a_kill_nothing_runs_on_and_it_goes_on_where_it_was(start, tmp_pat
     assert again.exit_code == 0
     assert run(tmp_path / "whole", "kitti-tracking", frames, 1, "--streets-of", 30).exit_code == 0
     assert content(out) == content(tmp_path / "whole")
-    assert len(open_kitti(out)) == frames
+    assert len(open_recording(out)) == frames
     assert len(list(out.glob("training/label_02/*.txt"))) == 2
 
 

@@ -9,10 +9,9 @@ import torch
 from simulate_samples import TINY, run
 
 from lidar_perception.data.kitti import write as write_kitti
-from lidar_perception.data.kitti.folder import open_kitti
 from lidar_perception.data.kitti.labels import read_object_labels, read_tracking_labels
 from lidar_perception.data.open import open_recording
-from lidar_perception.data.semantickitti import MOVING, THINGS, open_semantic_kitti
+from lidar_perception.data.semantickitti import MOVING, THINGS
 from lidar_perception.geometry import box_corners, points_in_box, wrap_angle
 from lidar_perception.simulation.batch import training_scans
 from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
@@ -81,7 +80,7 @@ def test_what_is_hidden_or_nearly_so_is_not_labelled_but_marked():
 
 
 def test_tracking_layout_reads_back(made):
-    frames = open_kitti(made / "kitti-tracking")
+    frames = open_recording(made / "kitti-tracking").frames
     assert [f.name for f in frames] == ["0000/000000", "0000/000001", "0001/000000", "0001/000001",
                                         "0002/000000"]
     for number, recorded in enumerate(open_recording(made / "kitti-tracking")):
@@ -111,7 +110,7 @@ def same_objects(found, expected, accuracy, truncation=None):
 
 def test_semantickitti_layout_reads_back(made):
     root = made / "semantickitti"
-    frames = open_semantic_kitti(root)
+    frames = open_recording(root).frames
     assert [f.name for f in frames] == ["00/000000", "00/000001", "01/000000", "01/000001",
                                         "02/000000"]
     for number, frame in enumerate(frames):
@@ -176,7 +175,7 @@ def test_2d_boxes_are_those_of_the_corners_in_the_image():
 
 def test_2d_boxes_are_those_of_real_labels(data):
     worst, shares = [], []
-    for frame in open_kitti(data / "kitti_object"):
+    for frame in open_recording(data / "kitti_object"):
         truth = frame.truth()
         boxes, outside = write_kitti.image_boxes(truth.boxes, frame.calibration())
         for box, share, extra in zip(boxes, outside, truth.extras):

@@ -26,14 +26,14 @@ from lidar_perception.scoring.points.clusters import (
     unknown_where,
 )
 from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.data import JudgedScenes
+from lidar_perception.training.data import ReadScenes
 from lidar_perception.training.params import ClusterAugmentParams
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes, cut
 from lidar_perception.training.pointnet.task import (
     FEWEST,
     ClusterPreparation,
     changed,
-    judged_clusters,
+    clusters_to_validate,
     make_loss,
     validated,
 )
@@ -266,7 +266,7 @@ def test_validation_reads_every_scene_and_calibrates(rng):
         def frame(self, i):
             return Frame.of("a", LidarFrame(np.zeros((0, 3), np.float32)), truth, CALIBRATION)
 
-    items = [JudgedScenes((Source(),), judged_clusters)[n] for n in range(2)]
+    items = [ReadScenes((Source(),), clusters_to_validate)[n] for n in range(2)]
     assert items[1].sample is None and items[1].skipped == ("broken.bin",)
     torch.manual_seed(0)
     network = make_pointnet(CONFIG).eval()

@@ -29,12 +29,12 @@ from lidar_perception.simulation import drive
 from lidar_perception.training import scenes as scenes_module
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cut_objects import cut_objects
-from lidar_perception.training.data import Batches, Item, JudgedScenes, RawScenes, Stream
+from lidar_perception.training.data import Batches, Item, ReadScenes, Stream, some_scenes
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pointpillars.task import (
     Preparation,
     Sample,
-    frame_to_judge,
+    frame_to_validate,
     make_loss,
     targets_of,
     validation_report,
@@ -87,7 +87,7 @@ def test_what_is_broken_is_named_skipped_and_counted(tmp_path, capsys):
     reasons = sorted(batches.skipped)
     assert "000001.txt:1" in reasons[0] and "000003.bin" in reasons[1]
     assert capsys.readouterr().err.replace("\n", "").count("skipped:") == 2  # each said once
-    assert len(list(RawScenes(stream).some(10, 0))) == 3
+    assert len(list(some_scenes(stream.sources, 10, 0, 0))) == 3
     broken = Stream((RecordedScenes(root, ("000001", "000003")),), keep_all)
     with pytest.raises(InputError, match="none of the 2 scenes"):
         broken[0]
@@ -296,7 +296,7 @@ def test_a_scene_that_the_network_cannot_see_is_skipped():
 
 def test_a_perfect_detector_scores_and_a_blind_one_does_not(tmp_path):
     root = broken_folder(tmp_path)
-    scenes = JudgedScenes((RecordedScenes(root, names_of(root)),), frame_to_judge)
+    scenes = ReadScenes((RecordedScenes(root, names_of(root)),), frame_to_validate)
     right = validation_report(lambda frame: Found(Detections.of([WALKER])), scenes)
     blind = validation_report(lambda frame: Found(Detections.none()), scenes)
     assert right.compute()["frames"] == 3 and len(right.skipped) == 2
@@ -328,7 +328,8 @@ def test_workers_end_with_a_process_that_is_killed():
               "    print(pids[0], flush=True)\n"
               "    input()\n")
     with subprocess.Popen([sys.executable, "-c", script], cwd=Path(__file__).parent, text=True,
-                          env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+                          env={**os.environ, "PYTHONPATH": os.pathsep.join(
+                              map(str, Path(__file__).parents[1:3]))},
                           stdin=subprocess.PIPE, stdout=subprocess.PIPE,
                           stderr=subprocess.DEVNULL) as run:
         worker = Path(f"/proc/{int(run.stdout.readline())}/stat")

@@ -47,6 +47,10 @@ def test_the_camera_is_the_same_from_either_direction_of_the_transform(make):
     (lambda info, tf: setattr(info, "p", np.zeros(12)), "no projection matrix"),
     (lambda info, tf: setattr(tf.transform.rotation, "w", 5.0), "no unit quaternion"),
     (lambda info, tf: setattr(tf.transform.rotation, "w", float("nan")), "no unit quaternion"),
+    (lambda info, tf: setattr(tf.transform.translation, "y", float("nan")), "not finite"),
+    (lambda info, tf: setattr(info, "p", np.full(12, np.nan)), "not finite"),
+    (lambda info, tf: setattr(info, "p", np.r_[info.p[:11], np.inf]), "not finite"),
+    (lambda info, tf: setattr(info, "width", 2**32 - 1), "4294967295 x 375 pixels"),
 ])
 def test_a_camera_that_cannot_be_used_is_an_input_error(make, change, words):
     info = camera_info(CALIBRATION, header(make, frame_id=CAMERA_FRAME), make)

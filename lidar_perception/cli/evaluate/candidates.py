@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -9,15 +10,7 @@ import click
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.cli.data import (
-    a_path,
-    frame_options,
-    json_option,
-    no_labels,
-    one_way,
-    opened,
-    write_json,
-)
+from lidar_perception.cli.data import Walk, a_path, no_labels, walk_options
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.terminal import console, errors
@@ -33,12 +26,10 @@ def view_as_recorded(recording: Any, params: PipelineParams) -> PipelineParams:
 
 
 @click.command()
-@frame_options
-@json_option
+@walk_options()
 @a_path("--png", "Draw the frame with most pedestrians from above.")
 @parameter_options(PAPER)
-def candidates(data: Path, split: Path | None, limit: int | None, jobs: int, dask: str | None,
-               json_file: Path | None, png: Path | None, params: PipelineParams) -> None:
+def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
     """Pedestrian candidates of paper A (STM-CPA) against the Pedestrian labels.
 
     The paper's protocol unless flags say otherwise: frames with a pedestrian, points in the
@@ -52,18 +43,15 @@ def candidates(data: Path, split: Path | None, limit: int | None, jobs: int, das
     from lidar_perception.data.frame import BOXES
     from lidar_perception.scoring.centres.report import CandidateReport, by_pipeline
     from lidar_perception.scoring.centres.tables import print_candidate_report
-    from lidar_perception.scoring.run import fill
 
-    where = one_way(jobs, dask)
-    recording = opened(data, split=split)
-    recording.require(BOXES, "evaluate candidates")
+    recording = walk.opened(BOXES)
     params = view_as_recorded(recording, params)
     if params.seed.source == "click":
         raise click.UsageError("there is nobody to click here; use --seed-source file")
     report = CandidateReport()
-    fill(report, recording, by_pipeline(params), limit=limit, **where)
+    walk.fill(report, recording, partial(by_pipeline, params))
     content = report.compute()
-    write_json(json_file, content)
+    walk.write(content)
     if report.frames == 0:
         raise no_labels(recording, report.skipped, "a Pedestrian label")
     print_candidate_report(content, console)

@@ -2,29 +2,20 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import click
 
-from lidar_perception.cli.data import (
-    a_path,
-    frame_options,
-    json_option,
-    no_labels,
-    one_way,
-    opened,
-    write_json,
-)
+from lidar_perception.cli.data import Walk, a_path, no_labels, walk_options
 from lidar_perception.runs.terminal import console
 
 
 @click.command()
-@frame_options
+@walk_options()
 @a_path("--weights", "Checkpoint of a cluster network. Default: the one that comes with the "
         "package.")
-@json_option
-def clusters(data: Path, split: Path | None, limit: int | None, jobs: int, dask: str | None,
-             weights: Path | None, json_file: Path | None) -> None:
+def clusters(walk: Walk, weights: Path | None) -> None:
     """Classes that a cluster network (paper C) gives to clusters, and so to points.
 
     Clusters are made as the network asks for. One is an object if half of its points or more lie
@@ -42,15 +33,13 @@ def clusters(data: Path, split: Path | None, limit: int | None, jobs: int, dask:
     from lidar_perception.detectors.pointnet.weights_file import WEIGHTS
     from lidar_perception.scoring.points.cluster_tables import print_cluster_scores
     from lidar_perception.scoring.points.clusters import ClusterScores, by_network
-    from lidar_perception.scoring.run import fill
 
-    where, file = one_way(jobs, dask), weights or WEIGHTS
+    file = weights or WEIGHTS
     scores = ClusterScores(read_header(file, PointNetConfig).config.classes)
-    recording = opened(data, split=split)
-    recording.require(BOXES, "evaluate clusters")
-    fill(scores, recording, by_network(file), limit=limit, **where)
+    recording = walk.opened(BOXES)
+    walk.fill(scores, recording, partial(by_network, file))
     content = {"source": str(weights or "the package's own"), **scores.compute()}
-    write_json(json_file, content)
+    walk.write(content)
     if not scores.frames:
         raise no_labels(recording, scores.skipped)
     print_cluster_scores(content, console)

@@ -8,14 +8,12 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.data import (
+    Walk,
     a_path,
     device_option,
-    frame_options,
-    json_option,
     no_labels,
-    one_way,
-    opened,
-    write_json,
+    walk_options,
+    weights_option,
 )
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.runs.terminal import console
@@ -23,10 +21,9 @@ from lidar_perception.types import InputError
 
 
 @click.command()
-@frame_options
+@walk_options()
 @a_path("--results", "Result files of any detector, in KITTI's format: DIR/000000.txt ...", "DIR")
-@a_path("--weights", "Run the detector of this checkpoint, or one by its name: pointpillars or "
-        "pointnet, with the weights that come with the package.", "FILE|NAME")
+@weights_option
 @device_option
 @click.option("--min-score", type=click.FloatRange(0, 1), default=MIN_SCORE, show_default=True,
               help="Boxes of --weights with a lower score are left out. AP is made of precision "
@@ -36,10 +33,8 @@ from lidar_perception.types import InputError
               "always the same. Default: 1.")
 @a_path("--write-results", "Write what --weights detect as KITTI result files, frames without "
         "labels too.", "DIR")
-@json_option
-def detection(data: Path, split: Path | None, limit: int | None, jobs: int, dask: str | None,
-              results: Path | None, weights: Path | None, device: str, min_score: float,
-              keep: float, write_results: Path | None, json_file: Path | None) -> None:
+def detection(walk: Walk, results: Path | None, weights: Path | None, device: str,
+              min_score: float, keep: float, write_results: Path | None) -> None:
     """Boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
 
     Average precision in the image, from above and in space, and of orientation, at 40 and 11
@@ -58,7 +53,6 @@ def detection(data: Path, split: Path | None, limit: int | None, jobs: int, dask
     from lidar_perception.scoring.detections import by_detector, by_files
     from lidar_perception.scoring.kitti.report import DetectionReport
     from lidar_perception.scoring.kitti.tables import print_detection_report
-    from lidar_perception.scoring.run import fill
 
     if (results is None) == (weights is None):
         raise click.UsageError("give either --results DIR or --weights FILE")
@@ -67,22 +61,19 @@ def detection(data: Path, split: Path | None, limit: int | None, jobs: int, dask
                                "its files already")
     if keep != 1 and weights is None:
         raise click.UsageError("--keep thins the scans that --weights see; --results DIR sees none")
-    where = one_way(jobs, dask)
-    recording = opened(data, split=split, scans=weights is not None)
-    if write_results is None:
-        recording.require(BOXES, "evaluate detection")
+    recording = walk.opened(BOXES if write_results is None else None, scans=weights is not None)
     if results is not None:
         if not results.is_dir():
             raise InputError(f"{results} is not a folder; give the folder of the result files")
-        start = by_files(results)
+        start = partial(by_files, results)
     else:
         height = recording.frames[0].sensor_height
         open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height)
-        start = by_detector(open_, keep, write_results)
+        start = partial(by_detector, open_, keep, write_results)
     report = DetectionReport()
-    fill(report, recording, start, limit=limit, **where)
+    walk.fill(report, recording, start)
     content = {"source": str(results or weights), "keep": keep, **report.compute()}
-    write_json(json_file, content)
+    walk.write(content)
     if write_results is not None:
         console.print(f"result files: {write_results}")
     if report.frames:

@@ -8,32 +8,27 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.data import (
+    Walk,
     a_path,
     device_option,
-    frame_options,
-    json_option,
     no_labels,
-    one_way,
-    opened,
-    write_json,
+    walk_options,
+    weights_option,
 )
 from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
 
 
 @click.command()
-@frame_options
+@walk_options()
 @a_path("--results", "Result file of any detector, in the format of nuScenes' detection task.",
         "JSON")
-@a_path("--weights", "Run the detector of this checkpoint, or one by its name: pointpillars or "
-        "pointnet, with the weights that come with the package.", "FILE|NAME")
+@weights_option
 @device_option
 @a_path("--write-results", "Write what --weights detect as a result file, frames without labels "
         "too.", "JSON")
-@json_option
-def nuscenes(data: Path, split: Path | None, limit: int | None, jobs: int, dask: str | None,
-             results: Path | None, weights: Path | None, device: str, write_results: Path | None,
-             json_file: Path | None) -> None:
+def nuscenes(walk: Walk, results: Path | None, weights: Path | None, device: str,
+             write_results: Path | None) -> None:
     """Boxes by the protocol of nuScenes' detection task.
 
     Average precision by centre distance at 0.5, 1, 2 and 4 m, the five errors of true positives and
@@ -52,31 +47,30 @@ def nuscenes(data: Path, split: Path | None, limit: int | None, jobs: int, dask:
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.scoring.nuscenes.report import NuscenesReport, by_detector, by_file
     from lidar_perception.scoring.nuscenes.tables import print_nuscenes_report
-    from lidar_perception.scoring.run import fill
 
     if (results is None) == (weights is None):
         raise click.UsageError("give either --results JSON or --weights FILE")
     if write_results is not None and weights is None:
         raise click.UsageError("--write-results writes what --weights detect; --results JSON is "
                                "such a file already")
-    where = one_way(jobs, dask)
-    recording = opened(data, split=split)
+    recording = walk.opened(None)
     first = recording.frames[0]
     if not isinstance(first.native, KeyFrame):
-        raise InputError(f"{data} ({recording.layout}) is not nuScenes; use evaluate detection")
+        raise InputError(f"{walk.data} ({recording.layout}) is not nuScenes; use evaluate "
+                         "detection")
     if results is not None:
-        start = by_file(results)
+        start = partial(by_file, results)
     else:
-        start = by_detector(partial(open_detector, weights, device,
-                                    sensor_height=first.sensor_height), write_results is not None)
+        open_ = partial(open_detector, weights, device, sensor_height=first.sensor_height)
+        start = partial(by_detector, open_, write_results is not None)
     report = NuscenesReport()
-    fill(report, recording, start, limit=limit, **where)
+    walk.fill(report, recording, start)
     content = {"source": str(results or weights), "version": recording.layout.split()[-1],
                **report.compute()}
     if write_results is not None:
         write_result_file(write_results, report.boxes)
         console.print(f"result file: {write_results}")
-    write_json(json_file, content)
+    walk.write(content)
     if report.frames:
         print_nuscenes_report(content, console)
     elif write_results is None or report.skipped:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -9,19 +10,7 @@ from typing import Any
 import click
 from rich.markup import escape
 
-from lidar_perception.cli.data import (
-    WHAT,
-    a_path,
-    dask_option,
-    jobs_option,
-    json_option,
-    limit_option,
-    no_labels,
-    one_way,
-    opened,
-    split_option,
-    write_json,
-)
+from lidar_perception.cli.data import WHAT, Walk, a_path, no_labels, walk_options
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.clustering.params import CLUSTERING_METHODS
 from lidar_perception.ground.params import GROUND_METHODS
@@ -43,20 +32,13 @@ class MethodList(click.ParamType):
 
 
 @click.command()
-@a_path("--data", f"{WHAT} May be repeated.", "PATH", multiple=True, required=True)
-@split_option
-@limit_option
-@jobs_option
-@dask_option
+@walk_options(a_path("--data", f"{WHAT} May be repeated.", "PATH", multiple=True, required=True))
 @click.option("--methods", type=MethodList(), default=GROUND_METHODS + CLUSTERING_METHODS,
               help="Methods to score, of ground and of clustering, with commas between. "
               "Default: all.")
-@json_option
 @a_path("--png", "Draw the ground of the first scan with labelled points from above.")
 @parameter_options(SegmentationParams())
-def segmentation(data: tuple[Path, ...], split: Path | None, limit: int | None, jobs: int,
-                 dask: str | None, methods: tuple, json_file: Path | None, png: Path | None,
-                 params: SegmentationParams) -> None:
+def segmentation(walk: Walk, methods: tuple, png: Path | None, params: SegmentationParams) -> None:
     """Ground and clusters against labels.
 
     Ground: each method against the classes of SemanticKITTI's points. Clusters: each method, on
@@ -72,13 +54,11 @@ def segmentation(data: tuple[Path, ...], split: Path | None, limit: int | None, 
     from lidar_perception.data.frame import BOXES, POINT_LABELS
     from lidar_perception.scoring.points.report import SegmentationReport, by_methods
     from lidar_perception.scoring.points.tables import draw_ground, print_scores
-    from lidar_perception.scoring.run import fill
 
-    where = one_way(jobs, dask)
     grounds = tuple(name for name in GROUND_METHODS if name in methods)
     clusterings = tuple(name for name in CLUSTERING_METHODS if name in methods)
     # Everything is opened first: a typing error in the last path should not cost an hour.
-    recordings = [opened(path, split=split) for path in data]
+    recordings = [walk.opened(None, path) for path in walk.data]
     labelled = [each for each in recordings if POINT_LABELS in each.has]
     for recording in recordings:
         if recording not in labelled:
@@ -92,19 +72,19 @@ def segmentation(data: tuple[Path, ...], split: Path | None, limit: int | None, 
     report = SegmentationReport()
     for recording in recordings:
         report.source = recording.layout
-        fill(report, recording, by_methods(params, grounds, clusterings), limit=limit,
-             title=recording.layout, **where)
+        walk.fill(report, recording, partial(by_methods, params, grounds, clusterings),
+                  recording.layout)
     content = report.compute()
-    write_json(json_file, content)
+    walk.write(content)
     if not (report.ground or report.clusters):
         raise no_labels(recordings[0], report.skipped)
     if report.whole:
-        errors.print(f"{escape(', '.join(str(path) for path in data))}: {report.whole} frames "
+        errors.print(f"{escape(', '.join(map(str, walk.data)))}: {report.whole} frames "
                      "without a camera calibration were taken as a whole")
     print_scores(content, params.ground.method, console)
     if png is not None:
         from lidar_perception.scoring.points.report import ground_of_methods
-        for frame in islice(labelled[0], limit):
+        for frame in islice(labelled[0], walk.limit):
             scan, labels, found = ground_of_methods(frame, params, grounds)
             draw_ground(png, frame.name, scan, labels.classes, found)
             break

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidar_perception.camera import Calibration
+from lidar_perception.runs.files import regular
 from lidar_perception.types import InputError
 
 # Size of the rectified images by focal length: it differs with the recording day, and the object
@@ -45,7 +46,7 @@ def read_raw_calibration(day: Path) -> Calibration:
 def matrices(path: Path) -> dict[str, np.ndarray]:
     """The numbers of each line "NAME: ..." of a file. InputError where it cannot be read."""
     try:
-        lines = path.read_text().splitlines()
+        lines = regular(path).read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the calibration {path}: {error}; every frame needs "
                          "one") from None
@@ -64,9 +65,9 @@ def matrix(values: dict, path: Path, name: str, shape: tuple[int, ...],
            other: str = "") -> np.ndarray:
     """The one of a name, or else of another. InputError, naming the file, if it is not there."""
     found = values.get(name, values.get(other))
-    if found is None or found.size != np.prod(shape):
-        raise InputError(f"{path} has no {name} of {int(np.prod(shape))} numbers; download KITTI's "
-                         "calibration again")
+    if found is None or found.size != np.prod(shape) or not np.isfinite(found).all():
+        raise InputError(f"{path} has no {name} of {int(np.prod(shape))} finite numbers; download "
+                         "KITTI's calibration again")
     return found.reshape(shape)
 
 

@@ -18,6 +18,8 @@ from lidar_perception.data.kitti.labels import (
     read_tracking_labels,
     read_tracklets,
 )
+from lidar_perception.data.records import read_records
+from lidar_perception.runs.files import regular
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.topics import LIDAR_FRAME
 
@@ -29,14 +31,7 @@ SCANS = ("velodyne_reduced", "velodyne")  # of one name, the full scan wins
 
 def read_velodyne(path: Path) -> np.ndarray:
     """(N, 4) float32 [x y z reflectance] of a .bin file."""
-    try:
-        raw = np.fromfile(path, np.float32)
-    except OSError as error:
-        raise InputError(f"cannot read {path}: {error}") from None
-    if path.stat().st_size % 16:
-        raise InputError(f"{path} has {path.stat().st_size} bytes, not a multiple of 16 (x y z "
-                         "reflectance as float32); it was cut, download it again")
-    return raw.reshape(-1, 4)
+    return read_records(path, "x y z reflectance")
 
 
 def load_velodyne(path: Path, stamp_ns: int) -> LidarFrame:
@@ -54,29 +49,13 @@ def recognises(path: Path) -> bool:
 
 
 def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """The frames of open_kitti."""
-    frames, layout, labelled = _open(path, scans)
-    lost = tuple((label.stem, f"{label} has no scan; download it again")
-                 for label in labels_without_scan(path)) if scans else ()
-    return Recording(path, f"KITTI {layout}", frames,
-                     frozenset({CAMERA} | ({BOXES} if labelled else set())), lost)
-
-
-def open_kitti(root: str | Path, scans: bool = True) -> list[Frame]:
     """The frames of a KITTI folder, in order of time; nothing is read but the file lists.
 
-    root is a 3D-object or tracking folder (with velodyne/, or its parent with training/), or a
+    path is a 3D-object or tracking folder (with velodyne/, or its parent with training/), or a
     raw drive, day or folder of days. Without scans, labels are enough to make a frame in the
     object layout: its points may not exist. InputError says what is missing.
     """
-    return _open(Path(root), scans)[0]
-
-
-def _open(root: Path, scans: bool) -> tuple[list[Frame], str, bool]:
-    """The frames, the layout, and whether there are labels."""
-    if not root.is_dir():
-        raise InputError(f"{root} is not a folder; give the folder of a KITTI download")
-    for folder in (root / "training", root):
+    for folder in (path / "training", path):
         known = SCANS if scans else (*SCANS, "label_2")
         if any((folder / name).is_dir() for name in known):
             if (folder / "label_02").is_dir() or any(
@@ -87,20 +66,19 @@ def _open(root: Path, scans: bool) -> tuple[list[Frame], str, bool]:
             labelled = (folder / "label_02").is_dir() or (folder / "label_2").is_dir()
             break
     else:
-        frames, layout = _raw(root.absolute()), "raw drives"
+        frames, layout = _raw(path.absolute()), "raw drives"
         labelled = any((frame.native / "tracklet_labels.xml").exists() for frame in frames)
     if not frames:
-        raise InputError(f"{root} has no KITTI scans: expected training/velodyne/*.bin (object), "
+        raise InputError(f"{path} has no KITTI scans: expected training/velodyne/*.bin (object), "
                          "training/velodyne/0000/*.bin (tracking) or "
                          "DATE/DRIVE_sync/velodyne_points/data/*.bin (raw)")
-    return frames, layout, labelled
-
-
-def labels_without_scan(root: Path) -> list[Path]:
-    """Label files of a 3D-object folder whose scans are not there."""
-    return sorted(label for folder in (root / "training", root)
+    lost = sorted(label for folder in (path / "training", path)
                   for label in folder.glob("label_2/*.txt")
                   if not any((folder / name / f"{label.stem}.bin").exists() for name in SCANS))
+    return Recording(path, f"KITTI {layout}", frames,
+                     frozenset({CAMERA} | ({BOXES} if labelled else set())),
+                     tuple((label.stem, f"{label} has no scan; download it again")
+                           for label in lost) if scans else ())
 
 
 def _object(folder: Path, scans: bool) -> list[Frame]:
@@ -189,7 +167,7 @@ def _raw_stamps(path: Path) -> list[int]:
     """Nanoseconds of the lines '2011-09-26 13:02:25.594360375', read as UTC."""
     try:
         stamps = []
-        for line in path.read_text().split("\n"):
+        for line in regular(path).read_text().split("\n"):
             if line.strip():
                 seconds, _, fraction = line.strip().partition(".")
                 when = datetime.strptime(seconds, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)

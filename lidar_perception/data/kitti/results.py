@@ -16,12 +16,11 @@ from lidar_perception.data.kitti.labels import (
     to_ground_truth,
     to_labels,
 )
-from lidar_perception.data.kitti.write import TRACKING_NAMES, image_boxes
+from lidar_perception.data.kitti.write import image_boxes, tracking_line
 from lidar_perception.runs.files import write_text
 from lidar_perception.types import Detections, GroundTruth, InputError
 
 DECIMALS = 4  # of a score, so that the order stays, and of metres, so that overlaps do
-TRACKING_DECIMALS = 6  # as in the labels of the tracking benchmark
 
 
 def read_results(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
@@ -42,13 +41,8 @@ def read_results(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
 def write_results(path: Path, detections: Detections, calibration: Calibration) -> None:
     """Write the result file of one frame: truncation and occlusion -1, the 2D box projected (0
     outside the image). InputError where it cannot be written."""
-    pixels = np.nan_to_num(image_boxes(detections.boxes, calibration)[0])
-    extras = [{"score": float(score), "bbox": box.tolist()}
-              for score, box in zip(detections.scores, pixels)]
-    found = GroundTruth.of(detections.boxes, detections.class_ids, extras)
-    write_text(path, "".join(
-        format_label({**label, "truncated": "-1", "occluded": -1}, DECIMALS) + "\n"
-        for label in to_labels(found, calibration.lidar_to_camera)))
+    write_text(path, "".join(format_label(label, DECIMALS) + "\n"
+                             for label in _labels(detections, calibration)))
 
 
 def write_tracking_results(path: Path, frames: Iterable[tuple[int, np.ndarray, Detections]],
@@ -58,16 +52,18 @@ def write_tracking_results(path: Path, frames: Iterable[tuple[int, np.ndarray, D
     be written."""
     lines = []
     for number, ids, detections in frames:
-        pixels = np.nan_to_num(image_boxes(detections.boxes, calibration)[0])
-        extras = [{"score": float(score), "bbox": box.tolist()}
-                  for score, box in zip(detections.scores, pixels)]
-        found = GroundTruth.of(detections.boxes, detections.class_ids, extras)
-        for track, label in zip(ids, to_labels(found, calibration.lidar_to_camera)):
-            name = TRACKING_NAMES.get(label["class"], label["class"])
-            line = format_label({**label, "class": name, "truncated": "-1", "occluded": -1},
-                                TRACKING_DECIMALS)
-            lines.append(f"{number} {int(track)} {line}\n")
+        lines += [tracking_line(number, int(track), label)
+                  for track, label in zip(ids, _labels(detections, calibration))]
     write_text(path, "".join(lines))
+
+
+def _labels(detections: Detections, calibration: Calibration) -> list[dict]:
+    """The detections as labels of a result file, see write_results."""
+    pixels = np.nan_to_num(image_boxes(detections.boxes, calibration)[0])
+    extras = [{"score": float(score), "bbox": box.tolist(), "truncated": "-1", "occluded": -1}
+              for score, box in zip(detections.scores, pixels)]
+    return to_labels(GroundTruth.of(detections.boxes, detections.class_ids, extras),
+                     calibration.lidar_to_camera)
 
 
 def read_tracking_results(path: Path, lidar_to_camera: np.ndarray) -> dict[int, GroundTruth]:

@@ -1,4 +1,4 @@
-"""Scans and labels into KITTI's object and tracking layouts; kitti.py reads them back.
+"""Scans and labels into KITTI's object and tracking layouts; folder.py reads them back.
 
 The development kits' readme files define the columns. KITTI labels what its colour camera sees:
 here every object of which a part falls into the image. Measured on the 250 labels of 57 frames of
@@ -66,21 +66,23 @@ def seen_by_camera(truth: GroundTruth, calibration: Calibration) -> GroundTruth:
 
 def object_label_text(truth: GroundTruth, calibration: Calibration) -> str:
     """A label_2 file: numbers with two decimals."""
-    labels = to_labels(truth, calibration.lidar_to_camera)
-    return "".join(f"{format_label(label)}\n" for label in labels)
+    return "".join(f"{format_label(label)}\n"
+                   for label in to_labels(truth, calibration.lidar_to_camera))
 
 
 def tracking_label_text(number: int, truth: GroundTruth, calibration: Calibration) -> str:
     """The lines of frame number in a label_02 file, six decimals; every extra has a track_id.
 
     Truncation is a level here: 0, 1, 2 for a share nearest to none, half, all."""
-    lines = []
-    for label in to_labels(truth, calibration.lidar_to_camera):
-        level = str(max(-1, round(2 * label["truncated"])))
-        name = TRACKING_NAMES.get(label["class"], label["class"])
-        line = format_label({**label, "class": name, "truncated": level}, decimals=6)
-        lines.append(f"{number} {label['track_id']} {line}\n")
-    return "".join(lines)
+    return "".join(tracking_line(number, label["track_id"], {
+        **label, "truncated": str(max(-1, round(2 * label["truncated"])))})
+        for label in to_labels(truth, calibration.lidar_to_camera))
+
+
+def tracking_line(number: int, track: int, label: dict) -> str:
+    """A label of frame number as a line of the tracking benchmark's files, six decimals."""
+    name = TRACKING_NAMES.get(label["class"], label["class"])
+    return f"{number} {track} {format_label({**label, 'class': name}, decimals=6)}\n"
 
 
 def calibration_text(calibration: Calibration) -> str:

@@ -8,7 +8,7 @@ by the calibration and not moved, and the ground lies sensor_height below the or
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,10 +19,12 @@ from lidar_perception.data.frame import BOXES, POSES, Frame, Recording
 from lidar_perception.data.nuscenes.boxes import matrices
 from lidar_perception.data.nuscenes.labels import NuscenesLabels, read_labels
 from lidar_perception.data.nuscenes.tables import Tables
+from lidar_perception.data.records import read_records
 from lidar_perception.types import GroundTruth, InputError, LidarFrame, usable_returns
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 CHANNEL = "LIDAR_TOP"
+SWEEP = "x y z intensity ring"  # of a .pcd.bin file, float32
 OWN_VEHICLE = 1.0       # metres: what is nearer in both x and y is a return of the vehicle itself
 FULL_REFLECTION = 255   # intensity
 
@@ -42,7 +44,7 @@ class KeyFrame:
 def load_sweep(path: Path, turn: np.ndarray, stamp_ns: int) -> LidarFrame:
     """The usable points of a .pcd.bin file without those on the vehicle itself; turn (3, 3) from
     the sensor's axes to the frame's."""
-    cloud = read_sweep(path)
+    cloud = read_records(path, SWEEP)
     away = (np.abs(cloud[:, :2]) >= OWN_VEHICLE).any(axis=1)
     cloud = cloud.compress(away & usable_returns(cloud[:, :3]), axis=0)
     xyz = (cloud[:, :3].astype(np.float64) @ turn.T).astype(np.float32)
@@ -55,20 +57,6 @@ def _truth(key: KeyFrame) -> GroundTruth | None:
     points."""
     labels = key.labels()
     return None if labels is None else labels.in_frame(key.pose)
-
-
-def read_sweep(path: Path) -> np.ndarray:
-    """(N, 5) float32 [x y z intensity ring] of a .pcd.bin file."""
-    try:
-        raw = np.fromfile(path, np.float32)
-        size = path.stat().st_size
-    except OSError as error:
-        raise InputError(f"cannot read the sweep {path}: {error.strerror}; unpack the file blobs "
-                         "with samples/LIDAR_TOP there") from None
-    if size % 20:
-        raise InputError(f"{path} has {size} bytes, not a multiple of 20 (x y z intensity ring as "
-                         "float32); it was cut, download it again")
-    return raw.reshape(-1, 5)
 
 
 def recognises(path: Path) -> bool:
@@ -95,22 +83,16 @@ def _versions(root: Path) -> list[str]:
     return sorted(table.parent.name for table in root.glob("*/sample_data.json"))
 
 
-def open_nuscenes(root: str | Path, version: str = "v1.0-mini",
-                  scenes: Sequence[str] | None = None) -> list[Frame]:
-    """The key frames of ROOT/VERSION, in the order of the scene table and of time; with scenes, of
-    these only and in their order. Sweeps and labels are read later. InputError says which folder,
-    table or scene is missing or wrong."""
+def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
+    """The key frames of ROOT/VERSION, in the order of the scene table and of time. Sweeps and
+    labels are read later. InputError says which folder or table is missing or wrong."""
     tables = Tables(root, version)
     names = dict(tables.rows("scene", "token", "name"))
-    rank = {name: i for i, name in enumerate(names.values() if scenes is None else scenes)}
-    if unknown := sorted(rank.keys() - set(names.values())):
-        raise InputError(f"{tables.folder} has no scene {unknown[0]} ({len(unknown)} such); its "
-                         f"scenes are {', '.join(list(names.values())[:3])} ...")
+    rank = {name: i for i, name in enumerate(names.values())}
     samples = sorted((rank[names[scene]], time, token) for token, time, scene in tables.rows(
         "sample", "token", "timestamp", "scene_token") if names.get(scene) in rank)
     if not samples:
-        raise InputError(f"{tables.folder} has no key frame" + (
-            " of the scenes that were named" if scenes is not None else "; download it again"))
+        raise InputError(f"{tables.folder} has no key frame; download it again")
     scene_names, times = list(rank), {token: time for _, time, token in samples}
     sweeps = _sweeps(tables, times)
     mounts = _poses(tables, "calibrated_sensor", {mount for _, _, _, mount in sweeps.values()})

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.nuscenes.boxes import ATTRIBUTES, NAMES, GlobalBoxes, in_global
-from lidar_perception.runs.files import write_text
+from lidar_perception.runs.files import regular, write_text
 from lidar_perception.types import CLASSES, Detections, InputError
 
 MAX_BOXES = 500    # of a frame
@@ -54,7 +54,7 @@ def read_results(path: Path, frames: Sequence[Frame]) -> dict[str, GlobalBoxes]:
     """The boxes of each frame by its name; those of other frames are left out. InputError names the
     frame that is missing and the box that is wrong."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(regular(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"cannot read the results {path}: {error.strerror}") from None
     except ValueError as error:

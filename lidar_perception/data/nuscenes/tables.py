@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.runs.files import regular
 from lidar_perception.types import InputError
 
 CHUNK = 2**22        # characters read at a time; no row is longer
@@ -51,7 +52,7 @@ class Tables:
     def _decoded(self, table: str) -> Iterator[Any]:
         path, decode = self.path(table), json.JSONDecoder().raw_decode
         try:
-            with open(path, encoding="utf-8") as stream:
+            with open(regular(path), encoding="utf-8") as stream:
                 text = stream.read(CHUNK).lstrip()
                 if text[:1] != "[":
                     raise InputError(f"{path} is no list of rows; download the tables of "

@@ -17,7 +17,6 @@ from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
 
 NEAR = (3.0, 6.0, 12.0)  # m: so far around a cluster the ground is looked for
 FEWEST = 3               # points of it
-WIDEST = 2000.0          # m
 
 
 @dataclass(frozen=True)
@@ -47,6 +46,13 @@ class Clusters:
         rows = np.repeat(self.first[chosen] - first[:-1], sizes) + np.arange(first[-1])
         return Clusters(self.points[rows], first, self.ids[chosen],
                         None if self.ground is None else self.ground[chosen])
+
+    def nearest(self, most: int) -> Clusters:
+        """At most so many, those whose means are nearest to the sensor, in their order."""
+        if len(self) <= most:
+            return self
+        away = np.hypot(*_middles(self.points, self.first).T)
+        return self.take(np.sort(np.argsort(away, kind="stable")[:most]))
 
     def on(self, ground: np.ndarray) -> Clusters:
         """The same clusters, none of them empty, over the ground's points (G, 3)."""
@@ -97,19 +103,16 @@ def ground_under(xyz: np.ndarray, indices: np.ndarray) -> np.ndarray:
         return np.zeros(0)
     low = indices.min(axis=0) - NEAR[-1]
     size = indices.max(axis=0) + NEAR[-1] - low
-    if not (size < WIDEST).all():  # a distant outlier would blow up the grid
-        return np.array([ground_under(xyz, place[None])[0] for place in indices])
     shape = np.ceil(size / NEAR[0]).astype(np.int64) + 1
     column = np.floor((xyz[:, :2] - low) / NEAR[0])
     inside = ((column >= 0) & (column < shape)).all(axis=1)
     cell = (column[inside] @ np.array([shape[1], 1.0])).astype(np.int64)
     order = np.argsort(cell, kind="stable")
-    start = np.searchsorted(cell[order], np.arange(shape.prod() + 1))
-    return _ground_under(xyz[inside][order].astype(np.float64), start, shape, low, indices)
+    return _ground_under(xyz[inside][order].astype(np.float64), cell[order], shape, low, indices)
 
 
 @njit(cache=True, nogil=True)
-def _ground_under(xyz, start, shape, low, indices):
+def _ground_under(xyz, cell, shape, low, indices):
     heights = np.full(len(indices), -SENSOR_HEIGHT)
     for k in range(len(indices)):
         x, y = indices[k]
@@ -120,7 +123,7 @@ def _ground_under(xyz, start, shape, low, indices):
             for i in range(max(row - cells, 0), min(row + cells + 1, shape[0])):
                 first = i * shape[1] + max(column - cells, 0)
                 last = i * shape[1] + min(column + cells, shape[1] - 1)
-                for j in range(start[first], start[last + 1]):
+                for j in range(np.searchsorted(cell, first), np.searchsorted(cell, last + 1)):
                     if (xyz[j, 0] - x) ** 2 + (xyz[j, 1] - y) ** 2 <= reach * reach:
                         count += 1
                         total += xyz[j, 2]

@@ -12,9 +12,10 @@ from typing import Any, ClassVar
 
 from lidar_perception.classes import DETECTED
 from lidar_perception.clustering.params import ClusteringParams, EuclideanParams
-from lidar_perception.detectors.config_json import config_of
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.types import CLASSES, InputError
+
+MAX_POINTS = 4096  # of a cluster: what is computed grows with it
 
 
 # l w h in metres, means of KITTI's training labels (Geiger et al. 2012)
@@ -58,25 +59,30 @@ class PointNetConfig:
     global_channels: int = 128
     head_channels: tuple[int, ...] = (256, 128)
     yaw_bins: int = 12
-    sizes: tuple[tuple[float, ...], ...] = tuple(of.mean_size for of in DETECTED.values())
-
-    @classmethod
-    def of_json(cls, content: dict[str, Any], source: str = "the header") -> PointNetConfig:
-        """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
-        return config_of(cls, content, source, {
-        "sizes": lambda sizes: tuple(map(tuple, sizes))})
+    sizes: tuple[tuple[float, float, float], ...] = tuple(of.mean_size for of in DETECTED.values())
 
     def __post_init__(self) -> None:
+        numbers = (self.points, self.centroids, self.coarse, self.coarse_neighbours, self.yaw_bins,
+                   self.local_channels, self.global_channels, *self.neighbours,
+                   *self.point_channels, *self.group_channels, *self.head_channels)
+        if min(numbers) < 1 or min(self.coarse_radius, *self.radii) <= 0 or not (
+                self.point_channels and self.group_channels and self.head_channels):
+            raise ValueError("every count, width and radius must be above 0")
         if unknown := [name for name in self.classes if name not in CLASSES]:
             raise ValueError(f"there is no class {unknown[0]!r}; known are {', '.join(CLASSES)}")
         if not self.classes or len(self.sizes) != len(self.classes):
             raise ValueError("classes and sizes differ in length")
-        if len(self.radii) != len(self.neighbours):
+        if len(set(self.classes)) < len(self.classes) or min(map(min, self.sizes)) <= 0:
+            raise ValueError("a class is there twice, or has a size of 0")
+        if not self.radii or len(self.radii) != len(self.neighbours):
             raise ValueError("radii and neighbours differ in length")
         if list(self.radii) != sorted(self.radii) or max(self.neighbours) > self.points:
             raise ValueError("radii must rise, and neighbours be at most as many as points")
-        if not self.coarse <= self.centroids <= self.points:
-            raise ValueError("coarse must be at most centroids, and these at most points")
+        if not max(self.coarse, self.coarse_neighbours) <= self.centroids <= self.points:
+            raise ValueError("coarse and coarse_neighbours must be at most centroids, and these at "
+                             "most points")
+        if self.points > MAX_POINTS:
+            raise ValueError(f"points are more than {MAX_POINTS}")
 
     @property
     def title(self) -> str:

@@ -54,7 +54,10 @@ class PointNetDetector(NetworkDetector):
         if cluster_ids is None:
             cluster_ids = cluster_obstacles(seen.xyz, ground, self.params.clustering)
         t3 = perf_counter()
-        clusters = clusters_of(seen, cluster_ids, self.settings.min_points, ground)
+        clusters = clusters_of(seen, cluster_ids, self.settings.min_points)
+        most = self.settings.max_clusters
+        left_out = max(len(clusters) - most, 0)
+        clusters = clusters.nearest(most).on(seen.xyz.compress(ground, axis=0))
         t4 = self.now()
         predicted = self.guarded(lambda: predict(self.network, clusters))
         t5 = self.now()
@@ -63,7 +66,7 @@ class PointNetDetector(NetworkDetector):
         t6 = perf_counter()
         ms = {step: seconds * 1e3 for step, seconds in zip(
             STEPS, (t1 - t0 + t4 - t3, t2 - t1, t3 - t2, t5 - t4, t6 - t5))}
-        problem = broken or self._problem(frame, cluster_ids, clusters) or self.fallback
+        problem = broken or self._problem(frame, cluster_ids, clusters, left_out) or self.fallback
         return Found(detections, ms, problem, best)
 
     def _detections(self, predicted: Predictions) -> tuple:
@@ -82,8 +85,8 @@ class PointNetDetector(NetworkDetector):
             broken = nan or broken
         return detections, best, broken
 
-    def _problem(self, frame: LidarFrame, cluster_ids: np.ndarray,
-                 clusters: Clusters) -> str | None:
+    def _problem(self, frame: LidarFrame, cluster_ids: np.ndarray, clusters: Clusters,
+                 left_out: int) -> str | None:
         if len(frame) == 0:
             return "the cloud is empty or has no finite point, or crop.* leaves none"
         if not (cluster_ids > 0).any():
@@ -92,6 +95,9 @@ class PointNetDetector(NetworkDetector):
         if len(clusters) == 0:
             return (f"every cluster has fewer than {self.settings.min_points} points; lower "
                     "pointnet.min_points")
+        if left_out:
+            return (f"{left_out} of {len(clusters) + left_out} clusters are left out, the "
+                    "farthest; raise clustering's min_size or pointnet.max_clusters")
         if frame.intensity is None and self.settings.intensity_scale:
             return "the cloud has no intensity, which the network was trained with; it reads zeros"
         return None

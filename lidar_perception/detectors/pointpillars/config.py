@@ -7,11 +7,11 @@ JSON, so that weights always come with their network.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from lidar_perception.classes import DETECTED
-from lidar_perception.detectors.config_json import config_of
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError
 
 VERSIONS = {  # paper B, Table 3
@@ -31,6 +31,9 @@ SIZES = {
 }
 
 XY_SCALE = 0.02  # of networks that are trained here
+CHOICES = {"neck": ("deconv", "fpn"), "fusion": ("add", "concat"), "anchors_at": ("cells", "ends")}
+MAX_CELLS = 1 << 22  # of a grid: 100 m x 100 m of 5 cm; what is computed grows with it
+MAX_LAYERS = 64
 
 
 @dataclass(frozen=True)
@@ -105,16 +108,24 @@ class NetworkConfig:
     anchors_at: str = "cells"
     direction_offset: float = 0.7853981633974483
 
-    @classmethod
-    def of_json(cls, content: dict[str, Any], source: str = "the header") -> NetworkConfig:
-        """The inverse of dataclasses.asdict. InputError naming source and what does not fit."""
-        return config_of(cls, content, source, {"anchors": _anchors})
-
     def __post_init__(self) -> None:
+        widths = (self.pillar_channels, self.deconv_channels, self.fpn_channels,
+                  *self.map_channels, *self.block_channels, *self.block_strides)
+        if not (self.map_channels and self.block_channels and self.yaws and self.anchors) or (
+                min(widths) < 1 or min(self.block_layers, default=0) < 0
+                or min(min(anchor.size) for anchor in self.anchors) <= 0 or self.max_points < 0):
+            raise ValueError("every width and stride must be at least 1, and sizes above 0")
+        if sum(self.block_layers) > MAX_LAYERS:
+            raise ValueError(f"block_layers are more than {MAX_LAYERS} in all")
+        for name, allowed in CHOICES.items():
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name} is not one of {', '.join(allowed)}")
+        if not (self.cell > 0 and all(a < b for a, b in zip(self.low, self.high))):
+            raise ValueError("cell must be above 0, and low below high")
         height, width = self.grid
-        total = 1
-        for stride in self.block_strides:
-            total *= stride
+        if height * width > MAX_CELLS:
+            raise ValueError(f"a grid of {width} x {height} cells is more than {MAX_CELLS}")
+        total = math.prod(self.block_strides)
         if height % total or width % total or height < total or width < total:
             raise ValueError(f"a grid of {width} x {height} cells cannot be divided by {total}, "
                              "the product of block_strides; change low, high or cell")
@@ -122,6 +133,8 @@ class NetworkConfig:
             raise ValueError("block_channels, block_layers and block_strides differ in length")
         if unknown := [name for name in self.classes if name not in CLASSES]:
             raise ValueError(f"there is no class {unknown[0]!r}; known are {', '.join(CLASSES)}")
+        if len(set(self.classes)) < len(self.classes):
+            raise ValueError("a class has two anchors")
         if self.zero_row and not self.max_points:
             raise ValueError("zero_row needs max_points")
 
@@ -176,7 +189,3 @@ def network_config(version: str = "v0", size: str = "full",
         return NetworkConfig(**{**settings, **changes})
     except ValueError as error:
         raise InputError(str(error)) from None
-
-
-def _anchors(content: list[dict[str, Any]]) -> tuple[AnchorClass, ...]:
-    return tuple(AnchorClass(**{**anchor, "size": tuple(anchor["size"])}) for anchor in content)

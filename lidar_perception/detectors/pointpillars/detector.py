@@ -106,7 +106,10 @@ class PointPillarsDetector(NetworkDetector):
         limits = logits.new_tensor([_logit(settings.scores.of_class(name))
                                     for name in self.config.classes])
         chosen = torch.nonzero((logits >= limits).any(dim=1))[:, 0]
-        if len(chosen) == 0:
+        if len(logits) > 1 and (logits == logits[0]).all():
+            chosen, broken = chosen[:0], ("the network gives every place the same scores; the "
+                                          "weights are broken, take others")
+        elif len(chosen) == 0:
             best_scores, broken = self.nothing_passed(torch.sigmoid(logits.amax(dim=0)).tolist())
         best, kinds = logits[chosen].max(dim=1)
         valid = torch.nonzero(best >= limits[kinds])[:, 0]

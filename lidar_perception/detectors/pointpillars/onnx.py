@@ -8,20 +8,29 @@ has one loop-free operation that is not in every runtime, ScatterElements with r
 from __future__ import annotations
 
 import logging
+import math
 import warnings
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from lidar_perception.detectors.checkpoint import KEY, Header
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
-from lidar_perception.detectors.pointpillars.network import PointPillars, Prediction, fused
+from lidar_perception.detectors.pointpillars.network import (
+    BINS,
+    CODE,
+    PointPillars,
+    Prediction,
+    fused,
+)
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError
 
 OPSET = 18
+COUNT = 100  # points of an example
 OUTPUTS = ["logits", "codes", "directions"]
 
 
@@ -37,6 +46,16 @@ class OneCloud(nn.Module):
         return tuple(self.network(Pillars(points, offsets, cells, 1, self.grid), cluster_map))
 
 
+def _inputs(config: NetworkConfig) -> dict[str, tuple[str, tuple[int, ...]]]:
+    """The type and the shape of each input, of COUNT points."""
+    inputs: dict[str, tuple[str, tuple[int, ...]]] = {
+        "points": ("float", (COUNT, config.point_columns)),
+        "offsets": ("float", (COUNT, config.offset_columns)), "cells": ("int64", (COUNT,))}
+    if config.pseudo_map:
+        inputs["cluster_map"] = ("uint8", (1, 3, *config.grid))
+    return inputs
+
+
 def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None:
     """Write network for one cloud: points (N, 4 or 5), offsets (N, 5 or 6) float32 and cells (N,)
     int64 of pillars.Pillars, for V4 cluster_map (1, 3, H, W) uint8, to logits (1, A, K), codes
@@ -48,13 +67,12 @@ def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None
     except ImportError:
         raise InputError("export onnx needs the packages of the extra [onnx]: pip install "
                          "'lidar_perception[onnx]'") from None
-    config, count = header.config, 100
-    inputs = {"points": torch.zeros(count, config.point_columns), "offsets":
-              torch.zeros(count, config.offset_columns), "cells": torch.arange(count)}
-    free = {name: {0: torch.export.Dim("points_in_range", min=1)} for name in inputs}
-    if config.pseudo_map:
-        inputs["cluster_map"] = torch.zeros(1, 3, *config.grid, dtype=torch.uint8)
-        free["cluster_map"] = None
+    config = header.config
+    inputs = {name: torch.zeros(shape, dtype=getattr(torch, kind))
+              for name, (kind, shape) in _inputs(config).items()}
+    inputs["cells"] += torch.arange(COUNT)
+    free = {name: None if name == "cluster_map" else
+            {0: torch.export.Dim("points_in_range", min=1)} for name in inputs}
     logging.getLogger("torch.onnx").setLevel(logging.ERROR)  # it misses torchvision
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -71,9 +89,11 @@ def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None
 class OnnxNetwork:
     """An exported network in ONNX Runtime, on the CPU."""
 
-    def __init__(self, session):
-        self.session = session
+    def __init__(self, session: Any, source: str, config: NetworkConfig):
+        self.session, self.source = session, source
         self.inputs = [i.name for i in session.get_inputs()]
+        anchors = math.prod(config.head_grid) * len(config.anchors) * len(config.yaws)
+        self.shapes = [(1, anchors, width) for width in (len(config.anchors), CODE, BINS)]
 
     @staticmethod
     def load(path: str | Path) -> tuple[Header, OnnxNetwork]:
@@ -94,7 +114,14 @@ class OnnxNetwork:
             reason = str(error).splitlines()[0]
             raise InputError(f"ONNX Runtime cannot read {path}: {reason}") from None
         text = session.get_modelmeta().custom_metadata_map.get(KEY)
-        return Header.of_text(text, str(path), NetworkConfig), OnnxNetwork(session)
+        header = Header.of_text(text, str(path), NetworkConfig)
+        wanted = {name: (f"tensor({kind})", len(shape)) for name, (kind, shape) in
+                  _inputs(header.config).items()}
+        found = {i.name: (i.type, len(i.shape)) for i in session.get_inputs()}
+        if found != wanted or not {*OUTPUTS} <= {o.name for o in session.get_outputs()}:
+            raise InputError(f"{path} has other inputs or outputs than a network of its header; "
+                             "export it again")
+        return header, OnnxNetwork(session, str(path), header.config)
 
     def to(self, device: torch.device) -> None:
         """Stays on the CPU."""
@@ -102,6 +129,13 @@ class OnnxNetwork:
     def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
         given = dict(points=pillars.points, offsets=pillars.offsets, cells=pillars.cells,
                      cluster_map=maps)
-        logits, codes, directions = map(torch.from_numpy, self.session.run(
-            OUTPUTS, {name: given[name].numpy() for name in self.inputs}))
+        try:
+            logits, codes, directions = map(torch.from_numpy, self.session.run(
+                OUTPUTS, {name: given[name].numpy() for name in self.inputs}))
+        except Exception as error:  # its errors have no common base
+            raise InputError(f"ONNX Runtime cannot run {self.source}: "
+                             f"{str(error).splitlines()[0]}") from None
+        if [x.shape for x in (logits, codes, directions)] != self.shapes:
+            raise InputError(f"the outputs of {self.source} have other shapes than a network of "
+                             "its header; export it again")
         return logits[0], lambda anchors: (codes[0, anchors], directions[0, anchors])

@@ -21,7 +21,6 @@ from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, range_bins
-from lidar_perception.scoring.run import Start
 from lidar_perception.types import PEDESTRIAN, GroundTruth, InputError
 
 
@@ -42,13 +41,10 @@ class CandidateResult:
     name: str = ""
 
 
-def by_pipeline(params: PipelineParams) -> Start:
-    """Run the candidate pipeline on every frame with a pedestrian, as paper A does."""
-    return partial(_by_pipeline, params)
-
-
-def _by_pipeline(params: PipelineParams, recording: Recording
-                 ) -> Callable[[Frame], CandidateResult | None]:
+def by_pipeline(params: PipelineParams, recording: Recording
+                ) -> Callable[[Frame], CandidateResult | None]:
+    """Runs the candidate pipeline on every frame with a pedestrian, as paper A does. With params a
+    Start of scoring.run."""
     warm_up()
     template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
     return partial(of_frame, params=params, template=template)

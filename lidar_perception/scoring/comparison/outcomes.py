@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.detections import Detected, detected
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
 from lidar_perception.scoring.kitti.report import ROWS, DetectionReport
-from lidar_perception.scoring.run import Start
 from lidar_perception.types import Detections
 
 AP_ROWS = tuple(row for row, (metric, _) in ROWS.items() if metric != "image")
@@ -39,15 +37,11 @@ class Contender:
     source: str = ""
 
 
-def by_contenders(open_: Callable[[], list[Contender]]) -> Start:
-    """Run every contender that open_() gives on every frame with labels, in turns; gives their
+def by_contenders(open_: Callable[[], list[Contender]], recording: Recording
+                  ) -> Callable[[Frame], dict[str, Detected] | None]:
+    """Runs every contender that open_() gives on every frame with labels, in turns; gives their
     Detected by name. The first frame is run once more before it counts, as a first run also loads
-    what was compiled."""
-    return partial(_by_contenders, open_)
-
-
-def _by_contenders(open_: Callable[[], list[Contender]], recording: Recording
-                   ) -> Callable[[Frame], dict[str, Detected] | None]:
+    what was compiled. With open_ a Start of scoring.run."""
     contenders, state = open_(), {"turn": 0}
 
     def measure(frame: Frame) -> dict[str, Detected] | None:

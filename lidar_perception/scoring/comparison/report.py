@@ -15,7 +15,7 @@ from lidar_perception.scoring.comparison.outcomes import AP_ROWS
 from lidar_perception.scoring.kitti.protocol import RELAXED, SCORED, STRICT
 from lidar_perception.scoring.kitti.tables import CENTRE_F1
 from lidar_perception.scoring.pictures import save_picture
-from lidar_perception.scoring.tables import narrow_table, print_skipped
+from lidar_perception.scoring.tables import counts, narrow_table, number, percent, print_skipped
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,12 +46,12 @@ def _print_precision(content: dict, console: Console) -> None:
                                      for name in SCORED for row in AP_ROWS), style="dim",
                   end_section=True)
     for name, row in content["rows"].items():
-        table.add_row(name, *(_number(None if row["ap"][each] is None else
+        table.add_row(name, *(number(None if row["ap"][each] is None else
                                       row["ap"][each][which]["moderate"])
                               for each in SCORED for which in AP_ROWS))
-    counts = {name: content["objects"][name]["moderate"] for name in SCORED}
+    labels = {name: content["objects"][name]["moderate"] for name in SCORED}
     table.caption = "Labels: " + ", ".join(
-        f"{name} {n}{'*' * (0 < n < FEW)}" for name, n in counts.items()) + (
+        f"{name} {n}{'*' * (0 < n < FEW)}" for name, n in labels.items()) + (
         ". BEV: from above, 3D: in space. * too few for KITTI's own sampling of recall, so read "
         "off the whole curve. A dash: not a class of the detector, or no label.")
     console.print(table)
@@ -65,9 +65,9 @@ def _print_pedestrians(content: dict, console: Console) -> None:
                          "runs", "failed", width=4)
     for name, row in content["rows"].items():
         used, best = (row["pedestrian_centres"][key] for key in ("operating", "best"))
-        table.add_row(name, f"{used['score']:.2f}", *(str(used[k]) for k in ("tp", "fp", "fn")),
-                      *(f"{100 * used[k]:.1f}" for k in ("precision", "recall", "f1")),
-                      f"{100 * best['f1']:.1f}", _number(best["score"]), _number(row["ms"]),
+        table.add_row(name, f"{used['score']:.2f}", *counts(used, "tp", "fp", "fn"),
+                      *percent(used, "precision", "recall", "f1"),
+                      *percent(best, "f1"), number(best["score"]), number(row["ms"]),
                       str(row["frames"]), str(len(row["failed"])))
     table.add_section()
     for name, f1 in CENTRE_F1.items():
@@ -127,13 +127,13 @@ def _draw(axes: Axes, points: dict[str, tuple[float, float, float]], legend: str
     axes.xaxis.set_major_locator(_ticks(*axes.get_xlim()))
     axes.xaxis.set_major_formatter("{x:g}")
     axes.xaxis.set_minor_formatter("")
-    places = spread([y for _, y, _ in points.values()], -2, 102, 4.0)
-    for (name, (x, y, other)), place in zip(points.items(), places):
+    heights = kept_apart([y for _, y, _ in points.values()], -2, 102, 4.0)
+    for (name, (x, y, other)), height in zip(points.items(), heights):
         color, marker = next(style for begin, style in FAMILIES.items() if name.startswith(begin))
         axes.plot([x, x], [y, other], color=color, linewidth=0.8, alpha=0.6)
         axes.plot(x, other, marker, color=color, markerfacecolor="white", markersize=6)
         axes.plot(x, y, marker, color=color, markersize=6)
-        axes.annotate(f"{name}  {y:.1f}", (x, y), (1.03, place), fontsize=8, color=color,
+        axes.annotate(f"{name}  {y:.1f}", (x, y), (1.03, height), fontsize=8, color=color,
                       textcoords=("axes fraction", "data"), va="center", annotation_clip=False,
                       arrowprops=dict(arrowstyle="-", color=color, linewidth=0.4, alpha=0.5,
                                       relpos=(0, 0.5), shrinkA=1, shrinkB=3))
@@ -145,27 +145,15 @@ def _ticks(low: float, high: float):
                          if low <= step * 10.0 ** power <= high])
 
 
-def spread(values: Sequence[float], low: float, high: float, gap: float) -> np.ndarray:
-    """(N,) places as near to the values (N,) as they can be, in the same order, at least gap apart
-    and within low .. high; nearer to each other than gap only where there is no room for all."""
+def kept_apart(values: Sequence[float], low: float, high: float, gap: float) -> np.ndarray:
+    """(N,) heights as near to the values (N,) as they can be, in the same order, at least gap apart
+    and within low .. high; nearer to each other than gap only where there is no room for all. N is
+    at least 1."""
+    from sklearn.isotonic import isotonic_regression
     count = len(values)
     gap = min(gap, (high - low) / max(count - 1, 1))
-    order = np.argsort(values, kind="stable")
-    # Without the gaps the places must only not fall (isotonic regression by pools).
-    wanted = np.asarray(values, float)[order] - gap * np.arange(count)
-    pools: list[list[float]] = []
-    for value in wanted:
-        pools.append([value, 1])
-        while len(pools) > 1 and pools[-2][0] > pools[-1][0]:
-            mean, size = pools.pop()
-            before, earlier = pools[-1]
-            pools[-1] = [(before * earlier + mean * size) / (earlier + size), earlier + size]
-    level = np.repeat([mean for mean, _ in pools], [int(size) for _, size in pools])
-    places = np.empty(count)
-    places[order] = np.clip(level, low, high - gap * max(count - 1, 0)) + gap * np.arange(count)
-    return places
-
-
-def _number(value: float | None) -> str:
-    """Five characters: 84.00, 100.0."""
-    return "-" if value is None else f"{value:.2f}"[:5].rstrip(".")
+    order, heights = np.argsort(values, kind="stable"), np.empty(count)
+    # Less the gaps below them, heights must only not fall.
+    level = isotonic_regression(np.asarray(values, float)[order] - gap * np.arange(count))
+    heights[order] = np.clip(level, low, high - gap * (count - 1)) + gap * np.arange(count)
+    return heights

@@ -8,7 +8,14 @@ from rich.markup import escape
 from lidar_perception.classes import BY_SIZE
 from lidar_perception.scoring.average_precision import FEW
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES
-from lidar_perception.scoring.tables import narrow_table, print_skipped
+from lidar_perception.scoring.tables import (
+    counts,
+    narrow_table,
+    number,
+    percent,
+    print_skipped,
+    print_time,
+)
 
 # The EG-PointPillars paper, Table 5: AP in space at 0.7 (Car) and 0.5; easy, moderate, hard. It
 # does not say at how many recall points.
@@ -35,8 +42,7 @@ def print_detection_report(content: dict, console: Console) -> None:
     _print_centres(content["pedestrian_centres"], console)
     for line in content["diagnosis"]:
         console.print(f"[yellow]{escape(line)}[/]")
-    if content["ms"] is not None:
-        console.print(f"detector: {content['ms']:.1f} ms a frame (median)")
+    print_time(content["ms"], console)
     print_skipped(content["skipped"], console)
 
 
@@ -45,8 +51,8 @@ def _print_precision(content: dict, console: Console) -> None:
                          "", "R40", "", "", "R11", "", width=6)
     table.add_row("", "", *("easy", "mod.", "hard") * 2, style="dim")
     for name, rows in content["ap"].items():
-        counts = [level["objects"] if level else 0 for level in _levels(rows["3d"])]
-        table.add_row(name, "", *(f"{n}{'*' * (0 < n < FEW)}" for n in counts), "", "", "",
+        objects = [level["objects"] if level else 0 for level in _levels(rows["3d"])]
+        table.add_row(name, "", *(f"{n}{'*' * (0 < n < FEW)}" for n in objects), "", "", "",
                       style="bold")
         for row, title in TITLES.items():
             if row in rows:
@@ -67,7 +73,7 @@ def _print_paper(content: dict, console: Console) -> None:
         cells = [_cell(level, key) for name in COLUMNS
                  for level in _levels(content["ap"][name]["3d"])]
         mean = content["map_3d"]
-        table.add_row(f"here, {key.upper()}", *cells, _number(mean[key]) if mean else "-",
+        table.add_row(f"here, {key.upper()}", *cells, number(mean[key] if mean else None),
                       style="bold")
     for name, classes in PAPER.items():
         table.add_row(name, *(f"{v:.2f}" for levels in classes for v in levels),
@@ -87,8 +93,8 @@ def _print_centres(centres: dict, console: Console) -> None:
     if centres["best_score"] is not None:
         rows[f"score {centres['best_score']:.3g} and more"] = centres["at_best_score"]["all"]
     for title, row in rows.items():
-        table.add_row(title, *(str(row[k]) for k in ("tp", "fp", "fn")),
-                      *(f"{100 * row[k]:.1f}" for k in ("precision", "recall", "f1")))
+        table.add_row(title, *counts(row, "tp", "fp", "fn"),
+                      *percent(row, "precision", "recall", "f1"))
     table.caption = "F1 in the STM-CPA paper: " + ", ".join(
         f"{name} {100 * f1:.1f}" for name, f1 in CENTRE_F1.items())
     console.print(table)
@@ -99,9 +105,4 @@ def _levels(row: dict) -> list[dict | None]:
 
 
 def _cell(level: dict | None, key: str) -> str:
-    return "-" if level is None else _number(level[key])
-
-
-def _number(value: float) -> str:
-    """Five characters: 84.00, 100.0."""
-    return f"{value:.2f}"[:5]
+    return number(None if level is None else level[key])

@@ -6,7 +6,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +16,6 @@ from lidar_perception.data.nuscenes.results import DETECTED, read_results, to_re
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.detections import detected
 from lidar_perception.scoring.nuscenes.protocol import ClassScores, class_scores, counted, summary
-from lidar_perception.scoring.run import Start
 from lidar_perception.types import InputError
 
 OURS = tuple(DETECTED.values())
@@ -48,14 +46,10 @@ def key_frame(frame: Frame, boxes: GlobalBoxes, ms: float | None = None,
                           boxes[counted(boxes, key.ego, racks)], ms, problem)
 
 
-def by_detector(open_: Callable[[], Detector], unlabelled: bool) -> Start:
-    """Run the detector that open_() gives on every key frame with labels, with unlabelled on
-    all."""
-    return partial(_by_detector, open_, unlabelled)
-
-
-def _by_detector(open_: Callable[[], Detector], unlabelled: bool,
-                 recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
+def by_detector(open_: Callable[[], Detector], unlabelled: bool,
+                recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
+    """Runs the detector that open_() gives on every key frame with labels, with unlabelled on
+    all. All but the recording given, a Start of scoring.run."""
     detector = open_()
 
     def measure(frame: Frame) -> KeyFrameResult | None:
@@ -72,12 +66,8 @@ def _by_detector(open_: Callable[[], Detector], unlabelled: bool,
     return measure
 
 
-def by_file(path: Path) -> Start:
-    """Read a result file of nuScenes' detection task."""
-    return partial(_by_file, path)
-
-
-def _by_file(path: Path, recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
+def by_file(path: Path, recording: Recording) -> Callable[[Frame], KeyFrameResult | None]:
+    """Reads a result file of nuScenes' detection task. With a path a Start of scoring.run."""
     boxes = read_results(path, list(recording))
     return lambda frame: (None if frame.native.labels() is None
                           else key_frame(frame, boxes[frame.name]))

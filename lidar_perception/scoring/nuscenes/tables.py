@@ -6,7 +6,7 @@ from rich.console import Console
 
 from lidar_perception.scoring.nuscenes.protocol import DISTANCES, ERRORS
 from lidar_perception.scoring.nuscenes.report import OURS
-from lidar_perception.scoring.tables import narrow_table, print_skipped
+from lidar_perception.scoring.tables import narrow_table, number, print_skipped, print_time
 
 # The improved-PointNet paper on nuScenes. It names neither the split nor the classes, and gives no
 # AOE, AVE and AAE.
@@ -21,7 +21,7 @@ def print_nuscenes_report(content: dict, console: Console) -> None:
     for name, row in content["classes"].items():
         table.add_row(name.replace("construction_vehicle", "constr. veh.").replace("_", " "),
                       str(row["objects"]), *(f"{ap:.3g}" for ap in row["ap"].values()),
-                      _number(row["mean_ap"]), *_errors(row), style="" if name in OURS else "dim")
+                      number(row["mean_ap"]), *_errors(row), style="" if name in OURS else "dim")
     table.add_section()
     for key, title in ("all", "all ten"), ("ours", "our three"):
         objects = sum(row["objects"] for name, row in content["classes"].items()
@@ -35,19 +35,13 @@ def print_nuscenes_report(content: dict, console: Console) -> None:
         "(our Cyclist), no figure of nuScenes' ranking. Without velocities and attributes AVE and "
         "AAE are 1, and NDS is 80 at most. The paper names neither its classes nor its split.")
     console.print(table)
-    if content["ms"] is not None:
-        console.print(f"detector: {content['ms']:.1f} ms a frame (median)")
+    print_time(content["ms"], console)
     print_skipped(content["skipped"], console)
 
 
 def _means(row: dict) -> list[str]:
-    return [_number(row["map"]), *_errors(row), _number(row["nds"])]
+    return [number(row["map"]), *_errors(row), number(row["nds"])]
 
 
 def _errors(row: dict) -> list[str]:
-    return ["-" if row.get(name) is None else f"{row[name]:.2f}"[:4] for name in ERRORS]
-
-
-def _number(value: float) -> str:
-    """Five characters: 84.00, 100.0."""
-    return f"{value:.2f}"[:5]
+    return [number(row.get(name), width=4) for name in ERRORS]

@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.console import Console
 
-from lidar_perception.scoring.tables import narrow_table, print_skipped
+from lidar_perception.scoring.tables import narrow_table, number, print_skipped
 
 # Paper C: segmentation on KITTI, in percent
 PAPER = {"accuracy": 94.96, "precision": 94.3, "recall": 93.5, "f1": 93.9, "iou": 92.12}
@@ -41,4 +41,4 @@ def print_cluster_scores(content: dict[str, Any], out: Console) -> None:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}"
+    return number(value, digits=1)

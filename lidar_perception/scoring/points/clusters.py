@@ -19,7 +19,6 @@ from lidar_perception.detectors.pointnet.network import fused, load_pointnet
 from lidar_perception.detectors.pointnet.predict import Predictions, predict
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.scoring.run import Start
 from lidar_perception.types import CLASSES, GroundTruth
 
 UNKNOWN = -1              # a label of which nothing is said
@@ -104,12 +103,9 @@ def confusions(clusters: Clusters, labels: np.ndarray, predictions: Predictions,
     return of_clusters, of_points
 
 
-def by_network(weights: Path) -> Start:
-    """Ask a cluster network of every frame with labelled boxes, of its points in the image."""
-    return partial(_by_network, weights)
-
-
-def _by_network(weights: Path, recording: Recording) -> Callable[[Frame], Any]:
+def by_network(weights: Path, recording: Recording) -> Callable[[Frame], Any]:
+    """Runs a cluster network on every frame with labelled boxes, on its points in the image. With
+    weights a Start of scoring.run."""
     network = fused(load_pointnet(weights)[1])
     config, background = network.config, len(network.config.classes)
 

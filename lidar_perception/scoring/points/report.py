@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 from time import perf_counter
 from typing import Any
 
@@ -25,7 +24,6 @@ from lidar_perception.scoring.points.segmentation import (
     objects_of_instances,
     score_clusters,
 )
-from lidar_perception.scoring.run import Start
 from lidar_perception.types import LidarFrame
 from lidar_perception.wire.params import ViewParams
 
@@ -49,16 +47,11 @@ class SegmentationResult:
     whole: bool = False
 
 
-def by_methods(params: SegmentationParams, grounds: tuple[str, ...],
-               clusterings: tuple[str, ...]) -> Start:
-    """Run the methods on every frame with labels. Labelled points judge the ground, and clusters
-    by their instances; labelled boxes judge clusters, on the ground of params, in the camera's
-    view where there is a camera."""
-    return partial(_by_methods, params, grounds, clusterings)
-
-
-def _by_methods(params: SegmentationParams, grounds: tuple[str, ...], clusterings: tuple[str, ...],
-                recording: Recording) -> Callable[[Frame], SegmentationResult | None]:
+def by_methods(params: SegmentationParams, grounds: tuple[str, ...], clusterings: tuple[str, ...],
+               recording: Recording) -> Callable[[Frame], SegmentationResult | None]:
+    """Runs the methods on every frame with labels. Ground is scored on labelled points, clusters on
+    their instances, or on labelled boxes: then on the ground of params, in the camera's view where
+    there is a camera. All but the recording given, a Start of scoring.run."""
     timed = Timed()
 
     def on_points(frame: Frame, labels: Any) -> SegmentationResult:

@@ -9,12 +9,14 @@ from rich.console import Console
 
 from lidar_perception.scoring.pictures import save_picture
 from lidar_perception.scoring.points.segmentation import HIT_IOU, MIN_POINTS, PROTOCOLS, true_ground
-from lidar_perception.scoring.tables import narrow_table, print_skipped
+from lidar_perception.scoring.tables import counts, narrow_table, percent, print_skipped
 from lidar_perception.types import LidarFrame
 
 # Patchwork++ on sequences 00 to 10 of SemanticKITTI, mean of the sequences, in percent: precision,
 # recall, F1. The first from the paper (IROS 2022, Table I), the second from its repository.
 PUBLISHED = {"without vegetation": (94.92, 98.18, 96.51), "with vegetation": (93.72, 92.33, 92.87)}
+
+RANGE = 50.0  # metres to each side that are drawn
 
 
 def print_scores(content: dict, ground_method: str, console: Console) -> None:
@@ -36,8 +38,8 @@ def _print_ground(reports: dict, console: Console) -> None:
         table.add_row(titles[protocol], style="bold")
         for name, report in reports.items():
             row = report["protocols"][protocol]
-            table.add_row(f"  {name}", *_percent(row, "precision", "recall", "f1", "accuracy"),
-                          *(str(row[k]) for k in ("tp", "fp", "fn")), _ms(report))
+            table.add_row(f"  {name}", *percent(row, "precision", "recall", "f1", "accuracy"),
+                          *counts(row, "tp", "fp", "fn"), _ms(report))
         if protocol in PUBLISHED:
             table.add_row("  Patchwork++ published", *(f"{v:.1f}" for v in PUBLISHED[protocol]),
                           style="dim")
@@ -66,13 +68,9 @@ def _print_clusters(reports: dict, title: str, console: Console) -> None:
 
 def _object_cells(row: dict) -> list[str]:
     """Precision and F1 are known for all objects together only."""
-    judged = _percent(row, "precision", "f1") if "precision" in row else ("", "")
-    return [str(row["objects"]), str(row["hits"]), *_percent(row, "recall"), *judged,
-            *_percent(row, "mean_iou", "over_segmentation", "under_segmentation")]
-
-
-def _percent(row: dict, *keys: str) -> list[str]:
-    return [f"{100 * row[key]:.1f}" for key in keys]
+    judged = percent(row, "precision", "f1") if "precision" in row else ("", "")
+    return [*counts(row, "objects", "hits"), *percent(row, "recall"), *judged,
+            *percent(row, "mean_iou", "over_segmentation", "under_segmentation")]
 
 
 def _ms(report: dict) -> str:
@@ -84,7 +82,7 @@ def _count(count: int, noun: str) -> str:
 
 
 def draw_ground(path: Path, name: str, frame: LidarFrame, semantic: np.ndarray,
-                found: dict[str, np.ndarray], max_range: float = 50.0) -> None:
+                found: dict[str, np.ndarray]) -> None:
     """Write a PNG: the scan from above, for each method what it found (N,) of the true ground.
     x (forward) points up, y (left) to the left, metres. Vegetation is left out of the count."""
     import matplotlib
@@ -103,7 +101,7 @@ def draw_ground(path: Path, name: str, frame: LidarFrame, semantic: np.ndarray,
                 (counted & ~true & ground, "#d55e00", "found, but not ground", 1.2)):
             axes.scatter(-frame.xyz[mask, 1], frame.xyz[mask, 0], s=size, c=color, linewidths=0,
                          label=f"{label} ({int(mask.sum())})")
-        axes.set(xlim=(-max_range, max_range), ylim=(-max_range, max_range), aspect="equal",
+        axes.set(xlim=(-RANGE, RANGE), ylim=(-RANGE, RANGE), aspect="equal",
                  xlabel="right [m]", ylabel="forward [m]", title=f"{method}, scan {name}")
         for handle in axes.legend(loc="upper right", framealpha=0.9).legend_handles:
             handle.set_sizes([30])

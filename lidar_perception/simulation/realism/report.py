@@ -5,12 +5,10 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Table
 
 from lidar_perception.scoring.pictures import save_picture
+from lidar_perception.scoring.tables import narrow_table, number, print_skipped
 from lidar_perception.simulation.realism.compare import MIN_SAMPLES, factor_off
 from lidar_perception.simulation.realism.scan_statistics import CURVES
 
@@ -29,11 +27,7 @@ def print_realism(content: dict, console: Console) -> None:
                       soft_wrap=True)
     _print_curves(content, console)
     _print_worst(content, console)
-    skipped = content["real"]["skipped"] + content["simulated"]["skipped"]
-    for line in skipped[:5]:
-        console.print(f"[yellow]skipped[/]: {escape(line)}", soft_wrap=True)
-    if len(skipped) > 5:
-        console.print(f"[yellow]skipped[/]: {len(skipped) - 5} more, see the JSON file")
+    print_skipped(content["real"]["skipped"] + content["simulated"]["skipped"], console)
     console.print(summary(content), style="bold", soft_wrap=True)
 
 
@@ -50,13 +44,14 @@ def typical_factor(curve: dict) -> float | None:
 
 
 def _print_curves(content: dict, console: Console) -> None:
-    table = _table("Simulated against real, worst curves first",
-                   "curve", "within 20 %", "typical", "worst at", "ratio")
+    table = narrow_table("Simulated against real, worst curves first",
+                   "curve", "within 20 %", "typical", "worst at", "ratio", fold=True)
     judged = [c for c in content["curves"].values() if c["judged"]]
     for curve in sorted(judged, key=lambda c: (c["share"], -typical_factor(c))):
         worst = max((b for b in curve["bins"] if b["within"] is not None), key=factor_off)
         table.add_row(_title(curve), f"{curve['within']} of {curve['judged']}",
-                      _factor(typical_factor(curve)), worst["bin"], _ratio(worst))
+                      number(typical_factor(curve), width=9), worst["bin"],
+                      number(worst["ratio"], width=9))
     unknown = sum(not curve["judged"] and not CURVES[name].histogram
                   for name, curve in content["curves"].items())
     table.caption = ("typical: the median factor between simulated and real. ratio: simulated / "
@@ -68,12 +63,13 @@ def _print_curves(content: dict, console: Console) -> None:
 def _print_worst(content: dict, console: Console) -> None:
     bins = [(curve, b) for curve in content["curves"].values() for b in curve["bins"]
             if b["within"] is False]
-    table = _table(f"The {min(WORST, len(bins))} worst bins of {len(bins)} not within 20 %",
-                   "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio")
+    table = narrow_table(f"The {min(WORST, len(bins))} worst bins of {len(bins)} not within 20 %",
+                   "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio",
+                         fold=True)
     for curve, b in sorted(bins, key=lambda item: -factor_off(item[1]))[:WORST]:
         table.add_row(_title(curve), b["bin"],
                       *(cell for side in ("real", "simulated") for cell in _cells(b[side])),
-                      _ratio(b))
+                      number(b["ratio"], width=9))
     table.caption = "Median and spread of the scans or objects, n of them."
     if bins:
         console.print(table)
@@ -91,22 +87,6 @@ def _cells(side: dict) -> list[str]:
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.0f}" if value >= 100 else f"{value:.2g}"
-
-
-def _factor(value: float) -> str:
-    return "-" if math.isinf(value) else f"{value:.2f}"
-
-
-def _ratio(b: dict) -> str:
-    return "-" if b["ratio"] is None else f"{b['ratio']:.2f}"
-
-
-def _table(title: str, first: str, *others: str) -> Table:
-    table = Table(title=title, box=SIMPLE_HEAD, padding=0, caption_justify="left")
-    table.add_column(first, overflow="fold")
-    for name in others:
-        table.add_column(name, justify="right", no_wrap=True)
-    return table
 
 
 def draw_realism(path: Path, content: dict) -> None:

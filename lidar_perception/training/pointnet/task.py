@@ -24,7 +24,7 @@ from lidar_perception.geometry import points_in_box
 from lidar_perception.scoring.detections import Detected
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import noisy, with_reflector
-from lidar_perception.training.data import Batches, JudgedScenes, loaded
+from lidar_perception.training.data import Batches, ReadScenes, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes
 from lidar_perception.training.record import begun_with, keeper, metrics_of
@@ -155,8 +155,8 @@ def make_loss(config: PointNetConfig, device: torch.device) -> Callable:
 
 
 @dataclass(frozen=True)
-class JudgedClusters:
-    """A validation scene: the clusters that clustering made, with the truth of its frame."""
+class ValidationClusters:
+    """A scene to validate on: the clusters that clustering made, with the truth of its frame."""
 
     name: str
     clusters: Clusters
@@ -165,16 +165,16 @@ class JudgedClusters:
     calibration: Calibration | None
 
 
-def judged_clusters(source: CutScenes, i: int) -> JudgedClusters:
+def clusters_to_validate(source: CutScenes, i: int) -> ValidationClusters:
     """Scene i of a source, to validate on. InputError naming the file that cannot be used."""
     scene = source.scene(i)
     made = np.flatnonzero(~scene.loose)
     frame = source.frame(i)
-    return JudgedClusters(frame.name, scene.clusters.take(made), scene.labels[made], frame.truth(),
-                          frame.calibration())
+    return ValidationClusters(frame.name, scene.clusters.take(made), scene.labels[made],
+                              frame.truth(), frame.calibration())
 
 
-def validated(network: PointNet, scenes: Sequence[JudgedClusters]) -> dict[str, float]:
+def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> dict[str, float]:
     """Calibrate the network on the scenes and score it: score, the mean AP from above at the
     relaxed overlaps (moderate, R40), and each class's; accuracy, the share of clusters of
     SCORED_POINTS or more, and of the objects among them, whose class is right."""
@@ -201,19 +201,19 @@ def validated(network: PointNet, scenes: Sequence[JudgedClusters]) -> dict[str, 
 
 
 def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches,
-              validation: JudgedScenes, out: Path, device: torch.device, about: dict[str, Any],
+              validation: ReadScenes, out: Path, device: torch.device, about: dict[str, Any],
               commit: str = "", init: Path | None = None) -> Task:
     """The task of training a network of a config; see training.pointpillars.make_task."""
     torch.manual_seed(params.seed)
     network = begun_with(make_pointnet(config), init, PointNetConfig).to(device)
-    judged: list[JudgedClusters] = []
+    scenes: list[ValidationClusters] = []
 
     def validate(module: PointNet) -> dict[str, float]:
-        if not judged:
+        if not scenes:
             for item, in loaded(validation, ([n] for n in range(len(validation))), batches.jobs):
                 if item.sample is not None:
-                    judged.append(item.sample)
-        return validated(module, judged)
+                    scenes.append(item.sample)
+        return validated(module, scenes)
 
     return Task(network, make_loss(config, device), batches, validate,
                 keeper(out, config, params, batches, about, commit), batches.epoch, about)

@@ -38,7 +38,7 @@ from lidar_perception.scoring.detections import detected
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import TrainingScene, augmented, faced
-from lidar_perception.training.data import Batches, JudgedScenes, loaded
+from lidar_perception.training.data import Batches, ReadScenes, loaded
 from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
 from lidar_perception.training.putting import inside
@@ -164,14 +164,13 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     return loss
 
 
-def frame_to_judge(source: Any, i: int) -> Frame:
-    """TrainingScene i of a source, read, to validate on. InputError naming the file that cannot be
-    used."""
+def frame_to_validate(source: Any, i: int) -> Frame:
+    """Frame i of a source, read. InputError naming the file that cannot be used."""
     frame = source.frame(i)
     return Frame.of(frame.name, frame.load(), frame.truth(), frame.calibration())
 
 
-def validation_report(detector: Detector, scenes: JudgedScenes, jobs: int = 0) -> DetectionReport:
+def validation_report(detector: Detector, scenes: ReadScenes, jobs: int = 0) -> DetectionReport:
     """The detector on every scene, by KITTI's protocol."""
     report = DetectionReport()
     for item, in loaded(scenes, ([n] for n in range(len(scenes))), jobs):
@@ -183,7 +182,7 @@ def validation_report(detector: Detector, scenes: JudgedScenes, jobs: int = 0) -
 
 
 def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batches,
-              validation: JudgedScenes, out: Path, device: torch.device, about: dict[str, Any],
+              validation: ReadScenes, out: Path, device: torch.device, about: dict[str, Any],
               commit: str = "", init: Path | None = None) -> Task:
     """The task of training a network of a config. about: what the header says of the data; a
     resumed run must have the same. init: checkpoint to begin with, see checkpoint.adopt. Weights

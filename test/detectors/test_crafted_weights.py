@@ -1,0 +1,175 @@
+"""Weights that somebody has crafted: they can be used, or one line says why not."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import random
+
+import numpy as np
+import pytest
+import torch
+from detection_samples import eager, frame, lively, same, tiny
+from safetensors.torch import save
+
+from lidar_perception.detectors.checkpoint import KEY, Header, read_header
+from lidar_perception.detectors.pointnet.config import pointnet_config
+from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
+from lidar_perception.detectors.pointnet.network import make_pointnet
+from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
+from lidar_perception.detectors.pointpillars.detector import (
+    CPU,
+    PointPillarsDetector,
+    TorchNetwork,
+    load_detector,
+)
+from lidar_perception.param_fields import with_values
+from lidar_perception.types import InputError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+ODD = [None, True, 0, 1, -1, 2, 3, 63, 64, 1e-9, 0.5, -1e308, 1e308, math.nan, math.inf, 2**31,
+       2**63, 10**400, "", "1", "Car", "v9", "\x00", "x" * 10_000, [], [1], [1, 2, 3], [0] * 1000,
+       [[[]]], [None], ["Car", "Car"], [[1, 2, 3]] * 3, {}, {"size": [1]}, [{}], {"x": {"y": []}}]
+
+
+def write(path, tensors, header):
+    """A checkpoint with any text as its header."""
+    path.write_bytes(save({name: value.contiguous() for name, value in tensors.items()},
+                          {KEY: header}))
+
+
+def places(value, path=()):
+    """The paths of all values within JSON."""
+    yield path
+    if isinstance(value, dict | list):
+        for key, part in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from places(part, (*path, key))
+
+
+def mutated(header, rng):
+    """A header with a few of its values changed, removed, added, or put deeper."""
+    header = {"": copy.deepcopy(header)}
+    for _ in range(rng.choice([1, 1, 1, 2, 5])):
+        *path, last = rng.choice([*places(header)][1:])
+        parent = header
+        for key in path:
+            parent = parent[key]
+        kind = rng.randrange(4)
+        if kind == 0:
+            parent[last] = copy.deepcopy(rng.choice(ODD))
+        elif kind == 1 and path:
+            del parent[last]
+        elif kind == 2 and isinstance(parent, dict) and path:
+            parent[rng.choice(["", "size", "format", "a" * 99])] = copy.deepcopy(parent[last])
+        else:
+            parent[last] = rng.choice([[parent[last]], {"": parent[last]}])
+    return header[""]
+
+
+SMALL = {
+    "pointpillars": (lambda: Header(tiny("v4"), {"steps": 1}, {"map": 0.5}, "abc"), lively,
+                     load_detector, eager()),
+    "pointnet": (lambda: Header(pointnet_config(points=16, centroids=8, coarse=4,
+                                                neighbours=(4, 4, 4), coarse_neighbours=4)),
+                 make_pointnet, load_pointnet_detector,
+                 with_values(PointNetDetectorParams(), {"pointnet.warm_up": False})),
+}
+
+
+@pytest.mark.parametrize("kind", SMALL)
+def test_a_mutated_header_is_used_or_refused_with_one_line(kind, tmp_path):
+    """What passes has the tensors' shapes, so it takes no more memory than the file says."""
+    make_header, make, load, params = SMALL[kind]
+    header = make_header()
+    tensors = make(header.config).state_dict()
+    path, text, rng = tmp_path / "w.safetensors", json.loads(header.text()), random.Random(7)
+    scan, refused = frame(), 0
+    texts = [json.dumps(mutated(text, rng)) for _ in range(250)]
+    texts += ["[" * 100_000, '{"format":' * 50_000, "1" * 5000, "", "null", "\ud83d".encode(
+        "utf-8", "replace").decode(), json.dumps({**text, "format": [1]})]
+    for one in texts:
+        write(path, tensors, one)
+        try:
+            read_header(path)
+            found = load(path, "cpu", params)(scan)
+            assert np.isfinite(found.detections.boxes).all()
+        except InputError as error:
+            refused += 1
+            assert str(path) in str(error) and "\n" not in str(error) and len(str(error)) < 400
+    assert 100 < refused < len(texts)
+
+
+def test_a_header_takes_no_memory_before_the_tensors_fit_it(tmp_path):
+    header = json.loads(SMALL["pointpillars"][0]().text())
+    header["config"]["block_channels"] = [65_536, 65_536, 65_536]  # 300 GB of weights
+    path = tmp_path / "w.safetensors"
+    write(path, lively(tiny("v4")).state_dict(), json.dumps(header))
+    with pytest.raises(InputError, match="do not fit"):
+        load_detector(path, "cpu")
+    header["config"].update(low=[-60_000, -60_000, -3], high=[60_000, 60_000, 1], cell=0.01)
+    write(path, lively(tiny("v4")).state_dict(), json.dumps(header))
+    with pytest.raises(InputError, match="cells"):
+        load_detector(path, "cpu")
+
+
+def test_weights_that_say_the_same_everywhere_detect_nothing_and_are_named():
+    config = tiny("v4")
+    for value in 0.0, 1.0:
+        network = lively(config)
+        for tensor in network.state_dict().values():
+            tensor.fill_(0)
+        network.head.scores.bias.fill_(value)
+        found = PointPillarsDetector(TorchNetwork(network), Header(config), CPU,
+                                     eager(score=0.1))(frame())
+        assert len(found.detections) == 0 and "same scores" in found.problem
+
+
+def test_onnx_files_with_other_inputs_are_refused(tmp_path):
+    """Renamed, of another type or rank, or missing: none of them reaches a cloud."""
+    onnx = pytest.importorskip("onnx", reason="needs the extra [onnx]")
+    pytest.importorskip("onnxruntime", reason="needs the extra [onnx]")
+    from onnx import TensorProto, helper
+    text = Header(tiny("v0")).text()
+
+    def model(path, inputs, outputs=("logits", "codes", "directions"), header=text):
+        nodes = [helper.make_node("Constant", [], [name], value=helper.make_tensor(
+            name, TensorProto.FLOAT, [1], [0.0])) for name in outputs]
+        graph = helper.make_graph(
+            nodes, "g", [helper.make_tensor_value_info(*i) for i in inputs],
+            [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]) for name in outputs])
+        made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+        helper.set_model_props(made, {KEY: header} if header else {})
+        path.write_bytes(made.SerializeToString())
+
+    right = [("points", TensorProto.FLOAT, ["n", 4]), ("offsets", TensorProto.FLOAT, ["n", 5]),
+             ("cells", TensorProto.INT64, ["n"])]
+    assert onnx
+    path = tmp_path / "n.onnx"
+    for change, words in (
+            (dict(inputs=[("pixels", *right[0][1:]), *right[1:]]), "other inputs"),
+            (dict(inputs=right[:2]), "other inputs"),
+            (dict(inputs=[("points", TensorProto.DOUBLE, ["n", 4]), *right[1:]]), "other inputs"),
+            (dict(inputs=[("points", TensorProto.FLOAT, ["n"]), *right[1:]]), "other inputs"),
+            (dict(inputs=right, outputs=("logits",)), "other inputs or outputs"),
+            (dict(inputs=right, header="[" * 99_999), "no header"),
+            (dict(inputs=right, header=""), "no header"),
+            (dict(inputs=right), "n.onnx")):  # outputs of a shape that no cloud has
+        model(path, **change)
+        with pytest.raises(InputError, match=words) as error:
+            load_detector(path, "cpu")(frame())
+        assert "\n" not in str(error.value)
+
+
+def test_tensors_of_other_types_are_refused(tmp_path):
+    config = tiny("v4")
+    path, state = tmp_path / "w.safetensors", lively(config).state_dict()
+    for dtype in torch.bool, torch.int8, torch.complex64:
+        write(path, {name: value.to(dtype) for name, value in state.items()}, Header(config).text())
+        with pytest.raises(InputError, match="should be floats of shape"):
+            load_detector(path, "cpu", eager())
+    write(path, {name: value.double() if value.is_floating_point() else value
+                 for name, value in state.items()}, Header(config).text())
+    expected = PointPillarsDetector(TorchNetwork(lively(config)), Header(config), CPU, eager())
+    assert same(load_detector(path, "cpu", eager())(frame()), expected(frame()))

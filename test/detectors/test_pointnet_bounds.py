@@ -1,0 +1,66 @@
+"""However many clusters a cloud has, the network looks at a number of them that is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pointnet_samples import eager, random_detector
+
+from lidar_perception.detectors.pointnet.clusters import ground_under
+from lidar_perception.detectors.pointnet.predict import CHUNK
+from lidar_perception.param_fields import with_values
+from lidar_perception.types import LidarFrame
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def test_small_and_large_clusters_and_many_are_no_trouble():
+    rng = np.random.default_rng(0)
+    detector = random_detector(with_values(eager(), {"pointnet.min_points": 1}))
+    batches = []
+    detector.network.register_forward_hook(lambda net, given, _: batches.append(len(given[0])))
+    one = LidarFrame(np.float32([[9, 0, -1]]), np.ones(1, np.float32))
+    assert len(detector(one, cluster_ids=np.ones(1, int)).detections) == 1
+    xyz = rng.uniform([5, -3, -1.7], [9, 3, 2], (50_000, 3)).astype(np.float32)
+    big = LidarFrame(xyz, rng.uniform(0, 1, len(xyz)).astype(np.float32))
+    assert len(detector(big, cluster_ids=np.ones(len(xyz), int)).detections) == 1
+    spots = rng.uniform(-80, 80, (5000, 1, 3)) * [1, 1, 0.01]
+    xyz = (spots + rng.normal(0, 0.2, (5000, 6, 3))).reshape(-1, 3).astype(np.float32)
+    batches.clear()
+    found = detector(LidarFrame(xyz, np.zeros(len(xyz), np.float32)),
+                     cluster_ids=np.repeat(np.arange(5000), 6) + 1)
+    assert sum(batches) == 4000 and max(batches) <= CHUNK
+    assert len(found.detections) == detector.params.pointnet.nms.max_boxes
+    assert "1000 of 5000 clusters are left out" in found.problem
+
+
+def test_of_too_many_clusters_the_nearest_are_looked_at_and_the_others_counted():
+    rng = np.random.default_rng(0)
+    centres = np.column_stack([np.linspace(4, 60, 300), rng.uniform(-3, 3, 300), np.zeros(300)])
+    rng.shuffle(centres)
+    xyz = (np.repeat(centres, 6, axis=0) + rng.normal(0, 0.02, (1800, 3))).astype(np.float32)
+    frame = LidarFrame(xyz, np.full(1800, 0.5, np.float32))
+    ids, ground = np.repeat(np.arange(1, 301), 6), np.zeros(1800, bool)
+
+    def detected(params, chosen=None):
+        wanted = ids if chosen is None else np.where(chosen, ids, 0)
+        return random_detector(with_values(params, {"pointnet.intensity_scale": 0.0}))(
+            frame, ground=ground, cluster_ids=wanted)
+    few = with_values(eager(), {"pointnet.max_clusters": 40})
+    capped, everything = detected(few), detected(eager())
+    assert "260 of 300 clusters are left out" in capped.problem
+    assert "left out" not in (everything.problem or "")
+    means = np.add.reduceat(xyz, np.arange(0, 1800, 6)) / 6
+    nearest = np.argsort(np.hypot(means[:, 0], means[:, 1]))[:40] + 1
+    expected = detected(eager(), np.isin(ids, nearest))
+    np.testing.assert_array_equal(capped.detections.boxes, expected.detections.boxes)
+    assert 0 < len(capped.detections) < len(everything.detections)
+
+
+def test_the_ground_is_found_under_each_cluster_however_far_another_one_is():
+    rng = np.random.default_rng(1)
+    ground = rng.uniform([-40, -40, -1.8], [40, 40, -1.6], (5000, 3)).astype(np.float32)
+    places = rng.uniform(-30, 30, (50, 2))
+    near = ground_under(ground, places)
+    far = np.array([[9e4, -9e4], [-9e4, 9e4]])
+    np.testing.assert_array_equal(ground_under(ground, np.concatenate([places, far]))[:50], near)
