@@ -9,6 +9,7 @@ from lidar_perception.detectors.params import NetworkParams
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
+from lidar_perception.robot.params import CropParams
 from lidar_perception.wire.params import InputParams
 
 STEPS = ("preprocess", "ground", "clustering", "network", "postprocess")  # each has its time
@@ -33,6 +34,7 @@ class PointNetDetectorParams:
     """All groups of the detector."""
 
     input: InputParams = INPUT
+    crop: CropParams = CropParams()
     ground: GroundParams = GROUND
     clustering: ClusteringParams = CLUSTERING
     pointnet: PointNetParams = PointNetParams()

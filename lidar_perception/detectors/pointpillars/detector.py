@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.contract import Found, require_columns
+from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.devices import CPU, chosen_device
 from lidar_perception.detectors.nms import best_of_each, suppressed
 from lidar_perception.detectors.pointpillars.anchors import make_anchors
@@ -63,11 +63,9 @@ class PointPillarsDetector(NetworkDetector):
         self.network = network
         self.anchors = make_anchors(self.config, device)
 
-    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> Found:
-        """See contract.Detector; columns are computed only if the version needs them. InputError
-        also where CUDA is out of memory and the CPU may not take over."""
-        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
+    def detect(self, frame: LidarFrame, ground: np.ndarray | None,
+               cluster_ids: np.ndarray | None) -> Found:
+        """Columns are computed only if the version needs them."""
         t0 = perf_counter()
         pose = self.params.ground.sensor_pose
         indices, seen = visible(frame, self.config, pose)
@@ -127,7 +125,7 @@ class PointPillarsDetector(NetworkDetector):
 
     def _problem(self, frame: LidarFrame, seen: LidarFrame, inputs: NetworkInput) -> str | None:
         if len(frame) == 0:
-            return "the cloud is empty or has no finite point"
+            return "the cloud is empty or has no finite point, or crop.* leaves none"
         if len(seen) == 0:
             low, high = self.config.low, self.config.high
             return (f"no point lies in the network's range, x {low[0]:g} .. {high[0]:g}, y "

@@ -8,6 +8,7 @@ from lidar_perception.clustering.params import ClusteringParams, DbscanParams
 from lidar_perception.detectors.params import NetworkParams
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
+from lidar_perception.robot.params import CropParams
 from lidar_perception.wire.params import InputParams
 
 STEPS = ("preprocess", "experts", "network", "postprocess")  # of which each has its time
@@ -39,6 +40,7 @@ class DetectorParams:
     """All groups of the detector; ground and clustering are its experts."""
 
     input: InputParams = INPUT
+    crop: CropParams = CropParams()
     ground: GroundParams = EXPERT_GROUND
     clustering: ClusteringParams = EXPERT_CLUSTERING
     pointpillars: PointPillarsParams = PointPillarsParams()
