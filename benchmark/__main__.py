@@ -20,7 +20,7 @@ from benchmark.graph import measure_graph, print_graph
 from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, print_planes
 from benchmark.simulation import measure_simulation
-from benchmark.timing import spread
+from benchmark.timing import evenly_chosen
 from benchmark.tracking import measure_recording, print_tracking
 from lidar_perception.candidates.segmented import points_in_view
 from lidar_perception.candidates.warm_up import warm_up
@@ -70,7 +70,7 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     if not frames:
         raise InputError(f"{recording.path} has no frame with a Pedestrian label")
     labelled = [f for each in recordings if POINT_LABELS in each.has
-                for f in spread(each.frames, count)]
+                for f in evenly_chosen(each.frames, count)]
     warm_up()
     content = {"machine": {"cpu": cpu_name(), "cores": os.cpu_count(), "python":
                            platform.python_version(), "numpy": np.__version__},
@@ -108,12 +108,12 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
 def _with_camera(recording: Recording, pedestrian: list[Frame], count: int) -> list[tuple]:
     """(scan, camera) of the frames with a pedestrian; of any frames where these are few."""
     chosen = pedestrian if len(pedestrian) >= FEW else recording.frames
-    return [(f.load(), f.camera()) for f in spread(chosen, count)]
+    return [(f.load(), f.camera()) for f in evenly_chosen(chosen, count)]
 
 
 def _full_scans(recording: Recording, count: int) -> list[LidarFrame]:
     whole = [f for f in recording if len(f.load()) > FULL_SCAN]
-    return [f.load() for f in spread(whole, count)]
+    return [f.load() for f in evenly_chosen(whole, count)]
 
 
 def _measure(in_view: list[np.ndarray], scans: list[LidarFrame], repeat: int) -> dict:

@@ -31,13 +31,19 @@ CAMERA_IN = [
     ("~/input/camera_info", "sensor_msgs/CameraInfo", "P and the image size; latched. Only needed "
      "with `view.enabled`."),
     ("~/input/extrinsics", "geometry_msgs/TransformStamped", "The camera in the LiDAR frame or the "
-     "other way round; latched. /tf_static is read too where tf2_msgs is installed."),
+     "other way round; latched. TF is asked too where tf2_msgs is installed."),
 ]
 SEED_IN = [
     ("~/input/ground_truth", MARKERS, "Labels, for `seed.source` ground_truth; matched to the "
      "cloud by header.stamp."),
     ("/clicked_point", "geometry_msgs/PointStamped", "A point on a pedestrian, for `seed.source` "
-     "click, in the frame of the cloud."),
+     "click, in the frame of the cloud or, with TF, in any that is connected with it."),
+]
+ROBOT_IN = [
+    ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves; only with `input.deskew` "
+     "odometry."),
+    ("/tf, /tf_static", "tf2_msgs/TFMessage", "Where tf2_msgs is installed; /tf only with "
+     "`base_frame`, `target_frame`, `input.deskew` tf, or a click."),
 ]
 DETECTIONS_3D = ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, where "
                  "vision_msgs is installed.")
@@ -204,7 +210,8 @@ def page(name: str) -> str:
     node = PAGES[name]
     lines = [f"# {name}", "", node["what"], "",
              f"    ros2 run lidar_perception {name}      # or: lidar-perception run {name}", ""]
-    for title, rows in (("Subscribes", node["inputs"]), ("Publishes", outputs(name)),
+    robot = ROBOT_IN if "base_frame" in node_parameters(name) else []
+    for title, rows in (("Subscribes", node["inputs"] + robot), ("Publishes", outputs(name)),
                         ("Services", MANAGED_SERVICES if _managed(name)
                          else node.get("services", []))):
         if rows:

@@ -23,6 +23,7 @@ from lidar_perception.candidates.params import (
 from lidar_perception.clustering.params import BoxParams, ClusteringParams
 from lidar_perception.ground.params import GroundParams, ObstacleParams
 from lidar_perception.param_fields import Params, param
+from lidar_perception.robot.params import CropParams
 from lidar_perception.tracking.params import EgoParams, TrackingParams, tracking_of
 from lidar_perception.wire.params import InputParams, ViewParams
 
@@ -38,8 +39,8 @@ class ReceptionParams(Params):
     queue: int = param(1, "Clouds that wait while one is worked on; older ones are dropped, and "
                           "counted. 1: the newest wins.", low=1, high=1000)
     max_wait: float = param(10.0, "A cloud that needs what has not come yet, such as the camera's "
-                            "calibration with view.enabled, waits for this time.", unit="s",
-                            low=0.0, high=3600.0)
+                            "calibration with view.enabled, or a transform of its time, waits for "
+                            "this time.", unit="s", low=0.0, high=3600.0)
     rate: float = param(0.0, "Clouds a second that the sensor sends; 0 takes what the first 21 "
                         "say.", unit="Hz", low=0.0, high=1000.0)
     min_rate: float = param(0.7, "WARN below this share of the rate.", low=0.0, high=1.0)
@@ -52,6 +53,13 @@ class ReceptionParams(Params):
     max_dropped: float = param(
         0.5, "WARN when more than this share of the last 100 clouds was dropped because a newer "
         "one came before its turn.", low=0.0, high=1.0)
+    deskew: str = param(
+        "off", "Motion correction: points are moved to header.stamp, by the cloud's column of "
+        "times and, odometry: ~/input/odometry (nav_msgs/Odometry), or tf: TF, from "
+        "`input.fixed_frame`. off: they are used as they are.", choices=("off", "odometry", "tf"),
+        fixed=True)
+    fixed_frame: str = param("odom", "For `input.deskew` tf: a frame in which the robot moves "
+                             "without jumps.", fixed=True)
 
 
 @dataclass(frozen=True)
@@ -84,6 +92,9 @@ class CloudNodeParams(Params):
     """What a node that takes clouds has besides the numbers of its algorithm."""
 
     input: ReceptionParams = ReceptionParams()
+    base_frame: str = param("", "A frame on the ground, such as base_footprint: height, roll and "
+                            "pitch of the sensor come from TF instead of ground.sensor_pose, and "
+                            "all is computed on the levelled cloud. Empty: off.", fixed=True)
     autostart: bool = param(True, "Configure and activate at the start. false: a lifecycle manager "
                             "does, as Nav2's, or `ros2 lifecycle`.", fixed=True)
 
@@ -93,6 +104,8 @@ class BoxNodeParams(CloudNodeParams):
     """What a node that makes boxes of clouds has besides the numbers of its algorithm."""
 
     output: MarkerParams = MarkerParams()
+    target_frame: str = param("", "The frame of the boxes that go out, by TF at the stamp of their "
+                              "cloud. Empty: the cloud's.", fixed=True)
 
 
 @dataclass(frozen=True)
@@ -143,6 +156,7 @@ class TrackInputParams(CloudNodeParams):
 @dataclass(frozen=True)
 class GroundNodeParams:
     input: InputParams = InputParams()
+    crop: CropParams = CropParams()
     view: ViewParams = ViewParams()
     ground: GroundParams = GroundParams()
 

@@ -43,9 +43,10 @@ from msg_utils.markers import from_marker_array
               help="Seed of the simulated drive.")
 @click.option("--rate", type=click.FloatRange(0.01, 100), default=1.0, show_default=True,
               help="Speed of the replay.")
-@click.option("--single", is_flag=True, help="All stages in one process instead of three.")
-@click.option("--real-time", is_flag=True, help="Play as a sensor sends, whether the machine keeps "
-              "up or not. Without it a cloud is sent when those before have their result.")
+@click.option("--single", is_flag=True, help="Run all stages in one process instead of three.")
+@click.option("--real-time", is_flag=True, help="Play at the speed of the sensor, even if the "
+                                                "machine cannot keep up. Without it each cloud is "
+                                                "sent once those before it have their results.")
 @parameter_options(PAPER)
 def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float, single: bool,
          real_time: bool, params: PipelineParams) -> None:
@@ -53,7 +54,7 @@ def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float
     tracks of them.
 
     Without options: makes a simulated drive with walking pedestrians, writes it as a rosbag2 bag,
-    replays it into the nodes, each a process of its own on a private ROS domain, and prints the
+    replays it into the nodes, each in its own process on a private ROS domain, and prints the
     scores. Leaves in --out: the bag, the result bag, scores.json, birdseye.png and the logs.
 
     \b
@@ -78,7 +79,7 @@ def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float
     latency = content["latency_ms"]
     slower = content["slower"]
     pace = f"{rate:g}x" if slower < 1.05 else f"{rate / slower:.2g}x, {slower:.2g} times slower " \
-        "than asked for, as the machine is slower than the sensor"
+        "than asked for, as the machine cannot keep up"
     console.print(f"{clouds} clouds replayed at {pace}; {content['results']} results; latency "
                   f"cloud to candidates median {latency['median']:.0f} ms, 95 % under "
                   f"{latency['p95']:.0f} ms; memory of the graph {content['memory_mb']:.0f} MB")

@@ -36,6 +36,7 @@ class CandidateRefinement(ManagedNode):
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices = to_frame(msg)
+            frame = self.transforms.placing(msg.header).levelled(frame)
             ground, clusters = column(msg, "ground", indices), cluster_column(msg, indices)
             if clusters is None:
                 raise InputError("the cloud has no column 'cluster_id'; remap ~/input/points to "

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import random
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from time import monotonic
@@ -154,16 +156,24 @@ def chosen_clouds(bag: str, types: Mapping[str, str], wanted: str = "") -> str:
                      f"{bag}: give the topic of the clouds with points:=TOPIC; {has}")
 
 
+_taken: list[Any] = []  # locks on the files of our domains, until this process ends
+
+
 def private_domain() -> int:
     """A ROS domain that nobody on this machine uses: 1..100, as the ports of higher ones are also
-    handed out to other programs."""
+    handed out to other programs. It stays this process's own while none of its nodes runs."""
     for domain in random.SystemRandom().sample(range(1, 101), 100):
+        name = f"lidar_perception-{os.getuid()}-domain-{domain}.lock"
+        lock = open(Path(tempfile.gettempdir()) / name, "w")
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 # Where the domain's first participant listens (RTPS 2.5, Section 9.6.2.3).
                 probe.bind(("", 7410 + 250 * domain))
             except OSError:
+                lock.close()
                 continue
+        _taken.append(lock)
         return domain
     raise InputError("all ROS domains 1..100 are in use on this machine")
 

@@ -42,6 +42,13 @@ ARGUMENTS = {
     "points": dict(default_value=relative(POINTS), description="The cloud's topic."),
     "reliability": dict(default_value="", description="auto, reliable or best_effort, for the "
                         "parameter input.reliability; empty: that of the parameter file."),
+    "base_frame": dict(default_value="", description="Parameter base_frame: the mounting comes "
+                       "from TF; empty: that of the parameter file."),
+    "target_frame": dict(default_value="", description="Parameter target_frame: of the boxes that "
+                         "go out; empty: that of the parameter file."),
+    "deskew": dict(default_value="", choices=["", "off", "odometry", "tf"], description="Parameter "
+                   "input.deskew: clouds are moved to their stamp; empty: that of the parameter "
+                   "file."),
     "config": dict(default_value="", description="Parameter file of all nodes; empty: "
                    "config/*.param.yaml of each detector."),
     "experts": dict(default_value="", description="Of ground and clusters: a parameter file, or "
@@ -54,7 +61,7 @@ ARGUMENTS = {
     "tracking": dict(**SWITCHES, description="Tracks of what each detector finds: a tracker behind "
                      "each; with `single` in the detector's process."),
     "odometry": dict(default_value=relative(ODOMETRY), description="Topic of the odometry, for "
-                     "the trackers."),
+                     "the trackers and deskew."),
     "single": dict(**SWITCHES, description="Each detector in one process, which finds ground and "
                    "clusters itself."),
     "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
@@ -98,7 +105,7 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     files |= dict.fromkeys(trackers, value["config"] or str(
         config_folder / f"{TRACKER}.param.yaml"))
     topics = {relative(POINTS): value["points"], relative(ODOMETRY): value["odometry"]}
-    inside = ODOMETRY_IN if tracking and single else {}
+    inside = ODOMETRY_IN if (tracking and single) or value["deskew"] == "odometry" else {}
     viewer = [_viewer(value, config_folder)] if value["rviz"] == "true" else []
     return viewer + [Node(
         package="lidar_perception", executable=executable_of(node.removeprefix(prefix)), name=node,
@@ -217,6 +224,9 @@ def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, 
         given["autostart"] = False
     if value["reliability"]:
         given["input.reliability"] = value["reliability"]
+    if value["deskew"]:
+        given["input.deskew"] = value["deskew"]
+    given |= {name: value[name] for name in ("base_frame", "target_frame") if value[name]}
     detector = node.removesuffix("_detector")
     if detector in NETWORKS:
         weights = _weights(value["weights"], [d for d in detectors if d in NETWORKS])

@@ -42,13 +42,12 @@ class Perception(ManagedNode):
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, usable = self.sensor.frame(msg)
-            segmented = segment(frame, self.camera.get(frame.frame_id, self.params.view),
-                                self.params)
+            frame, usable, params = self.sensor.frame(msg)
+            segmented = segment(frame, self.camera.get(msg.header, params.view), params)
             problem = (explain_nothing(len(frame), segmented.ground, segmented.cluster_ids)
-                       or self.sensor.problem(frame))
+                       or self.sensor.problem(frame, params))
             self.outputs.publish(msg.header, frame.xyz,
-                                 lambda: refined(segmented, source, self.params), problem)
+                                 lambda: refined(segmented, source, params), problem)
         indices = usable.take(segmented.indices)
         if self.points.get_subscription_count():
             self.points.publish(encode(add_columns(

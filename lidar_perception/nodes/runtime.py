@@ -48,8 +48,11 @@ class LidarNode(Node):
 
     params is a dataclass of params.py; its fields are declared as ROS parameters, and a change at
     run time goes through the same checks. So is robot, what the node has besides its algorithm's
-    numbers: CloudNodeParams, BoxNodeParams ... where it takes clouds.
+    numbers: CloudNodeParams, BoxNodeParams ... where it takes clouds; transforms are its frames
+    then.
     """
+
+    transforms: Any = None  # of transforms.py
 
     def __init__(self, name: str, params: Any, robot: Any = None, **options: Any):
         super().__init__(name, **options)
@@ -113,9 +116,10 @@ class LidarNode(Node):
                 msg = _decoded(data, type_name)
                 if type_name == CLOUD:
                     self.frame_id = msg.header.frame_id
-                missing = needs(msg)
+                    missing = self.transforms.missing(msg)
+                missing = missing or needs(msg)
                 if missing is None or not patient:
-                    callback(msg)
+                    callback(self.transforms.corrected(msg) if type_name == CLOUD else msg)
             except InputError as error:
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {error}")
             except Exception as error:
@@ -188,8 +192,8 @@ class LidarNode(Node):
         """The state, and what is wrong with the inputs and with the node's name."""
         level, message = self.state
         values = dict(self.counts, last_stamp_ns=self.last_stamp_ns)
-        for reception in self._receptions():
-            values.update(reception.values())
+        for source in self._sources():
+            values.update(source.values())
         if self.times:
             values["processing_ms_median"] = f"{np.median(self.times):.1f}"
         for publisher in self._outputs:
@@ -208,9 +212,13 @@ class LidarNode(Node):
     def _receptions(self) -> list[Reception]:
         return [made for made in self.inputs if isinstance(made, Reception)]
 
+    def _sources(self) -> list[Any]:
+        """What has values and problems of its own."""
+        return [*self._receptions(), *([self.transforms] if self.transforms else [])]
+
     def _problems(self) -> list[Problem]:
         """Each is logged when it comes up, at most once in LOG_PERIOD."""
-        found = [p for reception in self._receptions() for p in reception.problems()]
+        found = [p for source in self._sources() for p in source.problems()]
         name, namespace = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count((name, namespace)) > 1:
             found.append(("name", WARN, f"another node is called {self.get_fully_qualified_name()} "

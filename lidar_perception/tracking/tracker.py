@@ -25,7 +25,7 @@ class Tracker:
     and alive those there are.
     """
 
-    def __init__(self, params: TrackingParams = TrackingParams()):
+    def __init__(self, params: TrackingParams = TrackingParams()) -> None:
         self.params = params
         self.problem: str | None = None
         self.taken = False

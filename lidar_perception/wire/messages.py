@@ -117,10 +117,6 @@ def _single(points: np.ndarray, name: str) -> np.ndarray:
 def calibration_of(info: Any, transform: Any) -> Calibration:
     """From CameraInfo and the TransformStamped between the LiDAR frame and the camera's, in either
     direction. InputError when P is empty or the frames do not fit."""
-    intrinsics = np.asarray(info.p, float).reshape(3, 4)
-    if intrinsics[0, 0] <= 0 or info.width == 0 or info.height == 0:
-        raise InputError("CameraInfo has no projection matrix P or no image size; calibrate the "
-                         "camera or set view.enabled to false")
     t, q = transform.transform.translation, transform.transform.rotation
     rotation, translation = np.array([q.x, q.y, q.z, q.w]), np.array([t.x, t.y, t.z])
     if not abs(np.linalg.norm(rotation) - 1) < 1e-3:
@@ -135,6 +131,16 @@ def calibration_of(info: Any, transform: Any) -> Calibration:
                              f"links '{parent}' and '{child}'")
         lidar_to_camera[:3, :3] = lidar_to_camera[:3, :3].T
         lidar_to_camera[:3, 3] = -lidar_to_camera[:3, :3] @ translation
+    return calibrated(info, lidar_to_camera)
+
+
+def calibrated(info: Any, lidar_to_camera: np.ndarray) -> Calibration:
+    """From CameraInfo and the pose (4, 4) of the LiDAR in the camera's frame. InputError when P is
+    empty."""
+    intrinsics = np.asarray(info.p, float).reshape(3, 4)
+    if intrinsics[0, 0] <= 0 or info.width == 0 or info.height == 0:
+        raise InputError("CameraInfo has no projection matrix P or no image size; calibrate the "
+                         "camera or set view.enabled to false")
     return Calibration(intrinsics, lidar_to_camera, int(info.width), int(info.height))
 
 

@@ -87,6 +87,11 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
     for node in nodes(autostart="false").values():
         assert node.parameters[1] == {"use_sim_time": False, "autostart": False}
     assert nodes(config="mine.yaml")["clustering"].parameters[0] == "mine.yaml"
+    frames = {"base_frame": "base", "target_frame": "odom"}
+    for node in nodes(deskew="odometry", odometry="/odometry", **frames).values():
+        assert frames.items() < node.parameters[1].items()
+        assert node.parameters[1]["input.deskew"] == "odometry"
+        assert ("~/input/odometry", "/odometry") in node.remappings
 
 
 def test_ground_and_clusters_have_one_file_and_what_others_would_take_is_said(launched, tmp_path):
