@@ -18,6 +18,25 @@ from lidar_perception.wire.codec import bag_message
 from msg_utils.messages import ros_message
 from msg_utils.stamps import header_message
 
+
+def for_all(cases):
+    """One test that goes through all cases: thousands of a microsecond each would take longer to
+    list than to run. The case that fails is named. A case is an argument, a tuple of them, or a
+    pytest.param."""
+    def of(test):
+        def each():
+            assert cases
+            for case in cases:
+                try:
+                    test(*getattr(case, "values", case if isinstance(case, tuple) else (case,)))
+                except BaseException as error:
+                    error.add_note(f"of {getattr(case, 'id', case)}")
+                    raise
+        each.__name__, each.__doc__, each.__module__ = test.__name__, test.__doc__, test.__module__
+        return each
+    return of
+
+
 # Both kinds of message classes: rosbags' own, and ROS's.
 each_make = pytest.mark.parametrize("make", [
     pytest.param(bag_message, id="rosbags"),

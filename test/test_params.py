@@ -6,6 +6,7 @@ import dataclasses
 import math
 
 import pytest
+from samples import for_all
 
 from lidar_perception import params as node_params
 from lidar_perception.candidates import params as candidate_params
@@ -22,20 +23,22 @@ from lidar_perception.ground import params as ground_params
 from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.param_fields import Params, flatten, parameter_fields, with_values
 from lidar_perception.params import (
-    BoxNodeParams,
-    CloudNodeParams,
     ClusteringNodeParams,
     GroundNodeParams,
     PlayerParams,
     RefinementNodeParams,
+    TrackerNodeParams,
 )
+from lidar_perception.robot import params as robot_params
+from lidar_perception.tracking import params as tracking_params
 from lidar_perception.training import params as training_params
 from lidar_perception.training.params import PointPillarsTraining
 from lidar_perception.types import InputError
 from lidar_perception.wire import params as wire_params
 
 MODULES = (node_params, candidate_params, clustering_params, detector_params, ground_params,
-           wire_params, pointpillars_params, pointnet_params, training_params)
+           robot_params, wire_params, tracking_params, pointpillars_params, pointnet_params,
+           training_params)
 
 
 def groups_below(base: type) -> list[type]:
@@ -44,14 +47,14 @@ def groups_below(base: type) -> list[type]:
 
 GROUPS = [group for group in groups_below(Params)
           if group.__module__ in [each.__name__ for each in MODULES]]
-COMPOSITES = [BoxNodeParams, CloudNodeParams, PipelineParams, GroundNodeParams,
+COMPOSITES = [TrackerNodeParams, PipelineParams, GroundNodeParams,
               ClusteringNodeParams, RefinementNodeParams,
               DetectorParams, PointNetDetectorParams, PointPillarsTraining]
 FIELDS = [pytest.param(group, f, id=f"{group.__name__}.{f.name}")
           for group in GROUPS for f in dataclasses.fields(group) if f.metadata]
 
-each_field = pytest.mark.parametrize("group, f", FIELDS)
-each_params = pytest.mark.parametrize("kind", [*GROUPS, *COMPOSITES])
+each_field = for_all(FIELDS)
+each_params = for_all([*GROUPS, *COMPOSITES])
 
 
 def kind_of(f: dataclasses.Field) -> type:
@@ -75,6 +78,8 @@ def other_value(f: dataclasses.Field):
     """A value in range that is not the default."""
     if f.metadata["choices"]:
         return next(c for c in f.metadata["choices"] if c != f.default)
+    if f.name in ("body", "sectors"):  # boxes and pairs; none by default
+        return (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
     if f.metadata["item"]:
         return (*f.default, "/more") if kind_of(f) is str else tuple(v + 1.0 for v in f.default)
     if isinstance(f.default, bool):
@@ -129,7 +134,7 @@ def test_with_values_changes_nothing_else(kind):
             **flatten(kind()), name: other_value(f)}
 
 
-@pytest.mark.parametrize("group, f", bounded("low"))
+@for_all(bounded("low"))
 def test_below_the_range_names_field_value_and_range(group, f):
     value = f.metadata["low"] - step_of(f)
     with pytest.raises(ValueError) as error:
@@ -138,7 +143,7 @@ def test_below_the_range_names_field_value_and_range(group, f):
         assert word in str(error.value)
 
 
-@pytest.mark.parametrize("group, f", bounded("high"))
+@for_all(bounded("high"))
 def test_above_the_range_names_field_value_and_range(group, f):
     value = f.metadata["high"] + step_of(f)
     with pytest.raises(ValueError) as error:
@@ -147,7 +152,7 @@ def test_above_the_range_names_field_value_and_range(group, f):
         assert word in str(error.value)
 
 
-@pytest.mark.parametrize("group, f", [p for p in bounded("low") + bounded("high")
+@for_all([p for p in bounded("low") + bounded("high")
                                       if not p.values[1].metadata["item"]])
 def test_the_ends_of_the_range_belong_to_it(group, f):
     for limit in (f.metadata["low"], f.metadata["high"]):
@@ -166,20 +171,20 @@ def test_wrong_types_name_field_value_and_type(group, f):
         assert kind_of(f).__name__ in str(error.value)
 
 
-@pytest.mark.parametrize("group, f", [p for p in FIELDS if p.values[1].metadata["item"]])
+@for_all([p for p in FIELDS if p.values[1].metadata["item"]])
 def test_a_scalar_is_no_list(group, f):
     for value in ("text", 1.0, None):
         with pytest.raises(ValueError, match=f"^{f.name} = .*must be a list"):
             group(**{f.name: value})
 
 
-@pytest.mark.parametrize("group, f", [p for p in FIELDS if kind_of(p.values[1]) is float])
+@for_all([p for p in FIELDS if kind_of(p.values[1]) is float])
 def test_nan_is_no_number(group, f):
     with pytest.raises(ValueError, match=f"^{f.name} is not a number"):
         group(**{f.name: as_field(f, math.nan)})
 
 
-@pytest.mark.parametrize("group, f", [p for p in FIELDS if p.values[1].metadata["choices"]])
+@for_all([p for p in FIELDS if p.values[1].metadata["choices"]])
 def test_what_is_not_a_choice_is_answered_with_the_choices(group, f):
     with pytest.raises(ValueError, match=f"^{f.name} = 'nothing'") as error:
         group(**{f.name: "nothing"})

@@ -14,15 +14,17 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
     "convert": ("convert.convert", "Turn a data set into a rosbag2 bag."),
     "evaluate": ("evaluate.group.evaluate", "Score the algorithms without ROS."),
     "compare": ("compare.compare", "Run every detector on the same frames, side by side."),
-    "reproduce": ("reproduce.reproduce", "Measure every table of the STM-CPA paper."),
+    "reproduce": ("reproduce.reproduce", "Reproduce every table of the STM-CPA paper."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),
     "simulate": ("simulate.simulate", "Write simulated, labelled scans as a bag or a data set."),
     "train": ("train.train", "Train a detector on recordings or simulated streets."),
-    "import-weights": ("weights.import_weights", "Read PointPillars weights of other projects."),
-    "export": ("weights.export", "Write a network for another runtime."),
-    "info": ("info.info", "Say what is in a bag."),
+    "import-weights": ("weights.import_weights", "Import PointPillars weights from other "
+                                                 "projects."),
+    "export": ("weights.export", "Export a network for another runtime."),
+    "info": ("info.info", "List what is in a bag."),
     "run": ("run.run_node", "Start one ROS node."),
     "benchmark": ("checkout.benchmark", "Time the algorithms next to their peers."),
+    "campaign": ("campaign.campaign", "Try to break the package, and say what came of it."),
     "test": ("checkout.test", "Run the tests of this checkout."),
 }
 

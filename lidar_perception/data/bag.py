@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Reader
 
 from lidar_perception.data.mcap_index import NO_INDEX, check_index
 from lidar_perception.data.record_file import RecordFile
-from lidar_perception.runs.files import short
+from lidar_perception.runs.files import regular, short
 from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode, encode, typestore
@@ -230,6 +230,8 @@ def _storage(path: Path) -> Path:
     """The folder, or the one storage file in a folder without metadata.yaml."""
     if not path.exists():
         raise InputError(f"there is no bag {path}")
+    for file in path.iterdir() if path.is_dir() else [path]:
+        regular(file)
     if path.is_dir() and not (path / "metadata.yaml").exists():
         files = [*path.glob("*.mcap"), *path.glob("*.db3")]
         if len(files) != 1:

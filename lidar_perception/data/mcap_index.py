@@ -9,13 +9,14 @@ from collections.abc import Iterator
 from pathlib import Path
 from zlib import crc32
 
+from lidar_perception.data.unpacking import MAX_CHUNK
+
 MAGIC = b"\x89MCAP0\r\n"
 FOOTER, CHUNK, CHUNK_INDEX, DATA_END = 0x02, 0x06, 0x08, 0x0F
 FOOTER_BYTES = 9 + 20
 RECORD = struct.Struct("<BQ")  # of each: its kind, and how many bytes follow
 NO_INDEX = (RECORD.pack(DATA_END, 4) + bytes(4) + RECORD.pack(FOOTER, 20) + bytes(20)
             + MAGIC)  # the end of a file that has none
-MAX_CHUNK = 2**30  # bytes that a chunk may unpack to; recorders write some megabytes
 
 
 def check_index(path: Path) -> None:
@@ -41,7 +42,7 @@ def check_index(path: Path) -> None:
 
 
 def _indexed(index: bytes) -> Iterator[tuple]:
-    """What the index says of each chunk: place, length, times, compression and sizes."""
+    """What the index says of each chunk: position, length, times, compression and sizes."""
     at = 0
     while at < len(index):
         kind, length = RECORD.unpack_from(index, at)
@@ -50,9 +51,9 @@ def _indexed(index: bytes) -> Iterator[tuple]:
             raise ValueError("its index is cut")
         if kind == CHUNK_INDEX:
             record = index[at:at + length]
-            *times, place, whole, offsets = struct.unpack_from("<QQQQI", record)
+            *times, start, whole, offsets = struct.unpack_from("<QQQQI", record)
             packing, sizes = _string(record, 36 + offsets + 8)
-            yield place, whole, *times, packing, *struct.unpack_from("<QQ", record, sizes)
+            yield start, whole, *times, packing, *struct.unpack_from("<QQ", record, sizes)
         at += length
 
 

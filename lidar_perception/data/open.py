@@ -11,6 +11,7 @@ from lidar_perception.data import bag_frames, semantickitti
 from lidar_perception.data.frame import Recording
 from lidar_perception.data.kitti import folder as kitti
 from lidar_perception.data.nuscenes import folder as nuscenes
+from lidar_perception.runs.files import regular
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS
 
@@ -46,7 +47,7 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
 def _of_split(recording: Recording, split: Path) -> Recording:
     """The frames that a file names, by themselves or by their sequence, each once."""
     try:
-        names = split.read_text().split()
+        names = regular(split).read_text().split()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the split {split}: {error}") from None
     sequences: dict[str, list[str]] = {}

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import DTypeLike
 
+from lidar_perception.runs.files import regular
 from lidar_perception.types import InputError
 
 
@@ -14,7 +15,7 @@ def read_records(path: Path, columns: str, dtype: DTypeLike = np.float32) -> np.
     """(N, C) of a file of N records, each a number of this dtype for each of the C columns, which
     are named for people: "x y z reflectance". InputError where it is missing or cut."""
     try:
-        numbers, size = np.fromfile(path, dtype), path.stat().st_size
+        numbers, size = np.fromfile(regular(path), dtype), path.stat().st_size
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror}; download it again") from None
     count = len(columns.split())

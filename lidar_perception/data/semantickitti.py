@@ -13,7 +13,7 @@ from lidar_perception.data.kitti.calibration import homogeneous, matrices, matri
 from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS, load_velodyne, read_velodyne
 from lidar_perception.data.kitti.write import numbers, write_velodyne
 from lidar_perception.data.records import read_records
-from lidar_perception.runs.files import write_bytes
+from lidar_perception.runs.files import regular, write_bytes
 from lidar_perception.types import InputError, usable_returns
 
 UNLABELLED = (0, 1)  # unlabelled; outlier, such as a reflection: nobody knows what these points are
@@ -85,7 +85,7 @@ def _pose(sequence: Path, i: int) -> np.ndarray | None:
         return None
     lidar_to_camera = matrix(matrices(calibration), calibration, "Tr", (3, 4))
     try:
-        moved = np.array(poses.read_text().splitlines()[i].split(), float).reshape(3, 4)
+        moved = np.array(regular(poses).read_text().splitlines()[i].split(), float).reshape(3, 4)
     except (OSError, ValueError, IndexError) as error:
         raise InputError(f"cannot read pose {i} of {poses} ({error}); download it again") from None
     to_camera = homogeneous(lidar_to_camera)

@@ -11,14 +11,20 @@ from pathlib import Path
 from lidar_perception.types import InputError
 
 
+def regular(path: Path) -> Path:
+    """The path itself. InputError for what is neither file nor folder, such as a pipe or a device,
+    from which a read may wait for ever; what is not there passes."""
+    if path.exists() and not path.is_file() and not path.is_dir():
+        raise InputError(f"{path} is no file; give the path of one")
+    return path
+
+
 def read_text(path: str | Path, max_bytes: int) -> str:
     """The UTF-8 text of a file of at most max_bytes. InputError where it cannot be read; also for
     what is no file, such as a pipe, from which a read may wait for ever."""
     path = Path(path)
     try:
-        if path.exists() and not path.is_file() and not path.is_dir():
-            raise InputError(f"{path} is no file; give the path of one")
-        with open(path, "rb") as stream:
+        with open(regular(path), "rb") as stream:
             content = stream.read(max_bytes + 1)
         if len(content) > max_bytes:
             raise InputError(f"{path} has more than {max_bytes} bytes, which is no file of this "

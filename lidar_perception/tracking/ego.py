@@ -88,7 +88,7 @@ class Odometry:
     """odometry(xyz (N, 3)) -> pose (4, 4) of the scan in the frame of the first, by KISS-ICP
     (Vizzo et al., RA-L 2023). InputError where it is not installed."""
 
-    def __init__(self, voxel: float = 1.0):
+    def __init__(self, voxel: float = 1.0) -> None:
         try:
             from kiss_icp.config.parser import KISSConfig
             from kiss_icp.kiss_icp import KissICP

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidar_perception.camera import Calibration
+from lidar_perception.runs.files import regular
 from lidar_perception.types import InputError
 
 # Size of the rectified images by focal length: it differs with the recording day, and the object
@@ -45,7 +46,7 @@ def read_raw_calibration(day: Path) -> Calibration:
 def matrices(path: Path) -> dict[str, np.ndarray]:
     """The numbers of each line "NAME: ..." of a file. InputError where it cannot be read."""
     try:
-        lines = path.read_text().splitlines()
+        lines = regular(path).read_text().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the calibration {path}: {error}; every frame needs "
                          "one") from None

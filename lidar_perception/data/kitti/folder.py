@@ -19,6 +19,7 @@ from lidar_perception.data.kitti.labels import (
     read_tracklets,
 )
 from lidar_perception.data.records import read_records
+from lidar_perception.runs.files import regular
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.topics import LIDAR_FRAME
 
@@ -166,7 +167,7 @@ def _raw_stamps(path: Path) -> list[int]:
     """Nanoseconds of the lines '2011-09-26 13:02:25.594360375', read as UTC."""
     try:
         stamps = []
-        for line in path.read_text().split("\n"):
+        for line in regular(path).read_text().split("\n"):
             if line.strip():
                 seconds, _, fraction = line.strip().partition(".")
                 when = datetime.strptime(seconds, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)

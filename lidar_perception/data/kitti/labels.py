@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from lidar_perception.geometry import wrap_angle
+from lidar_perception.runs.files import regular
 from lidar_perception.types import CLASSES, GroundTruth, InputError
 
 # The label file's own names and numbers, in its order; they travel in GroundTruth.extras.
@@ -124,7 +125,7 @@ def format_label(label: dict, decimals: int = 2) -> str:
 def read_tracklets(path: Path) -> dict[int, GroundTruth]:
     """Frame number -> objects, of a raw recording's tracklet_labels.xml (LiDAR frame already)."""
     try:
-        tracklets = ElementTree.parse(path).getroot().find("tracklets")
+        tracklets = ElementTree.parse(regular(path)).getroot().find("tracklets")
         items = [t for t in tracklets if t.tag == "item"]
         frames: dict[int, list] = {}
         for track, item in enumerate(items):
@@ -145,7 +146,7 @@ def read_tracklets(path: Path) -> dict[int, GroundTruth]:
 
 def _lines(path: Path) -> list[tuple[int, str]]:
     try:
-        text = path.read_text()
+        text = regular(path).read_text()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(f"cannot read the labels {path}: {error}") from None
     return [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.nuscenes.boxes import ATTRIBUTES, NAMES, GlobalBoxes, in_global
-from lidar_perception.runs.files import write_text
+from lidar_perception.runs.files import regular, write_text
 from lidar_perception.types import CLASSES, Detections, InputError
 
 MAX_BOXES = 500    # of a frame
@@ -27,12 +27,12 @@ def to_results(detections: Detections, frame: Frame) -> GlobalBoxes:
     if not (np.isfinite(detections.boxes).all() and np.isfinite(detections.scores).all()):
         raise InputError(f"{frame.name}: a box or score of the detector is not finite; its weights "
                          "or its input are broken")
-    kinds = np.array([NAMES.index(DETECTED[name]) if name in DETECTED else -1 for name in CLASSES])
-    kinds = kinds[detections.class_ids]
-    chosen = np.flatnonzero(kinds >= 0)
+    theirs = np.array([NAMES.index(DETECTED[name]) if name in DETECTED else -1 for name in CLASSES])
+    class_ids = theirs[detections.class_ids]
+    chosen = np.flatnonzero(class_ids >= 0)
     chosen = chosen[np.argsort(-detections.scores[chosen], kind="stable")][:MAX_BOXES]
-    return GlobalBoxes.of(*in_global(detections.boxes[chosen], frame.native.pose), kinds[chosen],
-                          scores=detections.scores[chosen])
+    return GlobalBoxes.of(*in_global(detections.boxes[chosen], frame.native.pose),
+                          class_ids[chosen], scores=detections.scores[chosen])
 
 
 def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:
@@ -40,11 +40,11 @@ def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:
     reads, and judges with an error of 1; strict readers of JSON do not."""
     rows = {token: [{
         "sample_token": token, "translation": centre, "size": [width, length, height],
-        "rotation": rotation, "velocity": velocity, "detection_name": NAMES[kind],
+        "rotation": rotation, "velocity": velocity, "detection_name": NAMES[class_id],
         "detection_score": score, "attribute_name": ATTRIBUTES[attribute] if attribute >= 0 else ""}
-        for centre, (length, width, height), rotation, kind, attribute, velocity, score in zip(
+        for centre, (length, width, height), rotation, class_id, attribute, velocity, score in zip(
             *(column.tolist() for column in (boxes.centres, boxes.sizes, boxes.rotations,
-                                             boxes.kinds, boxes.attributes, boxes.velocities,
+                                             boxes.class_ids, boxes.attributes, boxes.velocities,
                                              boxes.scores)))]
         for token, boxes in results.items()}
     write_text(path, json.dumps({"meta": META, "results": rows}))
@@ -54,7 +54,7 @@ def read_results(path: Path, frames: Sequence[Frame]) -> dict[str, GlobalBoxes]:
     """The boxes of each frame by its name; those of other frames are left out. InputError names the
     frame that is missing and the box that is wrong."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(regular(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"cannot read the results {path}: {error.strerror}") from None
     except ValueError as error:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.runs.files import regular
 from lidar_perception.types import InputError
 
 CHUNK = 2**22        # characters read at a time; no row is longer
@@ -51,27 +52,27 @@ class Tables:
     def _decoded(self, table: str) -> Iterator[Any]:
         path, decode = self.path(table), json.JSONDecoder().raw_decode
         try:
-            with open(path, encoding="utf-8") as stream:
+            with open(regular(path), encoding="utf-8") as stream:
                 text = stream.read(CHUNK).lstrip()
                 if text[:1] != "[":
                     raise InputError(f"{path} is no list of rows; download the tables of "
                                      f"{self.version} again")
-                text, place, ended = text[1:], 0, False
+                text, at, ended = text[1:], 0, False
                 while True:
-                    while place < len(text) and text[place] in SPACE:
-                        place += 1
-                    if place < len(text) and text[place] == "]":
+                    while at < len(text) and text[at] in SPACE:
+                        at += 1
+                    if at < len(text) and text[at] == "]":
                         return
                     try:
-                        row, place = decode(text, place)
+                        row, at = decode(text, at)
                         yield row
                         continue
                     except ValueError as error:  # the row goes on in the next chunk, or is broken
-                        if ended or len(text) - place > 2 * CHUNK:
+                        if ended or len(text) - at > 2 * CHUNK:
                             raise InputError(f"{path} is cut or damaged ({error}); download the "
                                              f"tables of {self.version} again") from None
                     more = stream.read(CHUNK)
-                    text, place, ended = text[place:] + more, 0, not more
+                    text, at, ended = text[at:] + more, 0, not more
         except OSError as error:
             raise InputError(f"cannot read the table {path}: {error.strerror}; unpack the "
                              f"metadata of {self.version} there") from None

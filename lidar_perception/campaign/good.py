@@ -1,0 +1,187 @@
+"""Good messages, small enough that thousands a second can be tried: what the campaign damages."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.campaign.case import pick
+from lidar_perception.campaign.mutation import FLOATS, INTEGERS, mutate_message
+from lidar_perception.simulation.camera import FORWARD_CAMERA
+from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, Detections, GroundTruth
+from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.messages import camera_info, detection_markers, extrinsics, truth_markers
+from msg_utils.point_cloud2 import CloudError, add_columns, from_array, to_array
+from msg_utils.stamps import header_message
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+STAMP = 1_700_000_000_000_000_000
+PERSON = np.array([8.0, 0.5, -0.85, 0.6, 0.6, 1.7, 0.0])  # [x y z l w h yaw]
+KINDS = ("f", "fi", "velodyne", "double", "big-endian", "rows", "padded", "columns", "columns",
+         "columns", "empty", "one")
+PLAIN = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+LAYOUTS: dict[str, Any] = {
+    "fi": [*PLAIN, ("intensity", "<f4")],
+    "velodyne": [*PLAIN, ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")],
+    "double": [(name, "<f8") for name in ("x", "y", "z", "timestamp")],
+    "big-endian": [(name, ">f4") for name in ("x", "y", "z", "intensity")],
+    "padded": dict(names=["z", "x", "y", "reflectivity"], formats=["<f4", "<f4", "<f4", "<u1"],
+                   offsets=[4, 16, 24, 33], itemsize=48),
+}
+
+
+@functools.cache
+def street(seed: int = 0, people: int = 3, ground: int = 500) -> np.ndarray:
+    """(N, 3) float32: level ground, people of whom the first fills PERSON, and a wall."""
+    rng = np.random.default_rng(seed)
+    parts = [rng.uniform([2, -10, -SENSOR_HEIGHT], [22, 10, -SENSOR_HEIGHT + 0.02], (ground, 3))]
+    for i in range(people):
+        body = rng.uniform([-0.2, -0.2, -0.82], [0.2, 0.2, 0.85], (90, 3))
+        parts.append(body + PERSON[:3] + [3.0 * i, -2.5 * i, 0.0])
+    parts.append(rng.uniform([18, -4, -1.7], [18.1, 4, 0.5], (150, 3)))
+    return np.concatenate(parts).astype(np.float32)
+
+
+def header(stamp: int = STAMP) -> Any:
+    """Of all good messages."""
+    return header_message(stamp, "lidar", bag_message)
+
+
+def cloud(kind: str = "columns", stamp: int = STAMP) -> Any:
+    """A good PointCloud2 of a kind of KINDS."""
+    xyz = street()[:{"empty": 0, "one": 1}.get(kind)]
+    points = np.zeros(len(xyz), np.dtype(LAYOUTS.get(kind, PLAIN)))
+    for i, name in enumerate("xyz"):
+        points[name] = xyz[:, i]
+    message = from_array(points, header(stamp), bag_message,
+                         height=4 if kind == "rows" else 1)
+    if kind == "columns":
+        body = (xyz[:, 2] > -SENSOR_HEIGHT + 0.05).astype("u1")
+        ids = np.where(body, 1 + np.arange(len(xyz)) // 90, 0).astype("u4")
+        message = add_columns(message, bag_message, ground=1 - body, in_view=np.ones_like(body),
+                              cluster_id=ids)
+    return message
+
+
+@functools.cache
+def _good(kind: str) -> bytes:
+    if kind == CLOUD:
+        return encode(cloud())
+    if kind == "sensor_msgs/msg/CameraInfo":
+        return encode(camera_info(FORWARD_CAMERA, header_message(STAMP, "camera_optical",
+                                                                 bag_message), bag_message))
+    if kind == "geometry_msgs/msg/TransformStamped":
+        return encode(extrinsics(FORWARD_CAMERA, header(), bag_message))
+    if kind == "tf2_msgs/msg/TFMessage":
+        return encode(bag_message(kind, transforms=[extrinsics(FORWARD_CAMERA, header(),
+                                                               bag_message)]))
+    if kind == "geometry_msgs/msg/PointStamped":
+        x, y, z = map(float, PERSON[:3])
+        return encode(bag_message(kind, header=header(), point=bag_message(
+            "geometry_msgs/msg/Point", x=x, y=y, z=z)))
+    if kind == "std_msgs/msg/Float64":
+        return encode(bag_message(kind, data=1.5))
+    raise LookupError(f"there is no good message of type {kind}")
+
+
+def markers(truth: bool, stamp: int = STAMP) -> bytes:
+    """CDR of a MarkerArray of the street: its labels, or detections."""
+    message = (truth_markers(GroundTruth.of([PERSON], [PEDESTRIAN], [{"track_id": 3}]),
+                             header(stamp), bag_message) if truth else
+               detection_markers(Detections.of([PERSON], PEDESTRIAN, 0.7), header(stamp),
+                                 bag_message))
+    return encode(message)
+
+
+def good(kind: str) -> bytes:
+    """CDR of a good message of a type."""
+    return markers(True) if kind == "visualization_msgs/msg/MarkerArray" else _good(kind)
+
+
+def mutated(kind: str, rng: np.random.Generator) -> tuple[bytes, str]:
+    """CDR of a message of a type with one to three changes that leave it decodable, and what they
+    were."""
+    changes = []
+    if kind == CLOUD:
+        form = pick(rng, KINDS)
+        message = cloud(form)
+        changes.append(form)
+    else:
+        message = decode(good(kind), kind)
+    for _ in range(int(rng.integers(1, 4))):
+        change = pick(rng, CLOUD_CHANGES) if kind == CLOUD else mutate_message
+        changes.append(change(message, rng))
+    return encode(message), ", ".join(changes)
+
+
+def _values(message: Any, rng: np.random.Generator) -> str:
+    """Values of one field of some points, or of all."""
+    fields = [f for f in message.fields if 1 <= f.datatype <= 8
+              and f.offset + 8 <= message.point_step]
+    count = len(message.data) // message.point_step if message.point_step else 0
+    if not fields or not count:
+        return mutate_message(message, rng)
+    field = pick(rng, fields)
+    order = ">" if message.is_bigendian else "<"
+    dtype = np.dtype(order + " i1u1i2u2i4u4f4f8"[2 * field.datatype - 1:2 * field.datatype + 1])
+    data = np.array(message.data)
+    column = np.ndarray(count, dtype, data, field.offset, (message.point_step,))
+    value = pick(rng, FLOATS if dtype.kind == "f" else INTEGERS)
+    chosen = rng.random(count) < pick(rng, (0.01, 0.3, 1.0))
+    with np.errstate(over="ignore"):
+        column[chosen] = (np.array(value).astype(dtype) if dtype.kind == "f"
+                          else value & np.iinfo(dtype).max)
+    message.data = data
+    return f"{field.name} = {value} in {int(chosen.sum())} points"
+
+
+def _column(message: Any, rng: np.random.Generator) -> str:
+    """A column of ours, of any type and with any values."""
+    try:
+        count = len(to_array(message))
+    except CloudError:  # an earlier change has made it no cloud
+        return mutate_message(message, rng)
+    name = pick(rng, ("ground", "in_view", "cluster_id", "cluster_id", "intensity"))
+    kind = pick(rng, ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8"))
+    how = pick(rng, ("ramp", "extreme", "random", "sparse"))
+    values = np.arange(count, dtype=float)
+    if how == "extreme":
+        values[:] = pick(rng, FLOATS if kind[0] == "f" else INTEGERS)
+    elif how == "random":
+        values = rng.integers(-5, 2**pick(rng, (3, 16, 32)), count).astype(float)
+    elif how == "sparse":
+        values = np.where(rng.random(count) < 0.01, float(pick(rng, INTEGERS)), 0.0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        column = values.astype(kind)
+    changed = add_columns(message, bag_message, **{name: column})
+    for field in ("fields", "point_step", "row_step", "data"):
+        setattr(message, field, getattr(changed, field))
+    return f"{name} as {kind}, {how}"
+
+
+def _field(message: Any, rng: np.random.Generator) -> str:
+    """The description of one field."""
+    if not message.fields:
+        return mutate_message(message, rng)
+    return f"{(f := pick(rng, message.fields)).name}.{mutate_message(f, rng)}"
+
+
+def _layout(message: Any, rng: np.random.Generator) -> str:
+    """Two numbers that must fit each other are swapped, or one is another's multiple."""
+    a, b = rng.permutation(["height", "width", "point_step", "row_step"])[:2]
+    factor = pick(rng, (0.5, 1, 2, 3))
+    setattr(message, a, int(getattr(message, b) * factor) % 2**32)
+    return f"{a} = {factor} {b}"
+
+
+def _data(message: Any, rng: np.random.Generator) -> str:
+    data = np.array(message.data)
+    size = int(rng.integers(0, len(data) + 20))
+    message.data = np.resize(data, size) if len(data) else np.zeros(size, np.uint8)
+    return f"{size} bytes of {len(data)}"
+
+
+CLOUD_CHANGES = (_values, _values, _values, _column, _column, _field, _layout,
+                 _data, mutate_message)

@@ -1,0 +1,157 @@
+"""Small damage to bytes, to text and to messages, drawn from a generator of random numbers.
+
+Each function returns what it made and, in a few words, what it did.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from lidar_perception.campaign.case import pick
+from lidar_perception.wire.codec import bag_message, typestore
+
+INTEGERS = (0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
+FLOATS = (0.0, -0.0, np.nan, np.inf, -np.inf, 5e-324, 1e-40, 1e38, -1e38, 1e308, 1e5, -1.0)
+WORDS = ("nan", "-inf", "1e400", "-1", "0", "1e-320", "9" * 400, "", "null", "é", "\x00", "0x10",
+         "1,5", "true", "[" * 5000, "{" * 5000, "-" * 30, "2147483648", "1e38")
+TEXTS = ("", "x" * 70_000, "é\u202e", "a b", "/", "../..", "\n", "x", "intensity")
+
+
+def mutate_bytes(data: bytes, rng: np.random.Generator) -> tuple[bytes, str]:
+    """1 to 3 of: bits flipped, bytes deleted, inserted, repeated, zeroed, cut off, a number put
+    there; anywhere, or near either end, where headers and indices are."""
+    changes = []
+    for _ in range(int(rng.integers(1, 4))):
+        data, change = _one_change(data, rng)
+        changes.append(change)
+    return data, ", ".join(changes)
+
+
+def _one_change(data: bytes, rng: np.random.Generator) -> tuple[bytes, str]:
+    size = len(data)
+    low, high = pick(rng, ((0, size), (0, size), (0, min(size, 512)), (max(0, size - 4096), size)))
+    at = int(rng.integers(low, high + 1))
+    count = int(rng.integers(1, 1 + pick(rng, (1, 8, 64, 4096))))
+    kind = pick(rng, ("flip", "flip", "delete", "insert", "repeat", "zero", "number", "number",
+                      "cut"))
+    if kind == "flip" and at < size:
+        changed = bytearray(data)
+        changed[at] ^= 1 << int(rng.integers(8))
+        return bytes(changed), f"bit flipped at {at}"
+    if kind == "delete":
+        return data[:at] + data[at + count:], f"{count} bytes deleted at {at}"
+    if kind == "insert":
+        return data[:at] + rng.bytes(count) + data[at:], f"{count} bytes inserted at {at}"
+    if kind == "repeat":
+        return data[:at] + data[at:at + count] + data[at:], f"{count} bytes repeated at {at}"
+    if kind == "zero":
+        return data[:at] + bytes(len(data[at:at + count])) + data[at + count:], \
+            f"{count} bytes zeroed at {at}"
+    if kind == "number":
+        number = struct.pack("<Q", pick(rng, (*INTEGERS, size, size + 1)))
+        number = number[:pick(rng, (1, 2, 4, 8))]
+        return data[:at] + number + data[at + len(number):], f"a number put at {at}"
+    return data[:at], f"cut at {at} of {size}"
+
+
+def mutate_text(text: str, rng: np.random.Generator) -> tuple[str, str]:
+    """1 to 3 of: a word or number replaced, moved or doubled, a line deleted, doubled or cut."""
+    changes = []
+    for _ in range(int(rng.integers(1, 4))):
+        spans = [m.span() for m in re.finditer(r"[\w.+-]+", text)] or [(0, 0)]
+        begin, end = pick(rng, spans)
+        kind = pick(rng, ("word", "word", "word", "number", "drop", "swap", "line", "no line",
+                          "character", "cut"))
+        if kind == "word":
+            word = pick(rng, WORDS)
+            text = text[:begin] + word + text[end:]
+            kind = f"{word[:12]!r} put at {begin}"
+        elif kind == "number":
+            text = text[:begin] + repr(float(rng.normal(0, 10.0 ** rng.integers(-3, 9)))) \
+                + text[end:]
+        elif kind == "drop":
+            text = text[:begin] + text[end:]
+        elif kind == "swap":
+            b, e = pick(rng, spans)
+            other = text[b:e]
+            text = text[:begin] + other + text[end:]
+        elif kind in ("line", "no line"):
+            lines = text.splitlines(keepends=True) or [""]
+            i = int(rng.integers(len(lines)))
+            text = "".join(lines[:i] + lines[i:i + 1] * (2 if kind == "line" else 0)
+                           + lines[i + 1:])
+        elif kind == "character":
+            text = text[:begin] + pick(rng, "\x00\ufeff\r\t{}[]:,\"'#&*!|>%@`\u2028") + text[begin:]
+        else:
+            text = text[:begin]
+        changes.append(kind)
+    return text, ", ".join(changes)
+
+
+def mutate_message(message: Any, rng: np.random.Generator) -> str:
+    """One field of a message of rosbags' classes, at any depth, gets another value of its type."""
+    name, kind = pick(rng, [field for field in typestore().fielddefs[message.__msgtype__][1]])
+    (node, detail), value = kind, getattr(message, name)
+    if node == Nodetype.NAME:
+        return f"{name}.{mutate_message(value, rng)}"
+    if node == Nodetype.BASE:
+        setattr(message, name, _value(detail[0], rng))
+        return f"{name} = {str(getattr(message, name))[:20]}"
+    element = detail[0]
+    if element[0] == Nodetype.BASE and element[1][0] != "string":
+        changed, what = _array(value, rng, fixed=node == Nodetype.ARRAY)
+        setattr(message, name, changed)
+        return f"{name}: {what}"
+    return f"{name}: {_list(message, name, element, rng)}"
+
+
+def _value(kind: str, rng: np.random.Generator) -> Any:
+    if kind == "string":
+        return pick(rng, TEXTS)
+    if kind == "bool":
+        return bool(rng.integers(2))
+    if kind.startswith("float"):
+        with np.errstate(over="ignore"):
+            return float(np.dtype(kind).type(pick(rng, FLOATS)))
+    limits = np.iinfo(kind.replace("octet", "uint8").replace("byte", "uint8"))
+    number = pick(rng, INTEGERS) if rng.random() < 0.7 else int(rng.integers(-20, 100))
+    return int(min(max(number, limits.min), limits.max))
+
+
+def _array(values: np.ndarray, rng: np.random.Generator, fixed: bool) -> tuple[np.ndarray, str]:
+    values = np.array(values)
+    if not fixed and rng.random() < 0.5:
+        size = int(rng.integers(0, 2 * len(values) + 2))
+        return np.resize(values, size) if len(values) else np.zeros(size, values.dtype), \
+            f"{size} values of {len(values)}"
+    if len(values):
+        at = int(rng.integers(len(values)))
+        values[at] = _value(values.dtype.name, rng)
+        return values, f"[{at}] = {values[at]}"
+    return values, "none"
+
+
+def _list(message: Any, name: str, element: tuple, rng: np.random.Generator) -> str:
+    items, kind = list(getattr(message, name)), pick(rng, ("inside", "inside", "drop", "double",
+                                                           "new", "order"))
+    what = kind
+    if kind == "new" or not items:
+        items.append("x" if element[0] == Nodetype.BASE else bag_message(element[1]))
+    elif kind == "inside" and element[0] == Nodetype.NAME:
+        at = int(rng.integers(len(items)))
+        what = f"[{at}].{mutate_message(items[at], rng)}"
+    elif kind == "inside":
+        items[int(rng.integers(len(items)))] = pick(rng, TEXTS)
+    elif kind == "drop":
+        del items[int(rng.integers(len(items)))]
+    elif kind == "double":
+        items.append(pick(rng, items))
+    else:
+        items.reverse()
+    setattr(message, name, items)
+    return what
