@@ -20,7 +20,8 @@ from benchmark.graph import measure_graph, print_graph
 from benchmark.pointnet import measure_pointnet, print_pointnet
 from benchmark.rows import print_ground, print_measured, print_planes
 from benchmark.simulation import measure_simulation
-from benchmark.timing import spread
+from benchmark.timing import evenly_chosen
+from benchmark.tracking import measure_recording, print_tracking
 from lidar_perception.candidates.segmented import points_in_view
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, Frame, Recording
@@ -41,7 +42,8 @@ FEW = 3              # frames with a pedestrian, below which those without serve
 @click.command(context_settings=dict(help_option_names=["-h", "--help"]))
 @click.option("--data", type=click.Path(path_type=Path), required=True, metavar="PATH",
               multiple=True, help="A recording with Pedestrian labels and a camera, such as KITTI. "
-              "A second one, with labelled points (SemanticKITTI), scores the ground methods too.")
+              "A second one, with labelled points (SemanticKITTI), scores the ground methods too, "
+              "and one with track ids (KITTI tracking) the trackers.")
 @click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
               help="Write the figures to this file.")
 @click.option("--repeat", type=click.IntRange(1), default=5, show_default=True,
@@ -68,7 +70,7 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     if not frames:
         raise InputError(f"{recording.path} has no frame with a Pedestrian label")
     labelled = [f for each in recordings if POINT_LABELS in each.has
-                for f in spread(each.frames, count)]
+                for f in evenly_chosen(each.frames, count)]
     warm_up()
     content = {"machine": {"cpu": cpu_name(), "cores": os.cpu_count(), "python":
                            platform.python_version(), "numpy": np.__version__},
@@ -89,6 +91,10 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
     if labelled:
         content["ground_scores"] = ground.measure_labelled(labelled, repeat)
         print_ground(content["ground_scores"])
+    for each in recordings:
+        if drives := measure_recording(each):
+            content["tracking"] = drives
+            print_tracking(drives)
     content["simulation"] = measure_simulation(count, repeat)
     print_measured(content["simulation"])
     if graph:
@@ -102,12 +108,12 @@ def main(data: tuple[Path, ...], json_file: Path | None, repeat: int, count: int
 def _with_camera(recording: Recording, pedestrian: list[Frame], count: int) -> list[tuple]:
     """(scan, camera) of the frames with a pedestrian; of any frames where these are few."""
     chosen = pedestrian if len(pedestrian) >= FEW else recording.frames
-    return [(f.load(), f.camera()) for f in spread(chosen, count)]
+    return [(f.load(), f.camera()) for f in evenly_chosen(chosen, count)]
 
 
 def _full_scans(recording: Recording, count: int) -> list[LidarFrame]:
     whole = [f for f in recording if len(f.load()) > FULL_SCAN]
-    return [f.load() for f in spread(whole, count)]
+    return [f.load() for f in evenly_chosen(whole, count)]
 
 
 def _measure(in_view: list[np.ndarray], scans: list[LidarFrame], repeat: int) -> dict:

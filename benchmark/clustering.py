@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from benchmark import peers, plain_euclidean
 from benchmark.memory import METHOD, dbscan_memory
 from benchmark.rows import against, measured, row, with_target
-from benchmark.timing import SLOW_REPEAT, Clock, in_child, spread, thin
+from benchmark.timing import SLOW_REPEAT, Clock, evenly_chosen, in_child, thin
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
 from lidar_perception.clustering.euclidean import euclidean
 from lidar_perception.clustering.params import DbscanParams, EuclideanParams
@@ -81,7 +81,7 @@ def measure_euclidean(clouds: list[np.ndarray], threshold: str, repeat: int) -> 
     frames then."""
     params = EuclideanParams(threshold=threshold)
     if threshold == "local":
-        clouds, repeat = spread(clouds, (len(clouds) + 1) // 2), min(repeat, SLOW_REPEAT)
+        clouds, repeat = evenly_chosen(clouds, (len(clouds) + 1) // 2), min(repeat, SLOW_REPEAT)
 
     def calls(xyz):
         return {PLAIN: partial(plain_euclidean.euclidean, xyz, params),

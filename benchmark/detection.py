@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from rich.table import Table
 
-from benchmark.timing import spread
+from benchmark.timing import evenly_chosen
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.devices import chosen_device
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS, network_config
@@ -34,7 +34,7 @@ def measure_detection(scans: list[LidarFrame], repeat: int,
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
     content = {"device": name, "threads": torch.get_num_threads(), "sizes": {}}
     for size in sizes:
-        chosen = spread(scans, FEW) if (size, device.type) == ("full", "cpu") else scans
+        chosen = evenly_chosen(scans, FEW) if (size, device.type) == ("full", "cpu") else scans
         detectors = {version: _random_detector(version, size, device, chosen[0])
                      for version in VERSIONS}
         content["sizes"][size] = {

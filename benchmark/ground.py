@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmark import peers
 from benchmark.rows import against, measured, row
-from benchmark.timing import SLOW_REPEAT, Clock, spread, thin
+from benchmark.timing import SLOW_REPEAT, Clock, evenly_chosen, thin
 from lidar_perception.data.frame import Frame
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.params import ClothParams, GroundParams, ThresholdParams
@@ -35,7 +35,7 @@ def measure_threshold(title: str, clouds: list[np.ndarray], repeat: int) -> dict
     rows, planes = [], {}
     for group, chosen, times in (
             (peers.RANSACS, clouds, repeat),
-            ((peers.RANSAC_2000,), spread(clouds, FRAMES_OF_2000), 1)):
+            ((peers.RANSAC_2000,), evenly_chosen(clouds, FRAMES_OF_2000), 1)):
         here = [p for p in group if not p.missing()]
         ms, found = _timed(title, chosen, times, here)
         for p in group:

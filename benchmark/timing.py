@@ -54,7 +54,7 @@ def in_child(function: Callable, *arguments):
         return child.submit(function, *arguments).result()
 
 
-def spread(items: Sequence, count: int) -> list:
+def evenly_chosen(items: Sequence, count: int) -> list:
     """count of the items, evenly spread from the first to the last; all where there are fewer."""
     if len(items) <= count:
         return list(items)

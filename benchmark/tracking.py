@@ -11,7 +11,10 @@ from rich.table import Table
 
 from benchmark.plain_ab3dmot import PlainAb3dmot
 from lidar_perception.camera import Calibration
-from lidar_perception.runs.terminal import console
+from lidar_perception.data.frame import Recording
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.params import MIN_SCORE
+from lidar_perception.runs.terminal import console, track
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
 from lidar_perception.tracking.params import TrackingParams
@@ -34,24 +37,41 @@ class Seen:
     pose: np.ndarray | None = None
 
 
+def measure_recording(recording: Recording) -> dict:
+    """What PointPillars finds in the drives of a recording, tracked by both; {} without track ids
+    in the labels."""
+    if not recording.frames or not recording.frames[0].sequence:
+        return {}
+    detector = open_detector(min_score=MIN_SCORE,
+                             sensor_height=recording.frames[0].sensor_height)
+    drives: dict[str, list[Seen]] = {}
+    for frame in track(recording, "detecting", len(recording)):
+        truth = frame.truth()
+        if truth is not None and all("track_id" in extra for extra in truth.extras):
+            drives.setdefault(frame.sequence, []).append(
+                Seen(detector(frame.load()).detections, truth, frame.stamp_ns, frame.pose()))
+    return measure_tracking(drives, recording.frames[0].calibration()) if drives else {}
+
+
 def measure_tracking(drives: dict[str, Sequence[Seen]], calibration: Calibration | None,
                      params: TrackingParams = TrackingParams()) -> dict:
     """By "ours" and "plain AB3DMOT": the scores of TrackingReport, by centres, and ms, the median
     time of a frame."""
     return {name: _measured(drives, calibration, make) for name, make in (
-        ("plain AB3DMOT", _peer), ("ours", lambda: _ours(params)))}
+        ("plain AB3DMOT", lambda: peer(PlainAb3dmot())), ("ours", lambda: tracker(params)))}
 
 
-def _peer() -> Step:
-    tracker = PlainAb3dmot()
-    return lambda seen: tracker(seen.found[seen.found.scores >= OPERATING], seen.pose)
+def peer(plain: PlainAb3dmot, operating: float = OPERATING) -> Step:
+    """One drive by the peer, which gets detections from the score `operating` on."""
+    return lambda seen: plain(seen.found[seen.found.scores >= operating], seen.pose)
 
 
-def _ours(params: TrackingParams) -> Step:
-    tracker = Tracker(params)
+def tracker(params: TrackingParams) -> Step:
+    """One drive by our tracker."""
+    ours = Tracker(params)
 
     def step(seen: Seen) -> tuple[np.ndarray, Detections]:
-        tracks = tracker(seen.found, seen.stamp_ns, seen.pose)
+        tracks = ours(seen.found, seen.stamp_ns, seen.pose)
         return tracks.ids, tracks.detections
     return step
 

@@ -31,16 +31,29 @@ CAMERA_IN = [
     ("~/input/camera_info", "sensor_msgs/CameraInfo", "P and the image size; latched. Only needed "
      "with `view.enabled`."),
     ("~/input/extrinsics", "geometry_msgs/TransformStamped", "The camera in the LiDAR frame or the "
-     "other way round; latched. /tf_static is read too where tf2_msgs is installed."),
+     "other way round; latched. TF is asked too where tf2_msgs is installed."),
 ]
 SEED_IN = [
     ("~/input/ground_truth", MARKERS, "Labels, for `seed.source` ground_truth; matched to the "
      "cloud by header.stamp."),
     ("/clicked_point", "geometry_msgs/PointStamped", "A point on a pedestrian, for `seed.source` "
-     "click, in the frame of the cloud."),
+     "click, in the frame of the cloud or, with TF, in any that is connected with it."),
+]
+ROBOT_IN = [
+    ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves; only with `input.deskew` "
+     "odometry."),
+    ("/tf, /tf_static", "tf2_msgs/TFMessage", "Where tf2_msgs is installed; /tf only with "
+     "`base_frame`, `target_frame`, `input.deskew` tf, or a click."),
 ]
 DETECTIONS_3D = ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, where "
                  "vision_msgs is installed.")
+TRACKS_OUT = [
+    ("~/output/tracks", MARKERS, "Tracks: boxes whose ids stay, with score, velocity and "
+     "probability of motion in the text; in the namespaces `velocity`, `number` and `trail` an "
+     "arrow, a text and the way of each. In the frame of the detections."),
+    ("~/output/tracks_3d", "vision_msgs/Detection3DArray", "The same with ids and covariances, "
+     "where vision_msgs is installed."),
+]
 BOXES_OUT = [
     ("~/output/detections", MARKERS, "Boxes with class and score; an empty array still carries the "
      "stamp."),
@@ -142,6 +155,22 @@ PAGES: dict[str, dict[str, Any]] = {
         outputs=[*BOXES_OUT,
                  ("~/debug/preprocess_ms, ground_ms, clustering_ms, network_ms, postprocess_ms",
                   STRING_TIMES, "Time of each step.")]),
+    "tracker": dict(
+        params=params.TrackerNodeParams(),
+        what="Follows the detections of any detector: ids that stay, velocities, and scores that "
+             "are the evidence over time, see [tracking](../tracking.md). A frame that was lost is "
+             "predicted over; one that is late, or has the stamp of the last one, is not answered; "
+             "time that jumps, as of a bag that is played again, ends all tracks. Warns of "
+             "what is wrong with a frame or the poses. The detector nodes do the same in their "
+             "own process with `tracking.enabled`, then from weak detections too. Files: the "
+             "argument `tracking:=true` of the launch files, `config/tracker.param.yaml`.",
+        inputs=[("~/input/detections", MARKERS, "CUBEs with `ns` as class, and a score in the text "
+                 "as JSON. A frame without any is a DELETE or DELETEALL with its header."),
+                ("~/input/detections_3d", "vision_msgs/Detection3DArray", "Or this, where "
+                 "vision_msgs is installed; one of both."),
+                ("~/input/odometry", "nav_msgs/Odometry", "How the sensor moves, for `ego.source` "
+                 "auto and odometry; for kiss_icp it is ~/input/points (PointCloud2).")],
+        outputs=TRACKS_OUT),
     "evaluator": dict(
         params=params.EvaluatorParams(),
         what="Scores detections against ground truth by the protocol of the STM-CPA paper.",
@@ -181,12 +210,17 @@ def page(name: str) -> str:
     node = PAGES[name]
     lines = [f"# {name}", "", node["what"], "",
              f"    ros2 run lidar_perception {name}      # or: lidar-perception run {name}", ""]
-    for title, rows in (("Subscribes", node["inputs"]), ("Publishes", outputs(name)),
+    robot = ROBOT_IN if "base_frame" in node_parameters(name) else []
+    for title, rows in (("Subscribes", node["inputs"] + robot), ("Publishes", outputs(name)),
                         ("Services", MANAGED_SERVICES if _managed(name)
                          else node.get("services", []))):
         if rows:
             lines += [f"## {title}", "", "| name | type | |", "|---|---|---|",
                       *(f"| `{a}` | {b} | {c} |" for a, b, c in rows), ""]
+    if "tracking.enabled" in node_parameters(name):
+        lines += ["With `tracking.enabled` the node has the topics of the [tracker](tracker.md), "
+                  "too; a detector with a network then tracks weak detections as well, from "
+                  "`tracking.min_score` on.", ""]
     lines += ["## Parameters", "", "| name | default | range | |", "|---|---|---|---|"]
     for key, f in node_parameters(name).items():
         lines.append(f"| `{key}` | {_default(f)} | {_range(f)} | {f.metadata['doc']}"

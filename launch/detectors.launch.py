@@ -1,6 +1,7 @@
 """Ground and clusters of a live or replayed cloud, once, and any of the detectors behind them.
 
     ros2 launch lidar_perception detectors.launch.py detectors:=pointpillars,candidates
+    ros2 launch lidar_perception detectors.launch.py detectors:=pointpillars tracking:=true
 
 Two sensors: one launch for each, with namespace:=left and namespace:=right.
 """

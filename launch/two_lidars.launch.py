@@ -14,7 +14,9 @@ from launch import LaunchDescription
 
 GRAPH = Path(__file__).resolve().parent / "detectors.launch.py"
 SIDES = ("left", "right")
-SHARED = {"detectors": "candidates", "single": "false", "rviz": "false", "rviz_frame": "",
+SHARED = {"detectors": "candidates", "single": "false", "tracking": "false",
+          "rviz": "false", "rviz_frame": "", "base_frame": "", "target_frame": "", "deskew": "",
+          "odometry": "odom",
           "use_sim_time": "false", "log_level": "info"}
 
 

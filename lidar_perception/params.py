@@ -9,6 +9,8 @@ dataclass is made, with the name, the value and the range in the message.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import Self
 
 from lidar_perception.candidates.params import (
     ConfidenceParams,
@@ -21,6 +23,8 @@ from lidar_perception.candidates.params import (
 from lidar_perception.clustering.params import BoxParams, ClusteringParams
 from lidar_perception.ground.params import GroundParams, ObstacleParams
 from lidar_perception.param_fields import Params, param
+from lidar_perception.robot.params import CropParams
+from lidar_perception.tracking.params import EgoParams, TrackingParams, tracking_of
 from lidar_perception.wire.params import InputParams, ViewParams
 
 
@@ -35,8 +39,8 @@ class ReceptionParams(Params):
     queue: int = param(1, "Clouds that wait while one is worked on; older ones are dropped, and "
                           "counted. 1: the newest wins.", low=1, high=1000)
     max_wait: float = param(10.0, "A cloud that needs what has not come yet, such as the camera's "
-                            "calibration with view.enabled, waits for this time.", unit="s",
-                            low=0.0, high=3600.0)
+                            "calibration with view.enabled, or a transform of its time, waits for "
+                            "this time.", unit="s", low=0.0, high=3600.0)
     rate: float = param(0.0, "Clouds a second that the sensor sends; 0 takes what the first 21 "
                         "say.", unit="Hz", low=0.0, high=1000.0)
     min_rate: float = param(0.7, "WARN below this share of the rate.", low=0.0, high=1.0)
@@ -49,6 +53,13 @@ class ReceptionParams(Params):
     max_dropped: float = param(
         0.5, "WARN when more than this share of the last 100 clouds was dropped because a newer "
         "one came before its turn.", low=0.0, high=1.0)
+    deskew: str = param(
+        "off", "Motion correction: points are moved to header.stamp, by the cloud's column of "
+        "times and, odometry: ~/input/odometry (nav_msgs/Odometry), or tf: TF, from "
+        "`input.fixed_frame`. off: they are used as they are.", choices=("off", "odometry", "tf"),
+        fixed=True)
+    fixed_frame: str = param("odom", "For `input.deskew` tf: a frame in which the robot moves "
+                             "without jumps.", fixed=True)
 
 
 @dataclass(frozen=True)
@@ -61,10 +72,29 @@ class MarkerParams(Params):
 
 
 @dataclass(frozen=True)
+class TrackMarkerParams(MarkerParams):
+    """Boxes, and the ways of tracks."""
+
+    trail: float = param(2.0, "The way of a track is drawn for this time; 0 draws none.", unit="s",
+                         low=0.0, high=60.0)
+
+
+@dataclass(frozen=True)
+class OptionalTracking(TrackingParams):
+    """Tracks in one process with a detector."""
+
+    enabled: bool = param(False, "Publish tracks of what is detected, too, on ~/output/tracks.",
+                          fixed=True)
+
+
+@dataclass(frozen=True)
 class CloudNodeParams(Params):
     """What a node that takes clouds has besides the numbers of its algorithm."""
 
     input: ReceptionParams = ReceptionParams()
+    base_frame: str = param("", "A frame on the ground, such as base_footprint: height, roll and "
+                            "pitch of the sensor come from TF instead of ground.sensor_pose, and "
+                            "all is computed on the levelled cloud. Empty: off.", fixed=True)
     autostart: bool = param(True, "Configure and activate at the start. false: a lifecycle manager "
                             "does, as Nav2's, or `ros2 lifecycle`.", fixed=True)
 
@@ -74,6 +104,8 @@ class BoxNodeParams(CloudNodeParams):
     """What a node that makes boxes of clouds has besides the numbers of its algorithm."""
 
     output: MarkerParams = MarkerParams()
+    target_frame: str = param("", "The frame of the boxes that go out, by TF at the stamp of their "
+                              "cloud. Empty: the cloud's.", fixed=True)
 
 
 @dataclass(frozen=True)
@@ -84,10 +116,38 @@ class GroundRobotParams(CloudNodeParams):
 
 
 @dataclass(frozen=True)
-class PerceptionRobotParams(BoxNodeParams):
+class DetectionNodeParams(BoxNodeParams):
+    """What a node that detects objects in clouds has besides."""
+
+    output: TrackMarkerParams = TrackMarkerParams()
+    tracking: OptionalTracking = OptionalTracking()
+    ego: EgoParams = EgoParams()
+
+    @classmethod
+    def of(cls, detector: str) -> Self:
+        """With the tracker's numbers for a detector."""
+        return cls(tracking=OptionalTracking(**vars(tracking_of(detector))))
+
+
+@dataclass(frozen=True)
+class PerceptionRobotParams(DetectionNodeParams):
     """What perception has besides."""
 
     obstacles: ObstacleParams = ObstacleParams()
+
+
+CANDIDATES, POINTPILLARS, POINTNET = (partial(DetectionNodeParams.of, name)
+                                      for name in ("candidates", "pointpillars", "pointnet"))
+PERCEPTION = partial(PerceptionRobotParams.of, "candidates")
+
+
+@dataclass(frozen=True)
+class TrackInputParams(CloudNodeParams):
+    """What the tracker has besides its numbers. Each detection counts, so some may wait, and each
+    waits a little for its pose."""
+
+    input: ReceptionParams = ReceptionParams(queue=10, max_wait=0.2)
+    output: TrackMarkerParams = TrackMarkerParams()
 
 
 # Each node declares the groups of its own stages, under the same names.
@@ -96,6 +156,7 @@ class PerceptionRobotParams(BoxNodeParams):
 @dataclass(frozen=True)
 class GroundNodeParams:
     input: InputParams = InputParams()
+    crop: CropParams = CropParams()
     view: ViewParams = ViewParams()
     ground: GroundParams = GroundParams()
 
@@ -115,6 +176,12 @@ class RefinementNodeParams:
     resolution: ResolutionParams = ResolutionParams()
     confidence: ConfidenceParams = ConfidenceParams()
     seed: SeedParams = SeedParams()
+
+
+@dataclass(frozen=True)
+class TrackerNodeParams:
+    tracking: TrackingParams = TrackingParams()
+    ego: EgoParams = EgoParams()
 
 
 @dataclass(frozen=True)

@@ -12,18 +12,23 @@ from msg_utils.stamps import to_ns
 
 
 def to_detection_array(boxes: np.ndarray, labels: Sequence[str], scores: Sequence[float], *,
-                       header: Any, make: Any) -> Any:
-    """Detection3DArray of boxes (K, 7) [x y z l w h yaw], one hypothesis each; ids are 0..K-1, as
-    those of the markers. The covariances are all zero: "unknown", as sensor_msgs/Imu has it."""
+                       header: Any, make: Any, ids: Sequence[int] | None = None,
+                       covariances: np.ndarray | None = None) -> Any:
+    """Detection3DArray of boxes (K, 7) [x y z l w h yaw], one hypothesis each; ids as those of the
+    markers, by default 0..K-1. covariances (K, 6, 6) of x y z and the turns about them, metres and
+    radians; without any they are all zero: "unknown", as sensor_msgs/Imu has it."""
     detections = []
-    for i, (box, label, score) in enumerate(zip(np.asarray(boxes, float).reshape(-1, 7), labels,
-                                                scores, strict=True)):
+    boxes = np.asarray(boxes, float).reshape(-1, 7)
+    ids = range(len(boxes)) if ids is None else ids
+    spread = np.zeros((len(boxes), 36)) if covariances is None else covariances.reshape(-1, 36)
+    for i, box, label, score, square in zip(ids, boxes, labels, scores, spread, strict=True):
         pose, (length, width, height) = box_pose(box, make), map(float, box[3:6])
         hypothesis = make("vision_msgs/msg/ObjectHypothesis", class_id=label, score=float(score))
         detections.append(make(
-            "vision_msgs/msg/Detection3D", header=header, id=str(i),
+            "vision_msgs/msg/Detection3D", header=header, id=str(int(i)),
             results=[make("vision_msgs/msg/ObjectHypothesisWithPose", hypothesis=hypothesis,
-                          pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose))],
+                          pose=make("geometry_msgs/msg/PoseWithCovariance", pose=pose,
+                                    covariance=square))],
             bbox=make("vision_msgs/msg/BoundingBox3D", center=pose,
                       size=make("geometry_msgs/msg/Vector3", x=length, y=width, z=height))))
     return make("vision_msgs/msg/Detection3DArray", header=header, detections=detections)

@@ -21,15 +21,16 @@ ROS = {"rclpy", "ament_index_python", "launch", "launch_ros", "launch_testing", 
 MAX_LINES = 400
 
 # From the ground up: a room imports only those before it, and itself.
-ROOMS = ("classes", "types", "param_fields", "geometry", "camera", "groups", "runs", "wire",
-         "data", "ground", "clustering", "candidates", "detectors", "tracking", "scoring",
+ROOMS = ("classes", "types", "param_fields", "geometry", "camera", "groups", "robot", "runs",
+         "wire", "data", "ground", "clustering", "candidates", "detectors", "tracking", "scoring",
          "simulation", "training", "reproduction", "params", "nodes", "campaign", "cli", "testing")
 # What the files of a room may import besides the rooms below and the standard library.
 NUMBERS = ["numpy", "scipy", "numba"]
 STRANGERS = {
     "classes": [], "types": ["numpy"], "param_fields": [], "geometry": ["numpy", "numba"],
     "camera": NUMBERS,
-    "groups": ["numpy"], "runs": ["rich"], "wire": ["numpy", "scipy", "rosbags", "msg_utils"],
+    "groups": ["numpy"], "robot": ["numpy", "scipy"], "runs": ["rich"],
+    "wire": ["numpy", "scipy", "rosbags", "msg_utils"],
     "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils", "lz4", "zstandard"],
     "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,
     "detectors": [*NUMBERS, "torch", "safetensors", "onnx", "onnxruntime", "onnxscript"],

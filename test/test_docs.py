@@ -42,7 +42,7 @@ def test_pages_are_made_from_the_code(generate, name):
 
 @pytest.mark.parametrize("name", ["ground_segmentation", "clustering", "candidate_refinement",
                                   "perception", "evaluator", "pointpillars_detector",
-                                  "pointnet_detector"])
+                                  "pointnet_detector", "tracker"])
 def test_documented_topics_are_the_nodes_own(generate, name, domain):
     rclpy = pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     from rclpy.context import Context

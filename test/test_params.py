@@ -23,20 +23,22 @@ from lidar_perception.ground import params as ground_params
 from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.param_fields import Params, flatten, parameter_fields, with_values
 from lidar_perception.params import (
-    BoxNodeParams,
-    CloudNodeParams,
     ClusteringNodeParams,
     GroundNodeParams,
     PlayerParams,
     RefinementNodeParams,
+    TrackerNodeParams,
 )
+from lidar_perception.robot import params as robot_params
+from lidar_perception.tracking import params as tracking_params
 from lidar_perception.training import params as training_params
 from lidar_perception.training.params import PointPillarsTraining
 from lidar_perception.types import InputError
 from lidar_perception.wire import params as wire_params
 
 MODULES = (node_params, candidate_params, clustering_params, detector_params, ground_params,
-           wire_params, pointpillars_params, pointnet_params, training_params)
+           robot_params, wire_params, tracking_params, pointpillars_params, pointnet_params,
+           training_params)
 
 
 def groups_below(base: type) -> list[type]:
@@ -45,7 +47,7 @@ def groups_below(base: type) -> list[type]:
 
 GROUPS = [group for group in groups_below(Params)
           if group.__module__ in [each.__name__ for each in MODULES]]
-COMPOSITES = [BoxNodeParams, CloudNodeParams, PipelineParams, GroundNodeParams,
+COMPOSITES = [TrackerNodeParams, PipelineParams, GroundNodeParams,
               ClusteringNodeParams, RefinementNodeParams,
               DetectorParams, PointNetDetectorParams, PointPillarsTraining]
 FIELDS = [pytest.param(group, f, id=f"{group.__name__}.{f.name}")
@@ -76,6 +78,8 @@ def other_value(f: dataclasses.Field):
     """A value in range that is not the default."""
     if f.metadata["choices"]:
         return next(c for c in f.metadata["choices"] if c != f.default)
+    if f.name in ("body", "sectors"):  # boxes and pairs; none by default
+        return (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0)
     if f.metadata["item"]:
         return (*f.default, "/more") if kind_of(f) is str else tuple(v + 1.0 for v in f.default)
     if isinstance(f.default, bool):

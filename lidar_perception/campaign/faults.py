@@ -31,7 +31,7 @@ WORK: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     "simulate": (("simulate", "--format", "kitti", "--sensor", SENSOR, "--frames", "12", "--jobs",
                   "1"), ("--resume",), "training/**/*"),
     "train": (TRAIN, ("--resume",), "last.safetensors"),
-    "reproduce": (("reproduce", "stm-cpa", "--data", "many", "--jobs", "1"), (), "*.csv"),
+    "reproduce": (("reproduce", "stm-cpa", "--data", "many", "--jobs", "1"), (), "tables/*.csv"),
 }
 MOMENTS = (0.3, 0.6, 0.9)  # shares of the time that the whole takes, from when it says something
 # What writes, for disks that are full or read-only; {} is the place.
@@ -140,13 +140,16 @@ class Attempt:
         """The same files as of a run that nothing has stopped."""
         command, resume, pattern = WORK[work]
         if work not in self.wholes:
-            begin, code = monotonic(), _run(self.folder, command, f"whole {work}")
+            (self.folder / f"whole {work}").mkdir(exist_ok=True)
+            begin, code = monotonic(), _run(self.folder, command, f"whole {work}/made")
             if code:
                 return Outcome(FAILED, f"{work}: exit code {code} without any fault")
-            self.wholes[work] = monotonic() - begin, _files(self.folder / f"whole {work}", pattern)
+            self.wholes[work] = monotonic() - begin, _files(
+                self.folder / f"whole {work}/made", pattern)
         seconds, wanted = self.wholes[work]
-        out = f"stopped {work}"
-        shutil.rmtree(self.folder / out, ignore_errors=True)
+        out = f"stopped {work}/made"
+        shutil.rmtree(self.folder / f"stopped {work}", ignore_errors=True)
+        (self.folder / f"stopped {work}").mkdir()
         code = _run(self.folder, command, out, fault, moment * seconds)
         if fault == signal.SIGINT and code not in (0, 1, 2, 130):
             return Outcome(FAILED, f"{work}: exit code {code} after SIGINT: {_said(self.folder)}")
@@ -192,7 +195,7 @@ def _said(folder: Path) -> str:
 
 
 def _files(folder: Path, pattern: str) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix().replace(folder.name, "OUT"): path.read_bytes()
+    return {path.relative_to(folder).as_posix(): path.read_bytes()
             for path in sorted(folder.glob(pattern)) if path.is_file()}
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from lidar_perception.clustering.params import BoxParams, ClusteringParams
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import Params, param
+from lidar_perception.robot.params import CropParams
 from lidar_perception.wire.params import InputParams, ViewParams
 
 
@@ -107,6 +108,7 @@ class PipelineParams:
     """All groups of the candidate pipeline, in the order of the stages."""
 
     input: InputParams = InputParams()
+    crop: CropParams = CropParams()
     view: ViewParams = ViewParams()
     ground: GroundParams = GroundParams()
     clustering: ClusteringParams = ClusteringParams()

@@ -1,6 +1,6 @@
 """The order of the stages, in one place: one LiDAR frame in, pedestrian candidates out.
 
-    view -> ground -> clusters -> boxes snapped to the ground -> height -> STM -> CPA
+    crop, view -> ground -> clusters -> boxes snapped to the ground -> height -> STM -> CPA
 
 The nodes call the same stage functions one by one, so that the graph over DDS and this file give
 the same candidates.
@@ -21,6 +21,7 @@ from lidar_perception.candidates.segmented import Segmented, grounded_boxes, poi
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.groups import renumbered
+from lidar_perception.robot.crop import cropped
 from lidar_perception.types import LidarFrame
 
 
@@ -28,10 +29,12 @@ def segment(frame: LidarFrame, camera: Camera | None = None,
             params: PipelineParams = PipelineParams(), *, ground: np.ndarray | None = None,
             cluster_ids: np.ndarray | None = None) -> Segmented:
     """Stages up to the boxes; ground (N,) bool and cluster_ids (N,) of the frame's points, from
-    whatever clustering, are computed where they are None. InputError if the crop is on and there
+    whatever clustering, are computed where they are None. InputError if the view is on and there
     is no camera."""
     t0 = perf_counter()
+    kept, frame = cropped(frame, params.crop)
     indices, seen = points_in_view(frame, camera, params.view)
+    indices = kept.take(indices)
     t1 = perf_counter()
     ground = segment_ground(seen, params.ground) if ground is None else ground[indices]
     t2 = perf_counter()

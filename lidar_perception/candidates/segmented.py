@@ -47,7 +47,7 @@ def explain_nothing(usable: int, ground: np.ndarray,
     usable is the number of finite points; ground (M,) and cluster_ids (M,) of those in view.
     """
     if usable == 0:
-        return "the cloud is empty or has no finite point"
+        return "the cloud is empty or has no finite point, or crop.* leaves none"
     if len(ground) == 0:
         return "no point is in the camera's view; check the LiDAR-to-camera transform"
     if not ground.any():

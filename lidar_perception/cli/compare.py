@@ -23,8 +23,8 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, device: str
 
     STM-CPA (`paper` and `best`), PointPillars V0 to V4 in both sizes, PointNet, and their hybrids:
     average precision, F1 of pedestrians by centre distance as in the STM-CPA paper, ms a frame.
-    Networks without weights are listed as missing. With several --jobs the times are those of
-    processes that share the machine.
+    Networks without weights are listed as missing. With several --jobs the processes share the
+    machine, and times are longer.
 
     \b
     Examples:

@@ -18,7 +18,7 @@ from lidar_perception.cli.evaluate.candidates import view_as_recorded
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.bag_frames import BagFrames
-from lidar_perception.data.frame import BOXES
+from lidar_perception.data.frame import BOXES, Recording
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.groups import renumbered
@@ -29,6 +29,7 @@ from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.wire.messages import column, to_detections, to_frame
 from lidar_perception.wire.topics import TRUTH
+from lidar_perception.wire.track_markers import drawn_trails
 from msg_utils.markers import from_marker_array
 
 
@@ -42,16 +43,18 @@ from msg_utils.markers import from_marker_array
               help="Seed of the simulated drive.")
 @click.option("--rate", type=click.FloatRange(0.01, 100), default=1.0, show_default=True,
               help="Speed of the replay.")
-@click.option("--single", is_flag=True, help="All stages in one process instead of three.")
-@click.option("--real-time", is_flag=True, help="Play as a sensor sends, whether the machine keeps "
-              "up or not. Without it a cloud is sent when those before have their result.")
+@click.option("--single", is_flag=True, help="Run all stages in one process instead of three.")
+@click.option("--real-time", is_flag=True, help="Play at the speed of the sensor, even if the "
+                                                "machine cannot keep up. Without it each cloud is "
+                                                "sent once those before it have their results.")
 @parameter_options(PAPER)
 def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float, single: bool,
          real_time: bool, params: PipelineParams) -> None:
-    """Replay a drive through the real nodes over DDS and score the pedestrian candidates.
+    """Replay a drive through the real nodes over DDS and score the pedestrian candidates, and the
+    tracks of them.
 
     Without options: makes a simulated drive with walking pedestrians, writes it as a rosbag2 bag,
-    replays it into the nodes, each a process of its own on a private ROS domain, and prints the
+    replays it into the nodes, each in its own process on a private ROS domain, and prints the
     scores. Leaves in --out: the bag, the result bag, scores.json, birdseye.png and the logs.
 
     \b
@@ -72,15 +75,16 @@ def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float
         warm_up()
     content = replay(drive, clouds, out, params, rate=rate, single=single,
                      real_time=real_time)
-    write_text(out / "scores.json", json.dumps(content, indent=1))
     print_candidate_report(content, console)
     latency = content["latency_ms"]
     slower = content["slower"]
     pace = f"{rate:g}x" if slower < 1.05 else f"{rate / slower:.2g}x, {slower:.2g} times slower " \
-        "than asked for, as the machine is slower than the sensor"
+        "than asked for, as the machine cannot keep up"
     console.print(f"{clouds} clouds replayed at {pace}; {content['results']} results; latency "
                   f"cloud to candidates median {latency['median']:.0f} ms, 95 % under "
                   f"{latency['p95']:.0f} ms; memory of the graph {content['memory_mb']:.0f} MB")
+    content["tracks"] = _print_tracks(out / "result", played)
+    write_text(out / "scores.json", json.dumps(content, indent=1))
     picture = _draw_best(out / "result", out / "birdseye.png", single)
     console.print(f"results in {out}: result (bag), scores.json, logs"
                   + (", birdseye.png" if picture else ""))
@@ -106,13 +110,34 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     return path
 
 
+def _print_tracks(result: Path, played: Recording) -> dict:
+    """Say how many pedestrians were tracked, and how well; the scores."""
+    from lidar_perception.nodes.replay import TRACKS
+    from lidar_perception.scoring.tracking.from_bag import recorded_tracks
+    person = CLASSES[PEDESTRIAN]
+    count, scores, problem = recorded_tracks(result, TRACKS, person,
+                                             next(iter(played)).calibration())
+    text = f"HOTA is not known: {problem}" if scores is None else (
+        f"{scores['true_tracks']} labelled; {scores['switches']} identity switches, HOTA "
+        f"{100 * scores['HOTA']:.1f} (detection {100 * scores['DetA']:.1f}, association "
+        f"{100 * scores['AssA']:.1f})")
+    console.print(f"tracks: {count} of pedestrians, {text}")
+    return {"found": count, "scores": scores}
+
+
 def _draw_best(result: Path, picture: Path, single: bool) -> bool:
-    """Draw the recorded frame with most hits; False if none has a labelled pedestrian."""
+    """Draw the recorded frame with most hits, and the ways of tracks; False if none has a labelled
+    pedestrian."""
+    from lidar_perception.nodes.replay import TRACKS
     from lidar_perception.scoring.pictures import draw_frame
     final = result_topics(single)["final"]
     frames: dict[int, dict] = {}
+    trails: dict[int, dict] = {}
     with Bag(result) as bag:
-        for topic, _, msg in bag.messages({TRUTH, final} & set(bag.topics)):
+        for topic, _, msg in bag.messages({TRUTH, final, TRACKS} & set(bag.topics)):
+            if topic == TRACKS:
+                trails[from_marker_array(msg).stamp_ns] = drawn_trails(msg)
+                continue
             objects = from_marker_array(msg)
             boxes = (to_detections(objects).boxes if topic == final
                      else objects.boxes[[x == CLASSES[PEDESTRIAN] for x in objects.labels]])
@@ -128,7 +153,8 @@ def _draw_best(result: Path, picture: Path, single: bool) -> bool:
                 ids, _ = renumbered(column(msg, "cluster_id", indices))
                 draw_frame(picture, frame.xyz, column(msg, "ground", indices) > 0, ids,
                            frames[best][TRUTH],
-                           frames[best][final], title=f"{hits[best][0]} of {hits[best][1]} "
-                           f"pedestrians found, stamp {best / 1e9:.1f} s")
+                           frames[best][final], trails=trails.get(best, {}),
+                           title=f"{hits[best][0]} of {hits[best][1]} pedestrians found, stamp "
+                           f"{best / 1e9:.1f} s")
                 return True
     return False

@@ -52,9 +52,11 @@ def parameter_options(defaults: Any) -> Callable:
         wrapper.__click_params__ = getattr(function, "__click_params__", [])
         for name, f in reversed(parameter_fields(defaults).items()):
             wrapper = _option(name, f, defaults)(wrapper)
+        named = [name for name, values in CONFIGURATIONS.items()
+                 if values.keys() & parameter_fields(defaults).keys()]
         return click.option("--config", type=click.Path(path_type=Path), metavar="YAML|NAME",
-                            help="ROS parameter file, as in config/, or one of "
-                            f"{', '.join(CONFIGURATIONS)}.")(wrapper)
+                            help="ROS parameter file, as in config/"
+                            + (f", or one of {', '.join(named)}." if named else "."))(wrapper)
 
     return decorate
 
@@ -67,7 +69,8 @@ def _option(name: str, f: dataclasses.Field, defaults: Any) -> Callable:
     flag = "--" + name.replace(".", "-").replace("_", "-")
     meta, default = f.metadata, flatten(defaults)[name]
     unit = f" [{meta['unit']}]" if meta["unit"] else ""
-    shown = ",".join(map(str, default)) if isinstance(default, tuple) else default
+    shown = (",".join(map(str, default)) if isinstance(default, tuple) else
+             f"{default:.4g}" if isinstance(default, float) else default)
     kind: Any = NumberList() if isinstance(default, tuple) else type(default)
     if meta["choices"]:
         kind = click.Choice(meta["choices"])

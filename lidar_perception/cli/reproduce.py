@@ -30,7 +30,8 @@ NAMES = ", ".join(STUDIES) or "none yet"
 @split_option
 @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True,
               help="Folder for the report; the same command resumes a run that was stopped.")
-@click.option("--jobs", type=click.IntRange(1), help="Processes. Default: one for each core.")
+@click.option("--jobs", type=click.IntRange(1), help="Number of processes. Default: one for each "
+                                                     "core.")
 @dask_option
 @limit_option
 @click.option("--force", is_flag=True, help="Start over, whatever is in --out.")
@@ -79,6 +80,6 @@ def reproduce(experiment: str, study: str | None, data: Path, split: Path | None
     console.print(f"report: {page}", soft_wrap=True)
 
 
-def _load(place: str) -> Any:
-    module, attribute = place.split(":")
+def _load(target: str) -> Any:
+    module, attribute = target.split(":")
     return getattr(importlib.import_module(module), attribute)

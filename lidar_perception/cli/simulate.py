@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
 import click
 
 from lidar_perception import __version__
-from lidar_perception.cli.data import opened
-from lidar_perception.data.frame import BOXES, Frame
+from lidar_perception.cli.data import a_path, opened, write_json
+from lidar_perception.data.frame import BOXES
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.runs.files import write_text
 from lidar_perception.runs.folder import is_finished, unfinished
 from lidar_perception.runs.terminal import console, track
-from lidar_perception.simulation.camera import FORWARD_CAMERA, labels_in_view
 from lidar_perception.simulation.dataset import LAYOUTS, Plan, write_frames
-from lidar_perception.simulation.drive import drive, longest_drive
+from lidar_perception.simulation.drive import longest_drive
 from lidar_perception.simulation.scene import KINDS, Streets
 from lidar_perception.simulation.sensor import GENERIC, SENSORS, sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
@@ -27,13 +23,13 @@ from lidar_perception.types import InputError
 
 
 @click.command()
-@click.option("--out", type=click.Path(path_type=Path), help="Folder to make.")
+@a_path("--out", "Folder to make.", "FOLDER")
 @click.option("--format", "layout", type=click.Choice(["mcap", *LAYOUTS]), default="mcap",
               show_default=True, help="A rosbag2 bag, or the folders of one of these data sets.")
 @click.option("--sensor", "sensor_name", default="hdl64e", show_default=True,
               help=f"One of {', '.join(SENSORS)}, or {GENERIC}.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
-              help="Scans; with --compare, one of each of as many streets.")
+              help="Number of scans; with --compare, one scan of each of that many streets.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
               help="Seed of the first street; the same seed gives the same bytes.")
 @click.option("--street", "kind", type=click.Choice(list(KINDS)), help="Streets of this kind only. "
@@ -41,24 +37,22 @@ from lidar_perception.types import InputError
 @click.option("--people", type=click.FloatRange(0), default=1.0, show_default=True,
               help="Pedestrians and cyclists, as a multiple of KITTI's.")
 @click.option("--streets-of", type=click.IntRange(1), metavar="N",
-              help="Scans of each street. Default: 1 for kitti, 20 s of "
-                   "driving for the others.")
+              help="Scans of each street. Default: 1 for kitti, a drive of 20 s for the others.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes that write the folders of a data "
               "set. Default: one for each core.")
 @click.option("--resume", is_flag=True, help="Resume an unfinished data set; needs identical "
               "settings.")
 @click.option("--force", is_flag=True, help="Replace an earlier simulated data set in --out.")
-@click.option("--compare", "real", type=click.Path(path_type=Path), metavar="PATH",
-              help="Compare with the labelled scans of a data set or bag; nothing is made.")
-@click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
-              help="With --compare: write every curve to this file.")
-@click.option("--png", type=click.Path(path_type=Path), metavar="FILE",
-              help="With --compare: draw every curve.")
+@a_path("--compare", "Compare simulated scans with the labelled ones of this data set or bag; "
+        "nothing is written to --out.", "PATH")
+@a_path("--json", "With --compare: write every curve to this file.")
+@a_path("--png", "With --compare: draw every curve.")
 def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed: int,
              kind: str | None, people: float, streets_of: int | None, jobs: int | None,
-             resume: bool, force: bool, real: Path | None, json_file: Path | None,
+             resume: bool, force: bool, compare: Path | None, json: Path | None,
              png: Path | None) -> None:
-    """Write labelled scans of simulated streets as a bag or data set, or measure how real they are.
+    """Write labelled scans of simulated streets as a bag or data set, or measure how realistic they
+    are.
 
     A file INCOMPLETE marks an unfinished data set; --resume resumes it.
 
@@ -68,13 +62,13 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
       lidar-perception simulate --format kitti --frames 1000 --out training_data
       lidar-perception simulate --compare /data/kitti/object --png realism.png
     """
-    if (out is None) == (real is None):
+    if (out is None) == (compare is None):
         raise click.UsageError("give either --out FOLDER or --compare PATH")
     streets = Streets(kind, people)
-    if real is not None:
-        _compare(real, frames, seed, streets, json_file, png)
+    if compare is not None:
+        _compare(compare, frames, seed, streets, json, png)
         return
-    if json_file or png:
+    if json or png:
         raise click.UsageError("--json and --png go with --compare")
     if resume and force:
         raise click.UsageError("--resume resumes, --force starts over: give one of them")
@@ -91,8 +85,7 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
 
 
 def _bag(out: Path, plan: Plan, force: bool) -> None:
-    scans = simulated_scans(plan.seed, plan.frames, plan.sensor, plan.streets_of,
-                            plan.streets)
+    scans = simulated_scans(plan.seed, plan.frames, plan.sensor, plan.streets_of, plan.streets)
     try:
         count = write_bag(out, track(scans, "simulating", plan.frames), force=force)
     except OSError as error:
@@ -139,21 +132,12 @@ def _compare(real: Path, frames: int, seed: int, streets: Streets, json_file: Pa
     chosen = evenly(recording)
     warm_up()
     measured = measured_scans(track(chosen, "measuring real scans", len(chosen)), PAPER)
-    made = track(_frames(seed, frames, streets), "measuring simulated scans", frames)
-    simulated = measured_scans(made, PAPER)
+    made = simulated_scans(seed, frames, streets_of=1, streets=streets)
+    simulated = measured_scans(track(made, "measuring simulated scans", frames), PAPER)
     content = {"data": str(real), "seed": seed, **side_by_side(measured, simulated)}
-    if json_file:
-        write_text(json_file, json.dumps(content, indent=1))
-    if png:
-        draw_realism(png, content)
+    write_json(json_file, content)
     print_realism(content, console)
     if png:
+        draw_realism(png, content)
         console.print(f"picture: {png}", soft_wrap=True)
 
-
-def _frames(seed: int, count: int, streets: Streets) -> Iterator[Frame]:
-    """The first scans of streets seed, seed + 1, ..., with labels of the objects whose centre the
-    camera sees, as in KITTI."""
-    for street in range(seed, seed + count):
-        scan, labels = next(iter(drive(street, 1, streets=streets)))
-        yield Frame.of(f"street {street}", scan, labels_in_view(labels), FORWARD_CAMERA)

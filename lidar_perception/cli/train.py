@@ -61,7 +61,7 @@ class Asked:
                                params.seed)
 
     def train(self, make_task: Callable, config: Any, params: Any, stream: Any, held_out: Any,
-              out: Path, place: Any) -> None:
+              out: Path, device: Any) -> None:
         """Train a network on a stream of samples and say how it ended. make_task: the one of its
         room; held_out: ReadScenes."""
         from lidar_perception.training.data import Batches
@@ -70,8 +70,8 @@ class Asked:
         from lidar_perception.training.sources import about_data
         batches = Batches(stream, params.batch, self.jobs, rank(), world())
         about = about_data(self.data, self.val, stream, held_out.sources, self.init)
-        task = make_task(config, params, batches, held_out, out, place, about, commit(), self.init)
-        progress = train(task, params, out, place, self.resume)
+        task = make_task(config, params, batches, held_out, out, device, about, commit(), self.init)
+        progress = train(task, params, out, device, self.resume)
         if rank() == 0:
             tell(progress, batches, out)
 
@@ -125,7 +125,7 @@ def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
     may_begin(asked.out, asked.resume)
     config, wanted, database = network_config(params.version, params.size), params.augment, None
     sources, held_out = asked.scenes(params)
-    with joined(chosen_device(asked.device)) as place:
+    with joined(chosen_device(asked.device)) as device:
         if wanted.database_scans and wanted.crowded and (
                 wanted.cars or wanted.pedestrians or wanted.cyclists or wanted.things):
             database = asked.out / "objects.npz"
@@ -136,7 +136,7 @@ def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
         prepare = Preparation(narrowed(config, params.ahead, params.aside), wanted,
                               params.data.min_points, database)
         asked.train(make_task, config, params, Stream(sources, prepare, params.seed),
-                    ReadScenes(held_out, frame_to_validate), asked.out, place)
+                    ReadScenes(held_out, frame_to_validate), asked.out, device)
 
 
 @train.command()
@@ -174,7 +174,7 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
     make_folder(asked.out)  # or say that it cannot be, before the data are prepared
     scenes = asked.scenes(params)
     cache = Path(params.data.cache) / "clusters" if params.data.cache else None
-    with joined(chosen_device(asked.device)) as place:
+    with joined(chosen_device(asked.device)) as device:
         for name in ABLATIONS if ablation else (params.network,):
             out = asked.out / name if ablation else asked.out
             if rank() == 0 and ablation:
@@ -186,7 +186,7 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
             prepare = ClusterPreparation(config, params.augment)
             asked.train(make_task, config, replace(params, network=name),
                         Stream(sources, prepare, params.seed),
-                        ReadScenes(held_out, clusters_to_validate), out, place)
+                        ReadScenes(held_out, clusters_to_validate), out, device)
         if ablation and rank() == 0:
             print_ablation(asked.out)
 

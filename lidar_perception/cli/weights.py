@@ -20,7 +20,7 @@ def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:
     """Turn PointPillars weights of OpenPCDet or mmdetection3d (1.x) into a checkpoint.
 
     Networks for KITTI with pillars of 0.16 m. The file is read as weights only; nothing in it is
-    run. What the projects read differently (anchors, headings, points of a pillar) is converted.
+    run. What the projects define differently (anchors, headings, points of a pillar) is converted.
 
     \b
     Examples:
@@ -38,7 +38,7 @@ def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:
 
 @click.group()
 def export() -> None:
-    """Write a network for another runtime."""
+    """Export a network for another runtime."""
 
 
 @export.command()
@@ -49,7 +49,7 @@ def onnx(weights: Path, out: Path) -> None:
     """Write a checkpoint of any version, size and classes as ONNX (needs the extra [onnx]).
 
     The graph takes points sorted into pillars and gives the raw outputs at every anchor; its
-    metadata says the rest. The detector reads the file in the place of a checkpoint.
+    metadata holds the rest. The detector takes the file instead of a checkpoint.
 
     \b
     Examples:

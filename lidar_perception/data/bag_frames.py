@@ -10,17 +10,20 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import Bag
-from lidar_perception.data.frame import BOXES, CAMERA, Frame, Recording
+from lidar_perception.data.frame import BOXES, CAMERA, POSES, Frame, Recording
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import decode
-from lidar_perception.wire.messages import calibration_of, to_frame, to_truth
-from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
+from lidar_perception.wire.messages import calibration_of, pose_of, to_frame, to_truth
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 from msg_utils.markers import from_marker_array
-from msg_utils.stamps import SECOND
+from msg_utils.stamps import SECOND, to_ns
 
-BESIDE = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}}  # what is known by these topics
+# What is known by these topics
+BESIDE = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}, POSES: {ODOMETRY}}
 
 
 def recognises(path: Path) -> bool:
@@ -104,11 +107,23 @@ class BagFrames(Sequence):
                     (infos if topic == CAMERA_INFO else transforms).append((time, msg))
         return truth, infos, transforms
 
+    @cached_property
+    def _poses(self) -> dict[int, Any]:
+        """The odometry by stamp."""
+        with Bag(self.path) as bag:
+            return {to_ns(msg.header.stamp): msg.pose.pose
+                    for _, _, msg in bag.messages({ODOMETRY} & set(bag.topics))}
+
+    def _pose(self, stamp: int) -> np.ndarray | None:
+        pose = self._poses.get(stamp)
+        return None if pose is None else pose_of(pose)
+
     def _frame(self, i: int, time: int, stamp: int, which: int,
                data: Callable[[], bytes]) -> Frame:
         name = str(stamp) if which == 1 else f"{stamp}-{which}"  # recorders may not set the stamp
         return Frame(name, stamp, partial(self._load, time, data), partial(self._truth, stamp),
-                     calibration=partial(self._calibration, time), index=i)
+                     calibration=partial(self._calibration, time),
+                     pose=partial(self._pose, stamp), index=i)
 
     def _load(self, time: int, data: Callable[[], bytes]) -> LidarFrame:
         try:

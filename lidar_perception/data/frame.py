@@ -39,7 +39,7 @@ class Frame:
     truth(): labelled objects in the LiDAR frame; point_truth(): labels of the points of load();
     calibration(): of the camera; pose(): (4, 4) float64 from the frame to a fixed one, metres;
     each None where there is none. sequence: the drive it belongs to, "" without drives; index: its
-    place there. sensor_height: metres above the ground. points, image: files, where there are
+    number there. sensor_height: metres above the ground. points, image: files, where there are
     any. native: what the protocol of this data set alone asks for.
     """
 

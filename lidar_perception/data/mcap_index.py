@@ -42,7 +42,7 @@ def check_index(path: Path) -> None:
 
 
 def _indexed(index: bytes) -> Iterator[tuple]:
-    """What the index says of each chunk: place, length, times, compression and sizes."""
+    """What the index says of each chunk: position, length, times, compression and sizes."""
     at = 0
     while at < len(index):
         kind, length = RECORD.unpack_from(index, at)
@@ -51,9 +51,9 @@ def _indexed(index: bytes) -> Iterator[tuple]:
             raise ValueError("its index is cut")
         if kind == CHUNK_INDEX:
             record = index[at:at + length]
-            *times, place, whole, offsets = struct.unpack_from("<QQQQI", record)
+            *times, start, whole, offsets = struct.unpack_from("<QQQQI", record)
             packing, sizes = _string(record, 36 + offsets + 8)
-            yield place, whole, *times, packing, *struct.unpack_from("<QQ", record, sizes)
+            yield start, whole, *times, packing, *struct.unpack_from("<QQ", record, sizes)
         at += length
 
 

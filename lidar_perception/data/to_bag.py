@@ -12,13 +12,15 @@ from lidar_perception.data.bag import LATCHED_QOS, BagWriter
 from lidar_perception.data.frame import Frame
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import camera_info, extrinsics, truth_markers
+from lidar_perception.wire.messages import camera_info, extrinsics, odometry, truth_markers
 from lidar_perception.wire.topics import (
     CAMERA_FRAME,
     CAMERA_INFO,
     EXTRINSICS,
     IMAGE,
     LIDAR_FRAME,
+    ODOMETRY,
+    ODOMETRY_FRAME,
     POINTS,
     TF_STATIC,
     TRUTH,
@@ -33,8 +35,9 @@ POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")
 def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False,
               force: bool = False, skipped: list[str] | None = None) -> int:
     """Write frames in order; returns how many. The calibration is written, latched, whenever it
-    changes, before the scan it belongs to: as CameraInfo, as TransformStamped and as TF. images:
-    the camera's PNG files too, where they are.
+    changes, before the scan it belongs to: as CameraInfo, as TransformStamped and as TF; poses,
+    where there are any, as the sensor's odometry. images: the camera's PNG files too, where they
+    are.
 
     A frame that cannot be read is left out, and the reason put into skipped; InputError without
     such a list, and where the bag cannot be written.
@@ -49,6 +52,7 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
         for frame in frames:
             try:
                 scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
+                pose = frame.pose()
             except InputError as error:
                 if skipped is None:
                     raise
@@ -58,6 +62,8 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
             if calibration is not None and not _same(calibration, written):
                 written = calibration
                 _write_calibration(bag, calibration, frame.stamp_ns, header)
+            if pose is not None:
+                _write_pose(bag, pose, frame.stamp_ns, header.frame_id)
             if truth is not None:
                 markers = truth_markers(truth, header, bag_message, shown)
                 shown = marker_keys(markers)
@@ -87,6 +93,13 @@ def _write_image(bag: BagWriter, image: Path, stamp_ns: int) -> None:
     header = header_message(stamp_ns, CAMERA_FRAME, bag_message)
     bag.write(IMAGE, stamp_ns, bag_message("sensor_msgs/msg/CompressedImage", header=header,
                                            format="png", data=np.fromfile(image, np.uint8)))
+
+
+def _write_pose(bag: BagWriter, pose: np.ndarray, stamp_ns: int, frame_id: str) -> None:
+    if ODOMETRY not in bag.channels:
+        bag.add_topic(ODOMETRY, "nav_msgs/msg/Odometry")
+    fixed = header_message(stamp_ns, ODOMETRY_FRAME, bag_message)
+    bag.write(ODOMETRY, stamp_ns, odometry(pose, fixed, frame_id, bag_message))
 
 
 def _write_calibration(bag: BagWriter, calibration: Calibration, stamp_ns: int,

@@ -9,13 +9,16 @@ from dataclasses import replace
 from time import perf_counter
 from typing import Any, Self, TypeVar
 
+import numpy as np
 import torch
 
 from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.contract import Found, require_columns
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
 from lidar_perception.param_fields import with_values
-from lidar_perception.types import InputError
+from lidar_perception.robot.crop import cropped
+from lidar_perception.types import InputError, LidarFrame
 
 Result = TypeVar("Result")
 
@@ -28,6 +31,22 @@ class NetworkDetector:
     def __init__(self, header: Header, device: torch.device, params: Any):
         self.header, self.config, self.params, self.device = header, header.config, params, device
         self.fallback: str | None = None
+
+    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
+                 cluster_ids: np.ndarray | None = None) -> Found:
+        """See contract.Detector. InputError also where CUDA is out of memory and the CPU may not
+        take over."""
+        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
+        if self.params.crop.enabled:
+            kept, frame = cropped(frame, self.params.crop)
+            ground, cluster_ids = (column if column is None else column.take(kept)
+                                   for column in (ground, cluster_ids))
+        return self.detect(frame, ground, cluster_ids)
+
+    def detect(self, frame: LidarFrame, ground: np.ndarray | None,
+               cluster_ids: np.ndarray | None) -> Found:
+        """The objects in a frame that is cropped."""
+        raise NotImplementedError
 
     @property
     def settings(self) -> NetworkParams:
@@ -57,7 +76,7 @@ class NetworkDetector:
         other.params = with_values(self.params, {"ground.sensor_pose.height": height})
         return other
 
-    def place(self, device: torch.device) -> None:
+    def bring_to(self, device: torch.device) -> None:
         """Bring the network, and what it needs, to a device."""
         raise NotImplementedError
 
@@ -65,7 +84,7 @@ class NetworkDetector:
         """Run on another device from now on, or on the CPU if it is out of memory."""
         self.device = device
         try:
-            self.place(device)
+            self.bring_to(device)
         except torch.cuda.OutOfMemoryError as error:
             self._fall_back(error)
 

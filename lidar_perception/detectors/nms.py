@@ -14,13 +14,13 @@ from lidar_perception.geometry import bev_iou
 from lidar_perception.types import CLASSES, Detections
 
 
-def best_of_each(boxes: np.ndarray, scores: np.ndarray, kinds: np.ndarray,
+def best_of_each(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray,
                  classes: tuple[str, ...], params: NmsParams) -> Detections:
-    """Detections, best first, of the boxes (N, 7) with scores (N,) that stay; kinds (N,) int are
+    """Detections, best first, of the boxes (N, 7) with scores (N,) that stay; labels (N,) int are
     indices in classes."""
-    kept = suppressed(boxes, scores, kinds, params.iou, params.across_classes)[:params.max_boxes]
+    kept = suppressed(boxes, scores, labels, params.iou, params.across_classes)[:params.max_boxes]
     ids = np.array([CLASSES.index(name) for name in classes])
-    return Detections.of(boxes[kept], ids[kinds[kept]], scores[kept])
+    return Detections.of(boxes[kept], ids[labels[kept]], scores[kept])
 
 
 def suppressed(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: float,

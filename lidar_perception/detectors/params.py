@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from lidar_perception.param_fields import Params, param
+from lidar_perception.types import CLASSES, Detections
 
 MIN_SCORE = 0.05  # of the boxes that average precision is made of: more than a robot would act on
 
@@ -13,46 +16,57 @@ MIN_SCORE = 0.05  # of the boxes that average precision is made of: more than a 
 class ScoreParams(Params):
     """The least score of a detection, by class."""
 
-    car: float = param(0.3, "Least score of a Car.", low=0.0, high=1.0)
-    pedestrian: float = param(0.3, "Least score of a Pedestrian.", low=0.0, high=1.0)
-    cyclist: float = param(0.3, "Least score of a Cyclist.", low=0.0, high=1.0)
-    other: float = param(0.3, "Least score of any other class of the weights.", low=0.0, high=1.0)
+    car: float = param(0.3, "Minimum score of a Car.", low=0.0, high=1.0)
+    pedestrian: float = param(0.3, "Minimum score of a Pedestrian.", low=0.0, high=1.0)
+    cyclist: float = param(0.3, "Minimum score of a Cyclist.", low=0.0, high=1.0)
+    other: float = param(0.3, "Minimum score of any other class of the weights.", low=0.0, high=1.0)
 
     @staticmethod
     def all_alike(score: float) -> ScoreParams:
         """One threshold for every class."""
         return ScoreParams(score, score, score, score)
 
+    def at_most(self, score: float) -> ScoreParams:
+        """These thresholds, but none above score."""
+        return ScoreParams(*(min(value, score) for value in vars(self).values()))
+
     def of_class(self, name: str) -> float:
         """The threshold of a class of types.CLASSES."""
         return getattr(self, name.lower(), self.other)
+
+    def passed(self, detections: Detections) -> np.ndarray:
+        """(K,) bool: which of K detections reach the threshold of their class."""
+        least = np.array([self.of_class(name) for name in CLASSES], np.float32)
+        return detections.scores >= least[detections.class_ids]
 
 
 @dataclass(frozen=True)
 class NmsParams(Params):
     """Non-maximum suppression: of boxes that overlap, seen from above, the best stays."""
 
-    iou: float = param(0.1, "A box that overlaps a better one by more than this is dropped.",
+    iou: float = param(0.1, "A box whose overlap with a better one exceeds this is dropped.",
                        low=0.0, high=1.0)
-    across_classes: bool = param(False, "Boxes of different classes compete too.")
-    candidates: int = param(500, "The best this many boxes take part.", low=1, high=10_000)
-    max_boxes: int = param(100, "The best this many are kept.", low=1, high=10_000)
+    across_classes: bool = param(False, "Boxes of different classes suppress each other too.")
+    candidates: int = param(500, "Only this many boxes, those with the highest scores, take part.",
+                            low=1, high=10_000)
+    max_boxes: int = param(100, "At most this many boxes are kept, those with the highest scores.",
+                           low=1, high=10_000)
 
 
 @dataclass(frozen=True)
 class NetworkParams(Params):
-    """Where a detector's network runs, and what counts as found."""
+    """Where a detector's network runs, and what counts as a detection."""
 
     weights: str = param("", "Checkpoint (.safetensors); empty: the one that comes with the "
                          "package.", fixed=True)
     device: str = param("auto", "cpu, cuda or cuda:N; auto: CUDA where there is one.", fixed=True)
     threads: int = param(0, "CPU threads of the network; fewer leave room for other programs. "
-                         "0 takes one for each core.", low=0, high=1024, fixed=True)
-    cpu_fallback: bool = param(True, "Go on with the CPU when CUDA runs out of memory; a node also "
-                               "where there is no CUDA at all.")
-    warm_up: bool = param(True, "Run once on made-up points before the first cloud.", fixed=True)
-    intensity_scale: float = param(1.0, "Factor on the intensity (0..1) before the network, for a "
-                                   "sensor that reports more or less than the one trained on; 0 "
+                         "0: one for each core.", low=0, high=1024, fixed=True)
+    cpu_fallback: bool = param(True, "Fall back to the CPU when CUDA runs out of memory; in a "
+                                     "node also when there is no CUDA device.")
+    warm_up: bool = param(True, "Run once on synthetic points before the first cloud.", fixed=True)
+    intensity_scale: float = param(1.0, "The intensity (0..1) is multiplied by this, for a sensor "
+                                        "that reports more or less than the one trained on; 0 "
                                    "leaves the intensity out.", low=0.0, high=1000.0)
     scores: ScoreParams = ScoreParams()
     nms: NmsParams = NmsParams()

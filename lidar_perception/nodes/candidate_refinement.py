@@ -14,7 +14,7 @@ from lidar_perception.nodes.inputs import SeedInput
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import CandidateOutputs
 from lidar_perception.nodes.runtime import CLOUD
-from lidar_perception.params import BoxNodeParams, RefinementNodeParams
+from lidar_perception.params import CANDIDATES, RefinementNodeParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import cluster_column, column, to_frame
 from msg_utils.stamps import to_ns
@@ -26,8 +26,7 @@ class CandidateRefinement(ManagedNode):
     """Ground snapping, height filter, STM and CPA."""
 
     def __init__(self, **options: Any):
-        super().__init__("candidate_refinement", RefinementNodeParams(), BoxNodeParams(),
-                         **options)
+        super().__init__("candidate_refinement", RefinementNodeParams(), CANDIDATES(), **options)
 
     def configure(self) -> None:
         self.outputs = CandidateOutputs(self)
@@ -37,6 +36,7 @@ class CandidateRefinement(ManagedNode):
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
             frame, indices = to_frame(msg)
+            frame = self.transforms.placing(msg.header).levelled(frame)
             ground, clusters = column(msg, "ground", indices), cluster_column(msg, indices)
             if clusters is None:
                 raise InputError("the cloud has no column 'cluster_id'; remap ~/input/points to "
@@ -46,4 +46,5 @@ class CandidateRefinement(ManagedNode):
             segmented = Segmented(indices, frame.xyz, ground, ids,
                                   grounded_boxes(frame.xyz, ground, ids,
                                                  self.params.boxes.shape), numbers)
-            self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params))
+            self.outputs.publish(msg.header, frame.xyz,
+                                 lambda: refined(segmented, source, self.params))

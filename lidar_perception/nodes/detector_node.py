@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
 from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.params import NetworkParams
 from lidar_perception.nodes.main import one_at_a_time
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import DetectionOutputs
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
 from lidar_perception.types import InputError, LidarFrame
-from lidar_perception.wire.messages import cluster_column, column, to_frame
+from lidar_perception.wire.messages import cluster_column, column
 from msg_utils.stamps import to_ns
 
 
@@ -73,16 +75,29 @@ class DetectorNode(ManagedNode):
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, indices = to_frame(msg, self.params.input.intensity_max)
+            frame, indices, params = self.sensor.frame(msg, with_intensity=True)
             ground, clusters = column(msg, "ground", indices), cluster_column(msg, indices)
-            self.detector.params = self.params
+            own = getattr(params, self.group)
+            self.detector.params = self._with_weak(params, own)
             found = self.detector(frame, ground=None if ground is None else ground > 0,
                                   cluster_ids=None if clusters is None else clusters[0])
-            self.outputs.publish(msg.header, found.detections, found.ms)
-        self._diagnose(frame, found)
+            weak = found.detections
+            if self.outputs.tracks is not None:
+                found = replace(found, detections=weak[own.scores.passed(weak)])
+            untracked = self.outputs.publish(msg.header, found.detections, found.ms, frame.xyz,
+                                             weak=weak)
+        self._diagnose(frame, found, params, untracked)
 
-    def _diagnose(self, frame: LidarFrame, found: Found) -> None:
-        problem = found.problem or self.sensor.problem(frame)
+    def _with_weak(self, params: Any, own: NetworkParams) -> Any:
+        """params, with thresholds that let through what a tracker needs as well."""
+        if self.outputs.tracks is None:
+            return params
+        low = own.scores.at_most(self.robot.tracking.min_score)
+        return replace(params, **{self.group: replace(own, scores=low)})
+
+    def _diagnose(self, frame: LidarFrame, found: Found, params: Any,
+                  untracked: str | None) -> None:
+        problem = found.problem or self.sensor.problem(frame, params) or untracked
         self.counts.update(detections=len(found.detections), device=str(self.detector.device))
         self.counts["best scores"] = " ".join(
             f"{name} {score:.2f}" for name, score in found.best.items())

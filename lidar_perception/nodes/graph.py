@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import random
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from time import monotonic
@@ -17,7 +19,7 @@ import yaml
 
 from lidar_perception.candidates.params import STEPS
 from lidar_perception.types import InputError
-from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, POINTS, TRUTH
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
 Graph = Mapping[str, Mapping[str, str]]  # node -> remapping of its topics
 
@@ -30,6 +32,8 @@ def relative(topic: str) -> str:
 CAMERA = {"~/input/camera_info": relative(CAMERA_INFO), "~/input/extrinsics": relative(EXTRINSICS)}
 TRUTH_IN = {"~/input/ground_truth": relative(TRUTH)}
 CLOUDS = {"~/input/points": relative(POINTS)}
+ODOMETRY_IN = {"~/input/odometry": relative(ODOMETRY)}
+TRACKER = "tracker"
 CLUSTERED = {"~/input/points": "clustering/output/points"}
 
 # Ground and clusters, once for all detectors ...
@@ -50,13 +54,33 @@ ALONE = {
 }
 
 
-def graph_of(detectors: Sequence[str], single: bool = False) -> dict[str, Mapping[str, str]]:
-    """The nodes of one or several detectors, each started once. InputError for an unknown one."""
+def graph_of(detectors: Sequence[str], single: bool = False,
+             tracking: bool = False) -> dict[str, Mapping[str, str]]:
+    """The nodes of one or several detectors, each started once; with tracking a tracker behind each
+    detector. InputError for an unknown one."""
     for name in detectors:
         if name not in BEHIND:
             raise InputError(f"detectors: '{name}' is none of {', '.join(BEHIND)}")
     parts = [(ALONE if single else BEHIND)[name] for name in detectors]
+    if tracking:
+        parts += [{tracker: _tracker_of(name, single)}
+                  for tracker, name in trackers_of(detectors).items()]
     return {k: v for part in ([] if single else [EXPERTS]) + parts for k, v in part.items()}
+
+
+def trackers_of(detectors: Sequence[str]) -> dict[str, str]:
+    """Name of each tracker -> its detector."""
+    return {f"{name}_{TRACKER}" if len(detectors) > 1 else TRACKER: name for name in detectors}
+
+
+def _tracker_of(detector: str, single: bool) -> dict[str, str]:
+    node, = (ALONE if single else BEHIND)[detector]
+    return {"~/input/detections": f"{node}/output/detections", **CLOUDS, **ODOMETRY_IN}
+
+
+def executable_of(node: str) -> str:
+    """What is started under the name of a node of a graph."""
+    return TRACKER if node.endswith(f"_{TRACKER}") else node
 
 
 def prefixed(graph: Graph, prefix: str) -> dict[str, dict[str, str]]:
@@ -132,16 +156,24 @@ def chosen_clouds(bag: str, types: Mapping[str, str], wanted: str = "") -> str:
                      f"{bag}: give the topic of the clouds with points:=TOPIC; {has}")
 
 
+_taken: list[Any] = []  # locks on the files of our domains, until this process ends
+
+
 def private_domain() -> int:
     """A ROS domain that nobody on this machine uses: 1..100, as the ports of higher ones are also
-    handed out to other programs."""
+    handed out to other programs. It stays this process's own while none of its nodes runs."""
     for domain in random.SystemRandom().sample(range(1, 101), 100):
+        name = f"lidar_perception-{os.getuid()}-domain-{domain}.lock"
+        lock = open(Path(tempfile.gettempdir()) / name, "w")
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 # Where the domain's first participant listens (RTPS 2.5, Section 9.6.2.3).
                 probe.bind(("", 7410 + 250 * domain))
             except OSError:
+                lock.close()
                 continue
+        _taken.append(lock)
         return domain
     raise InputError("all ROS domains 1..100 are in use on this machine")
 
@@ -163,16 +195,17 @@ class Processes:
 
     def start(self, node: str, remap: Mapping[str, str], params: Mapping[str, Any],
               namespace: str = "") -> None:
-        """Start an executable; in a namespace it is called NAMESPACE.NODE here."""
+        """Start a node of a graph; in a namespace it is called NAMESPACE.NODE here."""
         values = {k: list(v) if isinstance(v, tuple) else v for k, v in params.items()}
         values = {k: v for k, v in values.items() if v != []}  # an empty list has no type in YAML
         name = f"{namespace}.{node}" if namespace else node
         file = self.logs / f"{name}.param.yaml"
         file.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}))
-        rules = {**remap, **({"__ns": f"/{namespace}"} if namespace else {})}
+        rules = {**remap, **({"__ns": f"/{namespace}"} if namespace else {}),
+                 **({"__node": node} if executable_of(node) != node else {})}
         remapping = [word for rule in rules.items() for word in ("-r", ":=".join(rule))]
-        self.run(name, [sys.executable, "-m", "lidar_perception.nodes.main", node, "--ros-args",
-                        "--params-file", str(file), *remapping])
+        self.run(name, [sys.executable, "-m", "lidar_perception.nodes.main", executable_of(node),
+                        "--ros-args", "--params-file", str(file), *remapping])
 
     def run(self, name: str, command: Sequence[str]) -> None:
         """Start any program; what it writes goes to the log."""

@@ -40,10 +40,10 @@ class GroundSegmentation(ManagedNode):
 
     def on_points(self, msg: Any) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, usable = self.sensor.frame(msg)
-            camera = self.camera.get(frame.frame_id, self.params.view)
-            indices, seen = points_in_view(frame, camera, self.params.view)
-            ground = segment_ground(seen, self.params.ground)
+            frame, usable, params = self.sensor.frame(msg)
+            camera = self.camera.get(msg.header, params.view)
+            indices, seen = points_in_view(frame, camera, params.view)
+            ground = segment_ground(seen, params.ground)
             indices = usable.take(indices)
             self.points.publish(encode(add_columns(
                 msg, bag_message, ground=spread(ground, indices, msg, "u1"),
@@ -58,5 +58,5 @@ class GroundSegmentation(ManagedNode):
             self.counts.update(plane=" ".join(f"{v:.4f}" for v in plane),
                                plane_inlier_share=f"{inlier_share(seen.xyz, plane):.3f}",
                                ground_share=f"{ground.mean():.3f}")
-        problem = explain_nothing(len(frame), ground) or self.sensor.problem(frame)
+        problem = explain_nothing(len(frame), ground) or self.sensor.problem(frame, params)
         self.report(WARN if problem else OK, problem or "segmenting")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections import OrderedDict
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import Any
+
+import numpy as np
 
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import SeedParams
@@ -21,57 +23,59 @@ from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.nodes.graph import relative
 from lidar_perception.nodes.runtime import JUMP_NS, LATCHED, MARKERS, RELIABLE, LidarNode
+from lidar_perception.robot.poses import inverse, moved_points
+from lidar_perception.robot.tree import Missing
+from lidar_perception.tracking.ego import moved_boxes
 from lidar_perception.types import PEDESTRIAN, InputError
-from lidar_perception.wire.messages import camera_of, to_truth
+from lidar_perception.wire.messages import calibrated, camera_of, to_truth
 from lidar_perception.wire.params import ViewParams
-from lidar_perception.wire.topics import CLICK, TF_STATIC
+from lidar_perception.wire.topics import CLICK
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import to_ns
 
 
 class CameraInput:
-    """The camera from ~/input/camera_info and ~/input/extrinsics, or from /tf_static."""
+    """The camera from ~/input/camera_info and ~/input/extrinsics, or from TF."""
 
     def __init__(self, node: LidarNode):
         self.node = node
         self.info: Any = None
         self.transforms: dict[tuple[str, str], Any] = {}
-        self.cameras: dict[str, Camera] = {}  # by LiDAR frame
         node.input("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED)
         node.input("extrinsics", "geometry_msgs/msg/TransformStamped", self._on_transform,
                    LATCHED)
-        if importlib.util.find_spec("tf2_msgs"):
-            node.input(TF_STATIC, "tf2_msgs/msg/TFMessage",
-                       lambda m: [*map(self._on_transform, m.transforms)], LATCHED,
-                       private=False)
 
     def _on_info(self, msg: Any) -> None:
         self.info = msg
-        self.cameras.clear()
 
     def _on_transform(self, msg: Any) -> None:
         self.transforms[msg.header.frame_id, msg.child_frame_id] = msg
-        self.cameras.clear()
 
     def missing(self, cloud: Any) -> str | None:
         """What a cloud waits for; None if it can be cropped, or is not to be."""
         params = self.node.params.view
-        if not params.enabled or self.get(cloud.header.frame_id, params) is not None:
+        if not params.enabled or self.get(cloud.header, params) is not None:
             return None
         return "the camera's calibration: CameraInfo, and the transform from the LiDAR"
 
-    def get(self, lidar_frame: str, params: ViewParams) -> Camera | None:
-        """The camera as seen from lidar_frame; None until both messages are there, and while the
-        crop is off."""
-        if not params.enabled:
+    def get(self, header: Any, params: ViewParams) -> Camera | None:
+        """The camera for the levelled points of a cloud with this header; None until it is known
+        where it is, and while view is off."""
+        if not params.enabled or self.info is None:
             return None
-        if lidar_frame not in self.cameras and self.info is not None:
-            camera_frame = self.info.header.frame_id
-            transform = (self.transforms.get((lidar_frame, camera_frame))
-                         or self.transforms.get((camera_frame, lidar_frame)))
-            if transform is not None:
-                self.cameras[lidar_frame] = camera_of(self.info, transform)
-        return self.cameras.get(lidar_frame)
+        lidar, camera = header.frame_id, self.info.header.frame_id
+        transform = self.transforms.get((lidar, camera)) or self.transforms.get((camera, lidar))
+        level = self.node.transforms.placing(header).level
+        if transform is not None:
+            found = camera_of(self.info, transform)
+        else:
+            try:
+                pose = self.node.transforms.tree.lookup(camera, lidar, to_ns(header.stamp))
+            except Missing:
+                return None
+            found = calibrated(self.info, pose).camera()
+        return found if level is None else replace(
+            found, projection=found.projection @ inverse(level))
 
 
 class Paired:
@@ -154,7 +158,7 @@ class SeedInput:
         if self.params.source == "ground_truth":
             self.paired.add_cloud(to_ns(msg.header.stamp), msg)
         elif self.params.source == "click":
-            self.deliver(msg, partial(self._from_click, msg.header.frame_id))
+            self.deliver(msg, partial(self._from_click, msg.header))
         else:
             template = self._template()
             self.deliver(msg, fixed_seed(template) if self.params.source == "file"
@@ -174,22 +178,28 @@ class SeedInput:
             self.deliver(cloud, _missing("no ground truth with the stamp of this cloud; is it "
                                          "published, with the same header.stamp?"))
         else:
-            self.deliver(cloud, truth_seed(truth.of_class(PEDESTRIAN)))
+            people = truth.of_class(PEDESTRIAN)
+            level = self.node.transforms.placing(cloud.header).level
+            self.deliver(cloud, truth_seed(people if level is None
+                                           else moved_boxes(people, level)))
 
     def _on_click(self, msg: Any) -> None:
         self.click, self.clicked = msg, None
 
-    def _from_click(self, frame_id: str, segmented: Segmented) -> Seed:
+    def _from_click(self, header: Any, segmented: Segmented) -> Seed:
         if self.click is None:
             raise InputError("no seed yet: click a pedestrian (a PointStamped on "
                              f"{relative(CLICK)}, as RViz and Foxglove publish it)")
         if self.clicked is None:
-            if self.click.header.frame_id not in ("", frame_id):
-                raise InputError(f"the clicked point is in frame '{self.click.header.frame_id}' "
-                                 f"but the cloud in '{frame_id}'; set that as the fixed "
-                                 "frame and click again")
-            p = self.click.point
-            self.clicked = clicked_seed([p.x, p.y, p.z], self.params)(segmented)
+            p, frame_id = self.click.point, self.click.header.frame_id
+            try:
+                pose = self.node.transforms.to_level(header, frame_id)
+            except Missing as error:
+                raise InputError(f"the clicked point is in frame '{frame_id}' but the cloud in "
+                                 f"'{header.frame_id}' ({error}); set that as the fixed frame and "
+                                 "click again") from None
+            point = moved_points(np.array([[p.x, p.y, p.z]]), pose)[0]
+            self.clicked = clicked_seed(point, self.params)(segmented)
             self.node.get_logger().info(f"seed taken at ({p.x:.1f}, {p.y:.1f}, {p.z:.1f}), height "
                                         f"{self.clicked.height:.2f} m")
         return self.clicked

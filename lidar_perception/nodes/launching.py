@@ -15,16 +15,21 @@ from lidar_perception.nodes.graph import (
     ALONE,
     BEHIND,
     EXPERTS,
+    ODOMETRY_IN,
     SINGLE,
     STAGES,
+    TRACKER,
+    executable_of,
     graph_of,
     prefixed,
     relative,
+    trackers_of,
 )
 from lidar_perception.param_fields import flatten
 from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
+from lidar_perception.tracking.params import tracking_of
 from lidar_perception.types import InputError
-from lidar_perception.wire.topics import POINTS
+from lidar_perception.wire.topics import ODOMETRY, POINTS
 
 CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet"}
 NETWORKS = ("pointpillars", "pointnet")  # as their groups of parameters
@@ -37,6 +42,13 @@ ARGUMENTS = {
     "points": dict(default_value=relative(POINTS), description="The cloud's topic."),
     "reliability": dict(default_value="", description="auto, reliable or best_effort, for the "
                         "parameter input.reliability; empty: that of the parameter file."),
+    "base_frame": dict(default_value="", description="Parameter base_frame: the mounting comes "
+                       "from TF; empty: that of the parameter file."),
+    "target_frame": dict(default_value="", description="Parameter target_frame: of the boxes that "
+                         "go out; empty: that of the parameter file."),
+    "deskew": dict(default_value="", choices=["", "off", "odometry", "tf"], description="Parameter "
+                   "input.deskew: clouds are moved to their stamp; empty: that of the parameter "
+                   "file."),
     "config": dict(default_value="", description="Parameter file of all nodes; empty: "
                    "config/*.param.yaml of each detector."),
     "experts": dict(default_value="", description="Of ground and clusters: a parameter file, or "
@@ -46,6 +58,10 @@ ARGUMENTS = {
                     "that comes with the package."),
     "device": dict(default_value="", description="auto, cpu, cuda, cuda:N of the networks; empty: "
                    "that of the parameter file."),
+    "tracking": dict(**SWITCHES, description="Tracks of what each detector finds: a tracker behind "
+                     "each; with `single` in the detector's process."),
+    "odometry": dict(default_value=relative(ODOMETRY), description="Topic of the odometry, for "
+                     "the trackers and deskew."),
     "single": dict(**SWITCHES, description="Each detector in one process, which finds ground and "
                    "clusters itself."),
     "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
@@ -80,21 +96,35 @@ def graph_launch(config_folder: Path, detectors: str) -> LaunchDescription:
 def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     """The nodes that the values of the arguments ask for."""
     detectors, single = _detectors(value), value["single"] == "true"
-    prefix = value["name_prefix"]
-    graph = prefixed(graph_of(detectors, single), prefix)
+    prefix, tracking = value["name_prefix"], value["tracking"] == "true"
+    graph = prefixed(graph_of(detectors, single, tracking and not single), prefix)
     files = {node: value["config"] or _own_file(name, config_folder) for name in detectors
              for node in (ALONE if single else BEHIND)[name]}
     files |= dict.fromkeys(EXPERTS, _expert_file(value, config_folder))
+    trackers = trackers_of(detectors)
+    files |= dict.fromkeys(trackers, value["config"] or str(
+        config_folder / f"{TRACKER}.param.yaml"))
+    topics = {relative(POINTS): value["points"], relative(ODOMETRY): value["odometry"]}
+    inside = ODOMETRY_IN if (tracking and single) or value["deskew"] == "odometry" else {}
     viewer = [_viewer(value, config_folder)] if value["rviz"] == "true" else []
     return viewer + [Node(
-        package="lidar_perception", executable=node.removeprefix(prefix), name=node,
+        package="lidar_perception", executable=executable_of(node.removeprefix(prefix)), name=node,
         namespace=value["namespace"] or None, output="screen",
-        parameters=[files[node.removeprefix(prefix)],
+        parameters=[*_tracked(trackers.get(node.removeprefix(prefix))),
+                    files[node.removeprefix(prefix)],
                     _given(value, node.removeprefix(prefix), detectors)],
-        remappings=[(a, value["points"] if b == relative(POINTS) else b)
-                    for a, b in remap.items()],
+        remappings=[(a, topics.get(b, b)) for a, b in {**remap, **inside}.items()],
         ros_arguments=["--log-level", value["log_level"]],
     ) for node, remap in graph.items()]
+
+
+def _tracked(detector: str | None) -> list[dict[str, Any]]:
+    """What the tracker behind a detector has instead of the defaults; files stand above it."""
+    if detector is None:
+        return []
+    default = flatten(tracking_of(""))
+    return [{f"tracking.{name}": number for name, number in flatten(tracking_of(detector)).items()
+             if number != default[name]}]
 
 
 def conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
@@ -188,10 +218,15 @@ def _shown(topic: str, value: dict[str, str]) -> str:
 def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, Any]:
     """Parameters that arguments set."""
     given: dict[str, Any] = {"use_sim_time": value["use_sim_time"] == "true"}
+    if value["tracking"] == value["single"] == "true":
+        given["tracking.enabled"] = True
     if value["autostart"] == "false":
         given["autostart"] = False
     if value["reliability"]:
         given["input.reliability"] = value["reliability"]
+    if value["deskew"]:
+        given["input.deskew"] = value["deskew"]
+    given |= {name: value[name] for name in ("base_frame", "target_frame") if value[name]}
     detector = node.removesuffix("_detector")
     if detector in NETWORKS:
         weights = _weights(value["weights"], [d for d in detectors if d in NETWORKS])

@@ -14,6 +14,7 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 from rclpy.node import Node
 
 from lidar_perception.nodes.runtime import ERROR, OK, WAITING, WARN, LidarNode
+from lidar_perception.nodes.transforms import Transforms
 from lidar_perception.types import InputError
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -50,6 +51,10 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
     def configure(self) -> None:
         """Make outputs and inputs, and load what is needed. InputError if it is not to be had."""
         raise NotImplementedError
+
+    def _configure(self) -> None:
+        self.transforms = Transforms(self)
+        self.configure()
 
     def start(self) -> None:
         if not self.robot.autostart:
@@ -97,7 +102,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         if self._retry_at is None:
             self.report(WARN, "configuring", expected=True)
         before = self.state
-        if problem := self._problem_of(self.configure):
+        if problem := self._problem_of(self._configure):
             self._forget_configuration()
             self.report(ERROR, f"{UNCONFIGURED}, so nothing comes of this node: {problem}")
             return FAILURE

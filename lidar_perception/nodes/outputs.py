@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,9 @@ from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import class_by_diagonal
 from lidar_perception.ground.above import obstacles
 from lidar_perception.nodes.runtime import CLOUD, MARKERS, OK, RELIABLE, WARN, LidarNode
+from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, has_detections_3d
+from lidar_perception.robot.poses import inverse
+from lidar_perception.tracking.ego import moved_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import detection_markers, thin_cloud
@@ -20,6 +23,16 @@ from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys, to_marker_array
 from msg_utils.messages import message_class, ros_message
 from msg_utils.stamps import SECOND, header_message, to_ns
+
+
+def placed(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[Any, np.ndarray]:
+    """header and boxes (K, 7), found in the levelled frame of a cloud with this header, in the
+    frame that the results go out in."""
+    placing = node.transforms.placing(header)
+    if placing.frame_id != header.frame_id:
+        header = header_message(to_ns(header.stamp), placing.frame_id, bag_message)
+    return header, boxes if placing.out is None else moved_boxes(boxes, placing.out).astype(
+        boxes.dtype)
 
 
 def lifetime_ns(node: LidarNode) -> int:
@@ -37,7 +50,7 @@ class ClusterBoxes:
 
     def publish(self, header: Any, boxes: Callable[[], np.ndarray]) -> None:
         if self.publisher.get_subscription_count():
-            found = boxes()
+            header, found = placed(self.node, header, boxes())
             ids = range(1, len(found) + 1)  # as in the column cluster_id
             markers = to_marker_array(found, ["cluster"] * len(found), header=header,
                                       make=bag_message, ids=ids, previous=self.shown,
@@ -63,12 +76,15 @@ class Obstacles:
         self.node, self.publisher = node, node.output("obstacles", CLOUD)
 
     def publish(self, msg: Any, xyz: np.ndarray, ground: np.ndarray, indices: np.ndarray) -> None:
-        """Of points (M, 3) that are ground (M,) or not, at indices (M,) in the cloud msg."""
+        """Of levelled points (M, 3) that are ground (M,) or not, at indices (M,) in the cloud
+        msg, in whose frame they are published."""
         if self.publisher.get_subscription_count():
-            chosen = obstacles(xyz, ground, self.node.robot.obstacles,
-                               self.node.params.ground.sensor_pose)
+            placing = self.node.transforms.placing(msg.header)
+            params, _ = self.node.transforms.mounted(self.node.params, placing)
+            chosen = obstacles(xyz, ground, self.node.robot.obstacles, params.ground.sensor_pose)
             self.publisher.publish(encode(thin_cloud(
-                msg, xyz.compress(chosen, axis=0), indices.compress(chosen), bag_message)))
+                msg, placing.in_cloud(xyz.compress(chosen, axis=0)), indices.compress(chosen),
+                bag_message)))
 
 
 class DetectionMarkers:
@@ -80,6 +96,7 @@ class DetectionMarkers:
 
     def publish(self, header: Any, detections: Detections,
                 clusters: np.ndarray | None = None) -> None:
+        """In the frame of header, as they are."""
         message = detection_markers(detections, header, bag_message, self.shown,
                                     lifetime_ns(self.node), clusters)
         self.shown = marker_keys(message)
@@ -87,23 +104,31 @@ class DetectionMarkers:
 
 
 class DetectionOutputs:
-    """~/output/detections (and ~/output/detections_3d where vision_msgs is installed), and the time
-    of each step."""
+    """~/output/detections (and ~/output/detections_3d where vision_msgs is installed), the time
+    of each step, and with the parameter tracking.enabled the tracks."""
 
     def __init__(self, node: LidarNode, steps: tuple[str, ...]):
+        self.node = node
         self.markers = DetectionMarkers(node, "detections")
         self.detections_3d = None
-        if importlib.util.find_spec("vision_msgs"):
+        if has_detections_3d():
             self.detections_3d = node.create_publisher(
-                message_class("vision_msgs/msg/Detection3DArray"), "~/output/detections_3d",
-                RELIABLE)
+                message_class(DETECTIONS_3D), "~/output/detections_3d", RELIABLE)
         self.step_times = {step: node.create_publisher(Float64, f"~/debug/{step}_ms", RELIABLE)
                            for step in steps}
+        self.tracks = (TrackOutputs(node, lambda: node.robot, clouds=True)
+                       if node.robot.tracking.enabled else None)
 
     def publish(self, header: Any, detections: Detections, ms: Mapping[str, float],
-                clusters: np.ndarray | None = None) -> None:
-        """Publish detections, with the cluster_id of each where it is known, and the times of the
-        steps that are known."""
+                xyz: np.ndarray, *, weak: Detections | None = None,
+                clusters: np.ndarray | None = None) -> str | None:
+        """Publish detections of the scan xyz (N, 3), with the cluster_id of each where it is known,
+        the times of the steps that are known, and where there is a tracker the tracks; it is given
+        `weak`, with those below the thresholds too, if there are any. All are of the levelled
+        cloud; tracks are in the cloud's frame. Returns what was wrong for the tracker."""
+        cloud, found = header, detections if weak is None else weak
+        header, boxes = placed(self.node, header, detections.boxes)
+        detections = replace(detections, boxes=boxes)
         self.markers.publish(header, detections, clusters)
         if self.detections_3d is not None and self.detections_3d.get_subscription_count():
             self.detections_3d.publish(to_detection_array(
@@ -113,6 +138,12 @@ class DetectionOutputs:
         for step, publisher in self.step_times.items():
             if step in ms:
                 publisher.publish(Float64(data=ms[step]))
+        if self.tracks is None:
+            return None
+        placing = self.node.transforms.placing(cloud)
+        if placing.level is not None:
+            found = replace(found, boxes=moved_boxes(found.boxes, inverse(placing.level)))
+        return self.tracks.publish(cloud, found, placing.in_cloud(xyz))
 
 
 class CandidateOutputs:
@@ -125,19 +156,22 @@ class CandidateOutputs:
                        for stage in ("stage1", "stage2")}
         self.final = DetectionOutputs(node, steps)
 
-    def publish(self, header: Any, find: Callable[[], Candidates],
+    def publish(self, header: Any, xyz: np.ndarray, find: Callable[[], Candidates],
                 problem: str | None = None) -> None:
-        """Publish what find() gives; where it raises InputError, no candidates and the reason.
-        problem is what is known to be wrong with the frame already."""
+        """Publish what find() gives for the scan xyz (N, 3); where it raises InputError, no
+        candidates and the reason. problem is what is known to be wrong with the frame already."""
         try:
             candidates = find()
         except InputError as error:
             candidates, problem = Candidates.none(), problem or str(error)
         for stage, markers in self.stages.items():
             if markers.publisher.get_subscription_count():
-                markers.publish(header, getattr(candidates, stage))
-        self.final.publish(header, candidates.final, candidates.ms, candidates.clusters)
-        self._diagnose(candidates, problem)
+                found = getattr(candidates, stage)
+                place, boxes = placed(self.node, header, found.boxes)
+                markers.publish(place, replace(found, boxes=boxes))
+        untracked = self.final.publish(header, candidates.final, candidates.ms, xyz,
+                                       clusters=candidates.clusters)
+        self._diagnose(candidates, problem or untracked)
 
     def _diagnose(self, candidates: Candidates, problem: str | None) -> None:
         self.node.counts["candidates"] = len(candidates.final)

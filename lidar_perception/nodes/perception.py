@@ -14,7 +14,7 @@ from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes, Obstacles
 from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.params import PerceptionRobotParams
+from lidar_perception.params import PERCEPTION
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import spread
 from msg_utils.point_cloud2 import add_columns
@@ -28,7 +28,7 @@ class Perception(ManagedNode):
     between them. ~/output/points, boxes and obstacles are made only while somebody subscribes."""
 
     def __init__(self, **options: Any):
-        super().__init__("perception", PipelineParams(), PerceptionRobotParams(), **options)
+        super().__init__("perception", PipelineParams(), PERCEPTION(), **options)
 
     def configure(self) -> None:
         self.camera = CameraInput(self)
@@ -42,13 +42,12 @@ class Perception(ManagedNode):
 
     def on_cloud(self, msg: Any, source: SeedSource) -> None:
         with self.frame(to_ns(msg.header.stamp)):
-            frame, usable = self.sensor.frame(msg)
-            segmented = segment(frame, self.camera.get(frame.frame_id, self.params.view),
-                                self.params)
+            frame, usable, params = self.sensor.frame(msg)
+            segmented = segment(frame, self.camera.get(msg.header, params.view), params)
             problem = (explain_nothing(len(frame), segmented.ground, segmented.cluster_ids)
-                       or self.sensor.problem(frame))
-            self.outputs.publish(msg.header, lambda: refined(segmented, source, self.params),
-                                 problem)
+                       or self.sensor.problem(frame, params))
+            self.outputs.publish(msg.header, frame.xyz,
+                                 lambda: refined(segmented, source, params), problem)
         indices = usable.take(segmented.indices)
         if self.points.get_subscription_count():
             self.points.publish(encode(add_columns(

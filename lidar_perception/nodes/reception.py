@@ -96,10 +96,10 @@ class Arrivals:
 
 
 class Reception:
-    """A subscription of clouds. deliver gets the newest ones that are waiting (as many as the
-    parameter input.queue says), as bytes, one at a time, and says what the cloud still needs, or
-    None. While it is patient (up to input.max_wait seconds) it does not work on a cloud that needs
-    something, and gets it again at try_again().
+    """A subscription of clouds, or of arrays made of them. deliver gets the newest ones that are
+    waiting (as many as the parameter input.queue says), as bytes, one at a time, and says what the
+    cloud still needs, or None. While it is patient (up to input.max_wait seconds) it does not work
+    on a cloud that needs something, and gets it again at try_again().
 
     It is RELIABLE where all publishers offer that, as of an ordinary driver's 2 MB a best-effort
     subscriber gets less than half; a BEST_EFFORT publisher, also one that comes later, makes it
@@ -108,8 +108,9 @@ class Reception:
 
     def __init__(self, node: Node, kind: type, name: str,
                  deliver: Callable[[bytes, bool], str | None],
-                 params: Callable[[], ReceptionParams]):
+                 params: Callable[[], ReceptionParams], what: str = "cloud"):
         self.node, self.kind, self.deliver, self.params = node, kind, deliver, params
+        self.what = what  # one message, for people
         self.topic = node.resolve_topic_name(name)
         self.fixed = (f"qos_overrides.{self.topic}.subscription.reliability"
                       in node._parameter_overrides)
@@ -225,29 +226,30 @@ class Reception:
         if len(publishers) > 1:
             names = ", ".join(sorted(_name(p) for p in publishers))
             found.append(("publishers", WARN, f"{len(publishers)} publishers on {self.topic} "
-                          f"({names}): their clouds are mixed; remap all but one"))
+                          f"({names}): their {self.what}s are mixed; remap all but one"))
         if self.waiting and self.needs is not None:
-            return [*found, ("waiting", WARN, f"the cloud on {self.topic} waits for {self.needs}")]
+            return [*found, ("waiting", WARN, f"the {self.what} on {self.topic} waits for "
+                             f"{self.needs}")]
         silent = monotonic() - (self.last_time or monotonic())
         if silent > params.error_after:
             stale = silent > params.stale_after
             limit = params.stale_after if stale else params.error_after
             return [*found, ("stale" if stale else "silent", STALE if stale else ERROR,
-                             f"no cloud on {self.topic} for more than {limit:g} s: is the sensor "
-                             "running, and connected?")]
+                             f"no {self.what} on {self.topic} for more than {limit:g} s: is the "
+                             "sensor running, and connected?")]
         expected, rate = params.rate or self.arrivals.learned, self.arrivals.rate()
         if expected and rate and rate < params.min_rate * expected:
-            found.append(("rate", WARN, f"{rate:.1f} clouds a second on {self.topic} where "
+            found.append(("rate", WARN, f"{rate:.1f} {self.what}s a second on {self.topic} where "
                           f"{expected:.1f} are expected (input.rate): is the sensor overloaded?"))
         sent, lost, dropped = self.arrivals.recent()
         enough = max(sent, SHARE_OF)  # one of the first two clouds is no half of them
         if lost > params.max_lost * enough:
-            found.append(("lost", WARN, f"{lost} of the last {sent} clouds on {self.topic} were "
-                          f"lost on the way; {self._remedy(publishers)}"))
+            found.append(("lost", WARN, f"{lost} of the last {sent} {self.what}s on {self.topic} "
+                          f"were lost on the way; {self._remedy(publishers)}"))
         if dropped > params.max_dropped * enough:
-            found.append(("dropped", WARN, f"{dropped} of the last {sent} clouds on {self.topic} "
-                          "were dropped, as newer ones came before their turn: the work on one "
-                          "takes too long for this machine"))
+            found.append(("dropped", WARN, f"{dropped} of the last {sent} {self.what}s on "
+                          f"{self.topic} were dropped, as newer ones came before their turn: the "
+                          "work on one takes too long for this machine"))
         return found
 
     def _remedy(self, publishers: list[Any]) -> str:

@@ -7,14 +7,16 @@ from pathlib import Path
 from statistics import median
 
 from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.graph import (
-    SINGLE,
-    STAGES,
+    TRACKER,
     Processes,
     cloud_topic,
     evaluation,
+    graph_of,
     outputs_in_use,
     private_domain,
+    relative,
     result_topics,
     wait_for,
 )
@@ -22,8 +24,9 @@ from lidar_perception.nodes.main import use_large_shared_memory
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors, progress
 from lidar_perception.types import InputError
-from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, TRUTH
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, TRUTH
 
+TRACKS = f"/{TRACKER}/output/tracks"
 START_TIMEOUT = 180.0   # seconds for all nodes to compile, come up and find each other
 AHEAD = 2               # clouds at a time, so that one stage works while another does
 SILENCE_TIMEOUT = 10.0  # seconds without a result after the last cloud
@@ -43,14 +46,18 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
     use_large_shared_memory()
     from lidar_perception.nodes.watch import Watch
 
-    graph, topics = dict(SINGLE if single else STAGES), result_topics(single)
+    graph = graph_of(["candidates"], single, tracking=True)
+    topics = {**result_topics(single), "tracks": TRACKS}
     domain = private_domain()
     scores = out / "logs" / "scores.json"
     evaluator_remap, evaluator_params = evaluation(scores.resolve(), single)
     recorded = [cloud_topic(single), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
+    with Bag(drive) as bag:
+        moves = ODOMETRY in bag.topics
     with Processes(out / "logs", domain) as processes, Watch(domain, topics["final"]) as watch:
         for node, remap in graph.items():
-            processes.start(node, remap, {**flatten(params), "input.queue": AHEAD})
+            own = {} if node == TRACKER else {**flatten(params), "input.queue": AHEAD}
+            processes.start(node, remap, own)
         processes.start("evaluator", evaluator_remap, evaluator_params)
         if record:
             processes.start("bag_recorder", {}, {"bag": str((out / "result").resolve()),
@@ -65,6 +72,8 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
                              f"{list(watch.diagnostics) or 'none'} reported; see {out}/logs")
         # The watch hears the clouds too, and the recorder the labels.
         rules = wait_for(single, points=2, truth=2 + record)
+        rules += [f"{relative(topics['final'])}:={3 + record}"]  # watch, evaluator, tracker
+        rules += [relative(ODOMETRY)] if moves else []
         processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
                                            "wait_for": rules,
                                            "follow": [] if real_time else [topics["final"]],
@@ -81,9 +90,10 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
                                       or not processes.ended("bag_player")):
                 before = watch.frames
                 watch.until(finished, SILENCE_TIMEOUT, lambda: processes.check("bag_player"))
-        # The evaluator is behind the results by as much as its own work takes.
-        watch.until(lambda: int(watch.value_of("evaluator", "frames") or 0) >= watch.frames,
-                    SILENCE_TIMEOUT)
+        # These are behind the results by as much as their own work takes.
+        for node in ("evaluator", TRACKER):
+            watch.until(lambda n=node: int(watch.value_of(n, "frames") or 0) >= watch.frames,
+                        SILENCE_TIMEOUT)
         memory = processes.memory_mb()
         codes = processes.stop(timeout=30)
     if failed := {node: code for node, code in codes.items() if code}:

@@ -19,6 +19,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.serialization import deserialize_message
 from rclpy.task import Future
 from std_msgs.msg import Float64
 
@@ -47,8 +48,11 @@ class LidarNode(Node):
 
     params is a dataclass of params.py; its fields are declared as ROS parameters, and a change at
     run time goes through the same checks. So is robot, what the node has besides its algorithm's
-    numbers: CloudNodeParams or BoxNodeParams where it takes clouds.
+    numbers: CloudNodeParams, BoxNodeParams ... where it takes clouds; transforms are its frames
+    then.
     """
+
+    transforms: Any = None  # of transforms.py
 
     def __init__(self, name: str, params: Any, robot: Any = None, **options: Any):
         super().__init__(name, **options)
@@ -99,21 +103,23 @@ class LidarNode(Node):
               needs: Callable[[Any], str | None] = lambda _: None) -> None:
         """Subscribe to ~/input/TOPIC, or with private=False to the name as it is. callback gets
         rosbags' class of the message, the one that offline code reads from bags: it views the
-        received bytes, where rclpy's own class copies them several times. Without qos the topic
-        is received as reception.py does: needs says what a cloud still waits for, which comes by
-        another input, and None if nothing."""
+        received bytes, where rclpy's own class copies them several times. Types that rosbags does
+        not come with are of rclpy's class. Without qos the topic is received as reception.py does:
+        needs says what a cloud still waits for, which comes by another input, and None if nothing.
+        """
         name = f"~/input/{topic}" if private else topic
         _warm_up_type(type_name)
 
         def guarded(data: bytes, patient: bool = False) -> str | None:
             missing = None
             try:
-                msg = decode(data, type_name)
+                msg = _decoded(data, type_name)
                 if type_name == CLOUD:
                     self.frame_id = msg.header.frame_id
-                missing = needs(msg)
+                    missing = self.transforms.missing(msg)
+                missing = missing or needs(msg)
                 if missing is None or not patient:
-                    callback(msg)
+                    callback(self.transforms.corrected(msg) if type_name == CLOUD else msg)
             except InputError as error:
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {error}")
             except Exception as error:
@@ -128,8 +134,9 @@ class LidarNode(Node):
         def lost(event: Any) -> None:
             self.counts["lost"] += event.total_count_change
 
-        kind = message_class(type_name)
-        added = (Reception(self, kind, name, guarded, lambda: self.robot.input) if qos is None else
+        kind, what = message_class(type_name), "cloud" if type_name == CLOUD else "array"
+        added = (Reception(self, kind, name, guarded, lambda: self.robot.input, what)
+                 if qos is None else
                  Subscribed(self, lambda: self.create_subscription(
                      kind, name, guarded, qos, raw=True,
                      event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
@@ -185,8 +192,8 @@ class LidarNode(Node):
         """The state, and what is wrong with the inputs and with the node's name."""
         level, message = self.state
         values = dict(self.counts, last_stamp_ns=self.last_stamp_ns)
-        for reception in self._receptions():
-            values.update(reception.values())
+        for source in self._sources():
+            values.update(source.values())
         if self.times:
             values["processing_ms_median"] = f"{np.median(self.times):.1f}"
         for publisher in self._outputs:
@@ -205,9 +212,13 @@ class LidarNode(Node):
     def _receptions(self) -> list[Reception]:
         return [made for made in self.inputs if isinstance(made, Reception)]
 
+    def _sources(self) -> list[Any]:
+        """What has values and problems of its own."""
+        return [*self._receptions(), *([self.transforms] if self.transforms else [])]
+
     def _problems(self) -> list[Problem]:
         """Each is logged when it comes up, at most once in LOG_PERIOD."""
-        found = [p for reception in self._receptions() for p in reception.problems()]
+        found = [p for source in self._sources() for p in source.problems()]
         name, namespace = self.get_name(), self.get_namespace()
         if self.get_node_names_and_namespaces().count((name, namespace)) > 1:
             found.append(("name", WARN, f"another node is called {self.get_fully_qualified_name()} "
@@ -238,6 +249,12 @@ class LidarNode(Node):
 
     def close(self) -> None:
         """Called once before the node is destroyed."""
+
+
+def _decoded(data: bytes, type_name: str) -> Any:
+    if type_name in typestore().fielddefs:
+        return decode(data, type_name)
+    return deserialize_message(data, message_class(type_name))
 
 
 class Subscribed:

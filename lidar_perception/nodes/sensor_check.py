@@ -1,13 +1,17 @@
-"""Whether the parameters fit the sensor: its height and the scale of its intensity."""
+"""A cloud as the core takes it, and whether the parameters fit the sensor: its height, the scale of
+its intensity."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import height_problem, measured_height
+from lidar_perception.robot.crop import cropped
+from lidar_perception.robot.params import CropParams
 from lidar_perception.types import LidarFrame
 from lidar_perception.wire.messages import intensity_problem, to_frame
 
@@ -16,25 +20,34 @@ CLOUDS = 5  # on which the height is measured
 
 class SensorCheck:
     """Measures the sensor's height on the first clouds, and again when sensor_pose changes. node
-    has the parameter groups input and ground."""
+    has the parameter groups input, crop and ground."""
 
     def __init__(self, node: Any):
         self.node = node
         self.pose: SensorPoseParams | None = None
         self.heights: list[float | None] = []
 
-    def frame(self, msg: Any) -> tuple[LidarFrame, np.ndarray]:
-        """to_frame(msg), with the intensity where the ground method uses it."""
+    def frame(self, msg: Any, with_intensity: bool = False) -> tuple[LidarFrame, np.ndarray, Any]:
+        """The cropped and, with base_frame, levelled frame of a cloud; the indices (N,) of its
+        points in the cloud; and the node's parameters as they are for such a frame. The intensity
+        is read where it is asked for, or the ground method uses it."""
         params = self.node.params
-        reads_intensity = params.ground.method == "patchwork"
-        return to_frame(msg, params.input.intensity_max if reads_intensity else None)
+        reads_intensity = with_intensity or params.ground.method == "patchwork"
+        frame, indices = to_frame(msg, params.input.intensity_max if reads_intensity else None)
+        placing = self.node.transforms.placing(msg.header)
+        params, base = self.node.transforms.mounted(params, placing)
+        if params.crop.enabled:
+            kept, frame = cropped(frame, params.crop, base)
+            self.node.counts["cropped"] = len(indices) - len(kept)
+            indices, params = indices.take(kept), replace(params, crop=CropParams())
+        return placing.levelled(frame), indices, params
 
-    def problem(self, frame: LidarFrame) -> str | None:
-        """What does not fit, with the remedy; None if nothing is known against the parameters."""
-        return self._height_problem(frame) or intensity_problem(frame)
+    def problem(self, frame: LidarFrame, params: Any) -> str | None:
+        """What does not fit the parameters that frame() gave, with the remedy; None if nothing is
+        known against them."""
+        return self._height_problem(frame, params.ground.sensor_pose) or intensity_problem(frame)
 
-    def _height_problem(self, frame: LidarFrame) -> str | None:
-        pose = self.node.params.ground.sensor_pose
+    def _height_problem(self, frame: LidarFrame, pose: SensorPoseParams) -> str | None:
         if pose != self.pose:
             self.pose, self.heights = pose, []
         if len(self.heights) < CLOUDS:

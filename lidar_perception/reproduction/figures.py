@@ -32,16 +32,16 @@ def draw(figure: Figure, kind: str = "svg", *, dark: bool = False) -> bytes:
         FigureCanvasAgg(canvas)
         axes = canvas.subplots(rows, columns, squeeze=False).ravel()
         shown = {}
-        for panel, place in zip(figure.panels, axes):
+        for panel, axis in zip(figure.panels, axes):
             for line, color in zip(panel.lines, _colors(panel.lines)):
-                shown.setdefault(line.label, _plot(place, line, color))
-            place.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
+                shown.setdefault(line.label, _plot(axis, line, color))
+            axis.set(title=panel.title, xlabel=panel.x_label, ylabel=panel.y_label)
             if "%" in panel.y_label:
-                place.set_ylim(0, 102)
-            place.grid(linewidth=0.6)
-            place.spines[["top", "right"]].set_visible(False)
-        for place in axes[len(figure.panels):]:
-            place.set_visible(False)
+                axis.set_ylim(0, 102)
+            axis.grid(linewidth=0.6)
+            axis.spines[["top", "right"]].set_visible(False)
+        for axis in axes[len(figure.panels):]:
+            axis.set_visible(False)
         canvas.legend(shown.values(), shown.keys(), ncols=1 if beside else 2 * columns,
                       loc="outside right upper" if beside else "outside lower center")
         stream = BytesIO()
@@ -66,5 +66,5 @@ def _plot(axes, line: Line, color: str):
     style = dict(linestyle="--", marker="D", markerfacecolor="none") if line.dashed else dict(
         marker="o", markersize=3)
     if line.dashed and len(x) == 2 and x[0] == x[1]:
-        style["marker"] = ""  # an upright line marks a place on the x axis
+        style["marker"] = ""  # an upright line marks a value on the x axis
     return axes.plot(x, y, color=color, linewidth=1.4, **style)[0]

@@ -69,13 +69,14 @@ def journal(folder: Path, plan: dict[str, Any], *, force: bool = False) -> Itera
         for old in folder.glob(f".{NAME}.*.tmp"):  # of a process that was killed while it wrote
             old.unlink()
         write_text(path, "\n".join([_head(plan), *lines.values()]))
-        with open(path, "ab") as stream:
-            opened = Journal(path, plan, lines, stream)
-            try:
-                yield opened
-            finally:
+        stream = open(path, "ab")
+        opened = Journal(path, plan, lines, stream)
+        try:
+            yield opened
+        finally:
+            for last in (opened.sync, stream.close):
                 with suppress(OSError):  # of a disk that is full; add() has said so
-                    opened.sync()
+                    last()
 
 
 def _head(plan: dict[str, Any]) -> str:

@@ -45,9 +45,9 @@ def at_recall(values: np.ndarray, objects: int, official: bool = False) -> np.nd
         curve[:len(best)] = best
         return curve
     # The first true positive with which that recall is reached.
-    place = np.maximum((np.arange(FEW) * objects + STEPS - 1) // STEPS - 1, 0)
-    reached = place < len(best)
-    curve[reached] = best[place[reached]]
+    index = np.maximum((np.arange(FEW) * objects + STEPS - 1) // STEPS - 1, 0)
+    reached = index < len(best)
+    curve[reached] = best[index[reached]]
     return curve
 
 

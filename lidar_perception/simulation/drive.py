@@ -65,12 +65,6 @@ def scans(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
     return (scan_at(seed, i, sensor, streets) for i in range(frames))
 
 
-def drive(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E, streets: Streets = ANY
-          ) -> Iterator[tuple[LidarFrame, GroundTruth]]:
-    """The frames of scans() with their truth."""
-    return ((scan.frame, scan.truth) for scan in scans(seed, frames, sensor, streets))
-
-
 def scan_at(seed: int, i: int, sensor: Sensor, streets: Streets = ANY) -> SimulatedScan:
     """Scan i of the drive along street seed, whatever was asked for before."""
     return scans_at([(seed, i)], sensor, streets)[0]

@@ -16,19 +16,19 @@ Triple = list[torch.Tensor]
 
 def through_leaves(start: Triple, way: Triple, half: Triple, enter: torch.Tensor,
                    leave: torch.Tensor, density: torch.Tensor, plant: torch.Tensor,
-                   place: torch.Tensor) -> torch.Tensor:
+                   key: torch.Tensor) -> torch.Tensor:
     """(n,) range in metres at which leaves stop rays, inf where they pass: delta tracking (Woodcock
     et al., 1965) through a grid of full and empty cells.
 
     start, way: three tensors (n,) each, rays in the frames of unit shapes; half: the half sizes of
     these, m; enter, leave: ranges, m; density: mean, 1/m. plant (n,) int64: the same for all rays
-    of a plant, and all along a drive; place (n,) int64: of the random numbers of a pair.
+    of a plant, and all along a drive; key (n,) int64: of the random numbers of a pair.
     """
     met = torch.full_like(enter, torch.inf)
     t, pair = enter.clip(min=0.0), torch.arange(len(enter), device=enter.device)
     cells = [h / CLUMP for h in half]
     for step in range(STEPS):
-        t = t - torch.log(uniform(10 + step, place)) * FILLED / density
+        t = t - torch.log(uniform(10 + step, key)) * FILLED / density
         cell = plant
         for s, w, c in zip(start, way, cells):
             cell = mixed(cell + torch.floor((s + t * w) * c).to(torch.int64))
@@ -36,7 +36,7 @@ def through_leaves(start: Triple, way: Triple, half: Triple, enter: torch.Tensor
         stops = (uniform(1, cell) < FILLED) & inside
         met[pair[stops]] = t[stops]
         on = torch.nonzero(inside & ~stops)[:, 0]
-        t, leave, density, plant, place, pair = (
-            x[on] for x in (t, leave, density, plant, place, pair))
+        t, leave, density, plant, key, pair = (
+            x[on] for x in (t, leave, density, plant, key, pair))
         start, way, cells = ([x[on] for x in v] for v in (start, way, cells))
     return met

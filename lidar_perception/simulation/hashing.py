@@ -1,14 +1,14 @@
-"""Random numbers that depend on nothing but their place: a counter-based hash in torch."""
+"""Random numbers that depend on nothing but a key: a counter-based hash in torch."""
 
 from __future__ import annotations
 
 import torch
 
 
-def uniform(seed: int, place: torch.Tensor) -> torch.Tensor:
-    """float64 in the open interval 0 .. 1 for each int64 place; the same on every device, in any
+def uniform(seed: int, key: torch.Tensor) -> torch.Tensor:
+    """float64 in the open interval 0 .. 1 for each int64 key; the same on every device, in any
     order and in any batch. The finalizer is splitmix64's (Steele, Lea and Flood, OOPSLA 2014)."""
-    bits = _shifted(mixed(mixed(place) + signed(seed * 0x9E3779B97F4A7C15)), 12)
+    bits = _shifted(mixed(mixed(key) + signed(seed * 0x9E3779B97F4A7C15)), 12)
     return (bits.to(torch.float64) + 0.5) * 2.0 ** -52
 
 

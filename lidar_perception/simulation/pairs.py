@@ -42,8 +42,8 @@ class CastScene(NamedTuple):
     matrix (9, P): to the unit shape; offset (3, P): where that takes the frame's origin; drift
     (3, P): what it takes the sensor's velocity against the solid to; moving: whether that matters.
     kind (P,) int8; density, transmission, reflectance (P,); owner, semantic (P,) int32.
-    direction (3, R); since (R,) s after the stamp; lift (R,) m over the sensor's origin; place (R,)
-    int64: the ray's number in its view. salt (P,) and ray_salt (R,) int64: of random numbers."""
+    direction (3, R); since (R,) s after the stamp; lift (R,) m over the sensor's origin; number
+    (R,) int64: of the ray in its view. salt (P,) and ray_salt (R,) int64: of random numbers."""
 
     matrix: torch.Tensor
     offset: torch.Tensor
@@ -58,7 +58,7 @@ class CastScene(NamedTuple):
     direction: torch.Tensor
     since: torch.Tensor
     lift: torch.Tensor
-    place: torch.Tensor
+    number: torch.Tensor
     salt: torch.Tensor
     ray_salt: torch.Tensor
 
@@ -81,7 +81,7 @@ def scene_of(views: Sequence[View], sensor: Sensor, device: str) -> CastScene:
 
     turns = [rays(sensor, view.motion) for view in views]
     seeds = [mixed(torch.tensor(signed(view.seed))) for view in views]
-    place = torch.arange(sensor.columns * sensor.rings).repeat(len(views)).to(device)
+    number = torch.arange(sensor.columns * sensor.rings).repeat(len(views)).to(device)
     to_unit = [np.swapaxes(v.solids.axes, 1, 2) / v.solids.half[:, :, None] for v in views]
     drift = [np.einsum("pij,pj->pi", m, np.asarray(v.motion.velocity) - v.solids.velocity)
              for m, v in zip(to_unit, views)]
@@ -98,11 +98,11 @@ def scene_of(views: Sequence[View], sensor: Sensor, device: str) -> CastScene:
                           for t in turns]).T.contiguous(),
         since=tensor([np.tile(t.since, sensor.rings) for t in turns]),
         lift=tensor([np.repeat(sensor.origins()[:, 2], sensor.columns)] * len(views)),
-        place=place,
+        number=number,
         salt=torch.cat([(torch.arange(len(v.solids)) << 32) + seed
                         for v, seed in zip(views, seeds)]).to(device),
         ray_salt=torch.stack(seeds).repeat_interleave(sensor.columns * sensor.rings).to(device)
-        + place)
+        + number)
 
 
 def runs_of(views: Sequence[View], sensor: Sensor, device: str) -> Runs:
@@ -150,9 +150,9 @@ def _meetings(kind, scene, runs, chunk, only):
             inside = torch.ones_like(ray, dtype=torch.bool)
         enter, leave = span(kind, *unit_rays(scene, solid, ray, lift))
         inside &= (enter <= leave) & (leave > 0)
-        place = torch.nonzero(inside, as_tuple=True)
-        solid, ray = solid[place[0]].reshape(-1), ray[place]
-        enter, leave = enter[place], leave[place]
+        met = torch.nonzero(inside, as_tuple=True)
+        solid, ray = solid[met[0]].reshape(-1), ray[met]
+        enter, leave = enter[met], leave[met]
         t = stop(scene, solid, ray, enter, leave)
         met = torch.nonzero(t < leave)[:, 0]
         yield solid[met], ray[met], t[met]
@@ -205,12 +205,12 @@ def stop(scene: CastScene, solid: torch.Tensor, ray: torch.Tensor, enter: torch.
         t[leafy] = through_leaves(
             *unit_rays(scene, s, r, scene.lift[r]), half, enter[leafy], leave[leafy],
             scene.density[s], plant=scene.reflectance[s].view(torch.int64),
-            place=scene.salt[s] + scene.place[r])
+            key=scene.salt[s] + scene.number[r])
     clear = scene.transmission[solid]
     glass = torch.nonzero(clear > 0)[:, 0]
     if len(glass):
-        place = scene.salt[solid[glass]] + scene.place[ray[glass]]
-        t[glass] = torch.where(uniform(2, place) < clear[glass], torch.inf, t[glass])
+        key = scene.salt[solid[glass]] + scene.number[ray[glass]]
+        t[glass] = torch.where(uniform(2, key) < clear[glass], torch.inf, t[glass])
     return t
 
 
@@ -232,8 +232,8 @@ def shade(scene: CastScene, solid: torch.Tensor, ray: torch.Tensor
     brightness = shine(scene.reflectance[solid], cosine)
     # Leaves face anywhere: so much the neighbours of vegetation's points differ on SemanticKITTI.
     leaf = torch.nonzero(scene.density[solid] < torch.inf)[:, 0]
-    solid, place = solid[leaf], scene.salt[solid[leaf]] + scene.place[ray[leaf]]
-    brightness[leaf] = shine(scene.reflectance[solid], 0.5) * (0.5 + uniform(6, place))
+    solid, key = solid[leaf], scene.salt[solid[leaf]] + scene.number[ray[leaf]]
+    brightness[leaf] = shine(scene.reflectance[solid], 0.5) * (0.5 + uniform(6, key))
     cosine[leaf] = 1.0
     return far, brightness, cosine
 

@@ -94,7 +94,7 @@ def _first(views: Sequence[View], scene: CastScene, runs: Runs, sensor: Sensor, 
            only: torch.Tensor | None = None) -> tuple[Met, list[np.ndarray]]:
     """What all rays meet, or those of only (R,) bool; and how many rays meet each view's owners."""
     ground = _grounds(views, scene, sensor, only)
-    keys = _key(ground.range, torch.full_like(scene.place, NO_SOLID))
+    keys = _key(ground.range, torch.full_like(scene.number, NO_SOLID))
     rays, pairs = len(keys), []
     for solid, ray, t in meetings(scene, runs, chunk, only):
         near = torch.nonzero(t <= sensor.max_range)[:, 0]

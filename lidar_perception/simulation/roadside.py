@@ -10,7 +10,7 @@ from lidar_perception.simulation.actors import Actor, Room, prop
 from lidar_perception.simulation.shapes import furniture, vegetation
 from lidar_perception.simulation.shapes.buildings import building
 from lidar_perception.simulation.solids import extents
-from lidar_perception.simulation.street import CORNER, Kind, Side, Street, scattered, spread
+from lidar_perception.simulation.street import CORNER, Kind, Side, Street, evenly_spaced, scattered
 
 PLANTS = (70, 71)  # of SemanticKITTI
 BORDERS = (*[vegetation.hedge] * 3, *[furniture.fence] * 2, furniture.wall)
@@ -95,7 +95,7 @@ def _garden(rng, side: Side) -> Iterator[Actor]:
 def _verge(rng, side: Side) -> Iterator[Actor]:
     """A strip of grass with rows of trees, and something far behind it."""
     deep = rng.uniform(4, 14)
-    for along in spread(rng, side.length, rng.uniform(7, 14)):
+    for along in evenly_spaced(rng, side.length, rng.uniform(7, 14)):
         yield side.put(_tree(rng), along, side.walk + rng.uniform(1.2, 1.8))
     shrubs, depth = ((150, 0.35 * deep) if rng.random() < 0.7 else (rng.uniform(2, 50), deep))
     for along in scattered(rng, side.length, shrubs):
@@ -136,7 +136,7 @@ def _square(rng, side: Side) -> Iterator[Actor]:
     """Facades that stand back behind trees, planters and bollards."""
     deep = rng.uniform(5, 14)
     yield from _facade(rng, side._replace(walk=side.walk + deep))
-    for along in spread(rng, side.length, rng.uniform(6, 10)):
+    for along in evenly_spaced(rng, side.length, rng.uniform(6, 10)):
         yield side.put(_tree(rng), along, side.walk + deep * 0.5)
     for along in scattered(rng, side.length, 8):
         yield side.put(clutter(rng), along, side.walk + rng.uniform(0, deep),
@@ -156,7 +156,7 @@ def _furniture(rng, side: Side, kind: Kind) -> Iterator[Actor]:
             yield side.put(furniture.traffic_light(rng), along, edge + 0.3, -np.pi / 2)
     for rate, made in ((kind.lamp, furniture.lamp), (kind.tree, _street_tree)):
         if rate and rng.random() < 0.8:
-            for along in spread(rng, side.length, 100 / rate):
+            for along in evenly_spaced(rng, side.length, 100 / rate):
                 yield side.put(made(rng), along, edge + rng.uniform(0.2, 0.4), -np.pi / 2)
     for along in scattered(rng, side.length, 2.2 * kind.clutter):
         made = clutter(rng, rural)

@@ -199,7 +199,7 @@ def parked_width(crossing: tuple[float, float]) -> float:
     return PARALLEL if crossing[1] - crossing[0] > 8.0 else 0.0
 
 
-def spread(rng, length: float, spacing: float) -> np.ndarray:
+def evenly_spaced(rng, length: float, spacing: float) -> np.ndarray:
     """Places along a length, spacing apart in the mean."""
     places = np.arange(rng.uniform(0, spacing), length, spacing)
     return np.clip(places + rng.uniform(-0.2, 0.2, len(places)) * spacing, 0, length)

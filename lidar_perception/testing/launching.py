@@ -9,6 +9,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.graph import private_domain
 from lidar_perception.nodes.main import use_large_shared_memory
 from lidar_perception.types import InputError
@@ -44,14 +45,14 @@ def description(*actions: Any) -> Any:
     process and what it starts are on a ROS domain that nobody else uses, and on this machine only,
     so that no test ever talks to a robot. InputError where launch_testing is not installed."""
     try:
+        from launch.launch_description import LaunchDescription
         from launch_testing.actions import ReadyToTest
-
-        from launch import LaunchDescription
     except ModuleNotFoundError as error:
         raise _missing(error) from None
     os.environ.update(ROS_DOMAIN_ID=str(private_domain()),
                       ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
     use_large_shared_memory()
+    warm_up()  # what nodes compile is cached then; on a fresh machine that can outlast a wait
     return LaunchDescription([*actions, ReadyToTest()])
 
 

@@ -17,15 +17,15 @@ LAST_LINES = 60  # of a log, where a test failed
 class NodesUnderTest(Processes):
     """Processes whose logs are shown when a test fails while they run."""
 
-    open: list[NodesUnderTest] = []
+    entered: list[NodesUnderTest] = []  # of all tests
 
     def __enter__(self) -> NodesUnderTest:
         super().__enter__()
-        self.open.append(self)
+        self.entered.append(self)
         return self
 
     def __exit__(self, *error: Any) -> None:
-        self.open.remove(self)
+        self.entered.remove(self)
         super().__exit__(*error)
 
     def start_graph(self, detectors: Sequence[str], params: Any = None, *, single: bool = False,
@@ -71,7 +71,7 @@ class NodesUnderTest(Processes):
 def logs_of_all() -> list[tuple[str, str]]:
     """Title and last lines of the log of each process that any test runs now."""
     found = []
-    for processes in NodesUnderTest.open:
+    for processes in NodesUnderTest.entered:
         for name, process in processes.running.items():
             code = process.poll()
             state = "runs" if code is None else f"ended with code {code}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from lidar_perception.classes import TABLE
 from lidar_perception.param_fields import Params, param
@@ -58,6 +58,10 @@ class NeutralParams(Params):
     vehicle: float = param(0.35, "Of vehicles.", low=0.001, high=0.999)
     pedestrian: float = param(0.3, "Of pedestrians.", low=0.001, high=0.999)
     cyclist: float = param(0.3, "Of cyclists.", low=0.001, high=0.999)
+
+
+# Of detectors whose scores mean something else than those of PointPillars, see docs/tracking.md.
+NEUTRAL = {"pointnet": NeutralParams(pedestrian=0.5)}
 
 
 @dataclass(frozen=True)
@@ -117,3 +121,27 @@ class TrackingParams(Params):
     def kinds(self) -> tuple[MotionParams, ...]:
         """By KINDS."""
         return self.vehicle, self.pedestrian, self.cyclist
+
+
+EGO_SOURCES = ("auto", "odometry", "kiss_icp", "none")
+
+
+@dataclass(frozen=True)
+class EgoParams(Params):
+    """Where a node learns how the sensor moves."""
+
+    source: str = param(
+        "auto", "auto: odometry as soon as some comes. odometry: ~/input/odometry. kiss_icp: from "
+        "the scans on ~/input/points, by the extra [odometry]. none: tracks are relative to the "
+        "sensor.", choices=EGO_SOURCES, fixed=True)
+    max_gap: float = param(0.5, "Between two poses, and after the last one, a pose is taken to be "
+                           "known for so long; beyond, max_ego_gap of the tracker goes on.",
+                           unit="s", low=0.0, high=100.0)
+
+
+def tracking_of(detector: str, params: TrackingParams = TrackingParams()) -> TrackingParams:
+    """params for a detector, as LOAD of detectors/open.py or the graph names it: with its own
+    neutral scores, if it has any and params has the defaults there."""
+    if params.existence.neutral != NeutralParams() or detector not in NEUTRAL:
+        return params
+    return replace(params, existence=replace(params.existence, neutral=NEUTRAL[detector]))

@@ -95,3 +95,13 @@ class Tracks:
 
     def __len__(self) -> int:
         return len(self.ids)
+
+    def pose_covariances(self) -> np.ndarray:
+        """(K, 6, 6) float64 of x y z and the turns about them, as geometry_msgs has it; a box
+        turns about z alone."""
+        found = np.zeros((len(self), 6, 6))
+        flat, heading = [0, 1, 5], [0, 1, 4]  # x y and the turn about z; there, and in covariances
+        found[:, np.array(flat)[:, None], flat] = self.covariances[:, np.array(heading)[:, None],
+                                                                   heading]
+        found[:, 2, 2] = self.height_variances
+        return found

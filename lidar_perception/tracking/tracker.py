@@ -21,12 +21,14 @@ class Tracker:
     """tracker(detections, stamp_ns, pose) -> Tracks.
 
     params may be replaced at any time. After each call problem says what was wrong with the frame,
-    or is None; born and ended count tracks since the start, and alive those there are.
+    or is None, and taken whether the frame took part; born and ended count tracks since the start,
+    and alive those there are.
     """
 
     def __init__(self, params: TrackingParams = TrackingParams()) -> None:
         self.params = params
         self.problem: str | None = None
+        self.taken = False
         self.born = self.ended = 0
         self._states, self._ego = States.none(), Ego.unknown()
         self._stamp: int | None = None
@@ -36,6 +38,11 @@ class Tracker:
     def alive(self) -> int:
         """How many tracks there are, those that are not reported too."""
         return len(self._states)
+
+    @property
+    def pose(self) -> np.ndarray:
+        """(4, 4) the last frame in the fixed one."""
+        return self._ego.pose
 
     def reset(self) -> None:
         """End all tracks; ids go on."""
@@ -53,6 +60,7 @@ class Tracker:
         """
         self.problem = None
         seconds = self._seconds(int(stamp_ns))
+        self.taken = seconds is not None
         if seconds is None:
             return self._reported(np.zeros(len(self._states), bool))
         self._move_ego(pose, seconds)

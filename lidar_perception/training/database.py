@@ -73,24 +73,24 @@ def with_objects(scene: TrainingScene, database: Database, params: AugmentParams
     there is no ground, it is left out. What was in its box goes, and what is in its shadow.
     """
     points, taken = scene.points, scene.boxes
-    kinds = []
+    class_ids = []
     free = _free_depths(points)
-    for kind, number in ((CAR, params.cars), (PEDESTRIAN, params.pedestrians),
+    for class_id, number in ((CAR, params.cars), (PEDESTRIAN, params.pedestrians),
                          (CYCLIST, params.cyclists), (THING, params.things)):
-        known = np.flatnonzero(database.class_ids == kind)
-        missing = number - int((scene.class_ids == kind).sum())
+        known = np.flatnonzero(database.class_ids == class_id)
+        missing = number - int((scene.class_ids == class_id).sum())
         for i in rng.permutation(known)[:max(DRAWN * missing, 0)]:
             if missing == 0:
                 break
             box, own = database.boxes[i], database.points_of(i)
-            if kind == THING:
+            if class_id == THING:
                 box, own = varied(box, own, params, rng)
             put = _put(box, own, points, taken, free, low, high, rng)
             if put is not None:
                 points, taken = put
-                kinds.append(kind)
+                class_ids.append(class_id)
                 missing -= 1
-    new = np.array(kinds, scene.class_ids.dtype)
+    new = np.array(class_ids, scene.class_ids.dtype)
     objects = new != THING
     return replace(scene, points=points,
                    boxes=np.concatenate([scene.boxes, taken[len(scene.boxes):][objects]]),

@@ -18,10 +18,10 @@ class LoopParams(Params):
     steps: int = param(0, "Steps of the optimizer. 0: as many as the epochs have.", low=0,
                        high=10**9)
     epochs: float = param(80.0, "Passes over the data, if steps is 0.", low=0.001, high=1e5)
-    batch: int = param(4, "Scenes of a step, on each device.", low=1, high=4096)
+    batch: int = param(4, "Scenes in a step, on each device.", low=1, high=4096)
     lr: float = param(0.003, "Highest learning rate.", low=1e-9, high=10.0)
-    warm_share: float = param(0.4, "Share of the steps in which the learning rate rises; it falls "
-                              "in the rest.", low=0.01, high=0.99)
+    warm_share: float = param(0.4, "Share of the steps during which the learning rate rises; then "
+                                   "it falls.", low=0.01, high=0.99)
     weight_decay: float = param(0.01, "Weight decay of AdamW.", low=0.0, high=1.0)
     clip: float = param(10.0, "Largest norm of the gradient; larger ones are clipped. 0: none.",
                         low=0.0, high=1e6)
@@ -34,7 +34,8 @@ class LoopParams(Params):
                      choices=("auto", "bf16", "fp16", "off"))
     validate_epochs: float = param(5.0, "Epochs between validations, if validate_steps is 0.",
                                    low=0.001, high=1e5)
-    validate_steps: int = param(0, "Steps between validations.", low=0, high=10**9)
+    validate_steps: int = param(0, "Steps between validations; 0: validate_epochs decides.",
+                                low=0, high=10**9)
     save_steps: int = param(200, "Steps between saves of the state that a resumed run needs.",
                             low=1, high=10**9)
     log_steps: int = param(10, "Steps between logged losses.", low=1, high=10**6)
@@ -70,30 +71,31 @@ class NoiseParams(Params):
 class AugmentParams(NoiseParams):
     """How scenes are changed. 0 switches a change off."""
 
-    crowded: float = param(0.7, "Probability that objects of other scenes are pasted into a scene. "
-                           "The rest stay as they are.", low=0.0, high=1.0)
-    cars: int = param(10, "Cars of other scenes are pasted in until there are so many in the "
-                      "network's range.", low=0, high=100)
+    crowded: float = param(0.7, "Probability that objects from other scenes are pasted into a "
+                                "scene.", low=0.0, high=1.0)
+    cars: int = param(10, "Cars from other scenes are pasted in until there are this many in the "
+                          "network's range.", low=0, high=100)
     pedestrians: int = param(8, "Likewise pedestrians.", low=0, high=100)
     cyclists: int = param(8, "Likewise cyclists.", low=0, high=100)
-    things: int = param(12, "So many objects that resemble a standing person, such as posts, are "
+    things: int = param(12, "This many objects that resemble a standing person, such as posts, are "
                         "pasted in as background.", low=0, high=100)
-    things_stretch: float = param(0.5, "They are stretched or shrunk, in width and height, by "
-                                  "factors up to exp(this).", low=0.0, high=3.0)
-    things_intensity: float = param(0.8, "Their intensities are multiplied by up to exp(this), or "
-                                    "divided.", low=0.0, high=3.0)
-    things_shine: float = param(0.25, "Probability that a part of one is retroreflective, as "
+    things_stretch: float = param(0.5, "These objects are stretched or shrunk, in width and "
+                                       "height, by factors of up to exp(this).", low=0.0, high=3.0)
+    things_intensity: float = param(0.8, "Their intensities are multiplied or divided by up to "
+                                         "exp(this).", low=0.0, high=3.0)
+    things_shine: float = param(0.25, "Probability that a part of such an object is "
+                                      "retroreflective, as "
                                 "signs are.", low=0.0, high=1.0)
-    database_scans: int = param(2000, "Pasted objects come from at most so many scenes.", low=0,
+    database_scans: int = param(2000, "Pasted objects come from at most this many scenes.", low=0,
                                 high=10**6)
-    object_turn: float = param(0.157, "Each object is turned by up to this.", unit="rad", low=0.0,
+    object_turn: float = param(0.157, "Each object is rotated by up to this.", unit="rad", low=0.0,
                                high=3.1416)
     object_shift: float = param(0.25, "Each object is shifted along x and y; standard deviation.",
                                 unit="m", low=0.0, high=5.0)
     flip: float = param(0.5, "Probability that left and right are swapped.", low=0.0, high=1.0)
-    turn: float = param(0.785, "The scene is turned about the sensor by up to this; one that is "
-                        "labelled all around by any angle, unless this is 0.", unit="rad", low=0.0,
-                        high=3.1416)
+    turn: float = param(0.785, "The scene is rotated about the sensor by up to this; by any angle "
+                               "if it is labelled all around, unless this is 0.",
+                        unit="rad", low=0.0, high=3.1416)
     scale: float = param(0.05, "The scene is scaled by up to this share.", low=0.0, high=0.5)
     dropout: float = param(0.3, "Up to this share of the points is dropped.", low=0.0, high=0.99)
     intensity: float = param(0.15, "Intensities are multiplied by 1 plus or minus up to this, and "
@@ -108,10 +110,10 @@ class AugmentParams(NoiseParams):
 class DataParams(Params):
     """Which scenes."""
 
-    scans: int = param(4000, "Simulated scans of an epoch.", low=1, high=10**7)
-    street_scans: int = param(4, "Scans taken of each street, spread over a drive of 20 s.",
+    scans: int = param(4000, "Simulated scans in an epoch.", low=1, high=10**7)
+    street_scans: int = param(4, "Scans of each street, spread over a drive of 20 s.",
                               low=1, high=100)
-    val_scans: int = param(200, "Simulated scans of a validation, of other streets.", low=1,
+    val_scans: int = param(200, "Simulated scans in a validation, of other streets.", low=1,
                            high=10**6)
     sensor: str = param("hdl64e", "Sensor of the simulated scans: the name of a preset, or "
                         "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE. It is mounted at 1.73 m.")
@@ -120,13 +122,13 @@ class DataParams(Params):
     val_people: float = param(1.0, "Likewise on the streets validated on.", low=0.0, high=100.0)
     cache: str = param("", "Folder that keeps simulated scans, which take about a second to make. "
                        "Empty: none.")
-    cache_gb: float = param(20.0, "Size up to which scans are added to the cache.", unit="GB",
+    cache_gb: float = param(20.0, "Scans are added to the cache until it has this size.", unit="GB",
                             low=0.0, high=1e6)
     val_share: float = param(PAPER_SHARE, "Share of the frames held out for validation, drawn by "
                              "the seed, where neither --val nor --split is given.", low=0.0,
                              high=0.9)
     view: bool = param(True, "Use only the points in KITTI's image, since its labels end there.")
-    min_points: int = param(5, "Objects, and clusters, with fewer points are left out of the "
+    min_points: int = param(5, "Objects and clusters with fewer points are left out of the "
                               "loss.", low=1, high=1000)
 
 
@@ -158,10 +160,10 @@ class ClusterAugmentParams(NoiseParams):
                          high=1000)
     background: int = param(40, "Background clusters taken from a scene, at most.", low=0,
                             high=10_000)
-    box_shift: float = param(0.15, "Points around an object are cut by its box, shifted by this; "
-                             "standard deviation.", unit="m", low=0.0, high=2.0)
-    farther: float = param(1.5, "Some clusters are moved away, to up to 1 plus this times their "
-                           "range, and thinned accordingly.", low=0.0, high=10.0)
+    box_shift: float = param(0.15, "Objects are also cut out by their boxes, shifted by this; "
+                                   "standard deviation.", unit="m", low=0.0, high=2.0)
+    farther: float = param(1.5, "Some clusters are moved away, up to (1 + this) times their "
+                                "range, and thinned accordingly.", low=0.0, high=10.0)
     dropout: float = param(0.9, "Half of the clusters lose up to this share of their points.",
                            low=0.0, high=0.99)
     scale: float = param(0.05, "Clusters are scaled by up to this share.", low=0.0, high=0.5)
@@ -170,8 +172,9 @@ class ClusterAugmentParams(NoiseParams):
                              low=0.0, high=1.0)
     shine: float = param(0.1, "Probability that a part of a background cluster is retroreflective, "
                          "as signs are.", low=0.0, high=1.0)
-    height: float = param(0.15, "The ground is taken to be higher or lower by up to this, and by "
-                          "half of it for each cluster by itself.", unit="m", low=0.0, high=2.0)
+    height: float = param(0.15, "The ground is assumed higher or lower by up to this, and for "
+                                "each cluster by up to half of it in addition.",
+                          unit="m", low=0.0, high=2.0)
 
 
 @dataclass(frozen=True)

@@ -117,10 +117,6 @@ def _single(points: np.ndarray, name: str) -> np.ndarray:
 def calibration_of(info: Any, transform: Any) -> Calibration:
     """From CameraInfo and the TransformStamped between the LiDAR frame and the camera's, in either
     direction. InputError when P is empty or the frames do not fit."""
-    intrinsics = np.asarray(info.p, float).reshape(3, 4)
-    if intrinsics[0, 0] <= 0 or info.width == 0 or info.height == 0:
-        raise InputError("CameraInfo has no projection matrix P or no image size; calibrate the "
-                         "camera or set view.enabled to false")
     t, q = transform.transform.translation, transform.transform.rotation
     rotation, translation = np.array([q.x, q.y, q.z, q.w]), np.array([t.x, t.y, t.z])
     if not abs(np.linalg.norm(rotation) - 1) < 1e-3:
@@ -135,6 +131,16 @@ def calibration_of(info: Any, transform: Any) -> Calibration:
                              f"links '{parent}' and '{child}'")
         lidar_to_camera[:3, :3] = lidar_to_camera[:3, :3].T
         lidar_to_camera[:3, 3] = -lidar_to_camera[:3, :3] @ translation
+    return calibrated(info, lidar_to_camera)
+
+
+def calibrated(info: Any, lidar_to_camera: np.ndarray) -> Calibration:
+    """From CameraInfo and the pose (4, 4) of the LiDAR in the camera's frame. InputError when P is
+    empty."""
+    intrinsics = np.asarray(info.p, float).reshape(3, 4)
+    if intrinsics[0, 0] <= 0 or info.width == 0 or info.height == 0:
+        raise InputError("CameraInfo has no projection matrix P or no image size; calibrate the "
+                         "camera or set view.enabled to false")
     return Calibration(intrinsics, lidar_to_camera, int(info.width), int(info.height))
 
 
@@ -198,3 +204,25 @@ def detection_markers(detections: Detections, header: Any, make: Any, previous: 
 
 def _class_ids(labels: list[str]) -> list[int]:
     return [CLASSES.index(x if x in CLASSES else "Misc") for x in labels]
+
+
+def odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -> Any:
+    """nav_msgs/Odometry: the pose (4, 4) of moving_frame in the frame of header."""
+    x, y, z = map(float, pose[:3, 3])
+    qx, qy, qz, qw = map(float, Rotation.from_matrix(pose[:3, :3]).as_quat())
+    place = make("geometry_msgs/msg/Pose", position=make("geometry_msgs/msg/Point", x=x, y=y, z=z),
+                 orientation=make("geometry_msgs/msg/Quaternion", x=qx, y=qy, z=qz, w=qw))
+    return make("nav_msgs/msg/Odometry", header=header, child_frame_id=moving_frame,
+                pose=make("geometry_msgs/msg/PoseWithCovariance", pose=place))
+
+
+def pose_of(pose: Any) -> np.ndarray:
+    """(4, 4) float64 of a geometry_msgs/Pose. InputError if it is not finite, or its quaternion is
+    no rotation."""
+    p, q = pose.position, pose.orientation
+    place, turn = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
+    if not np.isfinite(place).all() or not abs(np.linalg.norm(turn) - 1) < 1e-2:
+        raise InputError("a pose is not finite, or has no unit quaternion")
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(turn).as_matrix(), place
+    return matrix

@@ -5,8 +5,10 @@ TRUTH = "/ground_truth/detections"
 CAMERA_INFO = "/camera/camera_info"
 EXTRINSICS = "/camera/extrinsics"  # geometry_msgs/TransformStamped, camera in the LiDAR frame
 IMAGE = "/camera/image/compressed"
-TF_STATIC = "/tf_static"
+TF, TF_STATIC = "/tf", "/tf_static"
+ODOMETRY = "/odom"                 # nav_msgs/Odometry, as drivers and navigation name it
 CLICK = "/clicked_point"           # what RViz and Foxglove publish
 
+ODOMETRY_FRAME = "odom"            # fixed; REP-105
 LIDAR_FRAME = "velodyne"
 CAMERA_FRAME = "camera_optical"    # z forward; REP-103

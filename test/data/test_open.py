@@ -247,12 +247,16 @@ def test_a_bag_made_of_a_recording_says_the_same(tmp_path, kind):
     recording = open_recording(MADE[kind][0](tmp_path / kind))
     assert write_bag(tmp_path / "made", recording) == len(recording)
     bag = open_recording(tmp_path / "made")
-    assert bag.has == recording.has & {BOXES, CAMERA}
+    assert bag.has == recording.has & {BOXES, CAMERA, POSES}
     for frame, read in zip(recording, bag, strict=True):
         expected, got = frame.load(), read.load()
         assert np.array_equal(got.xyz, expected.xyz)
         assert np.array_equal(got.intensity, expected.intensity)
         assert got.stamp_ns == expected.stamp_ns
+        pose, again = frame.pose(), read.pose()
+        assert (pose is None) == (again is None)
+        if pose is not None:
+            np.testing.assert_allclose(again, pose, atol=1e-6)
         truth, again = frame.truth(), read.truth()
         assert (truth is None) == (again is None)
         if truth is not None:

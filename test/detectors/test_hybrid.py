@@ -1,4 +1,4 @@
-"""The hybrid detectors: either score alone at the ends of the weight, each box judged by itself."""
+"""The hybrid detectors: either score alone at the ends of the weight, each box by itself."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from lidar_perception.candidates.seed_sources import automatic_seed
 from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.hybrid.candidates import RescoredCandidates
-from lidar_perception.detectors.hybrid.judging import combined, judged
 from lidar_perception.detectors.hybrid.params import ConfirmingParams, RescoringParams
 from lidar_perception.detectors.hybrid.proposals import ConfirmedProposals, points_of
+from lidar_perception.detectors.hybrid.rescoring import combined, rescored_by
 from lidar_perception.detectors.pointnet.clusters import clusters_of
 from lidar_perception.detectors.pointnet.predict import predict
 from lidar_perception.geometry import bev_iou, points_in_box
@@ -38,14 +38,14 @@ def cloud() -> LidarFrame:
 
 
 @pytest.fixture(scope="module")
-def judge():
+def classifier():
     return random_detector()
 
 
 @pytest.fixture(scope="module")
-def found(judge):
+def found(classifier):
     """What a low threshold leaves: the frame's segmentation and candidates."""
-    pipeline = RescoredCandidates(judge, SEED, None, RescoringParams(min_confidence=0.0),
+    pipeline = RescoredCandidates(classifier, SEED, None, RescoringParams(min_confidence=0.0),
                                   PIPELINE).pipeline
     segmented, candidates = find_candidates(cloud(), SEED, None, pipeline)
     assert len(candidates.final) >= 4
@@ -59,9 +59,9 @@ def clusters(found):
     return clusters_of(cloud().take(segmented.indices), ids, ground=segmented.ground)
 
 
-def rescored(judge, **changes) -> Detections:
+def rescored(classifier, **changes) -> Detections:
     params = RescoringParams(**{"min_confidence": 0.0, "threshold": 0.0, **changes})
-    return RescoredCandidates(judge, SEED, None, params, PIPELINE)(cloud()).detections
+    return RescoredCandidates(classifier, SEED, None, params, PIPELINE)(cloud()).detections
 
 
 def by_score(found: Detections) -> Detections:
@@ -88,53 +88,53 @@ def test_candidates_know_their_clusters(found):
     assert (np.diff(candidates.clusters) > 0).all()
 
 
-def test_with_weight_0_the_candidates_stand_as_they_are(judge, found):
-    assert same(rescored(judge, weight=0.0, box="cluster"), by_score(found[1].final))
+def test_with_weight_0_the_candidates_stand_as_they_are(classifier, found):
+    assert same(rescored(classifier, weight=0.0, box="cluster"), by_score(found[1].final))
 
 
-def test_with_weight_1_the_network_alone_scores(judge, found, clusters):
-    place = judge.config.classes.index("Pedestrian")
-    probability = predict(judge.network, clusters).probabilities[:, place]
+def test_with_weight_1_the_network_alone_scores(classifier, found, clusters):
+    place = classifier.config.classes.index("Pedestrian")
+    probability = predict(classifier.network, clusters).probabilities[:, place]
     alone = replace(found[1].final, scores=probability)
-    assert same(rescored(judge, weight=1.0, box="cluster"), by_score(alone), atol=1e-6)
+    assert same(rescored(classifier, weight=1.0, box="cluster"), by_score(alone), atol=1e-6)
 
 
-def test_a_candidate_is_judged_by_itself_whatever_the_order(judge, found, clusters):
-    whole, boxes = judged(judge, found[1].final, clusters, 0.5)
+def test_a_candidate_is_scored_by_itself_whatever_the_order(classifier, found, clusters):
+    whole, boxes = rescored_by(classifier, found[1].final, clusters, 0.5)
     order = np.random.default_rng(2).permutation(len(whole))[:-1]
-    part, part_boxes = judged(judge, found[1].final[order], clusters.take(order), 0.5)
+    part, part_boxes = rescored_by(classifier, found[1].final[order], clusters.take(order), 0.5)
     assert same(part, whole[order], atol=1e-5)
     np.testing.assert_allclose(part_boxes, boxes[order], atol=1e-4)
 
 
-def test_boxes_of_the_network_are_of_pedestrians_and_do_not_overlap(judge, found, clusters):
-    result = rescored(judge, overlap=0.1)
-    _, boxes = judged(judge, found[1].final, clusters, 0.5)
+def test_boxes_of_the_network_are_of_pedestrians_and_do_not_overlap(classifier, found, clusters):
+    result = rescored(classifier, overlap=0.1)
+    _, boxes = rescored_by(classifier, found[1].final, clusters, 0.5)
     assert all((np.abs(boxes - box).max(axis=1) < 1e-4).any() for box in result.boxes)
     overlap = bev_iou(result.boxes, result.boxes) - np.eye(len(result))
     assert overlap.max() <= 0.1 and (result.class_ids == PEDESTRIAN).all()
     assert (np.diff(result.scores) <= 0).all()
 
 
-def test_the_threshold_leaves_what_scores_as_much(judge):
-    everything = rescored(judge, box="cluster")
+def test_the_threshold_leaves_what_scores_as_much(classifier):
+    everything = rescored(classifier, box="cluster")
     limit = float(np.median(everything.scores))
-    assert same(rescored(judge, box="cluster", threshold=limit),
+    assert same(rescored(classifier, box="cluster", threshold=limit),
                 everything[everything.scores >= limit])
 
 
-def test_times_and_problems_are_told(judge):
-    detector = RescoredCandidates(judge, SEED, pipeline=PIPELINE)
+def test_times_and_problems_are_told(classifier):
+    detector = RescoredCandidates(classifier, SEED, pipeline=PIPELINE)
     found = detector(cloud())
     assert found.problem is None and {"clustering", "stm", "network"} <= {*found.ms}
     nothing = detector(LidarFrame(np.zeros((0, 3), np.float32)))
     assert len(nothing.detections) == 0 and "empty" in nothing.problem
     with pytest.raises(InputError, match="no camera calibration"):
-        RescoredCandidates(judge, SEED)(cloud())
+        RescoredCandidates(classifier, SEED)(cloud())
 
 
-def test_a_network_that_knows_no_pedestrian_cannot_judge_candidates():
-    with pytest.raises(InputError, match="no Pedestrian, only Car"):
+def test_a_network_that_knows_no_pedestrian_cannot_score_candidates():
+    with pytest.raises(InputError, match="not know the class Pedestrian, only Car"):
         RescoredCandidates(random_detector(classes=("Car",), sizes=((4, 2, 1.5),)), SEED)
 
 
@@ -146,10 +146,10 @@ def proposals():
     return Detections.of(boxes, [PEDESTRIAN, CAR, CAR, PEDESTRIAN, VAN], [0.9, 0.8, 0.5, 0.4, 0.35])
 
 
-def confirmed(judge, proposals, frame=None, **changes) -> Detections:
+def confirmed(classifier, proposals, frame=None, **changes) -> Detections:
     def proposer(frame, **columns) -> Found:
         return Found(proposals, problem="as the proposer says")
-    detector = ConfirmedProposals(proposer, judge, ConfirmingParams(**{"threshold": 0.0,
+    detector = ConfirmedProposals(proposer, classifier, ConfirmingParams(**{"threshold": 0.0,
                                                                        **changes}))
     found = detector(cloud() if frame is None else frame)
     assert found.problem == "as the proposer says"
@@ -157,13 +157,13 @@ def confirmed(judge, proposals, frame=None, **changes) -> Detections:
     return found.detections
 
 
-def test_with_weight_0_the_proposals_stand_as_they_are(judge, proposals):
-    assert same(confirmed(judge, proposals, weight=0.0), proposals)
-    assert len(confirmed(judge, proposals[:0])) == 0
+def test_with_weight_0_the_proposals_stand_as_they_are(classifier, proposals):
+    assert same(confirmed(classifier, proposals, weight=0.0), proposals)
+    assert len(confirmed(classifier, proposals[:0])) == 0
 
 
-def test_with_weight_1_those_with_points_get_the_networks_probability(judge, proposals):
-    result = confirmed(judge, proposals, weight=1.0)
+def test_with_weight_1_those_with_points_get_the_networks_probability(classifier, proposals):
+    result = confirmed(classifier, proposals, weight=1.0)
     assert (np.diff(result.scores) <= 0).all() and len(result) == len(proposals)
     score_of = {tuple(box) + (kind,): score for box, kind, score in zip(
         result.boxes.tolist(), result.class_ids, result.scores)}
@@ -172,19 +172,19 @@ def test_with_weight_1_those_with_points_get_the_networks_probability(judge, pro
     np.testing.assert_array_equal(scores[3:], proposals.scores[3:])  # no points, no such class
     assert (np.abs(np.array(scores[:3]) - proposals.scores[:3]) > 1e-3).all()
     for i in range(3):
-        alone = confirmed(judge, proposals[i:i + 1], weight=1.0)
+        alone = confirmed(classifier, proposals[i:i + 1], weight=1.0)
         assert alone.scores[0] == pytest.approx(scores[i], abs=1e-6)
 
 
-def test_few_points_say_nothing(judge, proposals):
-    assert same(confirmed(judge, proposals, min_points=1_000_000), proposals)
+def test_few_points_say_nothing(classifier, proposals):
+    assert same(confirmed(classifier, proposals, min_points=1_000_000), proposals)
 
 
-def test_a_higher_sensor_sees_the_same(judge, proposals):
+def test_a_higher_sensor_sees_the_same(classifier, proposals):
     frame, lift = cloud(), np.float32(0.5)
-    low = confirmed(judge, proposals, frame)
-    higher = random_detector(with_values(judge.params, {
-        "ground.sensor_pose.height": judge.params.ground.sensor_pose.height + float(lift)}))
+    low = confirmed(classifier, proposals, frame)
+    higher = random_detector(with_values(classifier.params, {
+        "ground.sensor_pose.height": classifier.params.ground.sensor_pose.height + float(lift)}))
     down = np.array([0, 0, -lift], np.float32)
     boxes = proposals.boxes + np.pad(down, (0, 4))
     high = confirmed(higher, replace(proposals, boxes=boxes),

@@ -47,6 +47,7 @@ def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, processes
         processes.start(node, remap, {**flatten(PAPER), "input.max_wait": 3600.0})
     found = peer.listen(f"/{last}/output/detections", MARKERS)
     truth, cloud = peer.talker(TRUTH, MARKERS), peer.talker(POINTS, CLOUD)
+    peer.wait_for_graph(graph)
     peer.send(cloud, sent[POINTS], lambda: "waits for the camera's calibration"
               in peer.message_of(first), "the reason why it waits")
     assert not found

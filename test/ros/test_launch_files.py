@@ -10,6 +10,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from lidar_perception.nodes.graph import graph_of
+from lidar_perception.nodes.main import node_parameters
 from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -54,7 +55,8 @@ def launched(monkeypatch):
                 perform_substitution=lambda s: {**arguments, **given}[s.args[0]])
             actions = start(context)
             said[:] = [a.msg for a in actions if hasattr(a, "msg")]
-            return {n.executable: n for n in actions if hasattr(n, "executable")}
+            return {n.name if n.executable == "tracker" else n.executable: n
+                    for n in actions if hasattr(n, "executable")}
         said: list[str] = []
         nodes.said = said  # by the last call
         return arguments, nodes
@@ -85,6 +87,11 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
     for node in nodes(autostart="false").values():
         assert node.parameters[1] == {"use_sim_time": False, "autostart": False}
     assert nodes(config="mine.yaml")["clustering"].parameters[0] == "mine.yaml"
+    frames = {"base_frame": "base", "target_frame": "odom"}
+    for node in nodes(deskew="odometry", odometry="/odometry", **frames).values():
+        assert frames.items() < node.parameters[1].items()
+        assert node.parameters[1]["input.deskew"] == "odometry"
+        assert ("~/input/odometry", "/odometry") in node.remappings
 
 
 def test_ground_and_clusters_have_one_file_and_what_others_would_take_is_said(launched, tmp_path):
@@ -125,6 +132,34 @@ def test_a_second_sensor_has_names_of_its_own(launched):
     assert started["clustering"].remappings == [
         ("~/input/points", "left_ground_segmentation/output/points")]
     assert ("~/input/points", "points") in started["ground_segmentation"].remappings
+
+
+def test_tracking_puts_a_tracker_behind_each_detector(launched):
+    _, nodes = launched("detectors")
+    started = nodes(tracking="true", odometry="/odometry", points="/cloud", namespace="left",
+                    name_prefix="a_")
+    trackers = {name: node for name, node in started.items() if node.executable == "tracker"}
+    assert list(trackers) == [f"a_{name}_tracker" for name in FILES["detectors"].split(",")]
+    behind = trackers["a_pointnet_tracker"]
+    found = "a_pointnet_detector/output/detections"
+    assert dict(behind.remappings) == {"~/input/points": "/cloud", "~/input/odometry": "/odometry",
+                                       "~/input/detections": found}
+    assert behind.namespace == "left"
+    own, file, given = behind.parameters
+    assert Path(file).name == "tracker.param.yaml" and Path(file).is_file()
+    assert own.keys() <= node_parameters("tracker").keys() and given == {"use_sim_time": False}
+    alone = nodes(tracking="true", detectors="pointpillars")
+    assert ("~/input/detections", "pointpillars_detector/output/detections") in (
+        alone["tracker"].remappings)
+    assert "tracker" not in nodes(detectors="pointpillars")
+
+
+def test_tracking_in_one_process_is_a_parameter_of_the_detector(launched):
+    _, nodes = launched("detectors")
+    for name, node in nodes(tracking="true", single="true").items():
+        assert node.executable != "tracker" and node.parameters[1]["tracking.enabled"] is True
+        assert "tracking.enabled" in node_parameters(name)
+        assert ("~/input/odometry", "odom") in node.remappings
 
 
 def test_rviz_follows_the_names_of_the_graph(launched):

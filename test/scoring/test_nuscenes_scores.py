@@ -118,7 +118,7 @@ def test_nothing_found_or_nothing_there_is_zero_and_errors_of_one():
 def test_errors_of_a_pair():
     truth = boxes((0, 0), velocities=[3.0, 0.0], attributes=5)
     found = boxes((0.3, 0.4), yaw=math.pi - 0.1, velocities=[0.0, 4.0], attributes=6)
-    larger = GlobalBoxes.of(found.centres, 2 * found.sizes, found.rotations, found.kinds)
+    larger = GlobalBoxes.of(found.centres, 2 * found.sizes, found.rotations, found.class_ids)
     e = hit_errors(truth, found, False)
     assert {k: v[0] for k, v in e.items()} == pytest.approx(
         dict(ate=0.5, ase=0, aoe=math.pi - 0.1, ave=5, aae=1))

@@ -15,20 +15,20 @@ from lidar_perception.data.semantickitti import MOVING, THINGS
 from lidar_perception.geometry import box_corners, points_in_box, wrap_angle
 from lidar_perception.simulation.batch import training_scans
 from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
-from lidar_perception.simulation.drive import drive, scan_at, scans, scans_at
+from lidar_perception.simulation.drive import scan_at, scans, scans_at
 from lidar_perception.simulation.scene import CROWDED
 from lidar_perception.simulation.sensor import SENSORS
 
 pytestmark = pytest.mark.usefixtures("streets", "tiny_sensor")
 
 
-def test_scans_and_drive_are_the_same_and_any_scan_can_be_had_alone():
+def test_any_scan_of_a_drive_can_be_had_alone():
     several = list(scans(3, 3, TINY))
-    for i, (scan, (frame, truth)) in enumerate(zip(several, drive(3, 3, TINY))):
+    for i, scan in enumerate(several):
         alone = scan_at(3, i, TINY)
-        assert scan.frame.xyz.tobytes() == frame.xyz.tobytes() == alone.frame.xyz.tobytes()
+        assert scan.frame.xyz.tobytes() == alone.frame.xyz.tobytes()
         assert np.array_equal(scan.semantic, alone.semantic)
-        assert truth.extras == scan.truth.extras == alone.truth.extras
+        assert scan.truth.extras == alone.truth.extras
     assert np.array_equal(several[0].pose, np.eye(4)) and several[2].pose[0, 3] > 0
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from lidar_perception.geometry import box_corners, points_in_box
 from lidar_perception.simulation import drive as drives
-from lidar_perception.simulation.drive import drive, truth
+from lidar_perception.simulation.drive import scans, truth
 from lidar_perception.simulation.raycast import cast
 from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.scene import ANY, CROWDED
@@ -35,21 +35,22 @@ def scan(seed, t, sensor=COARSE):
 
 def test_same_seed_same_bytes():
     def content(seed):
-        return [(f.xyz.tobytes(), f.intensity.tobytes(), f.stamp_ns, t.boxes.tobytes(), t.extras)
-                for f, t in drive(seed, 2, COARSE)]
+        return [(s.frame.xyz.tobytes(), s.frame.intensity.tobytes(), s.frame.stamp_ns,
+                 s.truth.boxes.tobytes(), s.truth.extras) for s in scans(seed, 2, COARSE)]
     first = content(0)
     assert first == content(0)
     assert all(a[0] != b[0] for a, b in zip(first, content(1)))
 
 
 def test_a_longer_drive_starts_like_a_shorter_one():
-    short, = drive(1, 1, COARSE)
-    long = next(drive(1, 9, COARSE))
-    assert np.array_equal(short[0].xyz, long[0].xyz)
+    short, = scans(1, 1, COARSE)
+    long = next(scans(1, 9, COARSE))
+    assert np.array_equal(short.frame.xyz, long.frame.xyz)
 
 
 def test_frames_are_as_promised():
-    for i, (frame, found) in enumerate(drive(0, 3, COARSE)):
+    for i, scan in enumerate(scans(0, 3, COARSE)):
+        frame, found = scan.frame, scan.truth
         assert frame.xyz.dtype == frame.intensity.dtype == np.float32
         assert frame.xyz.shape == (len(frame.intensity), 3) and frame.xyz.flags.c_contiguous
         assert frame.frame_id == "velodyne"
@@ -101,8 +102,8 @@ def test_boxes_stand_on_the_ground_and_apart(seed):
 
 
 def test_pedestrians_walk_in_view_all_the_time():
-    for _, found in drive(33, 11, replace(COARSE, rate=2.5), CROWDED):
-        boxes = found.of_class(PEDESTRIAN)
+    for scan in scans(33, 11, replace(COARSE, rate=2.5), CROWDED):
+        boxes = scan.truth.of_class(PEDESTRIAN)
         reach, bearing = np.hypot(boxes[:, 0], boxes[:, 1]), np.arctan2(boxes[:, 1], boxes[:, 0])
         seen = (np.abs(bearing) < np.radians(40)) & (reach > 6) & (reach < 35)
         assert seen.sum() >= 2
@@ -127,7 +128,8 @@ def test_scans_look_like_those_of_the_real_sensor():
     about 27 000 over the square of its range."""
     density, labels = [], set()
     for seed in (0, 33):
-        frame, found = next(drive(seed, 1, streets=CROWDED))
+        scan = next(scans(seed, 1, streets=CROWDED))
+        frame, found = scan.frame, scan.truth
         assert 95_000 < len(frame) < 135_000
         assert 0.15 < frame.intensity.mean() < 0.4
         labels |= set(found.labels)
@@ -143,5 +145,5 @@ def test_scans_look_like_those_of_the_real_sensor():
     ({"seed": -1}, "seed = -1")])
 def test_bad_input_is_named_at_the_call(arguments, named):
     with pytest.raises(ValueError, match=named) as error:
-        drive(**arguments)
+        scans(**arguments)
     assert "\n" not in str(error.value)

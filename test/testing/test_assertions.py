@@ -10,6 +10,7 @@ from samples import each_make, header, scene, walker_truth
 
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
+from lidar_perception.nodes.graph import private_domain
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.testing.detections import assert_detections, objects_of
 from lidar_perception.testing.launching import description, launch_file
@@ -136,8 +137,12 @@ def test_a_cloud_message_holds_its_columns():
 
 
 def test_without_launch_it_says_what_is_missing(monkeypatch):
-    for module in ("launch", "launch_testing", "launch_testing.actions", "launch.actions"):
+    for module in ("launch", "launch.actions", "launch.launch_description", "launch_testing"):
         monkeypatch.setitem(__import__("sys").modules, module, None)
     for call in description, launch_file:
         with pytest.raises(InputError, match=r"launch.* is not installed; it comes with ROS 2"):
             call()
+
+
+def test_a_private_domain_stays_private_while_nothing_runs_there():
+    assert len({private_domain() for _ in range(5)}) == 5

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -43,3 +45,37 @@ def test_both_trackers_are_scored_on_the_same_frames():
         car = scores["classes"]["Car"]
         assert (car["labels"], car["switches"], car["tracks"]) == (12, 0, 1)
         assert car["HOTA"] > 0.8
+
+
+def test_a_recording_with_track_ids_is_tracked_by_both_and_one_without_by_none(monkeypatch):
+    from types import SimpleNamespace
+
+    from benchmark import tracking
+    from lidar_perception.data.frame import Frame, Recording
+    from lidar_perception.types import LidarFrame
+    scans = [LidarFrame(one(10 + i).boxes[:, :3], None, 10**18 + i * 10**8) for i in range(6)]
+    monkeypatch.setattr(tracking, "open_detector", lambda **_: lambda scan: SimpleNamespace(
+        detections=one(scan.xyz[0, 0])))
+
+    def recording(sequence, extra):
+        return Recording(Path("drive"), "made up", [Frame.of(
+            str(i), scan, GroundTruth.of(one(10 + i).boxes, [CAR], [extra]), sequence=sequence,
+            index=i) for i, scan in enumerate(scans)])
+    content = tracking.measure_recording(recording("0000", {"track_id": 5}))
+    assert content["ours"]["classes"]["Car"]["tracks"] == 1
+    assert tracking.measure_recording(recording("", {"track_id": 5})) == {}
+    assert tracking.measure_recording(recording("0000", {})) == {}
+
+
+def test_intervals_of_drives_are_paired_and_precision_is_that_of_the_best_scores():
+    from benchmark.drives import _interval, resampled
+    from benchmark.precision import Curve, precision_at
+    values = [1.0, 2.0, 4.0]
+    means = resampled(values, lambda chosen: sum(chosen) / 3)
+    np.testing.assert_array_equal(means, resampled(values, lambda chosen: sum(chosen) / 3))
+    low, high = _interval(means)
+    assert 1.0 <= low < np.mean(values) < high <= 4.0
+    good = Curve(np.array([0.9, 0.8, 0.2]), np.array([True, False, True]), 4)
+    assert precision_at([good], 0.25) == 1.0 and precision_at([good], 0.5) == pytest.approx(2 / 3)
+    assert precision_at([good], 0.75) == 0.0 and precision_at([good, good], 0.5) == pytest.approx(
+        2 / 3)

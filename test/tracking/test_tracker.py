@@ -4,27 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, person, pose
 
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.param_fields import with_values
 from lidar_perception.tracking.association import FORBIDDEN, assigned, costs
 from lidar_perception.tracking.ego import Ego, moved_boxes, next_ego, usable
 from lidar_perception.tracking.existence import effective_looks
-from lidar_perception.tracking.params import AssociationParams, TrackingParams
+from lidar_perception.tracking.params import AssociationParams, TrackingParams, tracking_of
 from lidar_perception.tracking.tracker import Tracker
-from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
-
-CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
-TENTH = 100_000_000
-START = 10**18
-
-
-def car(x, y=0.0, yaw=0.0):
-    return [x, y, -1.0, 4.0, 1.8, 1.5, yaw]
-
-
-def person(x, y=0.0):
-    return [x, y, -0.8, 0.8, 0.6, 1.75, 0.0]
+from lidar_perception.types import PEDESTRIAN, Detections
 
 
 def followed(frames, poses=None, tracker=None, stamps=None):
@@ -32,30 +21,6 @@ def followed(frames, poses=None, tracker=None, stamps=None):
     tracker = tracker or Tracker()
     return [tracker(found, START + i * TENTH if stamps is None else stamps[i],
                     None if poses is None else poses[i]) for i, found in enumerate(frames)]
-
-
-def cars(*rows, scores=0.9, kind=CAR):
-    return Detections.of(np.reshape(rows, (-1, 7)), kind, scores)
-
-
-def pose(x, y=0.0, yaw=0.0):
-    result = np.eye(4)
-    result[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    result[:2, 3] = x, y
-    return result
-
-
-def crowd(seed=0, frames=20):
-    """Cars, cyclists and people on straight ways, in the fixed frame, seen with noise."""
-    rng = np.random.default_rng(seed)
-    kinds = np.array([CAR, CAR, CYCLIST, PEDESTRIAN, PEDESTRIAN, PEDESTRIAN])
-    start = np.array([car(10), car(20, 8, np.pi), car(15, -8), person(8, 4), person(12, -4),
-                      person(25, 5)])
-    velocity = np.array([[8, 0], [-5, 0], [4, 0], [1, 0.5], [0, 0], [-1, 0]])
-    for i in range(frames):
-        boxes = start.copy()
-        boxes[:, :2] += velocity * i / 10 + rng.normal(0, 0.05, (6, 2))
-        yield Detections.of(boxes, kinds, rng.uniform(0.7, 0.95, 6))
 
 
 def test_ids_stay_and_velocities_are_right():
@@ -277,3 +242,11 @@ def test_parked_cars_seen_from_a_turning_car_without_poses_keep_their_ids():
     assert {tuple(t.ids.tolist()) for t in tracks} == {(1, 2, 3)}
     for t, found in zip(tracks[5:], frames[5:]):
         np.testing.assert_allclose(t.detections.boxes[:, :2], found.boxes[:, :2], atol=0.3)
+
+
+def test_a_detector_has_its_own_neutral_scores_unless_others_are_given():
+    own = tracking_of("pointnet").existence.neutral
+    assert own != TrackingParams().existence.neutral and own.pedestrian == 0.5
+    assert tracking_of("pointpillars") == tracking_of("of another program") == TrackingParams()
+    given = with_values(TrackingParams(), {"existence.neutral.pedestrian": 0.7, "report": 0.1})
+    assert tracking_of("pointnet", given) == given

@@ -16,11 +16,11 @@ from lidar_perception.runs.terminal import console
 @a_path("--weights", "Checkpoint of a cluster network. Default: the one that comes with the "
         "package.")
 def clusters(walk: Walk, weights: Path | None) -> None:
-    """Classes that a cluster network (paper C) gives to clusters, and so to points.
+    """Classes that the cluster network (paper C) assigns to clusters and their points.
 
-    Clusters are made as the network asks for. One is an object if half of its points or more lie
-    in the object's box, and background if less than 15 percent lie in any; the others, and Van,
-    Truck, Tram, Person_sitting and what lies in a DontCare region, do not count. Only points in
+    Clusters are made as for its training. A cluster is an object if at least half of its points lie
+    in the object's box, and background if less than 15 percent lie in any; the others do not count,
+    nor do Van, Truck, Tram, Person_sitting and DontCare regions. Only points in
     the image count, as labels end there; without a camera all do.
 
     \b

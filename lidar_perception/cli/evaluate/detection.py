@@ -26,20 +26,20 @@ from lidar_perception.types import InputError
 @weights_option
 @device_option
 @click.option("--min-score", type=click.FloatRange(0, 1), default=MIN_SCORE, show_default=True,
-              help="Boxes of --weights with a lower score are left out. AP is made of precision "
-              "at every recall, so it needs those that a robot would not act on.")
+              help="Leave out boxes of --weights with a lower score. Average precision needs "
+                   "precision at every recall, so keep this lower than a robot would.")
 @click.option("--keep", type=click.FloatRange(0, 1), default=1.0, metavar="SHARE",
               help="Keep only this share of the points of each scan, 0..1, drawn at random but "
               "always the same. Default: 1.")
-@a_path("--write-results", "Write what --weights detect as KITTI result files, frames without "
-        "labels too.", "DIR")
+@a_path("--write-results", "Write the detections of --weights as KITTI result files, also for "
+                           "frames without labels.", "DIR")
 def detection(walk: Walk, results: Path | None, weights: Path | None, device: str,
               min_score: float, keep: float, write_results: Path | None) -> None:
     """Boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
 
     Average precision in the image, from above and in space, and of orientation, at 40 and 11
-    recall points; pedestrians by centre distance as in the STM-CPA paper. Either of a detector's
-    result files, or of a checkpoint, which is run on every scan.
+    recall points; pedestrians by centre distance as in the STM-CPA paper. Scores either the result
+    files of any detector, or a checkpoint, which is run on every scan.
 
     \b
     Examples:
@@ -57,7 +57,8 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
     if (results is None) == (weights is None):
         raise click.UsageError("give either --results DIR or --weights FILE")
     if write_results is not None and weights is None:
-        raise click.UsageError("--write-results writes what --weights detect; --results DIR has "
+        raise click.UsageError("--write-results writes the detections of --weights; --results DIR "
+                               "has "
                                "its files already")
     if keep != 1 and weights is None:
         raise click.UsageError("--keep thins the scans that --weights see; --results DIR sees none")

@@ -25,16 +25,16 @@ from lidar_perception.types import InputError
         "JSON")
 @weights_option
 @device_option
-@a_path("--write-results", "Write what --weights detect as a result file, frames without labels "
-        "too.", "JSON")
+@a_path("--write-results", "Write the detections of --weights as a result file, also for frames "
+                           "without labels.", "JSON")
 def nuscenes(walk: Walk, results: Path | None, weights: Path | None, device: str,
              write_results: Path | None) -> None:
     """Boxes by the protocol of nuScenes' detection task.
 
     Average precision by centre distance at 0.5, 1, 2 and 4 m, the five errors of true positives and
-    NDS, over all ten classes, and over the three that our detectors know. Either of a result file,
-    or of a checkpoint, which is run on every key frame. PATH is the folder of nuScenes, or that of
-    one version in it; --split names scenes.
+    NDS, over all ten classes, and over the three that our detectors know. Scores either a result
+    file, or a checkpoint, which is run on every key frame. PATH is the folder of nuScenes, or that
+    of one version in it; --split names scenes.
 
     \b
     Examples:
@@ -51,7 +51,8 @@ def nuscenes(walk: Walk, results: Path | None, weights: Path | None, device: str
     if (results is None) == (weights is None):
         raise click.UsageError("give either --results JSON or --weights FILE")
     if write_results is not None and weights is None:
-        raise click.UsageError("--write-results writes what --weights detect; --results JSON is "
+        raise click.UsageError("--write-results writes the detections of --weights; --results "
+                               "JSON is "
                                "such a file already")
     recording = walk.opened(None)
     first = recording.frames[0]

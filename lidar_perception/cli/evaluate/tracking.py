@@ -20,7 +20,7 @@ from lidar_perception.cli.data import (
 )
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.runs.terminal import console
-from lidar_perception.tracking.params import TrackingParams
+from lidar_perception.tracking.params import TrackingParams, tracking_of
 
 
 @click.command()
@@ -48,11 +48,14 @@ def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, d
       lidar-perception evaluate tracking --data drive --odometry --weights v4.safetensors
     """
     from lidar_perception.data.frame import BOXES
+    from lidar_perception.detectors.checkpoint import NETWORKS, network_of
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.scoring.run import fill
     from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
     from lidar_perception.scoring.tracking.tables import print_tracking_report
 
+    named = str(weights) in NETWORKS or weights.suffix == ".onnx"
+    params = tracking_of(str(weights) if named else network_of(weights), params)
     recording = opened(data, split=split)
     recording.require(BOXES, "evaluate tracking")
     open_ = partial(open_detector, weights, device, min_score=params.min_score,

@@ -33,23 +33,23 @@ WITH_RIDER = ATTRIBUTES.index("cycle.with_rider")
 class GlobalBoxes:
     """K boxes in the global frame, float64 unless said otherwise.
 
-    centres (K, 3) metres; sizes (K, 3) [l w h]; rotations (K, 4) quaternions [w x y z]; kinds (K,)
-    int into NAMES, -1 = none of them; attributes (K,) int into ATTRIBUTES, -1 = none; velocities
-    (K, 2) m/s, NaN = not known; scores (K,), 0 for labels; points (K,) int returns of LiDAR and
-    radar inside, -1 = not counted, as in detections.
+    centres (K, 3) metres; sizes (K, 3) [l w h]; rotations (K, 4) quaternions [w x y z];
+    class_ids (K,) int into NAMES, -1 = none of them; attributes (K,) int into ATTRIBUTES, -1 =
+    none; velocities (K, 2) m/s, NaN = not known; scores (K,), 0 for labels; points (K,) int
+    returns of LiDAR and radar inside, -1 = not counted, as in detections.
     """
 
     centres: np.ndarray
     sizes: np.ndarray
     rotations: np.ndarray
-    kinds: np.ndarray
+    class_ids: np.ndarray
     attributes: np.ndarray
     velocities: np.ndarray
     scores: np.ndarray
     points: np.ndarray
 
     @staticmethod
-    def of(centres, sizes, rotations, kinds, attributes=-1, velocities=np.nan, scores=0.0,
+    def of(centres, sizes, rotations, class_ids, attributes=-1, velocities=np.nan, scores=0.0,
            points=-1) -> GlobalBoxes:
         """Boxes with dtypes and shapes put right; the columns with a default may be scalars."""
         centres = np.asarray(centres, np.float64).reshape(-1, 3)
@@ -60,7 +60,7 @@ class GlobalBoxes:
 
         return GlobalBoxes(centres, np.asarray(sizes, np.float64).reshape(count, 3),
                            np.asarray(rotations, np.float64).reshape(count, 4),
-                           column(kinds, np.int32), column(attributes, np.int32),
+                           column(class_ids, np.int32), column(attributes, np.int32),
                            column(velocities, np.float64, 2), column(scores, np.float64),
                            column(points, np.int32))
 

@@ -1,7 +1,7 @@
 """nuScenes folders: the key frames of its LiDAR, scene by scene.
 
 LIDAR_TOP looks with its x axis to the right and its y axis forward, and may lean a little. Here a
-frame is the sensor's place with the vehicle's axes (x forward, y left, z up): the points are turned
+frame lies at the sensor and has the vehicle's axes (x forward, y left, z up): the points are turned
 by the calibration and not moved, and the ground lies sensor_height below the origin.
 """
 
@@ -101,12 +101,12 @@ def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
     frames, counts = [], dict.fromkeys(rank.values(), 0)
     for number, (scene, _, token) in enumerate(samples):
         file, time, pose, mount = sweeps[token]
-        place, turn = _at_sensor(poses[pose], mounts[mount]), mounts[mount][:3, :3]
-        key = KeyFrame(token, place, poses[pose][:3, 3], partial(_of_frame, all_labels, number))
+        at_sensor, turn = _at_sensor(poses[pose], mounts[mount]), mounts[mount][:3, :3]
+        key = KeyFrame(token, at_sensor, poses[pose][:3, 3], partial(_of_frame, all_labels, number))
         frames.append(Frame(
             f"{scene_names[scene]}/{counts[scene]:02}", time * 1000,
             partial(load_sweep, tables.root / file, turn, time * 1000), partial(_truth, key),
-            pose=place.copy, sequence=scene_names[scene], index=counts[scene],
+            pose=at_sensor.copy, sequence=scene_names[scene], index=counts[scene],
             sensor_height=float(mounts[mount][2, 3]), points=tables.root / file, native=key))
         counts[scene] += 1
     return frames
@@ -118,7 +118,7 @@ def _of_frame(all_labels: Callable, number: int) -> NuscenesLabels | None:
 
 
 def _at_sensor(ego: np.ndarray, mount: np.ndarray) -> np.ndarray:
-    """Pose of the sensor's place with the vehicle's axes."""
+    """Pose of the sensor's position with the vehicle's axes."""
     pose = ego.copy()
     pose[:3, 3] += ego[:3, :3] @ mount[:3, 3]
     return pose

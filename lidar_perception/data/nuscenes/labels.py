@@ -58,7 +58,7 @@ class NuscenesLabels:
         track_id."""
         boxes, extras, ids = self.boxes, [], []
         for i in range(len(self)):
-            name = NAMES[boxes.kinds[i]] if boxes.kinds[i] >= 0 else None
+            name = NAMES[boxes.class_ids[i]] if boxes.class_ids[i] >= 0 else None
             attribute = boxes.attributes[i]
             rides = name == "bicycle" and attribute == WITH_RIDER
             ids.append(CLASSES.index("Cyclist" if rides else CLASS_OF.get(name, "Misc")))
@@ -113,8 +113,8 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
     frames, neighbours = np.array(frames), _neighbours(tables, tokens, own, links)
     seconds = np.fromiter(times.values(), np.int64, len(times))[frames] * 1e-6
     categories, classes = np.array(categories), [CATEGORIES.get(name) for name in names.values()]
-    kinds = np.array([NAMES.index(name) if name else -1 for name in classes])[categories]
-    boxes = GlobalBoxes.of(centres, sizes[:, [1, 0, 2]], rotations, kinds, counts[:, 2],
+    class_ids = np.array([NAMES.index(name) if name else -1 for name in classes])[categories]
+    boxes = GlobalBoxes.of(centres, sizes[:, [1, 0, 2]], rotations, class_ids, counts[:, 2],
                            _velocities(centres, seconds, neighbours),
                            points=counts[:, 0] + counts[:, 1])
     everything = NuscenesLabels(boxes, categories, tuple(names.values()),

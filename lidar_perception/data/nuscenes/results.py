@@ -27,12 +27,12 @@ def to_results(detections: Detections, frame: Frame) -> GlobalBoxes:
     if not (np.isfinite(detections.boxes).all() and np.isfinite(detections.scores).all()):
         raise InputError(f"{frame.name}: a box or score of the detector is not finite; its weights "
                          "or its input are broken")
-    kinds = np.array([NAMES.index(DETECTED[name]) if name in DETECTED else -1 for name in CLASSES])
-    kinds = kinds[detections.class_ids]
-    chosen = np.flatnonzero(kinds >= 0)
+    theirs = np.array([NAMES.index(DETECTED[name]) if name in DETECTED else -1 for name in CLASSES])
+    class_ids = theirs[detections.class_ids]
+    chosen = np.flatnonzero(class_ids >= 0)
     chosen = chosen[np.argsort(-detections.scores[chosen], kind="stable")][:MAX_BOXES]
-    return GlobalBoxes.of(*in_global(detections.boxes[chosen], frame.native.pose), kinds[chosen],
-                          scores=detections.scores[chosen])
+    return GlobalBoxes.of(*in_global(detections.boxes[chosen], frame.native.pose),
+                          class_ids[chosen], scores=detections.scores[chosen])
 
 
 def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:
@@ -40,11 +40,11 @@ def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:
     reads, and judges with an error of 1; strict readers of JSON do not."""
     rows = {token: [{
         "sample_token": token, "translation": centre, "size": [width, length, height],
-        "rotation": rotation, "velocity": velocity, "detection_name": NAMES[kind],
+        "rotation": rotation, "velocity": velocity, "detection_name": NAMES[class_id],
         "detection_score": score, "attribute_name": ATTRIBUTES[attribute] if attribute >= 0 else ""}
-        for centre, (length, width, height), rotation, kind, attribute, velocity, score in zip(
+        for centre, (length, width, height), rotation, class_id, attribute, velocity, score in zip(
             *(column.tolist() for column in (boxes.centres, boxes.sizes, boxes.rotations,
-                                             boxes.kinds, boxes.attributes, boxes.velocities,
+                                             boxes.class_ids, boxes.attributes, boxes.velocities,
                                              boxes.scores)))]
         for token, boxes in results.items()}
     write_text(path, json.dumps({"meta": META, "results": rows}))

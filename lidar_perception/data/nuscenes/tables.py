@@ -57,22 +57,22 @@ class Tables:
                 if text[:1] != "[":
                     raise InputError(f"{path} is no list of rows; download the tables of "
                                      f"{self.version} again")
-                text, place, ended = text[1:], 0, False
+                text, at, ended = text[1:], 0, False
                 while True:
-                    while place < len(text) and text[place] in SPACE:
-                        place += 1
-                    if place < len(text) and text[place] == "]":
+                    while at < len(text) and text[at] in SPACE:
+                        at += 1
+                    if at < len(text) and text[at] == "]":
                         return
                     try:
-                        row, place = decode(text, place)
+                        row, at = decode(text, at)
                         yield row
                         continue
                     except ValueError as error:  # the row goes on in the next chunk, or is broken
-                        if ended or len(text) - place > 2 * CHUNK:
+                        if ended or len(text) - at > 2 * CHUNK:
                             raise InputError(f"{path} is cut or damaged ({error}); download the "
                                              f"tables of {self.version} again") from None
                     more = stream.read(CHUNK)
-                    text, place, ended = text[place:] + more, 0, not more
+                    text, at, ended = text[at:] + more, 0, not more
         except OSError as error:
             raise InputError(f"cannot read the table {path}: {error.strerror}; unpack the "
                              f"metadata of {self.version} there") from None

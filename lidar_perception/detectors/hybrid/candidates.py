@@ -14,8 +14,8 @@ from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import explain_nothing
 from lidar_perception.detectors.contract import Found, require_columns
-from lidar_perception.detectors.hybrid.judging import judged, seen_by
 from lidar_perception.detectors.hybrid.params import RescoringParams
+from lidar_perception.detectors.hybrid.rescoring import rescored_by, seen_by
 from lidar_perception.detectors.nms import suppressed
 from lidar_perception.detectors.pointnet.clusters import clusters_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
@@ -28,16 +28,17 @@ PERSON = CLASSES[PEDESTRIAN]
 class RescoredCandidates:
     """A detector of pedestrians, see contract.py.
 
-    judge: a network that knows Pedestrian, else InputError. seed, camera: as of CandidateDetector.
+    classifier: a network that knows Pedestrian, else InputError. seed, camera: as of
+    CandidateDetector.
     pipeline: how candidates are looked for; their score must be a confidence (confidence.enabled).
     """
 
-    def __init__(self, judge: PointNetDetector, seed: SeedSource, camera: Camera | None = None,
+    def __init__(self, classifier: PointNetDetector, seed: SeedSource, camera: Camera | None = None,
                  params: RescoringParams = RescoringParams(), pipeline: PipelineParams = BEST):
-        if PERSON not in judge.classes:
-            raise InputError(f"the network knows no {PERSON}, only {', '.join(judge.classes)}; "
-                             "candidates need one that does")
-        self.judge, self.seed, self.camera, self.params = judge, seed, camera, params
+        if PERSON not in classifier.classes:
+            raise InputError(f"the network does not know the class {PERSON}, only "
+                             f"{', '.join(classifier.classes)}; give one that does")
+        self.classifier, self.seed, self.camera, self.params = classifier, seed, camera, params
         self.pipeline = with_values(pipeline, {"confidence.enabled": True,
                                                "confidence.threshold": params.min_confidence})
 
@@ -53,13 +54,13 @@ class RescoredCandidates:
 
     def with_min_score(self, min_score: float) -> RescoredCandidates:
         """The same detector with this least score."""
-        return RescoredCandidates(self.judge, self.seed, self.camera,
+        return RescoredCandidates(self.classifier, self.seed, self.camera,
                                   replace(self.params, threshold=min_score), self.pipeline)
 
     def mounted_at(self, height: float) -> RescoredCandidates:
         """The same detector for a sensor so many metres above the ground."""
         pipeline = with_values(self.pipeline, {"ground.sensor_pose.height": height})
-        return RescoredCandidates(self.judge, self.seed, self.camera, self.params, pipeline)
+        return RescoredCandidates(self.classifier, self.seed, self.camera, self.params, pipeline)
 
     def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
@@ -71,10 +72,11 @@ class RescoredCandidates:
                                                 ground=ground, cluster_ids=cluster_ids)
         t0 = perf_counter()
         chosen = np.flatnonzero(np.isin(segmented.cluster_ids, candidates.clusters))
-        seen = seen_by(self.judge, frame.take(segmented.indices), pose)
+        seen = seen_by(self.classifier, frame.take(segmented.indices), pose)
         clusters = clusters_of(seen.take(chosen), segmented.cluster_ids[chosen]).on(
             seen.xyz.compress(segmented.ground, axis=0))
-        result, whole = judged(self.judge, candidates.final, clusters, params.weight, pose)
+        result, whole = rescored_by(self.classifier, candidates.final, clusters, params.weight,
+                                    pose)
         result = result[result.scores >= params.threshold] if params.box == "cluster" else (
             self._whole(result, whole))
         result = result[np.argsort(-result.scores, kind="stable")]

@@ -8,8 +8,8 @@ from time import perf_counter
 import numpy as np
 
 from lidar_perception.detectors.contract import Detector, Found
-from lidar_perception.detectors.hybrid.judging import judged, known, seen_by
 from lidar_perception.detectors.hybrid.params import ConfirmingParams
+from lidar_perception.detectors.hybrid.rescoring import known, rescored_by, seen_by
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.view import levelled_ground
@@ -20,13 +20,13 @@ from lidar_perception.types import Detections, LidarFrame
 class ConfirmedProposals:
     """A detector, see contract.py.
 
-    proposer: a detector that proposes boxes. judge: whose network reads their points; its params
-    say how the sensor is mounted and what is ground. Boxes stay the proposer's.
+    proposer: a detector that proposes boxes. classifier: whose network reads their points; its
+    params say how the sensor is mounted and what is ground. Boxes stay the proposer's.
     """
 
-    def __init__(self, proposer: Detector, judge: PointNetDetector,
+    def __init__(self, proposer: Detector, classifier: PointNetDetector,
                  params: ConfirmingParams = ConfirmingParams()):
-        self.proposer, self.judge, self.params = proposer, judge, params
+        self.proposer, self.classifier, self.params = proposer, classifier, params
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -40,13 +40,13 @@ class ConfirmedProposals:
 
     def with_min_score(self, min_score: float) -> ConfirmedProposals:
         """The same detector with this least score of what comes out; the proposer keeps its own."""
-        return ConfirmedProposals(self.proposer, self.judge,
+        return ConfirmedProposals(self.proposer, self.classifier,
                                   replace(self.params, threshold=min_score))
 
     def mounted_at(self, height: float) -> ConfirmedProposals:
         """The same detector for a sensor so many metres above the ground."""
-        return ConfirmedProposals(self.proposer.mounted_at(height), self.judge.mounted_at(height),
-                                  self.params)
+        return ConfirmedProposals(self.proposer.mounted_at(height),
+                                  self.classifier.mounted_at(height), self.params)
 
     def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
@@ -57,21 +57,22 @@ class ConfirmedProposals:
         t1 = perf_counter()
         t2 = t3 = t1
         if len(proposals):
-            pose = self.judge.params.ground.sensor_pose
-            seen = seen_by(self.judge, frame, pose)
+            pose = self.classifier.params.ground.sensor_pose
+            seen = seen_by(self.classifier, frame, pose)
             if ground is None:
-                ground = levelled_ground(seen, self.judge.params.ground)
+                ground = levelled_ground(seen, self.classifier.params.ground)
             ground = np.asarray(ground, bool)
             obstacles = np.flatnonzero(~ground)
             t2 = perf_counter()
             clusters = points_of(proposals.boxes, frame.take(obstacles), seen.take(obstacles),
                                  params.margin)
             asked = np.flatnonzero((clusters.sizes >= params.min_points)
-                                   & known(self.judge, proposals.class_ids))
+                                   & known(self.classifier, proposals.class_ids))
             clusters = clusters.take(asked).on(seen.xyz.compress(ground, axis=0))
             t3 = perf_counter()
             scores = proposals.scores.copy()
-            scores[asked] = judged(self.judge, proposals[asked], clusters, params.weight)[0].scores
+            scores[asked] = rescored_by(self.classifier, proposals[asked], clusters,
+                                        params.weight)[0].scores
             kept = np.flatnonzero(scores >= params.threshold)
             kept = kept[np.argsort(-scores[kept], kind="stable")]
             proposals = Detections(proposals.boxes[kept], proposals.class_ids[kept], scores[kept])

@@ -32,15 +32,15 @@ class BoxTargets(NamedTuple):
     yaw_residuals: np.ndarray
 
 
-def encode(boxes: np.ndarray, kinds: np.ndarray, centres: np.ndarray, azimuths: np.ndarray,
+def encode(boxes: np.ndarray, labels: np.ndarray, centres: np.ndarray, azimuths: np.ndarray,
            config: PointNetConfig) -> BoxTargets:
-    """Targets of boxes (K, 7) of classes kinds (K,) into config.classes, for clusters with these
+    """Targets of boxes (K, 7) of classes labels (K,) into config.classes, for clusters with these
     centres (K, 3) and azimuths (K,)."""
     offset = boxes[:, :3] - centres
     cos, sin = np.cos(azimuths), np.sin(azimuths)
     turned = np.column_stack([cos * offset[:, 0] + sin * offset[:, 1],
                               cos * offset[:, 1] - sin * offset[:, 0], offset[:, 2]])
-    sizes = np.log(np.maximum(boxes[:, 3:6], 0.05) / np.array(config.sizes)[kinds])
+    sizes = np.log(np.maximum(boxes[:, 3:6], 0.05) / np.array(config.sizes)[labels])
     width = 2 * np.pi / config.yaw_bins
     yaw = np.mod(boxes[:, 6] - azimuths, 2 * np.pi)
     bins = np.mod(np.round(yaw / width).astype(np.int64), config.yaw_bins)
@@ -50,8 +50,8 @@ def encode(boxes: np.ndarray, kinds: np.ndarray, centres: np.ndarray, azimuths: 
 
 
 def decode(outputs: Outputs, inputs: ClusterInput, config: PointNetConfig,
-           kinds: np.ndarray) -> np.ndarray:
-    """(K, 7) float32 boxes, if cluster i is of class kinds[i]: the inverse of encode."""
+           labels: np.ndarray) -> np.ndarray:
+    """(K, 7) float32 boxes, if cluster i is of class labels[i]: the inverse of encode."""
     centres, logs, residuals = (x.float().cpu().numpy().astype(np.float64) for x in
                                 (outputs.centres, outputs.sizes, outputs.yaw_residuals))
     bins = outputs.yaw_bins.argmax(dim=1).cpu().numpy()
@@ -60,7 +60,7 @@ def decode(outputs: Outputs, inputs: ClusterInput, config: PointNetConfig,
     boxes[:, 0] = inputs.centres[:, 0] + cos * centres[:, 0] - sin * centres[:, 1]
     boxes[:, 1] = inputs.centres[:, 1] + sin * centres[:, 0] + cos * centres[:, 1]
     boxes[:, 2] = inputs.centres[:, 2] + centres[:, 2]
-    boxes[:, 3:6] = np.array(config.sizes)[kinds] * np.exp(np.clip(logs, -2, 2))
+    boxes[:, 3:6] = np.array(config.sizes)[labels] * np.exp(np.clip(logs, -2, 2))
     width = 2 * np.pi / config.yaw_bins
     rest = np.clip(residuals[np.arange(len(bins)), bins], -1, 1)
     boxes[:, 6] = wrap_angle(inputs.azimuths + (bins + rest / 2) * width)

@@ -43,6 +43,6 @@ def calibration_error(probabilities: np.ndarray, labels: np.ndarray, bins: int =
     it is right, in bins of equal width; probabilities (B, K), labels (B,). 0 without any."""
     best = probabilities.max(axis=1)
     right = probabilities.argmax(axis=1) == labels
-    place = np.minimum((best * bins).astype(int), bins - 1)
-    gap = sum(abs(best[place == i].sum() - right[place == i].sum()) for i in range(bins))
+    bin_of = np.minimum((best * bins).astype(int), bins - 1)
+    gap = sum(abs(best[bin_of == i].sum() - right[bin_of == i].sum()) for i in range(bins))
     return float(gap / max(len(labels), 1))

@@ -96,26 +96,26 @@ def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, min_points: int = 1,
     return found if ground is None else found.on(frame.xyz.compress(ground, axis=0))
 
 
-def ground_under(xyz: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """(K,) float64: the mean z of the ground's points (G, 3) around each of indices (K, 2), within
+def ground_under(xyz: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """(K,) float64: the mean z of the ground's points (G, 3) around each position xy (K, 2), within
     the first of NEAR that has FEWEST of them; -SENSOR_HEIGHT where none has. Metres."""
-    if len(indices) == 0:
+    if len(xy) == 0:
         return np.zeros(0)
-    low = indices.min(axis=0) - NEAR[-1]
-    size = indices.max(axis=0) + NEAR[-1] - low
+    low = xy.min(axis=0) - NEAR[-1]
+    size = xy.max(axis=0) + NEAR[-1] - low
     shape = np.ceil(size / NEAR[0]).astype(np.int64) + 1
     column = np.floor((xyz[:, :2] - low) / NEAR[0])
     inside = ((column >= 0) & (column < shape)).all(axis=1)
     cell = (column[inside] @ np.array([shape[1], 1.0])).astype(np.int64)
     order = np.argsort(cell, kind="stable")
-    return _ground_under(xyz[inside][order].astype(np.float64), cell[order], shape, low, indices)
+    return _ground_under(xyz[inside][order].astype(np.float64), cell[order], shape, low, xy)
 
 
 @njit(cache=True, nogil=True)
-def _ground_under(xyz, cell, shape, low, indices):
-    heights = np.full(len(indices), -SENSOR_HEIGHT)
-    for k in range(len(indices)):
-        x, y = indices[k]
+def _ground_under(xyz, cell, shape, low, xy):
+    heights = np.full(len(xy), -SENSOR_HEIGHT)
+    for k in range(len(xy)):
+        x, y = xy[k]
         row, column = int((x - low[0]) / NEAR[0]), int((y - low[1]) / NEAR[0])
         for reach in NEAR:
             cells = int(np.ceil(reach / NEAR[0]))

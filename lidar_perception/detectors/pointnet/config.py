@@ -30,7 +30,7 @@ class PointNetConfig:
     (Eq. 15, 17). skip: shallow features stand beside the deep ones (Eq. 16). grouped: without it,
     msg and mrg, each point is by itself, as in PointNet.
 
-    points: most points of a cluster that are read (Eq. 13). centroids, coarse: indices around which
+    points: most points of a cluster that are read (Eq. 13). centroids, coarse: points around which
     points, and then centroids, are grouped. radii, coarse_radius in metres; neighbours,
     coarse_neighbours: most points of a group. point_channels to head_channels: widths. yaw_bins:
     parts of the circle. sizes: l w h of each class, metres, that sizes are relative to.

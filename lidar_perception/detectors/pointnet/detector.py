@@ -11,7 +11,7 @@ import torch
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.contract import Found, require_columns
+from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.devices import CPU, chosen_device
 from lidar_perception.detectors.nms import suppressed
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
@@ -32,7 +32,7 @@ from lidar_perception.types import LidarFrame
 class PointNetDetector(NetworkDetector):
     """Paper C's detector, see contract.py. The whole cloud is looked at.
 
-    network: as loaded or trained; its norms are folded into its layers, in place.
+    network: as loaded or trained; its norms are folded into its layers, in where.
     """
 
     def __init__(self, network: PointNet, header: Header, device: torch.device = CPU,
@@ -40,11 +40,9 @@ class PointNetDetector(NetworkDetector):
         super().__init__(header, device, params)
         self.network = fused(network).to(device)
 
-    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> Found:
-        """See contract.Detector. InputError also where CUDA is out of memory and the CPU may not
-        take over."""
-        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
+    def detect(self, frame: LidarFrame, ground: np.ndarray | None,
+               cluster_ids: np.ndarray | None) -> Found:
+        """Ground and clusters are computed where they are None."""
         t0 = perf_counter()
         pose = self.params.ground.sensor_pose
         seen = with_intensity_scaled(levelled(frame, pose), self.settings.intensity_scale)
@@ -90,7 +88,7 @@ class PointNetDetector(NetworkDetector):
     def _problem(self, frame: LidarFrame, cluster_ids: np.ndarray, clusters: Clusters,
                  left_out: int) -> str | None:
         if len(frame) == 0:
-            return "the cloud is empty or has no finite point"
+            return "the cloud is empty or has no finite point, or crop.* leaves none"
         if not (cluster_ids > 0).any():
             return ("no clusters; are ground.sensor_pose, and the numbers of clustering.euclidean "
                     "or clustering.dbscan, right for this sensor?")
@@ -104,7 +102,7 @@ class PointNetDetector(NetworkDetector):
             return "the cloud has no intensity, which the network was trained with; it reads zeros"
         return None
 
-    def place(self, device: torch.device) -> None:
+    def bring_to(self, device: torch.device) -> None:
         """Bring the network to a device."""
         self.network.to(device)
 
@@ -126,13 +124,13 @@ def load_pointnet_detector(path: str | Path = "", device: str = "auto",
     path = Path(path) if str(path) not in ("", ".") else weights_file(settings)
     if settings.threads:
         torch.set_num_threads(settings.threads)
-    place = chosen_device(device)
+    where = chosen_device(device)
     header, network = load_pointnet(path)
     if params is None:
         params = PointNetDetectorParams(ground=header.config.ground,
                                         clustering=header.config.clustering)
     detector = PointNetDetector(network, header, CPU, params)
-    detector.move(place)
+    detector.move(where)
     if settings.warm_up:
         detector.warm_up()
     return detector

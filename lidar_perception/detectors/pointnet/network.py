@@ -139,13 +139,13 @@ class PointNet(nn.Module):
             found += wide
         if config.skip:
             found += shallow + (local if config.groups else 0)
-        kinds, bins = len(config.classes), config.yaw_bins
+        classes, bins = len(config.classes), config.yaw_bins
         self.head = mlp(found + CONTEXT, *config.head_channels)
-        self.classes = nn.Linear(config.head_channels[-1], kinds + 1)
+        self.classes = nn.Linear(config.head_channels[-1], classes + 1)
         self.box = nn.Linear(config.head_channels[-1], 6 + 2 * bins)
         # What calibration found: probabilities are softmax(logits / temperature + offsets).
         self.register_buffer("temperature", torch.ones(1))
-        self.register_buffer("offsets", torch.zeros(kinds + 1))
+        self.register_buffer("offsets", torch.zeros(classes + 1))
 
     def forward(self, points: Tensor, valid: Tensor, context: Tensor) -> Outputs:
         config = self.config

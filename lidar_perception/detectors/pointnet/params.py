@@ -9,6 +9,7 @@ from lidar_perception.detectors.params import NetworkParams
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
+from lidar_perception.robot.params import CropParams
 from lidar_perception.wire.params import InputParams
 
 STEPS = ("preprocess", "ground", "clustering", "network", "postprocess")  # each has its time
@@ -16,7 +17,7 @@ STEPS = ("preprocess", "ground", "clustering", "network", "postprocess")  # each
 
 @dataclass(frozen=True)
 class PointNetParams(NetworkParams):
-    """Which network, where it runs, which clusters it reads, and what counts as found."""
+    """Which network, where it runs, which clusters it reads, and what counts as a detection."""
 
     min_points: int = param(5, "Clusters of fewer points are left out.", low=1, high=1_000_000)
     max_clusters: int = param(4000, "Clusters that are looked at, the nearest first; a scan has "
@@ -33,6 +34,7 @@ class PointNetDetectorParams:
     """All groups of the detector."""
 
     input: InputParams = INPUT
+    crop: CropParams = CropParams()
     ground: GroundParams = GROUND
     clustering: ClusteringParams = CLUSTERING
     pointnet: PointNetParams = PointNetParams()

@@ -22,38 +22,38 @@ CHUNK = 256  # clusters at a time: bounds the memory, and the caches like it
 @dataclass(frozen=True)
 class Predictions:
     """Of K clusters: probabilities (K, C + 1) float32 of the C classes of the config and of
-    background, calibrated; kinds (K,) int64 the likeliest class but background, or the one that was
-    asked about; boxes (K, 7) float32 if it is of that class, in the frame of the clusters."""
+    background, calibrated; labels (K,) int64 the likeliest class but background, or the one that
+    was asked about; boxes (K, 7) float32 if it is of that class, in the frame of the clusters."""
 
     probabilities: np.ndarray
-    kinds: np.ndarray
+    labels: np.ndarray
     boxes: np.ndarray
 
     @property
     def scores(self) -> np.ndarray:
-        """(K,) the probability of the class of kinds."""
-        return self.probabilities[np.arange(len(self.kinds)), self.kinds]
+        """(K,) the probability of the class of labels."""
+        return self.probabilities[np.arange(len(self.labels)), self.labels]
 
     def take(self, chosen: np.ndarray) -> Predictions:
         """Those of the clusters at indices (M,)."""
-        return Predictions(self.probabilities[chosen], self.kinds[chosen], self.boxes[chosen])
+        return Predictions(self.probabilities[chosen], self.labels[chosen], self.boxes[chosen])
 
 
 def found(predictions: Predictions, config: PointNetConfig, least: Sequence[float],
           nms: NmsParams = NmsParams()) -> Detections:
     """The boxes whose score is at least `least` of their class, (C,), the best of those that
     overlap."""
-    chosen = np.flatnonzero(predictions.scores >= np.asarray(least)[predictions.kinds])
+    chosen = np.flatnonzero(predictions.scores >= np.asarray(least)[predictions.labels])
     chosen = chosen[np.argsort(-predictions.scores[chosen], kind="stable")][:nms.candidates]
     return best_of_each(predictions.boxes[chosen], predictions.scores[chosen],
-                        predictions.kinds[chosen], config.classes, nms)
+                        predictions.labels[chosen], config.classes, nms)
 
 
 @torch.inference_mode()
 def predict(network: PointNet, clusters: Clusters, seed: int = 0, chunk: int = CHUNK,
-            kinds: np.ndarray | None = None) -> Predictions:
-    """What the network, in eval mode, makes of each cluster, of class kinds (K,) if they are given.
-    K may be 0."""
+            labels: np.ndarray | None = None) -> Predictions:
+    """What the network, in eval mode, makes of each of K clusters, K may be 0; labels (K,): the
+    classes that are asked about, instead of the likeliest."""
     config, classes = network.config, len(network.config.classes)
     if len(clusters) == 0:
         return Predictions(np.zeros((0, classes + 1), np.float32), np.zeros(0, np.int64),
@@ -61,9 +61,9 @@ def predict(network: PointNet, clusters: Clusters, seed: int = 0, chunk: int = C
     inputs = network_input(clusters, config.points, seed)
     outputs = outputs_of(network, inputs, chunk)
     probabilities = network.probabilities(outputs.logits).cpu().numpy()
-    if kinds is None:
-        kinds = probabilities[:, :classes].argmax(axis=1)
-    return Predictions(probabilities, kinds, decode(outputs, inputs, config, kinds))
+    if labels is None:
+        labels = probabilities[:, :classes].argmax(axis=1)
+    return Predictions(probabilities, labels, decode(outputs, inputs, config, labels))
 
 
 @torch.inference_mode()

@@ -69,7 +69,7 @@ class NetworkConfig:
 
     xy_scale: x and y of a point are multiplied by this before the first layer. With 1, as in the
     papers and in imported weights, they are 50 times as large as the other inputs, and most of the
-    few channels of a compact network come to say where a pillar is, which its place says already.
+    few channels of a compact network come to say where a pillar is, which its cell says already.
 
     max_points: points of a pillar that are read, in the order of the cloud; 0 reads all. Imported
     weights need it, and the next two. zero_row: a pillar with fewer points than max_points also has

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.contract import Found, require_columns
+from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.devices import CPU, chosen_device
 from lidar_perception.detectors.nms import best_of_each, suppressed
 from lidar_perception.detectors.pointpillars.anchors import make_anchors
@@ -63,11 +63,9 @@ class PointPillarsDetector(NetworkDetector):
         self.network = network
         self.anchors = make_anchors(self.config, device)
 
-    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
-                 cluster_ids: np.ndarray | None = None) -> Found:
-        """See contract.Detector; columns are computed only if the version needs them. InputError
-        also where CUDA is out of memory and the CPU may not take over."""
-        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
+    def detect(self, frame: LidarFrame, ground: np.ndarray | None,
+               cluster_ids: np.ndarray | None) -> Found:
+        """Columns are computed only if the version needs them."""
         t0 = perf_counter()
         pose = self.params.ground.sensor_pose
         indices, seen = visible(frame, self.config, pose)
@@ -113,21 +111,21 @@ class PointPillarsDetector(NetworkDetector):
                                           "weights are broken, take others")
         elif len(chosen) == 0:
             best_scores, broken = self.nothing_passed(torch.sigmoid(logits.amax(dim=0)).tolist())
-        best, kinds = logits[chosen].max(dim=1)
-        valid = torch.nonzero(best >= limits[kinds])[:, 0]
+        best, labels = logits[chosen].max(dim=1)
+        valid = torch.nonzero(best >= limits[labels])[:, 0]
         if len(valid) > settings.nms.candidates:
             valid = valid[best[valid].topk(settings.nms.candidates).indices]
-        chosen, best, kinds = chosen[valid], best[valid], kinds[valid]
+        chosen, best, labels = chosen[valid], best[valid], labels[valid]
         codes, directions = boxes_at(chosen)
         boxes = decode(codes.float(), directions.argmax(dim=1), self.anchors[chosen],
                        self.config.direction_offset).cpu().numpy()
-        scores, kinds = torch.sigmoid(best).cpu().numpy(), kinds.cpu().numpy()
-        detections = best_of_each(boxes, scores, kinds, self.config.classes, settings.nms)
+        scores, labels = torch.sigmoid(best).cpu().numpy(), labels.cpu().numpy()
+        detections = best_of_each(boxes, scores, labels, self.config.classes, settings.nms)
         return detections, best_scores, broken
 
     def _problem(self, frame: LidarFrame, seen: LidarFrame, inputs: NetworkInput) -> str | None:
         if len(frame) == 0:
-            return "the cloud is empty or has no finite point"
+            return "the cloud is empty or has no finite point, or crop.* leaves none"
         if len(seen) == 0:
             low, high = self.config.low, self.config.high
             return (f"no point lies in the network's range, x {low[0]:g} .. {high[0]:g}, y "
@@ -140,7 +138,7 @@ class PointPillarsDetector(NetworkDetector):
             return "the cloud has no intensity, which the network was trained with; it reads zeros"
         return None
 
-    def place(self, device: torch.device) -> None:
+    def bring_to(self, device: torch.device) -> None:
         """Bring network and anchors to a device."""
         self.network.to(device)
         self.anchors = make_anchors(self.config, device)
@@ -168,12 +166,12 @@ def load_detector(path: str | Path = "", device: str = "auto",
     if path.suffix == ".onnx":
         from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork
         header, network = OnnxNetwork.load(path)
-        place = CPU
+        where = CPU
         if device not in ("auto", "cpu"):
             raise InputError(f"{path} runs in ONNX Runtime on the CPU, not on {device!r}; use the "
                              "checkpoint it was exported from")
     else:
-        place = chosen_device(device)
+        where = chosen_device(device)
         header, loaded = load_network(path)
         network = TorchNetwork(loaded, CPU)
     for name in "version", "size":
@@ -182,7 +180,7 @@ def load_detector(path: str | Path = "", device: str = "auto",
             raise InputError(f"{path} holds {name} {found}, asked for was {wanted}; change "
                              f"pointpillars.{name} or pointpillars.weights")
     detector = PointPillarsDetector(network, header, CPU, params)
-    detector.move(place)
+    detector.move(where)
     if params.pointpillars.warm_up:
         detector.warm_up()
     return detector

@@ -72,10 +72,10 @@ def draw_clusters(xyz: np.ndarray, cluster_ids: np.ndarray, config: NetworkConfi
     rectangle, and drawn as filled ellipses into the channel of their class (MAP_CLASSES): the
     cells whose middle lies in the ellipse, and the one that holds its centre.
     """
-    kinds = class_by_diagonal(oriented_boxes(xyz, cluster_ids, "min_area"))
-    channels = np.full(len(kinds), -1)
+    class_ids = class_by_diagonal(oriented_boxes(xyz, cluster_ids, "min_area"))
+    channels = np.full(len(class_ids), -1)
     for channel, name in enumerate(MAP_CLASSES):
-        channels[kinds == CLASSES.index(name)] = channel
+        channels[class_ids == CLASSES.index(name)] = channel
     image = np.zeros((len(MAP_CLASSES), *config.grid), np.uint8)
     _fill_ellipses(image, ellipses(xyz, cluster_ids), channels, config.low[0], config.low[1],
                    config.cell)

@@ -44,7 +44,7 @@ class Project:
     name: str
     points: str            # prefix of the linear layer of points and its norm
     block: str             # prefix of block i, {i}
-    first: int             # place of the first convolution in a block
+    first: int             # index of the first convolution in a block
     neck: str              # prefix of the neck's branch i, {i}
     head: tuple[str, str, str]
     classes: tuple[str, ...]
@@ -79,7 +79,7 @@ def import_weights(path: str | Path, classes: tuple[str, ...] = ()) -> tuple[Net
     if project is None:
         raise InputError(f"{path} is no PointPillars of {' or '.join(p.name for p in PROJECTS)}: "
                          f"it has no tensor {PROJECTS[0].points}linear.weight")
-    config = _config(project, _kinds(state, project, path), classes, path)
+    config = _config(project, _anchors_per_cell(state, project, path), classes, path)
     network = make_network(config)
     taken, converted = {}, network.state_dict()
     for ours, theirs in _names(project, config).items():
@@ -128,8 +128,8 @@ def _tensor(state: dict[str, Tensor], name: str, path: Path) -> Tensor:
     return state[name].float() if state[name].is_floating_point() else state[name]
 
 
-def _kinds(state: dict[str, Tensor], project: Project, path: Path) -> int:
-    """Anchors at one place, from the seven numbers of each."""
+def _anchors_per_cell(state: dict[str, Tensor], project: Project, path: Path) -> int:
+    """Anchors per cell, from the seven numbers of each."""
     outputs = len(_tensor(state, f"{project.head[1]}.weight", path))
     if outputs % 14:
         raise InputError(f"{path}: {project.head[1]} has {outputs} outputs, which is not 7 for "
@@ -137,13 +137,13 @@ def _kinds(state: dict[str, Tensor], project: Project, path: Path) -> int:
     return outputs // 7
 
 
-def _config(project: Project, kinds: int, classes: tuple[str, ...], path: Path) -> NetworkConfig:
+def _config(project: Project, per_cell: int, classes: tuple[str, ...], path: Path) -> NetworkConfig:
     names = classes or project.classes
-    if not classes and kinds == 2:
+    if not classes and per_cell == 2:
         names = ("Car",)
-    if kinds != 2 * len(names):
-        raise InputError(f"{path} has {kinds} anchors at each place, so {kinds // 2} classes; name "
-                         f"them in the order of training instead of {', '.join(names)}")
+    if per_cell != 2 * len(names):
+        raise InputError(f"{path} has {per_cell} anchors per cell, so {per_cell // 2} classes; "
+                         f"name them in the order of training instead of {', '.join(names)}")
     known = {anchor.name: anchor for anchor in ANCHORS}
     if unknown := [name for name in names if name not in known]:
         raise InputError(f"there is no anchor for {unknown[0]!r}; choose of {', '.join(known)}")
@@ -161,10 +161,10 @@ def _names(project: Project, config: NetworkConfig) -> dict[str, str]:
     names = {f"pillar_net.norm.{part}": f"{project.points}norm.{part}"
              for part in (*NORM_PARTS, "num_batches_tracked")}
 
-    def layer(ours: str, theirs: str, place: int) -> None:
-        names[f"{ours}.0.weight"] = f"{theirs}{place}.weight"
+    def layer(ours: str, theirs: str, index: int) -> None:
+        names[f"{ours}.0.weight"] = f"{theirs}{index}.weight"
         for part in (*NORM_PARTS, "num_batches_tracked"):
-            names[f"{ours}.1.{part}"] = f"{theirs}{place + 1}.{part}"
+            names[f"{ours}.1.{part}"] = f"{theirs}{index + 1}.{part}"
 
     for i, layers in enumerate(config.block_layers):
         for j in range(layers + 1):  # convolution, norm, ReLU

@@ -25,10 +25,11 @@ class Losses(NamedTuple):
     directions: Tensor
 
 
-def detection_loss(outputs: Outputs, targets: Targets, kinds: Tensor) -> Losses:
+def detection_loss(outputs: Outputs, targets: Targets, classes_of: Tensor) -> Losses:
     """Scores: the focal losses of the anchors of each class, divided by the number of those that
     have an object, averaged over the classes. Boxes and directions: the mean over all anchors that
-    have an object. Numbers are at least 1 a cloud. kinds (A,) of anchors.anchor_classes.
+    have an object. Numbers are at least 1 a cloud. classes_of (A,): the class of each
+    anchor, see anchors.anchor_classes.
 
     So classes weigh alike where they are told from the background. Lang et al. divide scores by
     the anchors of all classes, too; a car is on ten times as many of them as a pedestrian.
@@ -36,8 +37,8 @@ def detection_loss(outputs: Outputs, targets: Targets, kinds: Tensor) -> Losses:
     positive = targets.labels >= 0                                       # (B, A)
     logits = outputs.logits.float()
     clouds, _, classes = logits.shape
-    count = logits.new_zeros(classes).index_add_(0, kinds, positive.sum(dim=0).to(logits))
-    share = (count.clamp(min=clouds) * classes).reciprocal()[kinds]      # (A,)
+    count = logits.new_zeros(classes).index_add_(0, classes_of, positive.sum(dim=0).to(logits))
+    share = (count.clamp(min=clouds) * classes).reciprocal()[classes_of]      # (A,)
     wanted = functional.one_hot(targets.labels.clamp(min=0), classes).to(logits.dtype)
     focal = focal_loss(logits, wanted * positive[..., None]).sum(dim=2)  # (B, A)
     scores = ((focal * (targets.labels != IGNORED)).sum(dim=0) * share).sum()

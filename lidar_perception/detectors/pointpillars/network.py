@@ -54,7 +54,7 @@ def conv3x3(channels: int, out: int, stride: int = 1) -> ConvNormRelu:
 
 
 class PillarNet(nn.Module):
-    """A linear layer for each point, and the largest value of each pillar, in its place."""
+    """A linear layer for each point, and the largest value of each pillar, in its cell."""
 
     def __init__(self, config: NetworkConfig):
         super().__init__()
@@ -142,12 +142,12 @@ class Head(nn.Module):
     for boxes at a few anchors.
     """
 
-    def __init__(self, channels: int, kinds: int, classes: int):
+    def __init__(self, channels: int, per_cell: int, classes: int):
         super().__init__()
-        self.kinds, self.classes = kinds, classes  # kinds: anchors at one place
-        self.scores = nn.Conv2d(channels, kinds * classes, 1)
-        self.codes = nn.Conv2d(channels, kinds * CODE, 1)
-        self.directions = nn.Conv2d(channels, kinds * BINS, 1)
+        self.per_cell, self.classes = per_cell, classes  # anchors per cell
+        self.scores = nn.Conv2d(channels, per_cell * classes, 1)
+        self.codes = nn.Conv2d(channels, per_cell * CODE, 1)
+        self.directions = nn.Conv2d(channels, per_cell * BINS, 1)
         nn.init.normal_(self.scores.weight, std=0.01)
         nn.init.constant_(self.scores.bias, -math.log((1 - PRIOR) / PRIOR))
         nn.init.normal_(self.codes.weight, std=0.001)
@@ -163,19 +163,19 @@ class Head(nn.Module):
 
     def boxes_at(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
         """codes (M, 7) and directions (M, 2) of anchors (M,) of the only cloud."""
-        indices, kinds = anchors // self.kinds, anchors % self.kinds
-        rows = features[0].flatten(1)[:, indices].T  # (M, C)
+        cells, numbers = anchors // self.per_cell, anchors % self.per_cell
+        rows = features[0].flatten(1)[:, cells].T  # (M, C)
 
         def one(conv: nn.Conv2d, width: int) -> Tensor:
-            weight = conv.weight.view(self.kinds, width, -1)[kinds]  # (M, width, C)
-            bias = conv.bias.view(self.kinds, width)[kinds]
+            weight = conv.weight.view(self.per_cell, width, -1)[numbers]  # (M, width, C)
+            bias = conv.bias.view(self.per_cell, width)[numbers]
             return torch.baddbmm(bias[:, :, None], weight, rows[:, :, None])[:, :, 0]
 
         return one(self.codes, CODE), one(self.directions, BINS)
 
 
 def _by_anchor(x: Tensor, width: int) -> Tensor:
-    """(B, kinds * width, H, W) to (B, H * W * kinds, width)."""
+    """(B, P * width, H, W), P anchors per cell, to (B, H * W * P, width)."""
     return x.permute(0, 2, 3, 1).reshape(len(x), -1, width)
 
 

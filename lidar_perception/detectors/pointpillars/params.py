@@ -8,6 +8,7 @@ from lidar_perception.clustering.params import ClusteringParams, DbscanParams
 from lidar_perception.detectors.params import NetworkParams
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
+from lidar_perception.robot.params import CropParams
 from lidar_perception.wire.params import InputParams
 
 STEPS = ("preprocess", "experts", "network", "postprocess")  # of which each has its time
@@ -15,7 +16,7 @@ STEPS = ("preprocess", "experts", "network", "postprocess")  # of which each has
 
 @dataclass(frozen=True)
 class PointPillarsParams(NetworkParams):
-    """Which PointPillars, where it runs, and what counts as found."""
+    """Which PointPillars, where it runs, and what counts as a detection."""
 
     weights: str = param("", "Checkpoint (.safetensors) or exported network (.onnx); empty: the "
                          "one that comes with the package.", fixed=True)
@@ -39,6 +40,7 @@ class DetectorParams:
     """All groups of the detector; ground and clustering are its experts."""
 
     input: InputParams = INPUT
+    crop: CropParams = CropParams()
     ground: GroundParams = EXPERT_GROUND
     clustering: ClusteringParams = EXPERT_CLUSTERING
     pointpillars: PointPillarsParams = PointPillarsParams()

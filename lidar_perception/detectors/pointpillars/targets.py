@@ -55,15 +55,15 @@ def assign(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor
 
 
 def anchors_near(anchors: Tensor, config: NetworkConfig, boxes: Tensor, index: int) -> Tensor:
-    """Places (A',) int64, rising, of the anchors of class `index` that may overlap a box of (M, 7);
-    all others overlap none. Most of a street is empty, so this saves most of the work."""
-    kinds = len(config.anchors) * len(config.yaws)
-    cells = anchors.view(*config.head_grid, kinds, 7)
+    """Indices (A',) int64, rising, of the anchors of class `index` that may overlap one of boxes
+    (M, 7); all others overlap none. Most of a street is empty, so this saves most of the work."""
+    per_cell = len(config.anchors) * len(config.yaws)
+    cells = anchors.view(*config.head_grid, per_cell, 7)
     reach = (boxes[:, 3:5].amax(dim=1) + max(config.anchors[index].size[:2])) / 2
     column = (cells[0, :, 0, 0, None] - boxes[:, 0]).abs() <= reach          # (W, M)
     row = (cells[:, 0, 0, 1, None] - boxes[:, 1]).abs() <= reach             # (H, M)
     near = (row[:, None] & column).any(dim=2).flatten()                      # (H * W,)
-    first = torch.nonzero(near) * kinds + index * len(config.yaws)           # (cells, 1)
+    first = torch.nonzero(near) * per_cell + index * len(config.yaws)           # (cells, 1)
     return (first + torch.arange(len(config.yaws), device=anchors.device)).reshape(-1)
 
 

@@ -133,24 +133,24 @@ def _candidates(sensor_height: float) -> list[Contender]:
 def _hybrids(opened: Sequence[Opened], best: PipelineParams
              ) -> tuple[list[Contender], list[Missing]]:
     """STM-CPA and PointPillars, each with the first PointNet."""
-    judge = next((each for each in opened if each.network == POINTNET), None)
+    classifier = next((each for each in opened if each.network == POINTNET), None)
     proposers = {each.name: each for each in reversed(opened) if each.network == POINTPILLARS}
     proposer = proposers.get(PROPOSER, next(reversed(proposers.values()), None))
     names = "STM-CPA + PointNet", "STM-CPA + PointNet, auto", "PointPillars + PointNet"
-    if judge is None:
-        return [], [Missing(name, "there is no PointNet to judge") for name in names]
+    if classifier is None:
+        return [], [Missing(name, "no PointNet has weights") for name in names]
 
     def rescored(seed, camera, pipeline):
-        return RescoredCandidates(judge.detector, seed, camera, RescoringParams(), pipeline)
+        return RescoredCandidates(classifier.detector, seed, camera, RescoringParams(), pipeline)
     own = rescored(_no_seed, None, best).pipeline
-    found = [_seeded(names[0], rescored, best, _labelled, str(judge.source)),
-             _seeded(names[1], rescored, best, _own_seed(own), str(judge.source))]
+    found = [_seeded(names[0], rescored, best, _labelled, str(classifier.source)),
+             _seeded(names[1], rescored, best, _own_seed(own), str(classifier.source))]
     if proposer is None:
         return found, [Missing(names[2], "there is no PointPillars to propose")]
-    confirmed = ConfirmedProposals(proposer.detector.with_min_score(MIN_SCORE), judge.detector,
+    confirmed = ConfirmedProposals(proposer.detector.with_min_score(MIN_SCORE), classifier.detector,
                                    ConfirmingParams())
     return [*found, always(proposer.name.replace("PointPillars", "PP") + " + PointNet", confirmed,
-                           f"{proposer.source} {judge.source}")], []
+                           f"{proposer.source} {classifier.source}")], []
 
 
 def _seeded(name: str, make: Callable[..., Detector], params: PipelineParams,

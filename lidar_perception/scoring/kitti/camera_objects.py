@@ -91,13 +91,14 @@ def camera_objects(objects: GroundTruth, calibration: Calibration | None) -> Cam
     given = _columns(labels, "bbox", 4)
     has_pixels = (given[:, 2:] > given[:, :2]).all(axis=1, keepdims=True)
     sides = np.maximum(_columns(labels, "dimensions", 3), 0)
-    place, turn = _columns(labels, "location", 3), _columns(labels, "rotation_y")
+    location, turn = _columns(labels, "location", 3), _columns(labels, "rotation_y")
     alpha = _columns(labels, "alpha")
     whole = sides.all(axis=1)  # not a 2D box only
-    computed = np.where(whole, wrap_angle(turn - np.arctan2(place[:, 0], place[:, 2])), np.nan)
+    bearing = np.arctan2(location[:, 0], location[:, 2])
+    computed = np.where(whole, wrap_angle(turn - bearing), np.nan)
     return CameraObjects(
         class_ids=np.array([CLASSES.index(label["class"]) for label in labels], np.int32),
-        boxes=np.column_stack([place[:, 2], -place[:, 0], sides[:, 0] / 2 - place[:, 1],
+        boxes=np.column_stack([location[:, 2], -location[:, 0], sides[:, 0] / 2 - location[:, 1],
                                sides[:, [2, 1, 0]], -turn - np.pi / 2]),
         image_boxes=np.where(has_pixels, given, projected),
         alpha=np.where(alpha > NO_ANGLE, alpha, computed),

@@ -26,7 +26,7 @@ RANGES = {"car": 50.0, "truck": 50.0, "bus": 50.0, "trailer": 50.0, "constructio
 DISTANCES = (0.5, 1.0, 2.0, 4.0)    # metres between centres, below which a detection is a hit
 ERROR_DISTANCE = 2.0                # of the hits whose errors are taken
 RECALLS = np.linspace(0.0, 1.0, 101)
-FIRST_RECALL = 11                   # the first place of RECALLS above the least recall of 0.1
+FIRST_RECALL = 11                   # the first of RECALLS above the least recall of 0.1
 MIN_PRECISION = 0.1
 AP_WEIGHT = 5                       # of mAP in NDS, beside one for each of ERRORS
 IN_RACKS = ("bicycle", "motorcycle")  # not counted inside a bicycle rack
@@ -41,10 +41,10 @@ HALF_TURNS = ("barrier",)           # look the same from both sides
 def counted(boxes: GlobalBoxes, ego: np.ndarray, racks: GlobalBoxes) -> np.ndarray:
     """(K,) bool of the labels or detections of one frame: those of a class, within its range of the
     vehicle at ego (>=2,), not known to be without points, and no bicycle in a rack."""
-    ranges = np.array([RANGES[name] for name in NAMES] + [0.0])[boxes.kinds]  # the last is kind -1
+    ranges = np.array([RANGES[name] for name in NAMES] + [0.0])[boxes.class_ids]  # -1 is the last
     away = np.sqrt(((boxes.centres[:, :2] - ego[:2]) ** 2).sum(axis=1))
     kept = (away < ranges) & (boxes.points != 0)
-    cycles = np.isin(boxes.kinds, [NAMES.index(name) for name in IN_RACKS])
+    cycles = np.isin(boxes.class_ids, [NAMES.index(name) for name in IN_RACKS])
     for rack in np.column_stack([racks.centres, racks.sizes, racks.yaws]):
         kept &= ~(cycles & points_in_box(boxes.centres, rack))
     return kept
@@ -70,9 +70,9 @@ def class_scores(name: str, truth: GlobalBoxes, true_frames: np.ndarray, found: 
                  found_frames: np.ndarray) -> ClassScores:
     """Scores of the class called name, over counted boxes of all frames: truth (M) and found (K),
     with the numbers of their frames (M,), ascending, and (K,), int."""
-    kind = NAMES.index(name)
-    truth, true_frames = truth[truth.kinds == kind], true_frames[truth.kinds == kind]
-    found, found_frames = found[found.kinds == kind], found_frames[found.kinds == kind]
+    own, own_found = (boxes.class_ids == NAMES.index(name) for boxes in (truth, found))
+    truth, true_frames = truth[own], true_frames[own]
+    found, found_frames = found[own_found], found_frames[own_found]
     order = np.argsort(found.scores, kind="stable")[::-1]
     found, found_frames = found[order], found_frames[order]
     frames = max(true_frames.max(initial=-1), found_frames.max(initial=-1)) + 1

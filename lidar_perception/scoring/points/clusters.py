@@ -44,8 +44,8 @@ def labelled(clusters: Clusters, boxes: np.ndarray, class_ids: np.ndarray,
         part = np.bincount(number[inside], minlength=count) / sizes
         more = part > share
         share[more], owners[more] = part[more], i
-    kinds = np.append(kinds_of(class_ids, classes), background)
-    labels = np.where(share >= SURE, kinds[owners], UNKNOWN)
+    of_boxes = np.append(labels_of(class_ids, classes), background)
+    labels = np.where(share >= SURE, of_boxes[owners], UNKNOWN)
     labels[share < UNSURE] = background
     owners[(labels == UNKNOWN) | (labels == background)] = -1
     return labels, owners
@@ -56,8 +56,8 @@ def point_labels(xyz: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
     """(N,) int64 of points (N, 3): the class whose box they are in, else their number for
     background; UNKNOWN for those in a box that is neither."""
     labels = np.full(len(xyz), len(classes))
-    for kind, box in zip(kinds_of(class_ids, classes), boxes):
-        labels[points_in_box(xyz, box, BORDER)] = kind
+    for label, box in zip(labels_of(class_ids, classes), boxes):
+        labels[points_in_box(xyz, box, BORDER)] = label
     return labels
 
 
@@ -76,7 +76,7 @@ def unknown_where(labels: np.ndarray, clusters: Clusters, uncared: np.ndarray,
     return np.where((labels == background) & (share >= 0.5), UNKNOWN, labels)
 
 
-def kinds_of(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
+def labels_of(class_ids: np.ndarray, classes: Sequence[str]) -> np.ndarray:
     """(M,) int64 into classes of class_ids (M,) into CLASSES; their number for what is background,
     UNKNOWN for what looks like a class and is none."""
     return np.array([classes.index(name) if name in classes else
@@ -92,12 +92,12 @@ def confusions(clusters: Clusters, labels: np.ndarray, predictions: Predictions,
     and the numbers of their clusters, 0 for none."""
     shape = len(classes) + 1, len(classes) + 1
     of_clusters, of_points = np.zeros(shape, np.int64), np.zeros(shape, np.int64)
-    kinds = predictions.probabilities.argmax(axis=1)
+    predicted = predictions.probabilities.argmax(axis=1)
     counted = (labels >= 0) & (clusters.sizes >= MIN_POINTS)
-    np.add.at(of_clusters, (labels[counted], kinds[counted]), 1)
+    np.add.at(of_clusters, (labels[counted], predicted[counted]), 1)
     largest = max(int(cluster_ids.max(initial=0)), int(clusters.ids.max(initial=0)))
     of_number = np.full(largest + 1, len(classes))
-    of_number[clusters.ids] = kinds
+    of_number[clusters.ids] = predicted
     known = point_truth >= 0
     np.add.at(of_points, (point_truth[known], of_number[cluster_ids[known]]), 1)
     return of_clusters, of_points

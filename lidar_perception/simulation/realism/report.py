@@ -116,10 +116,10 @@ def draw_realism(path: Path, content: dict) -> None:
 
 def _draw_curve(axes, curve: dict, log: bool) -> None:
     """One panel; bins with too few real samples to be judged are grey."""
-    places = range(len(curve["bins"]))
+    positions = range(len(curve["bins"]))
     for side, color, shift in (("real", REAL, -0.08), ("simulated", SIMULATED, 0.08)):
         median, low, high = (_column(curve, side, key) for key in ("median", "low", "high"))
-        x = [p + shift for p in places]
+        x = [p + shift for p in positions]
         ranges = len(x) - (curve["bins"][-1]["bin"] == "all")  # no line leads to `all`
         axes.plot(x[:ranges], median[:ranges], color=color, linewidth=1.6)
         axes.plot(x, median, "o", color=color, markersize=4)
@@ -127,14 +127,14 @@ def _draw_curve(axes, curve: dict, log: bool) -> None:
                   [max(b - m, 0) for m, b in zip(median, high)]]
         axes.errorbar(x, median, spread, fmt="none", ecolor=color, elinewidth=1, alpha=0.6,
                       capsize=2)
-    for i in places:
+    for i in positions:
         if curve["bins"][i]["within"] is None:
             axes.axvspan(i - 0.5, i + 0.5, color="#eeeeee", linewidth=0)
     if log:
         axes.set_yscale("symlog", linthresh=10)
-    axes.set_xticks(places, [b["bin"] for b in curve["bins"]], fontsize=8,
-                    rotation=60 if len(places) > 9 else 30 if len(places) > 6 else 0)
-    axes.set_xlim(-0.5, len(places) - 0.5)
+    axes.set_xticks(positions, [b["bin"] for b in curve["bins"]], fontsize=8,
+                    rotation=60 if len(positions) > 9 else 30 if len(positions) > 6 else 0)
+    axes.set_xlim(-0.5, len(positions) - 0.5)
     verdict = f"{curve['within']}/{curve['judged']}" if curve["judged"] else "not judged"
     wrong = curve["judged"] and curve["share"] < 0.5
     _frame(axes, curve, f"{curve['title']}  [{verdict}]", WRONG if wrong else "black")
@@ -142,12 +142,12 @@ def _draw_curve(axes, curve: dict, log: bool) -> None:
 
 def _draw_histogram(axes, curve: dict, _log: bool) -> None:
     """One panel; the bars start at the names of their bins."""
-    places = range(len(curve["bins"]))
+    positions = range(len(curve["bins"]))
     for side, color, alpha in (("real", REAL, 0.5), ("simulated", SIMULATED, 0.35)):
         share = _column(curve, side, "median")
-        axes.bar(places, share, width=1.0, align="edge", color=color, alpha=alpha, linewidth=0)
-        axes.step([*places, len(places)], [*share, share[-1]], where="post", color=color)
-    axes.set_xticks(places[::4], [b["bin"] for b in curve["bins"]][::4], fontsize=8)
+        axes.bar(positions, share, width=1.0, align="edge", color=color, alpha=alpha, linewidth=0)
+        axes.step([*positions, len(positions)], [*share, share[-1]], where="post", color=color)
+    axes.set_xticks(positions[::4], [b["bin"] for b in curve["bins"]][::4], fontsize=8)
     _frame(axes, curve, curve["title"], "black")
 
 

@@ -16,8 +16,8 @@ EVEN = 1e-6           # m2, added to the scatter along x and y: a line of points
 def scatter_of_cells(xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of the cells of CELL on a side that are mostly ground, the middle of their points (C, 2) and
     the standard deviation of these about their plane (C,), metres. xyz (N, 3); C may be 0."""
-    places = np.floor(xyz[:, :2] / CELL).astype(np.int64)
-    _, cell = np.unique(places, axis=0, return_inverse=True)
+    cells = np.floor(xyz[:, :2] / CELL).astype(np.int64)
+    _, cell = np.unique(cells, axis=0, return_inverse=True)
     order = np.lexsort((xyz[:, 2], cell))
     points, cell = xyz[order].astype(np.float64), cell[order]
     count = np.bincount(cell)

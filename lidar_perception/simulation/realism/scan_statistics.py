@@ -128,8 +128,8 @@ def object_rows(frame: LidarFrame, truth: GroundTruth, camera: Camera | None) ->
     rows: dict[str, list] = {}
     bins = len(_BY_OBJECT_RANGE)
     for i, (box, name) in enumerate(zip(truth.boxes, truth.labels)):
-        place = _bin(horizontal_range(box[None]), OBJECT_RANGES)[0]
-        if name not in CLASSES or place == bins or not _seen_whole(camera, box):
+        at = _bin(horizontal_range(box[None]), OBJECT_RANGES)[0]
+        if name not in CLASSES or at == bins or not _seen_whole(camera, box):
             continue
         inside = np.flatnonzero(points_in_box(frame.xyz, box))
         if len(inside) == 0:
@@ -141,7 +141,7 @@ def object_rows(frame: LidarFrame, truth: GroundTruth, camera: Camera | None) ->
                 own = to_box_frame(frame.xyz[inside].astype(float), box) / box[3:6]
                 values |= dict(zip(("length", "width", "height"), np.ptp(own, axis=0)))
                 values["above"] = (own[:, 2] > BELT - 0.5).mean()
-        new = {f"{name} {what}": np.where(np.arange(bins) == place, value, np.nan)
+        new = {f"{name} {what}": np.where(np.arange(bins) == at, value, np.nan)
                for what, value in values.items()}
         if frame.intensity is not None and len(inside) >= MIN_POINTS:
             new |= _intensity(name, frame.intensity[inside])

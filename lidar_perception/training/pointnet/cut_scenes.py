@@ -31,8 +31,8 @@ AROUND = 0.3  # m: points so near to an object are looked at, too
 
 @dataclass(frozen=True)
 class CutScene:
-    """K clusters with labels (K,) int64 of evaluation.clusters.labelled; boxes (K, 7) float64 of
-    the objects, 0 where there is none. loose (K,) bool: not made by clustering but all around an
+    """K clusters with labels (K,) int64 of scoring.points.clusters.labelled; boxes (K, 7) float64
+    of the objects, 0 where there is none. loose (K,) bool: not made by clustering but all around an
     object that is not ground."""
 
     clusters: Clusters
@@ -96,12 +96,12 @@ def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutSce
             around.append(i)
             ids[inside] = len(around)
     loose = clusters_of(frame, ids, ground=ground)
-    kinds = [config.classes.index(CLASSES[scene.class_ids[i]]) for i in around]
+    of_loose = [config.classes.index(CLASSES[scene.class_ids[i]]) for i in around]
     both = Clusters(np.concatenate([clusters.points, loose.points]),
                     np.concatenate([clusters.first, clusters.first[-1] + loose.first[1:]]),
                     np.concatenate([clusters.ids, np.full(len(loose), -1)]),
                     np.concatenate([clusters.ground, loose.ground]))
-    return CutScene(both, np.concatenate([labels, np.array(kinds, np.int64)]),
+    return CutScene(both, np.concatenate([labels, np.array(of_loose, np.int64)]),
                     np.concatenate([boxes, scene.boxes[around].reshape(-1, 7)]),
                     np.arange(len(both)) >= len(clusters))
 

@@ -67,17 +67,17 @@ class ClusterPreparation:
         clusters, boxes = changed(clusters, boxes, scene.loose[chosen], self.augment, rng)
         inputs = network_input(clusters, self.config.points, int(rng.integers(1 << 30)))
         has_box = (labels >= 0) & (labels < len(self.config.classes))
-        kinds = np.where(has_box, labels, 0)
-        targets = encode(boxes, kinds, inputs.centres, inputs.azimuths, self.config)
+        classes = np.where(has_box, labels, 0)
+        targets = encode(boxes, classes, inputs.centres, inputs.azimuths, self.config)
         return ClusterSample(inputs, labels, targets, has_box)
 
     def _chosen(self, scene: CutScene, rng: np.random.Generator) -> np.ndarray:
         """All objects, up to a number of each class, and some background."""
         chosen = []
-        for kind in range(len(self.config.classes) + 1):
-            most = (self.augment.background if kind == len(self.config.classes)
+        for label in range(len(self.config.classes) + 1):
+            most = (self.augment.background if label == len(self.config.classes)
                     else self.augment.objects)
-            known = np.flatnonzero(scene.labels == kind)
+            known = np.flatnonzero(scene.labels == label)
             chosen.append(rng.permutation(known)[:most])
         return np.sort(np.concatenate(chosen))
 

@@ -149,7 +149,7 @@ def targets_of(sample: Sample, anchors: Tensor, config: NetworkConfig) -> Target
 
 def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     """loss(network, samples) -> total, parts, as the loop wants it."""
-    anchors, kinds = make_anchors(config, device), anchor_classes(config, device)
+    anchors, classes = make_anchors(config, device), anchor_classes(config, device)
 
     def loss(network: nn.Module, samples: Sequence[Sample]) -> tuple[Tensor, dict[str, Tensor]]:
         pillars = make_pillars([torch.from_numpy(s.points).to(device) for s in samples], config)
@@ -157,7 +157,7 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
         if config.pseudo_map:
             maps = torch.from_numpy(np.stack([s.cluster_map for s in samples])).to(device)
         targets = stacked([targets_of(sample, anchors, config) for sample in samples])
-        losses = detection_loss(network(pillars, maps), targets, kinds)
+        losses = detection_loss(network(pillars, maps), targets, classes)
         return losses.total, {"classes": losses.classes.detach(), "boxes": losses.boxes.detach(),
                               "directions": losses.directions.detach()}
 

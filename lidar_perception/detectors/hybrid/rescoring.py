@@ -1,4 +1,4 @@
-"""The cluster network as a judge: how probable is the class that a box claims, by its points."""
+"""The score of a box combined with the probability that the cluster network gives its class."""
 
 from __future__ import annotations
 
@@ -18,27 +18,28 @@ def combined(scores: np.ndarray, probabilities: np.ndarray, weight: float) -> np
     return scores ** (1.0 - weight) * probabilities ** weight
 
 
-def seen_by(judge: PointNetDetector, frame: LidarFrame, pose: SensorPoseParams) -> LidarFrame:
-    """The frame of a sensor with this pose as the judge's network reads it."""
-    return with_intensity_scaled(levelled(frame, pose), judge.settings.intensity_scale)
+def seen_by(classifier: PointNetDetector, frame: LidarFrame, pose: SensorPoseParams) -> LidarFrame:
+    """The frame of a sensor with this pose as the classifier's network reads it."""
+    return with_intensity_scaled(levelled(frame, pose), classifier.settings.intensity_scale)
 
 
-def known(judge: PointNetDetector, class_ids: np.ndarray) -> np.ndarray:
-    """(K,) bool: of class_ids (K,) into CLASSES, those that the judge's network tells apart."""
-    return np.isin(class_ids, [CLASSES.index(name) for name in judge.config.classes])
+def known(classifier: PointNetDetector, class_ids: np.ndarray) -> np.ndarray:
+    """(K,) bool: of class_ids (K,) into CLASSES, those that the network tells apart."""
+    return np.isin(class_ids, [CLASSES.index(name) for name in classifier.config.classes])
 
 
-def judged(judge: PointNetDetector, detections: Detections, clusters: Clusters, weight: float,
-           pose: SensorPoseParams = SensorPoseParams()) -> tuple[Detections, np.ndarray]:
+def rescored_by(classifier: PointNetDetector, detections: Detections, clusters: Clusters,
+                weight: float, pose: SensorPoseParams = SensorPoseParams()
+                ) -> tuple[Detections, np.ndarray]:
     """The detections with combined scores, and boxes (K, 7) float32 as the network makes them out,
     in the sensor's frame; K may be 0.
 
     detections: of classes that are known, detection i of the points of cluster i, which are those
-    of seen_by. Each is judged by itself.
+    of seen_by. Each is scored by itself.
     """
     names = [CLASSES[i] for i in detections.class_ids]
-    kinds = np.array([*map(judge.config.classes.index, names)], np.int64)
-    seen = judge.guarded(lambda: predict(judge.network, clusters, kinds=kinds))
+    labels = np.array([*map(classifier.config.classes.index, names)], np.int64)
+    seen = classifier.guarded(lambda: predict(classifier.network, clusters, labels=labels))
     scores = combined(detections.scores, seen.scores.astype(np.float32), weight)
     boxes = in_sensor_frame(Detections.of(seen.boxes), pose).boxes
     return Detections.of(detections.boxes, detections.class_ids, scores), boxes

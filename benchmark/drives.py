@@ -1,0 +1,203 @@
+"""Trackers on simulated drives that nothing was chosen on, with intervals by drive.
+
+    python -m benchmark.drives --drives 20 --seconds 20 --cache folder --json tracks.json
+
+Detections are computed once and kept in --cache, as simulation and networks take a second a frame;
+the trackers behind them take milliseconds.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import click
+import numpy as np
+from rich.table import Table
+
+from benchmark.plain_ab3dmot import PlainAb3dmot
+from benchmark.precision import Curve, curve_of, precision_at
+from benchmark.tracking import Seen, Step, peer, tracker
+from lidar_perception.candidates.configurations import BEST
+from lidar_perception.candidates.seed_sources import automatic_seed
+from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.detectors.candidates import CandidateDetector
+from lidar_perception.detectors.contract import Detector
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.param_fields import with_values
+from lidar_perception.runs.files import write_text
+from lidar_perception.runs.terminal import console, track
+from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
+from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
+from lidar_perception.scoring.tracking.pairs import pairs_of, tracked_labels, without_ignored
+from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
+from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.scene import Streets
+from lidar_perception.simulation.sensor import HDL64E
+from lidar_perception.tracking.params import TrackingParams, tracking_of
+from lidar_perception.types import Detections, InputError
+
+# Detector -> its classes, and the score from which on the peer gets its detections.
+DETECTORS = {"pointpillars": (("Car", "Pedestrian", "Cyclist"), 0.3),
+             "pointnet": (("Car", "Pedestrian", "Cyclist"), 0.3),
+             "candidates": (("Pedestrian",), BEST.confidence.threshold)}
+RESAMPLED, LEAST, INTERVAL = 2000, 0.05, (2.5, 97.5)
+RECALLS = (0.3, 0.5, 0.6)
+Drive = list[tuple[Seen, dict[str, Detections]]]
+Counts = dict[str, tuple[HotaCounts, ClearCounts]]
+
+
+def detected(street: int, frames: int, people: float) -> Drive:
+    """The first scans of a street and what each detector finds in them, weak detections too."""
+    params = with_values(BEST, {"seed.source": "automatic"})
+    detectors: dict[str, Detector] = {
+        "candidates": CandidateDetector(automatic_seed(load_seed(), params),
+                                        FORWARD_CAMERA.camera(), params),
+        **{name: open_detector(name, "cpu") for name in ("pointpillars", "pointnet")}}
+    detectors = {name: each.with_min_score(LEAST) for name, each in detectors.items()}
+    drive = []
+    for i in range(frames):
+        scan = scan_at(street, i, HDL64E, Streets(None, people))
+        found = {name: _found(each, scan.frame) for name, each in detectors.items()}
+        drive.append((Seen(Detections.none(), kitti_labels(scan.truth), scan.frame.stamp_ns,
+                           scan.pose), found))
+    return drive
+
+
+def _found(detector: Detector, frame) -> Detections:
+    try:
+        return detector(frame).detections
+    except InputError:  # no seed in this frame
+        return Detections.none()
+
+
+def cached(folder: Path, street: int, frames: int, people: float) -> Drive:
+    """detected(), kept in a folder of one's own."""
+    file = folder / f"{street}_{frames}_{people:g}.pkl"
+    if not file.exists():
+        folder.mkdir(parents=True, exist_ok=True)
+        part = file.with_suffix(".part")
+        part.write_bytes(pickle.dumps(detected(street, frames, people)))
+        part.rename(file)
+    return pickle.loads(file.read_bytes())
+
+
+def counts_of(drive: list[Seen], step: Step, classes: tuple[str, ...]) -> Counts:
+    """By class, what a tracker makes of a drive."""
+    frames = []
+    for seen in drive:
+        ids, found = step(seen)
+        frames.append(pairs_of(seen.truth, tracked_labels(ids, found), FORWARD_CAMERA))
+    return {name: (hota_counts(own := [without_ignored(f[name]) for f in frames]),
+                   clear_counts(own)) for name in classes}
+
+
+def measured(drives: list[Drive], detector: str, params: TrackingParams) -> dict:
+    """By class: the scores of both trackers with intervals, and precision at equal recall of
+    single frames and of tracks."""
+    classes, operating = DETECTORS[detector]
+    chosen = [[replace(seen, found=found[detector]) for seen, found in drive] for drive in drives]
+    peers = [counts_of(drive, peer(PlainAb3dmot(), operating), classes) for drive in chosen]
+    ours = [counts_of(drive, tracker(params), classes) for drive in chosen]
+    all_of_them = with_values(params, {"report": 0.0})
+    single = [curve_of(drive, _single(), classes) for drive in chosen]
+    tracked = [curve_of(drive, tracker(all_of_them), classes) for drive in chosen]
+    return {name: {**_scores([p[name] for p in peers], [o[name] for o in ours]),
+                   "precision": _precision([s[name] for s in single], [t[name] for t in tracked])}
+            for name in classes}
+
+
+def _single() -> Step:
+    return lambda seen: (np.arange(len(seen.found)), seen.found)
+
+
+def _scores(peers: list[tuple], ours: list[tuple]) -> dict:
+    labels = [clear.tp + clear.fn for _, clear in ours]
+    both = {}
+    for name, counted in ("peer", peers), ("ours", ours):
+        clear = sum((c for _, c in counted), ClearCounts())
+        hota = resampled(counted, lambda chosen: sum((h for h, _ in chosen), HotaCounts()
+                                                     ).scores()["HOTA"])
+        both[name] = {**sum((h for h, _ in counted), HotaCounts()).scores(), **clear.scores(),
+                      "interval": _interval(hota), "switches": clear.switches,
+                      "fragments": clear.fragments, "hits": clear.tp, "false": clear.fp}
+        both[name]["values"] = hota
+    difference = np.subtract(both["ours"].pop("values"), both["peer"].pop("values"))
+    return {"labels": sum(labels), **both,
+            "gain": both["ours"]["HOTA"] - both["peer"]["HOTA"],
+            "gain_interval": _interval(difference)}
+
+
+def _precision(single: list[Curve], tracked: list[Curve]) -> dict:
+    rows = {}
+    for recall in RECALLS:
+        values = [resampled(curves, lambda chosen, r=recall: precision_at(chosen, r))
+                  for curves in (single, tracked)]
+        rows[str(recall)] = {
+            "single": precision_at(single, recall), "tracked": precision_at(tracked, recall),
+            "gain_interval": _interval(np.subtract(values[1], values[0]))}
+    return rows
+
+
+def resampled(drives: list, value: Callable[[list], float], seed: int = 0) -> np.ndarray:
+    """(RESAMPLED,) values of drives drawn with replacement, the same draws for the same number of
+    drives, so that differences are paired."""
+    rng = np.random.default_rng(seed)
+    draws = rng.integers(0, len(drives), (RESAMPLED, len(drives)))
+    return np.array([value([drives[i] for i in draw]) for draw in draws])
+
+
+def _interval(values: np.ndarray) -> list[float]:
+    return [float(v) for v in np.percentile(values, INTERVAL)]
+
+
+def print_drives(content: dict) -> None:
+    """One row a detector and class; peer, then ours, in percent."""
+    table = Table(title=f"{content['drives']} drives of {content['seconds']:g} s")
+    for name in ("detector", "class", "boxes", "HOTA", "gain", "switches", "precision", "recall",
+                 *(f"precision at recall {r}" for r in RECALLS)):
+        table.add_column(name)
+    for detector, classes in content["detectors"].items():
+        for name, own in classes.items():
+            pair = [f"{100 * own['peer'][k]:.1f}, {100 * own['ours'][k]:.1f}"
+                    for k in ("HOTA", "precision", "recall")]
+            table.add_row(
+                detector, name, str(own["labels"]), pair[0],
+                f"{100 * own['gain']:+.1f} [{_range(own['gain_interval'])}]",
+                f"{own['peer']['switches']}, {own['ours']['switches']}", *pair[1:],
+                *(f"{100 * p['single']:.1f}, {100 * p['tracked']:.1f} "
+                  f"[{_range(p['gain_interval'])}]" for p in own["precision"].values()))
+    console.print(table)
+
+
+def _range(interval: list[float]) -> str:
+    return " .. ".join(f"{100 * v:+.1f}" for v in interval)
+
+
+@click.command()
+@click.option("--first", default=8301, show_default=True, help="Seed of the first street.")
+@click.option("--drives", "count", type=click.IntRange(1), default=20, show_default=True)
+@click.option("--seconds", type=click.FloatRange(0.1, 20.0), default=20.0, show_default=True)
+@click.option("--people", type=click.FloatRange(0), default=4.0, show_default=True,
+              help="Pedestrians and cyclists, as a multiple of KITTI's.")
+@click.option("--cache", type=click.Path(path_type=Path), required=True,
+              help="Folder for the detections.")
+@click.option("--json", "json_file", type=click.Path(path_type=Path))
+def main(first: int, count: int, seconds: float, people: float, cache: Path,
+         json_file: Path | None) -> None:
+    """Our tracker beside a plain AB3DMOT, and single frames beside tracks, on simulated drives."""
+    frames = round(seconds * HDL64E.rate)
+    drives = [cached(cache, street, frames, people) for street in
+              track(range(first, first + count), "detecting", count)]
+    content = {"drives": count, "seconds": seconds, "people": people, "first": first, "detectors": {
+        name: measured(drives, name, tracking_of(name)) for name in DETECTORS}}
+    print_drives(content)
+    if json_file:
+        write_text(json_file, json.dumps(content, indent=1))
+
+
+if __name__ == "__main__":
+    main(prog_name="python -m benchmark.drives")

@@ -1,0 +1,117 @@
+"""What motion correction gains: simulated turns of a sensor that drives and turns, as it reports
+them, and moved to their stamp by odometry: python -m benchmark.motion [STREETS]
+
+Error of a thing: how far the mean of its points is from where it was met, the same points in the
+sensor's frame at the stamp. The odometry is exact and comes 50 times a second.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections import defaultdict
+from collections.abc import Iterator
+
+import numpy as np
+from rich.table import Table
+
+from lidar_perception.detectors.contract import Detector
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.robot.deskew import deskewed
+from lidar_perception.robot.poses import interpolated
+from lidar_perception.runs.terminal import console
+from lidar_perception.simulation.drive import truth
+from lidar_perception.simulation.pairs import View
+from lidar_perception.simulation.raycast import cast_batch
+from lidar_perception.simulation.returns import returns_of
+from lidar_perception.simulation.scene import make_scene
+from lidar_perception.simulation.sensor import HDL64E, Motion, rays
+from lidar_perception.types import CLASSES, LidarFrame
+
+YAW_RATES = 0.0, 0.3, 0.6  # rad/s; at 10 m/s the last is a turn of 17 m
+POLE = 80                  # SemanticKITTI
+FEW = 10                   # points; things with fewer are left out
+NEAR = 2.0                 # m between a detection and its label
+ODOMETRY_HZ = 50
+
+
+def odometry(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """times (K,) ns around the stamp, translations (K, 3) and quaternions (K, 4) of the sensor."""
+    step = 10**9 // ODOMETRY_HZ
+    times = np.arange(-6, 7) * step + step // 3
+    half = times * 1e-9 * motion.yaw_rate / 2
+    return (times, times[:, None] * 1e-9 * np.asarray(motion.velocity),
+            np.column_stack([np.zeros((len(times), 2)), np.sin(half), np.cos(half)]))
+
+
+def turns(seed: int) -> Iterator[tuple]:
+    """Of a street: speed, yaw rate, the clouds as met, as reported and as corrected, each with the
+    same points, the number of each point's thing (0: none), which things are boxes that stand, and
+    the labels."""
+    scene = make_scene(seed)
+    moment = scene.at(5.0, HDL64E.height)
+    motions = [moment.motion._replace(yaw_rate=rate) for rate in YAW_RATES]
+    views = [View(moment.solids, scene.ground, moment.position, m, seed) for m in motions]
+    for motion, hits in zip(motions, cast_batch(views, HDL64E)):
+        met, reported = (returns_of(hits, HDL64E, motion, np.random.default_rng(seed), compensated)
+                         for compensated in (True, False))
+        way = odometry(motion)
+        corrected = deskewed(reported.xyz, met.time.astype(float), lambda at, way=way: interpolated(
+            *way, np.rint(at * 1e9).astype(np.int64)))
+        since = rays(HDL64E, motion).since.astype(np.float32)
+        order = np.argsort(since)
+        solid = hits.solid[order[np.searchsorted(since[order], met.time)], met.ring]
+        boxes = 1 + int(moment.track_ids.max(initial=0))
+        thing = np.where((met.semantic == POLE) & (solid >= 0), boxes + solid, met.owner)
+        standing = np.zeros(boxes, bool)
+        standing[moment.track_ids[moment.speeds == 0]] = True
+        yield (float(np.linalg.norm(motion.velocity)), motion.yaw_rate, (met, reported, corrected),
+               thing, standing, truth(moment, hits, met.owner))
+
+
+def errors(xyz: np.ndarray, met: np.ndarray, thing: np.ndarray) -> dict[int, float]:
+    """Thing -> metres between the means of its points."""
+    count = np.bincount(thing)
+    shift = np.column_stack([np.bincount(thing, axis) for axis in (xyz - met).astype(float).T])
+    return {i: float(np.linalg.norm(shift[i] / count[i]))
+            for i in np.flatnonzero(count >= FEW).tolist() if i}
+
+
+def detected(detector: Detector, xyz: np.ndarray, intensity: np.ndarray, labels) -> list[float]:
+    """Metres, from above, between each label that is found and the nearest detection of its
+    class."""
+    found, far = detector(LidarFrame(xyz, intensity)).detections, []
+    for box, kind in zip(labels.boxes, labels.class_ids):
+        same = found.boxes[found.class_ids == kind]
+        apart = np.hypot(*(same[:, :2] - box[:2]).T).min(initial=np.inf)
+        if apart < NEAR and CLASSES[kind] in detector.classes:
+            far.append(float(apart))
+    return far
+
+
+def measure(streets: int) -> None:
+    """Print the table."""
+    detector = open_detector()
+    rows: dict[tuple, list[float]] = defaultdict(list)
+    speeds = []
+    for seed in range(streets):
+        for speed, rate, (met, reported, corrected), thing, standing, labels in turns(seed):
+            speeds.append(speed)
+            for name, xyz in (("reported", reported.xyz), ("corrected", corrected)):
+                for i, error in errors(xyz, met.xyz, thing).items():
+                    kind = "poles" if i >= len(standing) else "standing boxes"
+                    if i >= len(standing) or standing[i]:
+                        rows[rate, kind, name].append(error)
+            for name, xyz in (("met", met.xyz), ("reported", reported.xyz),
+                              ("corrected", corrected)):
+                rows[rate, "detections", name] += detected(detector, xyz, met.intensity, labels)
+    table = Table(title=f"{streets} streets, {np.mean(speeds):.1f} m/s in the mean")
+    for column in ("yaw rate, rad/s", "of", "number", "median, m", "95 %, m"):
+        table.add_column(column)
+    for (rate, kind, name), values in sorted(rows.items()):
+        table.add_row(f"{rate:g}", f"{kind}, {name}", str(len(values)),
+                      f"{np.median(values):.3f}", f"{np.quantile(values, 0.95):.3f}")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    measure(int(sys.argv[1]) if len(sys.argv) > 1 else 20)

@@ -1,0 +1,61 @@
+"""Precision at a recall, of single frames and of tracks, by centres within 1 m."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lidar_perception.scoring.tracking.pairs import ALIKE, EPS, Pairs, pairs_of, tracked_labels
+from lidar_perception.simulation.camera import FORWARD_CAMERA
+
+if TYPE_CHECKING:
+    from benchmark.tracking import Seen, Step
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Of one drive and class: scores (K,) of all boxes that count, hits (K,) bool, and how many
+    labels there are to find."""
+
+    scores: np.ndarray
+    hits: np.ndarray
+    labels: int
+
+
+def curve_of(drive: list[Seen], step: Step, classes: tuple[str, ...]) -> dict[str, Curve]:
+    """By class; each label belongs to the best box that is like it."""
+    parts: dict[str, list[Curve]] = {name: [] for name in classes}
+    for seen in drive:
+        ids, found = step(seen)
+        pairs = pairs_of(seen.truth, tracked_labels(ids, found), FORWARD_CAMERA)
+        for name in classes:
+            parts[name].append(_of_frame(pairs[name]))
+    return {name: Curve(np.concatenate([p.scores for p in own]),
+                        np.concatenate([p.hits for p in own]), sum(p.labels for p in own))
+            for name, own in parts.items()}
+
+
+def _of_frame(pairs: Pairs) -> Curve:
+    alike = np.where(pairs.similarity >= ALIKE - EPS, pairs.similarity, 0.0)
+    counts, hits = np.ones(len(pairs.scores), bool), np.zeros(len(pairs.scores), bool)
+    for k in np.argsort(-pairs.scores, kind="stable"):
+        row = int(np.argmax(alike[:, k])) if len(alike) else -1
+        if row >= 0 and alike[row, k] > 0:
+            hits[k], counts[k] = not pairs.ignored[row], not pairs.ignored[row]
+            alike[row] = 0.0
+        else:
+            counts[k] = not pairs.excused[k]
+    return Curve(pairs.scores[counts], hits[counts], int((~pairs.ignored).sum()))
+
+
+def precision_at(curves: Sequence[Curve], recall: float) -> float:
+    """The best precision of these drives at a recall or beyond; 0 where it is not reached."""
+    labels = sum(c.labels for c in curves)
+    order = np.argsort(-np.concatenate([c.scores for c in curves]), kind="stable")
+    hits = np.cumsum(np.concatenate([c.hits for c in curves])[order])
+    reached = hits >= recall * max(labels, 1)
+    precision = hits / np.arange(1, len(hits) + 1)
+    return float(precision[reached].max(initial=0.0))

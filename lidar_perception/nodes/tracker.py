@@ -1,0 +1,53 @@
+"""~/input/detections of any detector -> ~/output/tracks: ids, velocities, and steadier boxes."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from lidar_perception.nodes.managed import ManagedNode
+from lidar_perception.nodes.runtime import MARKERS, OK, WARN
+from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, has_detections_3d
+from lidar_perception.params import TrackerNodeParams, TrackInputParams
+from lidar_perception.types import InputError
+from lidar_perception.wire.messages import to_detections
+from msg_utils.detections import from_detection_array
+from msg_utils.markers import MarkedObjects, from_marker_array
+from msg_utils.stamps import to_ns
+
+
+class TrackerNode(ManagedNode):
+    """A frame without detections is an array that says when it was: of markers a DELETE or
+    DELETEALL with its header."""
+
+    def __init__(self, **options: Any):
+        super().__init__("tracker", TrackerNodeParams(), TrackInputParams(), **options)
+
+    def configure(self) -> None:
+        self.tracks = TrackOutputs(self, lambda: self.params, clouds=False)
+        self.input("detections", MARKERS, self.on_markers,
+                   needs=lambda m: self._needs(m.markers[:1]))
+        if has_detections_3d():
+            self.input("detections_3d", DETECTIONS_3D, self.on_detections,
+                       needs=lambda m: self._needs([m]))
+
+    def _needs(self, messages: list[Any]) -> str | None:
+        """What a frame waits for, which messages with its header are of."""
+        return self.tracks.ego.needed(to_ns(messages[0].header.stamp)) if messages else None
+
+    def on_markers(self, msg: Any) -> None:
+        if not msg.markers:
+            raise InputError("an array without a marker does not say of when it is; send a "
+                             "DELETEALL with the header of the frame. It is left out")
+        self._track(msg.markers[0].header, from_marker_array(msg))
+
+    def on_detections(self, msg: Any) -> None:
+        self._track(msg.header, from_detection_array(msg))
+
+    def _track(self, header: Any, objects: MarkedObjects) -> None:
+        self.frame_id = header.frame_id
+        with self.frame(to_ns(header.stamp)):
+            problem = self.tracks.publish(header, to_detections(objects))
+        if problem:
+            self.report(WARN, problem)
+        else:
+            self.report(OK, "tracking")

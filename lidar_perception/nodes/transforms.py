@@ -1,0 +1,254 @@
+"""TF and odometry as a node needs them: how its sensor is mounted, where results go, how it moves.
+
+The tree is our own, over /tf and /tf_static, so that it is the same with and without tf2_ros.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from dataclasses import replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.nodes.reception import WARN, Problem
+from lidar_perception.robot.crop import cropped
+from lidar_perception.robot.deskew import deskewed
+from lidar_perception.robot.placing import Placing, levelling, tilted
+from lidar_perception.robot.poses import inverse
+from lidar_perception.robot.tree import Missing, TransformTree
+from lidar_perception.types import InputError
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.point_times import moved_cloud, point_times
+from lidar_perception.wire.topics import TF, TF_STATIC
+from msg_utils.stamps import SECOND, to_ns
+
+TF_QOS = QoSProfile(depth=100)
+STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+ODOMETRY_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)  # takes any
+MOVING, STILL = "moving", "still"  # frames of the odometry, whatever the message calls them
+
+
+class Transforms:
+    """The frames that a node with the parameters `robot` (base_frame, target_frame, input) asks
+    for. Where TF lacks one the parameters stand, and a diagnostic names the frames."""
+
+    def __init__(self, node: Any):
+        self.node, robot = node, node.robot
+        self.tree, self.odometry = TransformTree(), TransformTree()
+        self.base_frame = robot.base_frame.lstrip("/")
+        self.target_frame = getattr(robot, "target_frame", "").lstrip("/")
+        self.carrier = ""  # the frame that the odometry is of
+        self.sweep = 0.0  # seconds from the stamp to the last point of a cloud
+        self.lacking: dict[str, str] = {}  # what asked for it -> what is not there
+        self.known: dict[str, Any] = {}  # for the diagnostics
+        self._last: tuple[tuple[str, int], Placing] = (("", -1), Placing(""))
+        self._listening = False
+        self._installed = importlib.util.find_spec("tf2_msgs") is not None
+        if self._installed:
+            self._subscribe(TF_STATIC, STATIC_QOS, static=True)
+        if self.base_frame or self.target_frame or robot.input.deskew == "tf":
+            self.listen()
+        if robot.input.deskew == "odometry":
+            node.input("odometry", "nav_msgs/msg/Odometry", self.on_odometry, ODOMETRY_QOS)
+
+    @property
+    def in_use(self) -> bool:
+        """Whether a cloud's frame matters to the node at all."""
+        return bool(self.base_frame or self.target_frame
+                    or self.node.robot.input.deskew != "off")
+
+    def listen(self) -> None:
+        """Subscribe to what moves, too; once."""
+        if self._listening:
+            return
+        self._listening = True
+        if self._installed:
+            self._subscribe(TF, TF_QOS, static=False)
+        else:
+            self.lacking["TF"] = ("tf2_msgs is not installed, so nothing is known of TF; install "
+                                  "ROS 2's tf2_msgs")
+
+    def _subscribe(self, topic: str, qos: QoSProfile, static: bool) -> None:
+        self.node.input(topic, "tf2_msgs/msg/TFMessage", lambda m: self.on_tf(m, static), qos,
+                        private=False)
+
+    def on_tf(self, msg: Any, static: bool) -> None:
+        """A tf2_msgs/TFMessage; what is no transform in it is left out and named."""
+        wrong = None
+        for each in msg.transforms:
+            t, q = each.transform.translation, each.transform.rotation
+            try:
+                self.tree.set(each.header.frame_id, each.child_frame_id, to_ns(each.header.stamp),
+                              (t.x, t.y, t.z), (q.x, q.y, q.z, q.w), static)
+            except InputError as error:
+                wrong = error
+        self._changed()
+        if wrong is not None:
+            raise wrong
+
+    def on_odometry(self, msg: Any) -> None:
+        """A nav_msgs/Odometry: where its child frame is at its stamp."""
+        p, q = msg.pose.pose.position, msg.pose.pose.orientation
+        self.carrier = msg.child_frame_id.lstrip("/")
+        self.odometry.set(STILL, MOVING, to_ns(msg.header.stamp), (p.x, p.y, p.z),
+                          (q.x, q.y, q.z, q.w))
+        self._changed()
+
+    def _changed(self) -> None:
+        self._last = (("", -1), Placing(""))
+
+    # What a cloud needs
+
+    def missing(self, cloud: Any) -> str | None:
+        """What a cloud waits for, as it may still come; None if nothing."""
+        if not self.in_use:
+            return None
+        frame_id, stamp = cloud.header.frame_id, to_ns(cloud.header.stamp)
+        try:
+            for frame in filter(None, (self.base_frame, self.target_frame)):
+                self.tree.lookup(frame, frame_id, stamp)
+            if self.node.robot.input.deskew != "off":
+                self.sensor_poses(frame_id, np.array([stamp + round(self.sweep * SECOND)]))
+        except Missing as error:
+            return str(error) if error.late else None
+        return None
+
+    def placing(self, header: Any) -> Placing:
+        """Of a cloud with this header."""
+        key = header.frame_id, to_ns(header.stamp)
+        if not (self.base_frame or self.target_frame):
+            return Placing(header.frame_id)
+        if self._last[0] != key:
+            self._last = key, self._placing(*key)
+        return self._last[1]
+
+    def _placing(self, frame_id: str, stamp_ns: int) -> Placing:
+        base = self._looked_up("base_frame", self.base_frame, frame_id, stamp_ns)
+        if base is not None and not 0.0 <= base[2, 3] <= 50.0:
+            self.lacking["base_frame"] = (
+                f"'{frame_id}' is {base[2, 3]:.2f} m above '{self.base_frame}', which is to be on "
+                "the ground (as base_footprint is); ground.sensor_pose stands")
+            base = None
+        level = None if base is None else levelling(base)
+        target = self._looked_up("target_frame", self.target_frame, frame_id, stamp_ns)
+        if target is None:
+            return Placing(frame_id, base, level, None if level is None else inverse(level))
+        return Placing(self.target_frame, base, level,
+                       target if level is None else target @ inverse(level))
+
+    def _looked_up(self, what: str, frame: str, frame_id: str, stamp_ns: int) -> np.ndarray | None:
+        """The pose of frame_id in the frame that the parameter `what` names; None where there is
+        none, which problems() then says."""
+        self.lacking.pop(what, None)
+        if not frame:
+            return None
+        try:
+            return self.tree.lookup(frame, frame_id, stamp_ns)
+        except Missing as error:
+            instead = {"base_frame": "ground.sensor_pose stands",
+                       "target_frame": f"results are in '{frame_id}'"}[what]
+            self.lacking[what] = f"{what} '{frame}': {error}; {instead}"
+            return None
+
+    def mounted(self, params: Any, placing: Placing) -> tuple[Any, np.ndarray | None]:
+        """params, a node's, for a frame that is levelled, and the sensor's pose in base_frame for
+        the crop; both by params.ground.sensor_pose where TF has no base_frame."""
+        if placing.base is None:
+            return params, self._by_hand() if self.base_frame else None
+        height = float(placing.base[2, 3])
+        self.known["mount"] = f"{height:.3f} m above '{self.base_frame}'"
+        ground = replace(params.ground, sensor_pose=SensorPoseParams(height=height))
+        return replace(params, ground=ground), placing.base
+
+    def to_level(self, header: Any, frame_id: str) -> np.ndarray:
+        """(4, 4): takes points of a frame to the level frame of a cloud with this header. Missing
+        where TF does not connect them."""
+        if frame_id not in ("", header.frame_id):
+            self.listen()
+        pose = self.tree.lookup(header.frame_id, frame_id or header.frame_id, to_ns(header.stamp))
+        level = self.placing(header).level
+        return pose if level is None else level @ pose
+
+    # How the sensor moves
+
+    def sensor_poses(self, frame_id: str, at: np.ndarray) -> np.ndarray:
+        """(M, 4, 4): the poses of a frame of the robot at times (M,) ns, in one that does not
+        move: by input.deskew, the odometry's or TF's input.fixed_frame. Missing where they are not
+        known."""
+        params = self.node.robot.input
+        if params.deskew == "tf":
+            return self.tree.poses(params.fixed_frame, frame_id, at)
+        if not self.carrier:
+            raise Missing(f"nothing has come on {self.node.resolve_topic_name('~/input/odometry')}"
+                          "; remap it to the odometry's topic")
+        moved = self.odometry.poses(STILL, MOVING, at)
+        if frame_id.lstrip("/") == self.carrier:
+            return moved
+        try:
+            return moved @ self.tree.poses(self.carrier, frame_id, at)
+        except Missing as error:
+            pose = self._by_hand() if self.carrier == self.base_frame else None
+            if pose is None:
+                raise Missing(f"the odometry is of '{self.carrier}': {error}",
+                              error.late) from None
+            return moved @ pose
+
+    def _by_hand(self) -> np.ndarray | None:
+        """The sensor's pose above the ground as the parameters have it."""
+        ground = getattr(self.node.params, "ground", None)
+        pose = ground and ground.sensor_pose
+        return None if pose is None else tilted(pose.roll, pose.pitch, pose.height)
+
+    def corrected(self, msg: Any) -> Any:
+        """The cloud with its points moved to its stamp; the cloud itself, counted, where what is
+        needed for that is not there. What the crop takes for the robot's own body stays, as it
+        moves along."""
+        if self.node.robot.input.deskew == "off":
+            return msg
+        begin, counts = perf_counter(), self.node.counts
+        self.lacking.pop("deskew", None)
+        try:
+            moved = self._moved(msg)
+        except InputError as error:
+            self.lacking["deskew"] = f"input.deskew: {error}; clouds are used as they are"
+            counts["not_deskewed"] = counts.get("not_deskewed", 0) + 1
+            return msg
+        counts["deskewed"] = counts.get("deskewed", 0) + 1
+        self.known["deskew_ms"] = f"{(perf_counter() - begin) * 1e3:.1f}"
+        return moved
+
+    def _moved(self, msg: Any) -> Any:
+        frame, indices = to_frame(msg)
+        crop = getattr(self.node.params, "crop", None)
+        if crop is not None and crop.enabled:
+            _, base = self.mounted(self.node.params, self.placing(msg.header))
+            kept, frame = cropped(frame, crop, base)
+            indices = indices.take(kept)
+        if not len(indices):
+            return msg
+        times = point_times(msg, indices)
+        if not times.seconds.any():
+            return msg  # corrected already
+        if np.isnan(times.seconds).any():
+            kept = np.flatnonzero(np.isfinite(times.seconds))
+            indices, frame = indices.take(kept), frame.take(kept)
+            times = times._replace(seconds=times.seconds.take(kept))
+        self.sweep = float(times.seconds.max())
+        moved = deskewed(frame.xyz, times.seconds, lambda at: self.sensor_poses(
+            frame.frame_id, frame.stamp_ns + np.rint(at * SECOND).astype(np.int64)))
+        return moved_cloud(msg, bag_message, indices, moved, times)
+
+    # For the diagnostics
+
+    def values(self) -> dict[str, Any]:
+        """What is known."""
+        return self.known
+
+    def problems(self) -> list[Problem]:
+        """What is asked for and not there, each with what stands instead."""
+        return [(kind, WARN, message) for kind, message in self.lacking.items()]

@@ -1,0 +1,43 @@
+"""What of a cloud is left out, because of the robot that carries the sensor."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from lidar_perception.param_fields import Params, param
+
+
+@dataclass(frozen=True)
+class CropParams(Params):
+    """What is left out before everything else; by default nothing."""
+
+    body: tuple[float, ...] = param(
+        float, "The robot's own body: points in the box [min x, min y, min z, max x, max y, max z] "
+        "are left out. In the sensor's frame, or in `base_frame` where a node has that. Empty: "
+        "none.", unit="m")
+    min_range: float = param(0.0, "Points nearer to the sensor than this are left out.", unit="m",
+                             low=0.0, high=1e5)
+    max_range: float = param(0.0, "Points farther from the sensor than this are left out; 0: no "
+                                  "limit.", unit="m", low=0.0, high=1e5)
+    sectors: tuple[float, ...] = param(
+        float, "Azimuths that are left out, as seen from the sensor: from, to, from, to ...; 0 is "
+        "straight ahead, 90 to the left. 150, 210 is what is behind.", unit="deg")
+
+    @property
+    def enabled(self) -> bool:
+        """Whether anything is left out."""
+        return self != CropParams()
+
+    def check(self) -> None:
+        if not all(map(math.isfinite, (*self.body, *self.sectors))):
+            raise ValueError("body and sectors must be finite")
+        if len(self.body) not in (0, 6) or any(
+                low >= high for low, high in zip(self.body[:3], self.body[3:])):
+            raise ValueError(f"body = {list(self.body)} must be empty or six numbers, [min x, min "
+                             "y, min z, max x, max y, max z], each min below its max")
+        if len(self.sectors) % 2:
+            raise ValueError(f"sectors = {list(self.sectors)} must be pairs: from, to, from, to")
+        if 0.0 < self.max_range < self.min_range:
+            raise ValueError(f"max_range = {self.max_range} must not be below min_range "
+                             f"= {self.min_range}, but for 0")

@@ -1,0 +1,64 @@
+"""Poses as (4, 4) float64 matrices: made, turned round, interpolated.
+
+The pose of frame b in frame a takes points of b to a: a = pose @ b. This is the transform with
+header.frame_id a and child_frame_id b.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation, Slerp
+
+from lidar_perception.types import InputError
+
+NOT_UNIT = 1e-2  # how far a quaternion's length may be from 1; drivers round
+
+
+def pose_of(translation: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    """(..., 4, 4) of translations (..., 3), metres, and quaternions (..., 4) [x y z w]."""
+    translation = np.asarray(translation, np.float64)
+    pose = np.zeros((*translation.shape[:-1], 4, 4))
+    pose[..., :3, :3] = Rotation.from_quat(np.reshape(quaternion, (-1, 4))).as_matrix().reshape(
+        *translation.shape[:-1], 3, 3)
+    pose[..., :3, 3], pose[..., 3, 3] = translation, 1.0
+    return pose
+
+
+def checked(translation: np.ndarray, quaternion: np.ndarray, name: str) -> tuple:
+    """translation (3,) and quaternion (4,) [x y z w] as float64, the latter of length 1. InputError
+    with this name where they are no pose."""
+    translation, quaternion = (np.asarray(v, np.float64) for v in (translation, quaternion))
+    length = np.linalg.norm(quaternion)
+    if not np.isfinite(translation).all() or not abs(length - 1.0) < NOT_UNIT:
+        raise InputError(f"the transform {name} has no unit quaternion, or is not finite; its "
+                         "publisher is wrong")
+    return translation, quaternion / length
+
+
+def inverse(pose: np.ndarray) -> np.ndarray:
+    """(..., 4, 4): the pose the other way round."""
+    back = np.zeros_like(pose)
+    turned = np.swapaxes(pose[..., :3, :3], -1, -2)
+    back[..., :3, :3] = turned
+    back[..., :3, 3] = -(turned @ pose[..., :3, 3, None])[..., 0]
+    back[..., 3, 3] = 1.0
+    return back
+
+
+def interpolated(times: np.ndarray, translations: np.ndarray, quaternions: np.ndarray,
+                 at: np.ndarray) -> np.ndarray:
+    """(M, 4, 4): the poses at times at (M,), all within times (K,), which ascend, K > 0. Straight
+    from one translation (K, 3) to the next, on the shorter arc between quaternions (K, 4) (slerp,
+    Shoemake 1985)."""
+    if len(times) == 1:
+        return np.broadcast_to(pose_of(translations[0], quaternions[0]), (len(at), 4, 4)).copy()
+    begin = times[0]  # nanoseconds since 1970 do not fit into a float64
+    times, at = (np.asarray(t - begin, np.float64) for t in (times, at))
+    moved = np.column_stack([np.interp(at, times, axis) for axis in np.transpose(translations)])
+    return pose_of(moved, Slerp(times, Rotation.from_quat(quaternions))(at).as_quat())
+
+
+def moved_points(xyz: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """(N, 3) of the dtype of xyz (N, 3): points of the frame whose pose this is, in the frame of
+    the pose."""
+    return xyz @ pose[:3, :3].T.astype(xyz.dtype) + pose[:3, 3].astype(xyz.dtype)

@@ -1,0 +1,145 @@
+"""The tree of coordinate frames over time, as /tf, /tf_static and odometry tell of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from lidar_perception.robot.poses import checked, interpolated, inverse
+from lidar_perception.types import InputError
+
+SECOND = 10**9
+KEPT_NS = 10 * SECOND    # of each transform, as tf2 does
+MAX_KEPT = 10_000        # of each transform, however often it comes
+MAX_FRAMES = 10_000      # whoever makes a new name for every message does not fill the memory
+JUMP_NS = SECOND         # a stamp so far before the last one is a bag that starts again
+
+
+class Missing(InputError):
+    """Two frames that are not connected, or not at that time. late: what is missing may still
+    come, as only the newest transforms are from before that time."""
+
+    def __init__(self, message: str, late: bool = False):
+        super().__init__(message)
+        self.late = late
+
+
+class _Link:
+    """A frame in its parent: one pose for ever, or those of the last seconds."""
+
+    def __init__(self, parent: str, static: bool):
+        self.parent, self.static = parent, static
+        self.times: list[int] = []  # ns, ascending
+        self.values: list[np.ndarray] = []  # (7,) translation and quaternion
+
+    def add(self, stamp_ns: int, value: np.ndarray) -> None:
+        if self.static:
+            self.times, self.values = [stamp_ns], [value]
+            return
+        place = len(self.times)
+        while place and self.times[place - 1] > stamp_ns:
+            place -= 1
+        if place and self.times[place - 1] == stamp_ns:
+            self.values[place - 1] = value
+            return
+        self.times.insert(place, stamp_ns)
+        self.values.insert(place, value)
+        old = 0
+        while self.times[-1] - self.times[old] > KEPT_NS or len(self.times) - old > MAX_KEPT:
+            old += 1
+        if old > len(self.times) // 10:  # not with every message: that moves the whole list
+            del self.times[:old], self.values[:old]
+
+    def poses(self, at: np.ndarray, name: str) -> np.ndarray:
+        """(M, 4, 4) at times (M,) ns. Missing outside of what is known: nothing is guessed."""
+        if not self.static:
+            first, last = self.times[0], self.times[-1]
+            if int(at.max()) > last:
+                ago = (int(at.max()) - last) / SECOND
+                raise Missing(f"the newest transform of {name} is {ago:.3f} s older than needed; "
+                              "is its publisher late, or has it stopped?", late=ago < 1.0)
+            if int(at.min()) < first:
+                raise Missing(f"the oldest transform of {name} is "
+                              f"{(first - int(at.min())) / SECOND:.3f} s newer than needed")
+            before = max(int(np.searchsorted(self.times, at.min(), "right")) - 1, 0)
+            behind = int(np.searchsorted(self.times, at.max(), "left")) + 1
+        else:
+            before, behind = 0, 1
+        values = np.array(self.values[before:behind])
+        return interpolated(np.array(self.times[before:behind]), values[:, :3], values[:, 3:], at)
+
+
+class TransformTree:
+    """Frames, each in its parent; poses are interpolated between the stamps, never extrapolated.
+
+    Transforms are kept for KEPT_NS. A stamp that is JUMP_NS or more before the last one of its
+    frame is from a bag that starts again: all that moves is forgotten, what is fixed stays.
+    """
+
+    def __init__(self) -> None:
+        self._links: dict[str, _Link] = {}  # by the frame that is the child
+        self.jumps = 0
+
+    def set(self, parent: str, child: str, stamp_ns: int, translation: Sequence[float],
+            quaternion: Sequence[float], static: bool = False) -> None:
+        """The pose of child in parent: translation (3,) metres, quaternion (4,) [x y z w]. static:
+        at any time. A child that gets another parent leaves the first. InputError for what is no
+        pose, and for a frame in itself."""
+        parent, child = parent.lstrip("/"), child.lstrip("/")
+        name = f"'{parent}' -> '{child}'"
+        if not parent or not child or parent == child:
+            raise InputError(f"the transform {name} must be between two frames with names")
+        value = np.concatenate(checked(translation, quaternion, name))
+        link = self._links.get(child)
+        if link is None and len(self._links) >= MAX_FRAMES:
+            raise InputError(f"more than {MAX_FRAMES} frames in the tree; '{child}' is left out")
+        if link is None or (link.parent, link.static) != (parent, static):
+            link = self._links[child] = _Link(parent, static)
+        if not static and link.times and stamp_ns <= link.times[-1] - JUMP_NS:
+            self.forget()
+            link = self._links[child] = _Link(parent, static)
+        link.add(stamp_ns, value)
+
+    def forget(self) -> None:
+        """Forget all that moves, as when time went back."""
+        self._links = {child: link for child, link in self._links.items() if link.static}
+        self.jumps += 1
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> np.ndarray:
+        """(4, 4): the pose of source in target at a time, which takes points of source to target.
+        Missing where they are not connected at that time."""
+        return self.poses(target, source, np.array([stamp_ns]))[0]
+
+    def poses(self, target: str, source: str, at: np.ndarray) -> np.ndarray:
+        """(M, 4, 4): as lookup, at times (M,) int ns, M > 0."""
+        target, source = target.lstrip("/"), source.lstrip("/")
+        up, down = self._chain(source), self._chain(target)
+        common = next((frame for frame in up if frame in set(down)), None)
+        if common is None:
+            raise Missing(f"TF does not connect '{source}' with '{target}': "
+                          f"{self._known(source, up)}, {self._known(target, down)}")
+        return inverse(self._along(down, common, at)) @ self._along(up, common, at)
+
+    def _chain(self, frame: str) -> list[str]:
+        """The frame, its parent, and so on to the root."""
+        chain = [frame]
+        while (link := self._links.get(chain[-1])) is not None:
+            chain.append(link.parent)
+            if link.parent in chain[:-1]:
+                raise Missing(f"TF goes round in a circle: {' -> '.join(chain)}; two nodes publish "
+                              "what contradicts")
+        return chain
+
+    def _known(self, frame: str, chain: list[str]) -> str:
+        if len(chain) > 1:
+            return f"'{frame}' is below '{chain[-1]}'"
+        parents = {link.parent for link in self._links.values()}
+        return f"'{frame}' is " + ("the root of a tree" if frame in parents else "not in TF")
+
+    def _along(self, chain: list[str], common: str, at: np.ndarray) -> np.ndarray:
+        pose = np.broadcast_to(np.eye(4), (len(at), 4, 4))
+        for child in chain[:chain.index(common)]:
+            link = self._links[child]
+            pose = link.poses(at, f"'{link.parent}' -> '{child}'") @ pose
+        return pose

@@ -1,0 +1,87 @@
+"""When each point of a cloud was measured, from the column of times that its driver gives it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lidar_perception.types import InputError
+from msg_utils.point_cloud2 import CloudError, add_columns, to_array
+from msg_utils.stamps import to_ns
+
+# As Ouster, Velodyne, Hesai and RoboSense, Autoware and Livox call it; the first that is there.
+NAMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
+UNITS_NS = (10**9, 10**6, 10**3, 1)
+SWEEP = 2e-3, 1.0   # seconds that a turn takes: by these the unit is told from the others
+SINCE_1970_NS = 1e18  # later than 2001
+MAX_OFFSET = 1.0    # seconds between a point and the stamp of its cloud
+
+
+class PointTimes(NamedTuple):
+    """name: of the column; seconds (N,) float64 after the stamp, NaN where the driver says so;
+    at_stamp: what the column says of a point that was measured at the stamp."""
+
+    name: str
+    seconds: np.ndarray
+    at_stamp: int | float
+
+
+def point_times(msg: Any, indices: np.ndarray) -> PointTimes:
+    """Of the points (N,) of a PointCloud2 at indices (N,). Whether seconds, milli-, micro- or
+    nanoseconds is told by the span of a turn; times that count from 1970 are taken from the stamp.
+    InputError where there is no such column, or its times do not fit the stamp."""
+    try:
+        points = to_array(msg)
+    except CloudError as error:
+        raise InputError(str(error)) from None
+    names = points.dtype.names or ()
+    name = next((n for n in NAMES if n in names), None)
+    if name is None:
+        raise InputError(f"the cloud has no column of times ({', '.join(NAMES)}); it has "
+                         f"{', '.join(names) or 'none at all'}")
+    if points.dtype[name].shape:
+        raise InputError(f"field '{name}' has count > 1; a single number is needed")
+    whole = points[name].dtype.kind in "iu"
+    values = points[name].astype(np.int64 if whole else np.float64)
+    known = values if whole else values[np.isfinite(values)]
+    if not len(known):
+        raise InputError(f"no time in the column '{name}' is a number")
+    low, span = known.min(), known.max() - known.min()
+    unit = _unit_ns(float(span), whole, float(low))
+    stamp = to_ns(msg.header.stamp)
+    since_stamp = abs(float(low)) * unit <= abs(float(low) * unit - stamp)
+    at_stamp = 0 if since_stamp else stamp // unit if whole else stamp / unit
+    seconds = (values.take(indices) - at_stamp) * (unit * 1e-9)
+    if np.isnan(seconds).all():
+        return PointTimes(name, seconds, at_stamp)
+    off = max(float(np.nanmin(seconds)), float(np.nanmax(seconds)), key=abs)
+    if abs(off) > MAX_OFFSET:
+        raise InputError(f"the times in '{name}' are {off:.3f} s from header.stamp; do sensor and "
+                         "computer have the same clock?")
+    return PointTimes(name, seconds, at_stamp)
+
+
+def _unit_ns(span: float, whole: bool, low: float) -> int:
+    """Nanoseconds of the unit of times from low on that span a turn."""
+    since_1970 = next((unit for unit in reversed(UNITS_NS) if low * unit > SINCE_1970_NS), None)
+    if since_1970 is not None:
+        return since_1970
+    for unit in UNITS_NS[2:] if whole else UNITS_NS:  # whole seconds would tell nothing
+        if SWEEP[0] <= span * unit * 1e-9 <= SWEEP[1]:
+            return unit
+    return 1 if whole else 10**9  # a part of a turn, or one moment
+
+
+def moved_cloud(msg: Any, make: Any, indices: np.ndarray, moved: np.ndarray,
+                times: PointTimes) -> Any:
+    """The cloud with the points at indices (N,) moved to (N, 3), and all times at its stamp, so
+    that who corrects it again changes nothing."""
+    points = to_array(msg)
+    new = {}
+    for axis, name in enumerate("xyz"):
+        new[name] = points[name].astype(points[name].dtype.newbyteorder("="))
+        new[name][indices] = moved[:, axis]
+    kind = points[times.name].dtype.newbyteorder("=")
+    new[times.name] = np.full(len(points), times.at_stamp, kind)
+    return add_columns(msg, make, **new)

@@ -1,0 +1,122 @@
+"""The crop: its limits as laws, and the same points left out wherever it is applied."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from samples import header, scene
+from scipy.spatial.transform import Rotation
+
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import segment
+from lidar_perception.param_fields import with_values
+from lidar_perception.robot.crop import cropped, kept_points
+from lidar_perception.robot.params import CropParams
+from lidar_perception.types import LidarFrame
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.messages import to_frame
+from msg_utils.point_cloud2 import from_array
+
+BODY = (-1.0, -0.6, -1.7, 2.0, 0.6, 0.2)
+CROP = CropParams(body=BODY, min_range=1.0, max_range=15.0, sectors=(170.0, 190.0, -60.0, -45.0))
+
+
+def points(count=5000, seed=0):
+    rng = np.random.default_rng(seed)
+    return (rng.uniform(-20, 20, (count, 3)) * rng.uniform(0, 1, (count, 1))).astype(np.float32)
+
+
+def plainly_kept(point, params):
+    """The law, point by point."""
+    x, y, z = map(float, point)
+    far = np.sqrt(x * x + y * y + z * z)
+    if far < params.min_range or (params.max_range and far > params.max_range):
+        return False
+    low, high = params.body[:3], params.body[3:]
+    if params.body and all(a < v < b for a, v, b in zip(low, (x, y, z), high)):
+        return False
+    azimuth = np.degrees(np.arctan2(y, x))
+    for start, end in zip(params.sectors[::2], params.sectors[1::2]):
+        if any(start <= azimuth + turn <= end for turn in range(-1080, 1081, 360)):
+            return False
+    return True
+
+
+@pytest.mark.parametrize("params", [
+    CropParams(), CropParams(body=BODY), CropParams(min_range=5.0), CropParams(max_range=5.0),
+    CropParams(sectors=(350.0, 370.0)), CropParams(sectors=(-190.0, -170.0, 30.0, 31.0)),
+    CropParams(sectors=(0.0, 360.0)), CROP])
+def test_what_is_kept_is_what_a_plain_look_at_each_point_keeps(params):
+    xyz = points()
+    expected = [plainly_kept(p, params) for p in xyz]
+    np.testing.assert_array_equal(kept_points(xyz, params), expected)
+    if params.enabled:
+        assert 0 < len(xyz) - sum(expected)
+
+
+@given(st.integers(0, 1000), st.floats(-180, 180))
+def test_a_turned_sector_keeps_the_turned_points(seed, angle):
+    xyz = points(200, seed).astype(np.float64)
+    turned = Rotation.from_euler("z", angle, degrees=True).apply(xyz)
+    edges = np.array([20.0, 75.0])
+    near = np.abs((np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))[:, None] - edges + 180) % 360
+                  - 180).min(axis=1) < 1e-6
+    before = kept_points(xyz, CropParams(sectors=tuple(edges)))
+    after = kept_points(turned, CropParams(sectors=tuple(edges + angle)))
+    np.testing.assert_array_equal(before[~near], after[~near])
+
+
+def test_the_body_is_a_box_of_the_base_frame_where_its_pose_is_known():
+    base = np.eye(4)
+    base[:3, :3] = Rotation.from_euler("zyx", [2.0, 0.4, -0.3]).as_matrix()
+    base[:3, 3] = 0.5, -0.2, 1.1
+    xyz = points().astype(np.float64)
+    np.testing.assert_array_equal(kept_points(xyz, CropParams(body=BODY), base),
+                                  kept_points(xyz @ base[:3, :3].T + base[:3, 3],
+                                              CropParams(body=BODY)))
+
+
+def test_without_a_crop_the_frame_is_the_same_object():
+    frame = LidarFrame(points())
+    indices, same = cropped(frame, CropParams())
+    assert same is frame and indices.tolist() == list(range(len(frame)))
+
+
+def test_the_pipeline_sees_what_is_left_of_the_whole_cloud():
+    """Cropped by the pipeline, and before it, the result is the same, with indices into what was
+    given; and a crop that was done does nothing the second time."""
+    frame = LidarFrame(np.ascontiguousarray(scene()[:, :3]))
+    params = with_values(PipelineParams(), {"crop.min_range": 4.0, "crop.sectors": (90.0, 270.0)})
+    kept, before = cropped(frame, params.crop)
+    assert 0 < len(kept) < len(frame)
+    whole, part = segment(frame, params=params), segment(before)
+    np.testing.assert_array_equal(whole.indices, kept.take(part.indices))
+    for name in ("xyz", "ground", "cluster_ids", "boxes"):
+        np.testing.assert_array_equal(getattr(whole, name), getattr(part, name))
+    assert len(cropped(before, params.crop)[0]) == len(before)
+
+
+def test_the_cropped_points_of_a_cloud_are_those_of_its_frame():
+    cloud = np.zeros(300, [("x", "<f4"), ("y", "<f4"), ("z", "<f4")])
+    for i, name in enumerate("xyz"):
+        cloud[name] = points(300)[:, i]
+    cloud["x"][::7] = np.nan
+    frame, usable = to_frame(from_array(cloud, header(bag_message), bag_message))
+    kept, _ = cropped(frame, CROP)
+    finite = np.isfinite(cloud["x"])
+    np.testing.assert_array_equal(usable.take(kept), np.flatnonzero(
+        finite & kept_points(points(300), CROP)))
+
+
+@pytest.mark.parametrize("values, words", [
+    ({"body": (0.0, 1.0)}, "six numbers"),
+    ({"body": (1.0, 0.0, 0.0, 1.0, 1.0, 1.0)}, "min below its max"),
+    ({"body": (0.0, 0.0, 0.0, 1.0, 1.0, float("inf"))}, "finite"),
+    ({"sectors": (1.0,)}, "pairs"),
+    ({"min_range": 5.0, "max_range": 4.0}, "below min_range"),
+])
+def test_a_crop_that_cannot_be_is_refused_with_the_remedy(values, words):
+    with pytest.raises(ValueError, match=words):
+        CropParams(**values)

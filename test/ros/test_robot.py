@@ -1,0 +1,94 @@
+"""What belongs to the robot, over DDS: the crop before everything, and TF as others publish it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from test_robot_frames import PERIOD, START, WALKING, message, mounted, transforms, walker
+
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import find_candidates
+from lidar_perception.candidates.seed_sources import fixed_seed
+from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.data.bag import Bag
+from lidar_perception.nodes.transforms import STATIC_QOS
+from lidar_perception.param_fields import with_values
+from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.messages import column, to_detections, to_frame
+from lidar_perception.wire.topics import POINTS
+from msg_utils.markers import from_marker_array
+from msg_utils.stamps import header_message
+
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
+
+
+@pytest.fixture(scope="module")
+def cloud(drive_bag):
+    with Bag(drive_bag) as bag:
+        return next(m for _, _, m in bag.messages({POINTS}))
+
+
+def test_a_cropped_cloud_over_dds_is_the_cropped_frame_offline(processes, peer, cloud):
+    """Candidates equal those of the offline pipeline with the same parameters; what is cropped is
+    not in view. A parameter that was empty can be set while the node runs, with whole numbers."""
+    values = {"crop.body": [-2, -1, -2, 3, 1, 1], "crop.min_range": 3.0,
+              "crop.sectors": [60.0, 300.0], "crop.max_range": 40.0}
+    params = with_values(PipelineParams(), values)
+    processes.start("perception", {"~/input/points": "/in"}, values)
+    processes.start("ground_segmentation", {"~/input/points": "/in"}, values)
+    found = peer.listen("/perception/output/detections", MARKERS)
+    clouds = peer.listen("/ground_segmentation/output/points", CLOUD)
+    talker = peer.talker("/in", CLOUD)
+    peer.send(talker, cloud, lambda: found and clouds, "both results")
+    frame, usable = to_frame(cloud)
+    segmented, candidates = find_candidates(frame, fixed_seed(load_seed("")), params=params)
+    expected, received = candidates.final, to_detections(from_marker_array(found[-1]))
+    assert len(expected) and 0 < len(segmented.indices) < len(frame)
+    np.testing.assert_array_equal(received.boxes, expected.boxes)
+    np.testing.assert_array_equal(received.scores, expected.scores)
+    everything = np.arange(cloud.height * cloud.width)
+    in_view = np.flatnonzero(column(clouds[-1], "in_view", everything))
+    np.testing.assert_array_equal(in_view, usable.take(segmented.indices))
+    np.testing.assert_array_equal(column(clouds[-1], "ground", in_view) > 0, segmented.ground)
+    cropped = str(len(frame) - len(segmented.indices))
+    peer.wait(lambda: peer.value_of("perception", "cropped") == cropped, "the count")
+
+    peer.set_parameter("/ground_segmentation", "crop.sectors", [0, 360])
+    peer.send(talker, cloud, lambda: not column(clouds[-1], "in_view", everything).any(),
+              "a cloud of which nothing is left")
+    peer.wait(lambda: "crop.* leaves none" in peer.message_of("ground_segmentation"), "the reason")
+
+
+def test_a_tilted_sensor_gets_its_mounting_from_tf(processes, peer):
+    """By /tf_static and /tf as others publish them: the network's boxes in odom are those of a
+    level sensor, moved as the robot has moved; the cloud waits for a transform that is late."""
+    pytest.importorskip("tf2_msgs", reason="the wheels of the pip environment lack tf2_msgs")
+    base, moved = mounted(0.5, 0.2, 1.7, 0.0, 0.3, -0.2), mounted(30.0, -4.0, 0.0, 0.0, 0.0, 0.0)
+    xyz, person = walker(base)
+    processes.start("perception", {"~/input/points": "/in"}, {
+        **WALKING, "base_frame": "base", "target_frame": "odom"})
+    static = peer.talker("/tf_static", TF_MESSAGE, STATIC_QOS)
+    static.publish(encode(transforms(("base", "lidar", base, 0))))
+    moving = peer.talker("/tf", TF_MESSAGE)
+    click = peer.talker("/clicked_point", "geometry_msgs/msg/PointStamped")
+    found = peer.listen("/perception/output/detections", MARKERS)
+    talker = peer.talker("/in", CLOUD)
+    at = (person + moved[:3, 3]).tolist()
+    peer.send(click, bag_message(
+        "geometry_msgs/msg/PointStamped", header=header_message(START, "odom", bag_message),
+        point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at)))),
+        click.get_subscription_count, "a subscriber of the click")
+    early, late = (transforms(("odom", "base", moved, START + i * PERIOD)) for i in (-1, 1))
+    peer.send(moving, early, moving.get_subscription_count, "a subscriber of /tf")
+    peer.send(talker, message(xyz), lambda: "waits for the newest transform of 'odom' -> 'base'"
+              in peer.message_of("perception") or found, "the cloud to wait")
+    peer.send(moving, late, lambda: found and len(from_marker_array(found[-1])) == 1,
+              "the person, in a cloud that has waited")
+    objects = from_marker_array(found[-1])
+    assert (objects.frame_id, objects.stamp_ns) == ("odom", START)
+    np.testing.assert_allclose(objects.boxes[0, :2], at[:2], atol=0.3)
+    assert abs(objects.boxes[0, 2] - objects.boxes[0, 5] / 2) < 0.1  # it stands on the floor

@@ -1,0 +1,227 @@
+"""The tracker as a real process over DDS, against the library on the same detections."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from rclpy.qos import QoSProfile
+from test_bad_input import MARKERS
+from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, person, pose
+
+from lidar_perception.candidates.configurations import BEST
+from lidar_perception.data.bag import Bag
+from lidar_perception.nodes.graph import Processes, graph_of
+from lidar_perception.nodes.tracker import TrackerNode
+from lidar_perception.param_fields import flatten, with_values
+from lidar_perception.scoring.tracking.pairs import tracked_labels
+from lidar_perception.scoring.tracking.report import TrackingReport, observe
+from lidar_perception.testing.peer import Peer
+from lidar_perception.tracking.params import tracking_of
+from lidar_perception.tracking.tracker import Tracker
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
+from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.messages import (
+    detection_markers,
+    odometry,
+    pose_of,
+    to_detections,
+    to_truth,
+)
+from lidar_perception.wire.topics import CAMERA_INFO, ODOMETRY, POINTS, TRUTH
+from msg_utils.markers import ADD, box_pose, from_marker_array
+from msg_utils.stamps import header_message, to_ns
+
+NODE, ODOMETRY_TYPE = "tracker", "nav_msgs/msg/Odometry"
+REMAP = {"~/input/detections": "/found", "~/output/tracks": "/tracks",
+         "~/input/odometry": "/moved"}
+ALL_OF_THEM = QoSProfile(depth=1000)
+DELETEALL = 3
+
+
+def header(stamp, frame_id="lidar"):
+    return header_message(stamp, frame_id, bag_message)
+
+
+def poses_of(path):
+    """By stamp."""
+    with Bag(path) as bag:
+        return {to_ns(m.header.stamp): pose_of(m.pose.pose)
+                for _, _, m in bag.messages({ODOMETRY})}
+
+
+def read(message):
+    """stamp, ids, Detections, velocities of an array of tracks."""
+    objects = from_marker_array(message)
+    return (objects.stamp_ns, objects.ids.tolist(), to_detections(objects),
+            [extra["velocity"] for extra in objects.extras])
+
+
+def assert_same(message, tracks):
+    _, ids, found, velocities = read(message)
+    assert ids == tracks.ids.tolist()
+    np.testing.assert_array_equal(found.boxes[:, :6], tracks.detections.boxes[:, :6])
+    np.testing.assert_allclose(found.boxes[:, 6], tracks.detections.boxes[:, 6], atol=1e-6)
+    np.testing.assert_array_equal(found.scores, tracks.detections.scores)
+    np.testing.assert_array_equal(found.class_ids, tracks.detections.class_ids)
+    np.testing.assert_allclose(np.reshape(velocities, (-1, 2)), tracks.velocities, atol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def looped(domain, drive_bag, tmp_path_factory):
+    """What the graph says while a drive is played three times: the messages of each topic, those
+    of the same stamp in the order in which they came."""
+    params = with_values(BEST, {"seed.source": "automatic"})
+    graph = graph_of(["candidates"], single=True, tracking=True)
+    outputs = {"found": "/perception/output/detections", "behind": "/tracker/output/tracks",
+               "inside": "/perception/output/tracks"}
+    with Bag(drive_bag) as bag:
+        clouds = bag.counts[POINTS]
+    with Processes(tmp_path_factory.mktemp("looped"), domain) as processes, Peer(domain) as peer:
+        heard = {name: peer.listen(topic, MARKERS, ALL_OF_THEM) for name, topic in outputs.items()}
+        for node, remap in graph.items():
+            extra = ({**flatten(params), "tracking.enabled": True, "input.queue": 2}
+                     if node == "perception" else {})
+            inside = {"~/input/odometry": "odom"} if node == "perception" else {}
+            processes.start(node, {**remap, **inside}, extra)
+        processes.start("bag_player", {}, {
+            "bag": str(drive_bag), "loop": True, "follow": [outputs["behind"].lstrip("/")],
+            "wait_for": [POINTS, f"{ODOMETRY}:=2", f"{CAMERA_INFO}:=1", outputs["found"] + ":=2"],
+            "wait_timeout": 120.0})
+        peer.wait(lambda: len(heard["behind"]) > 2.5 * clouds, "the drive, three times", 300.0)
+        processes.check()
+        diagnostics = {key: peer.value_of(NODE, key) for key in ("alive", "born", "ended")}
+    return clouds, heard, diagnostics
+
+
+def test_tracks_of_the_graph_are_those_of_the_library_and_end_with_the_loop(looped, drive_bag):
+    clouds, heard, diagnostics = looped
+    poses = poses_of(drive_bag)
+    tracker, shown = Tracker(tracking_of("")), []
+    frames = [from_marker_array(m) for m in heard["found"]]
+    assert len(poses) == clouds and [f.stamp_ns for f in frames[:clouds]] == sorted(poses)
+    for frame, message in zip(frames, heard["behind"]):
+        tracks = tracker(to_detections(frame), frame.stamp_ns, poses[frame.stamp_ns])
+        assert read(message)[0] == frame.stamp_ns
+        assert message.markers[0].header.frame_id == "velodyne"
+        assert_same(message, tracks)
+        shown.append(tracks)
+    rounds = [{i for t in shown[start:start + clouds] for i in t.ids.tolist()}
+              for start in (0, clouds)]
+    assert rounds[0] and rounds[1] and not rounds[0] & rounds[1]
+    assert int(diagnostics["ended"]) > 0 and int(diagnostics["born"]) > 0
+
+
+def test_ids_stay_with_the_people_of_the_drive(looped, drive_bag):
+    clouds, heard, _ = looped
+    with Bag(drive_bag) as bag:
+        truth = {o.stamp_ns: to_truth(o) for o in
+                 (from_marker_array(m) for _, _, m in bag.messages({TRUTH}))}
+    report = TrackingReport()
+    for i, message in enumerate(heard["behind"][:clouds]):
+        stamp, ids, found, _ = read(message)
+        report.update(observe("drive", i, truth[stamp], tracked_labels(np.array(ids), found)))
+    people = report.compute()["classes"]["Pedestrian"]
+    assert people["switches"] == 0 and people["hits"] > clouds
+
+
+def test_in_one_process_with_the_detector_the_library_tracks_too(looped, drive_bag):
+    clouds, heard, _ = looped
+    poses, tracker = poses_of(drive_bag), Tracker(tracking_of("candidates"))
+    assert len(heard["inside"]) >= 2 * clouds
+    for frame, message in zip(map(from_marker_array, heard["found"]), heard["inside"]):
+        assert_same(message, tracker(to_detections(frame), frame.stamp_ns, poses[frame.stamp_ns]))
+
+
+def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes, peer):
+    processes.start(NODE, REMAP, {})
+    talker, tracks = peer.talker("/found", MARKERS), peer.listen("/tracks", MARKERS)
+    moving, now = peer.talker("/moved", ODOMETRY_TYPE), START
+    peer.wait(lambda: peer.message_of(NODE) and talker.get_subscription_count()
+              and moving.get_subscription_count(), "the tracker")
+
+    def send(message, words="tracking", answered=True):
+        """Publish once; wait for the tracks, if there are to be any, and for the reason."""
+        shown = len(tracks)
+        talker.publish(encode(message))
+        peer.wait(lambda: words in peer.message_of(NODE) and len(tracks) >= shown + answered,
+                  f"'{words}'")
+        return tracks[-1]
+
+    def frame(found, frame_id="lidar"):
+        nonlocal now
+        now += TENTH
+        return detection_markers(found, header(now, frame_id), bag_message)
+
+    def move(poses, child="lidar"):
+        """Poses of the next frames."""
+        for i, at in enumerate(poses):
+            stamp = now + (i + 1) * TENTH
+            moving.publish(encode(odometry(at, header(stamp, "odom"), child, bag_message)))
+        peer.wait(lambda: peer.value_of(NODE, "last_pose_ns") == str(stamp), "the poses")
+
+    found = cars(car(10))
+    for _ in range(3):
+        assert read(send(frame(found)))[1] == [1]
+    for late, words in (0, "has the stamp of the one before"), (3, "older than the last one"):
+        old = detection_markers(found, header(now - late * TENTH), bag_message)
+        send(old, words, answered=False)
+    send(bag_message(MARKERS), "an array without a marker", answered=False)
+    now += TENTH
+    gone = bag_message("visualization_msgs/msg/Marker", header=header(now), action=DELETEALL)
+    assert read(send(bag_message(MARKERS, markers=[gone])))[:2] == (now, [1])  # missed once
+    bad = Detections.of([car(10), car(np.nan), [1, 1, 1, 0, 1, 1, 0]], CAR, [0.9, 0.9, np.nan])
+    assert read(send(frame(bad), "2 of 3 detections are no boxes"))[1] == [1]
+    many = np.random.default_rng(0).uniform(1, 80, (10_000, 7))
+    crowded = send(frame(Detections.of(many, CAR, 0.9)), "10000 detections are too many")
+    assert len(read(crowded)[1]) <= 300
+    send(frame(found, "other"), "are mixed")
+    now += 100 * TENTH
+    before = read(send(frame(found), "are mixed"))[1]
+    for i in range(6):  # a class that changes each frame is one track
+        last = send(frame(cars(person(30), kind=[PEDESTRIAN, CYCLIST][i % 2])))
+    assert len({*read(last)[1]} - {*before}) == 1
+
+    assert read(send(detection_markers(found, header(0), bag_message), "no stamps"))[0] == 0
+    move([pose(0.8 * i) for i in range(12)])
+    send(frame(found), "poses began")
+    for i in range(1, 12):
+        last = send(frame(cars(car(10 - 0.8 * i))))
+    assert np.abs(read(last)[3][0]).max() < 0.3  # what stands, stands
+    arrows = {m.ns for m in last.markers if m.action == ADD}
+    assert arrows == {"Car", "number", "trail"}
+    now += 6 * TENTH
+    send(frame(cars(car(10 - 0.8 * 18))), "pose is missing")
+    move([pose(0.8 * 19)], "base")
+    send(frame(cars(car(10 - 0.8 * 19))), "odometry is of 'base'")
+    processes.check()
+    assert "Traceback" not in (processes.logs / f"{NODE}.log").read_text()
+
+
+def test_detection_arrays_are_tracked_as_markers_are(domain):
+    """By the node in this process, as vision_msgs is not everywhere."""
+    import rclpy
+    from rclpy.context import Context
+    context, shown = Context(), []
+    rclpy.init(context=context, domain_id=domain)
+    node, tracker = TrackerNode(context=context), Tracker()
+    node.configure()
+    node.tracks.markers = SimpleNamespace(publish=lambda data: shown.append(decode(data, MARKERS)))
+    for i, found in enumerate(crowd()):
+        boxes = [SimpleNamespace(
+            bbox=SimpleNamespace(center=box_pose(box, bag_message), size=SimpleNamespace(
+                x=float(box[3]), y=float(box[4]), z=float(box[5]))),
+            results=[SimpleNamespace(hypothesis=SimpleNamespace(
+                class_id=CLASSES[kind], score=float(score)))])
+            for box, kind, score in zip(found.boxes, found.class_ids, found.scores)]
+        stamp = START + i * TENTH
+        node.on_detections(SimpleNamespace(header=header(stamp), detections=boxes))
+        tracks = tracker(found, stamp)
+        assert read(shown[-1])[1] == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
+        np.testing.assert_allclose(read(shown[-1])[2].boxes, tracks.detections.boxes, atol=1e-4)
+    node.destroy_node()
+    rclpy.try_shutdown(context=context)

@@ -1,0 +1,103 @@
+"""Times of points as drivers give them, in their own units, types and names."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from samples import STAMP, header
+
+from lidar_perception.types import InputError
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.point_times import moved_cloud, point_times
+from msg_utils.point_cloud2 import from_array, to_array
+
+SECONDS = np.linspace(0.0, 0.0999, 1000)
+ABSOLUTE = STAMP + np.rint(SECONDS * 1e9).astype(np.int64)
+DRIVERS = {  # column, values
+    "Ouster": ("t", np.rint(SECONDS * 1e9).astype("<u4")),
+    "Velodyne": ("time", SECONDS.astype("<f4")),
+    "Velodyne, stamp at the end": ("time", (SECONDS - 0.0999).astype("<f4")),
+    "Hesai, RoboSense": ("timestamp", STAMP * 1e-9 + SECONDS),
+    "Livox PointCloud2": ("timestamp", ABSOLUTE.astype("<f8")),
+    "Livox custom": ("offset_time", np.rint(SECONDS * 1e9).astype("<u4")),
+    "Autoware": ("time_stamp", np.rint(SECONDS * 1e9).astype("<u4")),
+    "microseconds": ("t", np.rint(SECONDS * 1e6).astype("<u4")),
+    "milliseconds": ("time", (SECONDS * 1e3).astype("<f4")),
+    "microseconds since 1970": ("timestamp", (ABSOLUTE // 1000).astype("<f8")),
+}
+
+
+def cloud(name, values, order="<"):
+    kind = order + values.dtype.str[1:]
+    points = np.zeros(len(values), [("x", f"{order}f4"), ("y", f"{order}f4"), ("z", f"{order}f8"),
+                                    ("intensity", f"{order}f4"), (name, kind)])
+    points["x"], points["y"], points[name] = 5.0, np.arange(len(values)), values
+    return from_array(points, header(bag_message), bag_message)
+
+
+def every(msg):
+    return np.arange(msg.width)
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+@pytest.mark.parametrize("order", "<>")
+def test_each_driver_means_the_same_seconds(driver, order):
+    name, values = DRIVERS[driver]
+    msg = cloud(name, values, order)
+    expected = SECONDS - (0.0999 if "end" in driver else 0.0)
+    times = point_times(msg, every(msg))
+    assert times.name == name
+    np.testing.assert_allclose(times.seconds, expected, atol=2e-6)
+    np.testing.assert_array_equal(point_times(msg, np.array([7, 3, 999])).seconds,
+                                  times.seconds[[7, 3, 999]])
+
+
+@pytest.mark.parametrize("driver", DRIVERS)
+def test_a_corrected_cloud_is_at_its_stamp_and_else_the_same(driver):
+    name, values = DRIVERS[driver]
+    msg = cloud(name, values)
+    chosen = np.arange(0, 1000, 3)
+    frame, _ = to_frame(msg)
+    moved = frame.xyz[chosen] + np.float32([1, 2, 3])
+    times = point_times(msg, chosen)
+    after = moved_cloud(msg, bag_message, chosen, moved, times)
+    assert [f.name for f in after.fields] == [f.name for f in msg.fields]
+    assert (after.point_step, after.width) == (msg.point_step, msg.width)
+    np.testing.assert_array_equal(to_frame(after)[0].xyz[chosen], moved)
+    others = np.setdiff1d(every(msg), chosen)
+    np.testing.assert_array_equal(to_array(after)[others][["x", "y", "z", "intensity"]],
+                                  to_array(msg)[others][["x", "y", "z", "intensity"]])
+    np.testing.assert_allclose(point_times(after, every(msg)).seconds, 0.0, atol=1e-6)
+
+
+def test_a_part_of_a_turn_has_the_unit_of_its_type():
+    for name, values, seconds in [("t", np.array([4_000_000, 4_000_001], "<u4"), [4e-3, 4e-3]),
+                                  ("time", np.array([0.01, 0.0105], "<f4"), [0.01, 0.0105]),
+                                  ("timestamp", np.array([STAMP, STAMP + 10**6], "<f8"),
+                                   [0.0, 1e-3])]:
+        msg = cloud(name, values)
+        np.testing.assert_allclose(point_times(msg, every(msg)).seconds, seconds, atol=1e-6)
+
+
+def test_a_point_without_a_time_has_none():
+    values = SECONDS.copy()
+    values[::10] = np.nan
+    seconds = point_times(cloud("time", values), np.arange(1000)).seconds
+    np.testing.assert_array_equal(np.isnan(seconds), np.isnan(values))
+
+
+@pytest.mark.parametrize("name, values, words", [
+    ("ring", np.arange(9, dtype="<u2"), "no column of times .*it has x, y, z, intensity, ring"),
+    ("timestamp", STAMP * 1e-9 + SECONDS + 37.0, "37.100 s from header.stamp; do sensor and"),
+    ("t", np.array([0, 3 * 10**9], "<u4"), "3.000 s from header.stamp"),
+    ("time", np.full(5, np.nan), "no time in the column 'time' is a number"),
+    ("time", np.zeros((5, 2), "<f4"), "count > 1"),
+])
+def test_times_that_cannot_be_used_are_named(name, values, words):
+    points = np.zeros(len(values), [(n, "<f4") for n in ("x", "y", "z", "intensity")]
+                      + [(name, values.dtype, values.shape[1:])])
+    points[name] = values
+    msg = from_array(points, header(bag_message), bag_message)
+    with pytest.raises(InputError, match=words):
+        point_times(msg, every(msg))
