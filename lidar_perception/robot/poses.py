@@ -6,9 +6,8 @@ header.frame_id a and child_frame_id b.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
 from lidar_perception.types import InputError
@@ -26,7 +25,7 @@ def pose_of(translation: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     return pose
 
 
-def checked(translation: Sequence[float], quaternion: Sequence[float],
+def checked(translation: ArrayLike, quaternion: ArrayLike,
             name: str) -> tuple[np.ndarray, np.ndarray]:
     """translation (3,) and quaternion (4,) [x y z w] as float64, the latter of length 1. InputError
     with this name where they are no pose."""
