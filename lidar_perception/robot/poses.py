@@ -7,6 +7,7 @@ header.frame_id a and child_frame_id b.
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation, Slerp
 
 from lidar_perception.types import InputError
@@ -24,15 +25,16 @@ def pose_of(translation: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
     return pose
 
 
-def checked(translation: np.ndarray, quaternion: np.ndarray, name: str) -> tuple:
+def checked(translation: ArrayLike, quaternion: ArrayLike,
+            name: str) -> tuple[np.ndarray, np.ndarray]:
     """translation (3,) and quaternion (4,) [x y z w] as float64, the latter of length 1. InputError
     with this name where they are no pose."""
-    translation, quaternion = (np.asarray(v, np.float64) for v in (translation, quaternion))
-    length = np.linalg.norm(quaternion)
-    if not np.isfinite(translation).all() or not abs(length - 1.0) < NOT_UNIT:
+    moved, turned = np.asarray(translation, np.float64), np.asarray(quaternion, np.float64)
+    length = np.linalg.norm(turned)
+    if not np.isfinite(moved).all() or not abs(length - 1.0) < NOT_UNIT:
         raise InputError(f"the transform {name} has no unit quaternion, or is not finite; its "
                          "publisher is wrong")
-    return translation, quaternion / length
+    return moved, turned / length
 
 
 def inverse(pose: np.ndarray) -> np.ndarray:
