@@ -81,6 +81,10 @@ def _good(kind: str) -> bytes:
         x, y, z = map(float, PERSON[:3])
         return encode(bag_message(kind, header=header(), point=bag_message(
             "geometry_msgs/msg/Point", x=x, y=y, z=z)))
+    if kind == "nav_msgs/msg/Odometry":
+        message = bag_message(kind, header=header(), child_frame_id="lidar")
+        message.pose.pose.orientation.w = 1.0
+        return encode(message)
     if kind == "std_msgs/msg/Float64":
         return encode(bag_message(kind, data=1.5))
     raise LookupError(f"there is no good message of type {kind}")

@@ -15,7 +15,7 @@ import rclpy
 from rclpy.context import Context
 from rclpy.signals import SignalHandlerOptions
 
-from lidar_perception.campaign.case import FAILED, SURVIVED, Case, Outcome
+from lidar_perception.campaign.case import FAILED, SKIPPED, SURVIVED, Case, Outcome
 from lidar_perception.campaign.good import CLOUD, STAMP, cloud, good, markers, street
 from lidar_perception.campaign.messages import TRIED, Tried
 from lidar_perception.campaign.shapes import NETWORKS, work_of
@@ -28,6 +28,7 @@ from lidar_perception.wire.codec import encode
 FRAMES = 3000
 SECONDS = 240.0      # of one case, however few frames that are
 SETTLED = 0.3        # of the frames: from here on memory must be flat
+LEAST = 100          # frames; fewer say nothing
 GROWTH_MB = 20.0
 PERIOD = 100_000_000  # ns
 CASES = [*((f"node {node}", variant) for node, (_, _, variants) in TRIED.items()
@@ -89,6 +90,8 @@ def _repeated(what: str, work: Callable[[int], Any]) -> Outcome:
         if not settled and share >= SETTLED:
             gc.collect()
             settled = memory_mb("VmRSS")
+    if number < LEAST:
+        return Outcome(SKIPPED, f"{what}: {number} frames in {SECONDS:g} s are too few to tell")
     gc.collect()
     growth = memory_mb("VmRSS") - settled
     if growth > GROWTH_MB:

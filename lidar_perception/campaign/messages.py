@@ -20,6 +20,7 @@ from lidar_perception.campaign.good import CLOUD, good, mutated
 from lidar_perception.campaign.mutation import mutate_bytes
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes import NODES
+from lidar_perception.nodes.ego import ODOMETRY
 from lidar_perception.nodes.graph import private_domain
 from lidar_perception.nodes.reception import Reception
 from lidar_perception.nodes.runtime import ERROR, MARKERS, OK
@@ -56,6 +57,7 @@ TRIED: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
         for source, view, window in (
             ("ground_truth", True, "stretched"), ("file", False, "stretched"),
             ("automatic", False, "metric"), ("click", False, "metric"))]),
+    "tracker": (8, {"input/detections": MARKERS, "input/odometry": ODOMETRY}, [{}]),
     "evaluator": (8, {"input/ground_truth": MARKERS, "input/final": MARKERS}, [{}]),
     "pointnet_detector": (0.5, POINTS, [{}]),
     "pointpillars_detector": (0.2, POINTS, [{}]),
