@@ -195,8 +195,11 @@ def _said(folder: Path) -> str:
 
 
 def _files(folder: Path, pattern: str) -> dict[str, bytes]:
-    return {path.relative_to(folder).as_posix(): path.read_bytes()
-            for path in sorted(folder.glob(pattern)) if path.is_file()}
+    """Path -> content; of weights what follows the header, which says how long training took."""
+    found = {path.relative_to(folder).as_posix(): path.read_bytes()
+             for path in sorted(folder.glob(pattern)) if path.is_file()}
+    return {name: data[8 + int.from_bytes(data[:8], "little"):]
+            if name.endswith(".safetensors") else data for name, data in found.items()}
 
 
 @contextmanager

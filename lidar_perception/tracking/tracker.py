@@ -32,6 +32,7 @@ class Tracker:
         self.born = self.ended = 0
         self._states, self._ego = States.none(), Ego.unknown()
         self._stamp: int | None = None
+        self._late: int | None = None  # the stamp of the last frame, if that was late
         self._next = 1
 
     @property
@@ -55,8 +56,8 @@ class Tracker:
         in the sensor's frame; pose (4, 4) of the sensor in a fixed frame, None where unknown.
 
         What cannot be used does no harm: boxes that are not finite, or without a size, are left
-        out; a frame of the same stamp, or a little late, changes nothing; time that jumps, and a
-        sensor that does, ends all tracks.
+        out; a frame of the same stamp, or a little late, changes nothing; time that jumps, also
+        back by a little and on from there, and a sensor that does, ends all tracks.
         """
         self.problem = None
         seconds = self._seconds(int(stamp_ns))
@@ -103,14 +104,16 @@ class Tracker:
             self.problem = "the frames have no stamps: tracks take one frame each period"
             return self.params.period
         last, self._stamp = self._stamp, stamp
+        late, self._late = self._late, None
         if last is None:
             return self.params.period
         seconds = (stamp - last) / 1e9
         if seconds == 0:
             self.problem = "a frame has the stamp of the one before and is left out"
             return None
-        if seconds < 0 and -seconds <= self.params.max_gap:
-            self._stamp = last
+        goes_on = late is not None and stamp > late  # as of a short bag that is played again
+        if seconds < 0 and -seconds <= self.params.max_gap and not goes_on:
+            self._stamp, self._late = last, stamp
             self.problem = f"a frame is {-seconds:.2f} s older than the last one and is left out"
             return None
         if seconds < 0 or seconds > self.params.max_gap:

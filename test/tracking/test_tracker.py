@@ -166,6 +166,18 @@ def test_stamps_that_are_missing_equal_late_or_jump():
     assert tracker.problem is None
 
 
+def test_a_loop_that_is_shorter_than_the_longest_gap_is_a_jump_and_no_row_of_late_frames():
+    tracker, short = Tracker(), [START + i * TENTH for i in range(6)]
+    tracks = followed([cars(car(10))] * 18, tracker=tracker, stamps=short * 3)
+    assert tracker.ended == 2
+    assert [t.ids.tolist()[-1] for t in tracks] == [1] * 7 + [2] * 6 + [3] * 5
+    # one after the other, frames that are late do no harm
+    tracker = Tracker()
+    stamps = [START + i * TENTH for i in (0, 1, 4, 3, 2, 5)]
+    tracks = followed([cars(car(10))] * 6, tracker=tracker, stamps=stamps)
+    assert tracks[-1].ids.tolist() == [1] and tracker.ended == 0
+
+
 def test_poses_that_are_missing_for_a_while_are_replaced_by_the_motion_before():
     frames = [cars(car(40 - 0.8 * i)) for i in range(20)]
     poses = [None if 8 <= i < 13 else pose(0.8 * i) for i in range(20)]

@@ -1,0 +1,69 @@
+"""Tracks and labels in a bag: their scores, and the picture with their ways."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tracking_samples import START, TENTH, crowd
+
+from lidar_perception.data.bag import BagWriter
+from lidar_perception.scoring.pictures import draw_frame
+from lidar_perception.scoring.tracking.from_bag import recorded_tracks
+from lidar_perception.tracking.poses import Trails
+from lidar_perception.tracking.tracker import Tracker
+from lidar_perception.types import GroundTruth
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.messages import truth_markers
+from lidar_perception.wire.topics import TRUTH
+from lidar_perception.wire.track_markers import drawn_trails, track_markers
+from msg_utils.stamps import header_message
+
+MARKERS, TRACKS = "visualization_msgs/msg/MarkerArray", "/tracker/output/tracks"
+
+
+@pytest.fixture(params=[True, False], ids=["with track ids", "without"])
+def recorded(request, tmp_path):
+    """A bag of the crowd, tracked; whether its labels have track ids; the last array of tracks."""
+    tracker, trails = Tracker(), Trails()
+    with BagWriter(tmp_path / "bag") as bag:
+        for topic in (TRUTH, TRACKS):
+            bag.add_topic(topic, MARKERS)
+        for i, found in enumerate(crowd()):
+            stamp = START + i * TENTH
+            header = header_message(stamp, "velodyne", bag_message)
+            tracks = tracker(found, stamp)
+            extras = [{"track_id": k, "occluded": 0, "truncated": 0.0} if request.param else {}
+                      for k in range(len(found))]
+            truth = GroundTruth.of(found.boxes, found.class_ids, extras)
+            message = track_markers(tracks.ids, tracks.detections, tracks.velocities,
+                                    tracks.moving, trails(tracks, tracker.pose, stamp, 1.0),
+                                    header, bag_message)
+            bag.write(TRUTH, stamp, truth_markers(truth, header, bag_message))
+            bag.write(TRACKS, stamp, message)
+    return tmp_path / "bag", request.param, message
+
+
+def test_recorded_tracks_are_counted_and_scored_where_labels_have_ids(recorded):
+    path, with_ids, _ = recorded
+    count, scores, problem = recorded_tracks(path, TRACKS, "Pedestrian", None)
+    assert count == 3
+    if with_ids:
+        assert (scores["true_tracks"], scores["switches"], problem) == (3, 0, None)
+        assert scores["HOTA"] > 0.8
+    else:
+        assert scores is None and "track id" in problem
+    assert recorded_tracks(path, "/nothing", "Pedestrian", None)[0] == 0
+
+
+def test_the_ways_of_tracks_are_in_the_picture(recorded, tmp_path):
+    import matplotlib.image
+    trails = drawn_trails(recorded[2])
+    assert {*trails} == {1, 2, 3, 4, 5, 6} and all(len(way) > 5 for way in trails.values())
+    xyz, none = np.zeros((1, 3), np.float32), np.zeros((0, 7))
+    drawn = []
+    for name, ways in ("with", trails), ("without", {}):
+        draw_frame(tmp_path / name, xyz, np.zeros(1, bool), np.zeros(1, int), none, none,
+                   trails=ways)
+        drawn.append(matplotlib.image.imread(tmp_path / name, format="png"))
+    purple = [np.abs(p[..., :3] - [0.48, 0.18, 0.545]).max(axis=-1) < 0.02 for p in drawn]
+    assert purple[0].sum() > 200 and not purple[1].any()
