@@ -152,7 +152,8 @@ class Attempt:
         shutil.rmtree(self.folder / f"stopped {work}", ignore_errors=True)
         (self.folder / f"stopped {work}").mkdir()
         code = _run(self.folder, command, out, fault, moment * seconds)
-        if fault == signal.SIGINT and code not in (0, 1, 2, 130):
+        if fault == signal.SIGINT and code not in (
+                0, 1, 2, 130, -signal.SIGINT):  # the last two are the same to a shell
             return Outcome(FAILED, f"{work}: exit code {code} after SIGINT: {_said(self.folder)}")
         if "Traceback" in (self.folder / "said").read_text(errors="replace"):
             return Outcome(FAILED, f"{work}: traceback after {fault.name}: {_said(self.folder)}")
