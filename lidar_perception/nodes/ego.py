@@ -30,7 +30,7 @@ class EgoInput:
     def __init__(self, node: LidarNode, params: Callable[[], EgoParams], clouds: bool):
         self.node, self.params, self.clouds = node, params, clouds
         self.history = PoseHistory()
-        self.child = ""  # the frame whose poses the odometry has
+        self.child = self.fixed = ""  # the frame whose poses the odometry has, and in which
         self.icp: Odometry | None = None
         self.scan_ns = 0  # of the last scan that KISS-ICP took
         source = params().source
@@ -41,9 +41,12 @@ class EgoInput:
             if not clouds:
                 node.input("points", CLOUD, self._on_cloud)
 
-    def pose(self, stamp_ns: int, xyz: np.ndarray | None = None) -> np.ndarray | None:
-        """(4, 4) at the stamp of a frame; None where it is not known. xyz (N, 3) is its scan, where
-        the node takes the clouds."""
+    def pose(self, stamp_ns: int, frame_id: str,
+             xyz: np.ndarray | None = None) -> np.ndarray | None:
+        """(4, 4) at the stamp of a frame in frame_id; None where it is not known. xyz (N, 3) is its
+        scan, where the node takes the clouds."""
+        if self.fixed and frame_id == self.fixed:  # detections that are in the fixed frame already
+            return np.eye(4)
         if self.icp is not None and self.clouds and xyz is not None:
             self._register(stamp_ns, xyz)
         return self.history.at(stamp_ns, self.params().max_gap)
@@ -56,7 +59,7 @@ class EgoInput:
 
     def problem(self, frame_id: str) -> str | None:
         """What is wrong with the poses for frames in frame_id, with the remedy."""
-        if self.child and frame_id and self.child != frame_id:
+        if self.child and frame_id and frame_id not in (self.child, self.fixed):
             return (f"the odometry is of '{self.child}', the detections of '{frame_id}': they are "
                     "taken to be in one place")
         source = self.params().source
@@ -68,7 +71,7 @@ class EgoInput:
 
     def _on_odometry(self, msg: Any) -> None:
         pose = pose_of(msg.pose.pose)
-        self.child = msg.child_frame_id
+        self.child, self.fixed = msg.child_frame_id, msg.header.frame_id
         self._add(to_ns(msg.header.stamp), pose)
 
     def _on_cloud(self, msg: Any) -> None:

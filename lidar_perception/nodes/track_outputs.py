@@ -56,7 +56,7 @@ class TrackOutputs:
         stamp, tracker = to_ns(header.stamp), self.tracker
         problem = self._same_sensor(header.frame_id) or self.ego.problem(header.frame_id)
         tracker.params = self.params().tracking
-        tracks = tracker(detections, stamp, self.ego.pose(stamp, xyz))
+        tracks = tracker(detections, stamp, self.ego.pose(stamp, header.frame_id, xyz))
         if tracker.taken:
             self._send(header, stamp, tracks)
         self._count(stamp, len(tracks))

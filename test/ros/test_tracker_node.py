@@ -220,6 +220,8 @@ def test_detection_arrays_are_tracked_as_markers_are(domain):
     node, tracker = TrackerNode(context=context), Tracker()
     node.configure()
     node.tracks.markers = SimpleNamespace(publish=lambda data: shown.append(decode(data, MARKERS)))
+    node.tracks.ego._on_odometry(odometry(pose(50, 0, 1), header(START, "lidar"), "base",
+                                          bag_message))  # detections are in its fixed frame
     for i, found in enumerate(crowd()):
         boxes = [SimpleNamespace(
             bbox=SimpleNamespace(center=box_pose(box, bag_message), size=SimpleNamespace(
@@ -229,7 +231,7 @@ def test_detection_arrays_are_tracked_as_markers_are(domain):
             for box, kind, score in zip(found.boxes, found.class_ids, found.scores)]
         stamp = START + i * TENTH
         node.on_detections(SimpleNamespace(header=header(stamp), detections=boxes))
-        tracks = tracker(found, stamp)
+        tracks = tracker(found, stamp, np.eye(4))
         assert read(shown[-1])[1] == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
         np.testing.assert_allclose(read(shown[-1])[2].boxes, tracks.detections.boxes, atol=1e-4)
     node.destroy_node()
