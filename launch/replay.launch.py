@@ -29,6 +29,7 @@ from lidar_perception.nodes.graph import (
     result_topics,
     wait_for,
 )
+from lidar_perception.nodes.main import use_large_shared_memory
 from lidar_perception.wire.topics import POINTS, TF_STATIC
 
 HERE = Path(__file__).resolve().parent
@@ -42,6 +43,7 @@ def replay(context):
              for k in ("bag", "rate", "loop", "scores", "points", "config", "single",
                        "real_time", "use_sim_time", "log_level")}
     single = value["single"] == "true"
+    use_large_shared_memory()  # of the player, so that the nodes need not take it for a driver
     with Bag(value["bag"]) as bag:
         clouds = chosen_clouds(value["bag"], bag.topics, value["points"])
         played = [t for t in bag.topics if t == clouds or t not in cloud_topics(bag.topics)]

@@ -17,6 +17,7 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+from numpy.random import Generator as Rng
 
 from lidar_perception.campaign.case import FAILED, SURVIVED, Case, Outcome, generator
 from lidar_perception.campaign.worker import memory_mb
@@ -31,6 +32,7 @@ from lidar_perception.clustering.params import BOX_SHAPES
 from lidar_perception.detectors.hybrid.candidates import RescoredCandidates
 from lidar_perception.detectors.hybrid.proposals import ConfirmedProposals
 from lidar_perception.detectors.open import LOAD, open_detector
+from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.ground.params import GROUND_METHODS
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.param_fields import with_values
@@ -43,8 +45,6 @@ FAST = 1.0             # seconds of CPU that nobody minds
 LOCAL_FAST = 15.0      # where local thresholds are: what all of their exact distances take
 SMALL = 400.0          # megabytes that nobody minds
 BYTES_A_POINT = 4096.0
-
-Rng = np.random.Generator
 
 
 def _limits(rng: Rng, n: int) -> np.ndarray:
@@ -198,8 +198,9 @@ def work_of(stage: str) -> Callable[[LidarFrame], Any]:
         params = with_values(PipelineParams(), values)
         return lambda frame: find_candidates(frame, template, None, params)
     if name == "rescored":
-        return RescoredCandidates(open_detector("pointnet"), template,
+        return RescoredCandidates(load_pointnet_detector("", "auto"), template,
                                   pipeline=with_values(BEST, {"view.enabled": False}))
     if name == "confirmed":
-        return ConfirmedProposals(open_detector("pointpillars"), open_detector("pointnet"))
+        return ConfirmedProposals(open_detector("pointpillars"),
+                                  load_pointnet_detector("", "auto"))
     return open_detector(name)

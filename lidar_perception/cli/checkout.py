@@ -50,7 +50,7 @@ def _tests(folder: Path) -> list[str]:
     environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
     if sys.version_info >= (3, 12):
         environment["COVERAGE_CORE"] = "sysmon"  # lines are noticed once, and then cost nothing
-    pytest = [sys.executable, "-m", "pytest", "--cov", "--cov-report="]
+    pytest = [sys.executable, "-m", "pytest", "--cov", "--cov-report=", "--cov-fail-under=0"]
     nodes = [name for name in WITH_PROCESSES if (ROOT / name).is_dir()]
     workers = min(os.cpu_count() or 1, MAX_WORKERS)
     with (folder / "said").open("w+") as said:

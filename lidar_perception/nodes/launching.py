@@ -207,11 +207,14 @@ def rviz_topics(file: Path) -> list[tuple[str, str]]:
 
 def _shown(topic: str, value: dict[str, str]) -> str:
     node, slash, rest = topic.partition("/")
+    detectors, single = _detectors(value), value["single"] == "true"
     if topic == relative(POINTS):
         return value["points"]
-    if value["single"] == "true" and node in STAGES:
+    if node == TRACKER:  # of the first detector
+        node = next(iter(ALONE[detectors[0]] if single else trackers_of(detectors)))
+    elif single and node in STAGES:
         node = next(iter(SINGLE))
-    ours = node in {*graph_of([*BEHIND]), *SINGLE}
+    ours = node in {*graph_of([*BEHIND]), *trackers_of(detectors), *SINGLE}
     return (value["name_prefix"] if ours else "") + node + slash + rest
 
 

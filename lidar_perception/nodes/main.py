@@ -45,7 +45,7 @@ def help_text(name: str) -> str:
 STOP_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 PROFILES = {256 * 2**20: "fastdds.xml", 40 * 2**20: "fastdds_small.xml"}  # free bytes needed
-DRIVER_PROFILE, SOCKET_BUFFER = "fastdds_driver.xml", 4 * 2**20  # bytes of net.core.rmem_max needed
+DRIVER_PROFILE, SOCKET_BUFFER = "fastdds_driver.xml", 2 * 2**20  # bytes of net.core.rmem_max needed
 
 
 def use_large_shared_memory(from_driver: bool = False) -> None:

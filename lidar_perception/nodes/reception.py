@@ -255,7 +255,7 @@ class Reception:
     def _remedy(self, publishers: list[Any]) -> str:
         offered = {p.qos_profile.reliability for p in publishers}
         if BEST_EFFORT in offered:
-            sysctl = (f", or set net.core.rmem_max to {2 * SOCKET_BUFFER} (sysctl) and start this "
+            sysctl = (f", or set net.core.rmem_max to {4 * SOCKET_BUFFER} (sysctl) and start this "
                       "node again") if socket_buffer() < SOCKET_BUFFER else ""
             return (f"let {_name(publishers[0])} publish reliable, or start it with "
                     f"FASTRTPS_DEFAULT_PROFILES_FILE={PROFILE}{sysctl}")

@@ -53,6 +53,9 @@ class Transforms:
             self._subscribe(TF_STATIC, STATIC_QOS, static=True)
         if self.base_frame or self.target_frame or robot.input.deskew == "tf":
             self.listen()
+            if not self._installed:
+                self.lacking["TF"] = ("tf2_msgs is not installed, so nothing is known of TF; "
+                                      "install ROS 2's tf2_msgs")
         if robot.input.deskew == "odometry":
             node.input("odometry", "nav_msgs/msg/Odometry", self.on_odometry, ODOMETRY_QOS)
 
@@ -69,9 +72,6 @@ class Transforms:
         self._listening = True
         if self._installed:
             self._subscribe(TF, TF_QOS, static=False)
-        else:
-            self.lacking["TF"] = ("tf2_msgs is not installed, so nothing is known of TF; install "
-                                  "ROS 2's tf2_msgs")
 
     def _subscribe(self, topic: str, qos: QoSProfile, static: bool) -> None:
         self.node.input(topic, "tf2_msgs/msg/TFMessage", lambda m: self.on_tf(m, static), qos,

@@ -20,7 +20,6 @@ from lidar_perception.campaign.worker import Limits
 from lidar_perception.cli.campaign import campaign
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.kitti.folder import read_velodyne
-from lidar_perception.data.nuscenes.folder import read_sweep
 from lidar_perception.data.open import open_recording
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode
@@ -221,7 +220,6 @@ def test_a_pipe_in_the_place_of_a_file_is_refused_and_not_waited_for(tmp_path):
     for path in ("bag/bag.mcap", "pipe.bin"):
         os.mkfifo(tmp_path / path)
     for read in (lambda: open_recording(tmp_path / "bag"), lambda: Bag(tmp_path / "bag/bag.mcap"),
-                 lambda: read_velodyne(tmp_path / "pipe.bin"),
-                 lambda: read_sweep(tmp_path / "pipe.bin")):
+                 lambda: read_velodyne(tmp_path / "pipe.bin")):
         with pytest.raises(InputError, match="is no file"):
             read()

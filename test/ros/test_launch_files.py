@@ -166,14 +166,18 @@ def test_rviz_follows_the_names_of_the_graph(launched):
     _, nodes = launched("detectors")
     assert "rviz2" not in nodes()
     plain = nodes(rviz="true", points="/cloud", rviz_frame="base_link", namespace="left")["rviz2"]
-    assert plain.remappings == [("points", "/cloud")] and plain.namespace == "left"
+    assert dict(plain.remappings) == {
+        "points": "/cloud", "tracker/output/tracks": "candidates_tracker/output/tracks"}
+    assert plain.namespace == "left"
     assert plain.arguments == ["-d", str(ROOT / "config/lidar_perception.rviz"), "-f", "base_link"]
     prefixed = dict(nodes(rviz="true", name_prefix="left_")["rviz2"].remappings)
     assert prefixed["clustering/output/points"] == "left_clustering/output/points"
+    assert prefixed["tracker/output/tracks"] == "left_candidates_tracker/output/tracks"
     assert not {"points", "clicked_point"} & set(prefixed)  # of no node of ours
     single = dict(nodes(rviz="true", single="true")["rviz2"].remappings)
     assert single["clustering/output/points"] == "perception/output/points"
     assert single["candidate_refinement/output/detections"] == "perception/output/detections"
+    assert single["tracker/output/tracks"] == "perception/output/tracks"
     assert "pointnet_detector/output/detections" not in single
 
 

@@ -296,3 +296,19 @@ def test_a_cloud_of_a_moving_sensor_is_moved_to_its_stamp(start, source):
     give(node, message(raw, START + PERIOD))
     assert "no column of times" in problems(node) and len(node.sent["points"]) == 3
     assert time_message(START, bag_message).sec == after.header.stamp.sec and len(frame_)
+
+
+def test_tracks_of_a_tilted_sensor_stay_in_the_clouds_frame(start, weights):
+    """Where its detections are in the base, its tracks are in the cloud."""
+    scan, tilt = frame(), tilted(-0.2, 0.3, 1.73)
+    node = start(PointPillarsNode, **{**weights, "base_frame": "base", "target_frame": "base",
+                                      "tracking.enabled": True, "tracking.report": 0.0})
+    node.transforms.on_tf(transforms(("base", "lidar", tilt, 0)), static=True)
+    seen = moved_points(scan.xyz.astype(np.float64), tilted(-0.2, 0.3).T)
+    for i in range(4):
+        give(node, message(seen, START + i * PERIOD, scan.intensity))
+    (found, base, _), (tracks, cloud, _) = boxes_of(node), boxes_of(node, "tracks")
+    assert (base, cloud) == ("base", "lidar") and len(found) and len(tracks)
+    centres = moved_points(tracks.boxes[:, :3].astype(np.float64), tilt)
+    apart = np.linalg.norm(centres[:, None] - found.boxes[None, :, :3], axis=2).min(axis=1)
+    assert np.median(apart) < 0.3

@@ -60,7 +60,8 @@ def graph(domain):
     context = Context()
     rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     nodes, types, offered = [], {}, {}
-    for name, remap in {**graph_of([*BEHIND]), **SINGLE}.items():
+    for name, remap in {**graph_of([*BEHIND]), **SINGLE,
+                        **graph_of(["candidates"], tracking=True)}.items():
         module = importlib.import_module(f"lidar_perception.nodes.{name}")
         rules = [word for rule in remap.items() for word in ("-r", ":=".join(rule))]
         node = getattr(module, NODES[name][0])(context=context, cli_args=["--ros-args", *rules])
