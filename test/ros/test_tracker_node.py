@@ -90,7 +90,7 @@ def looped(domain, drive_bag, tmp_path_factory):
             processes.start(node, remap, extra)
         processes.start("bag_player", {}, {
             "bag": str(drive_bag), "loop": True, "follow": [outputs["found"].lstrip("/")],
-            "wait_for": [POINTS, f"{ODOMETRY}:=1", f"{CAMERA_INFO}:=1", outputs["found"] + ":=2"],
+            "wait_for": [POINTS, f"{ODOMETRY}:=1", f"{CAMERA_INFO}:=1", outputs["found"] + ":=3"],
             "wait_timeout": 120.0})
         peer.wait(lambda: min(map(len, heard.values())) > 2.5 * clouds, "the drive, three times",
                   300.0)
