@@ -20,7 +20,7 @@ class PoseHistory:
     A stamp that is max_jump_ns older than the newest begins anew, as a bag does that is played
     again."""
 
-    def __init__(self, max_jump_ns: int = 10**9):
+    def __init__(self, max_jump_ns: int = 10**9) -> None:
         self.max_jump_ns = max_jump_ns
         self._stamps: list[int] = []
         self._poses: list[np.ndarray] = []
