@@ -89,8 +89,10 @@ def looped(domain, drive_bag, tmp_path_factory):
                       "ego.source": "none"} if node == "perception" else {})
             processes.start(node, remap, extra)
         processes.start("bag_player", {}, {
-            "bag": str(drive_bag), "loop": True, "follow": [outputs["found"].lstrip("/")],
-            "wait_for": [POINTS, f"{ODOMETRY}:=1", f"{CAMERA_INFO}:=1", outputs["found"] + ":=3"],
+            "bag": str(drive_bag), "loop": True,
+            "follow": [outputs[name].lstrip("/") for name in ("found", "behind")],
+            "wait_for": [POINTS, f"{ODOMETRY}:=1", f"{CAMERA_INFO}:=1", outputs["found"] + ":=3",
+                         outputs["behind"] + ":=2"],
             "wait_timeout": 120.0})
         peer.wait(lambda: min(map(len, heard.values())) > 2.5 * clouds, "the drive, three times",
                   300.0)
