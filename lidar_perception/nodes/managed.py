@@ -88,6 +88,12 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         response.success = False
         return response
 
+    def destroy_node(self) -> None:
+        """With the state machine, which rclpy leaves, and with it the node in the graph, until it
+        is collected as garbage."""
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     def state_label(self) -> str:
         """unconfigured, inactive, active or finalized; configuring and so on in between."""
         return self._state_machine.current_state[1]
