@@ -32,7 +32,7 @@ setup(
     name=NAME,
     version="0.1.0",
     description="LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned "
-                "detectors, a simulator and training",
+                "detectors, tracks, a simulator and training",
     long_description=Path("README.md").read_text(),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
