@@ -88,6 +88,10 @@ def looped(domain, drive_bag, tmp_path_factory):
             extra = ({**flatten(params), "tracking.enabled": True, "input.queue": 2,
                       "ego.source": "none"} if node == "perception" else {})
             processes.start(node, remap, extra)
+        listeners = {"found": 2, "behind": 1, "inside": 1}  # as each node itself sees them
+        peer.wait(lambda: all(
+            int(peer.value_of(topic.split("/")[1], f"subscribers of {topic}") or 0)
+            >= listeners[name] for name, topic in outputs.items()), "the nodes to be connected")
         processes.start("bag_player", {}, {
             "bag": str(drive_bag), "loop": True,
             "follow": [outputs[name].lstrip("/") for name in ("found", "behind")],
