@@ -14,11 +14,13 @@ SIGNS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).astype(np
 
 class Windows(NamedTuple):
     """Of P solids: first (P,) int64 column, 0 .. columns - 1, and how many from there count (P,)
-    int64, counted past the end; beams (P, rings) bool. No ray outside meets the solid."""
+    int64, counted past the end; beams (P, rings) bool. No ray outside meets the solid, and none
+    nearer than near (P,) m."""
 
     first: np.ndarray
     count: np.ndarray
     beams: np.ndarray
+    near: np.ndarray
 
 
 def windows(solids: Solids, sensor: Sensor, motion: Motion = STILL,
@@ -42,7 +44,7 @@ def windows(solids: Solids, sensor: Sensor, motion: Motion = STILL,
         span = np.where(same_turn[:, None], seen, whole)
     near, beams = _beams(corners, sides, sensor, margin)
     beams &= (near <= sensor.max_range)[:, None]
-    return Windows(first % sensor.columns, count, beams)
+    return Windows(first % sensor.columns, count, beams, near - 1e-6)
 
 
 def _hull(solids: Solids, relative: np.ndarray,
