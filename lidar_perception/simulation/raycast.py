@@ -1,8 +1,9 @@
 """What the rays of a turn meet first, compiled.
 
 Solids are drawn into the grid of firings and beams as triangles are into a picture: each into its
-window (windows.py) of a depth buffer, which the ground fills first. Those that nobody labels come
-last and from near to far, so that most of their rays are found hidden with one comparison.
+window (windows.py) of a depth buffer. Those that nobody labels come last and from near to far, so
+that most of their rays are found hidden with one comparison; then the ground, which takes longest,
+where it may be nearer.
 Beams at the edges of things are cast once more, into their footprint: see edges.py.
 Solids are in the sensor's frame at the stamp; the ground is in the world, whose axes are parallel.
 """
@@ -20,7 +21,7 @@ from lidar_perception.simulation.hashing import mixed
 from lidar_perception.simulation.pairs import shade, shapes_of, span, stop, unit_ray
 from lidar_perception.simulation.sensor import STILL, Motion, Sensor, rays
 from lidar_perception.simulation.solids import Solids
-from lidar_perception.simulation.terrain import Ground, cast_ground, compiled
+from lidar_perception.simulation.terrain import Ground, cast_ground, compiled, not_before
 from lidar_perception.simulation.windows import windows
 
 
@@ -82,43 +83,37 @@ def cast(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sensor,
 def _first(hits, turn, only, shapes, seen, order, ground, position, velocity, max_range, filled,
            counting):
     """Fills the hits of only those rays, (columns, rings) bool; reached only where counting."""
-    _draw_ground(hits, turn, only, ground, position, velocity, max_range)
+    hits.range[:] = np.inf
+    hits.solid[:] = -1
     _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, counting)
     columns, rings = only.shape
     for column in range(columns):
+        since = turn.since[column]
+        x, y, z = (position[0] + velocity[0] * since, position[1] + velocity[1] * since,
+                   position[2] + velocity[2] * since)
         for ring in range(rings):
-            s = hits.solid[column, ring]
-            if s >= 0 and only[column, ring]:
-                number = ring * columns + column
-                hits.brightness[column, ring], hits.cosine[column, ring] = shade(
-                    shapes, s, _way(turn, column, ring), turn.since[column], turn.lift[ring],
-                    number)
-                hits.owner[column, ring] = shapes.owner[s]
-                hits.semantic[column, ring] = shapes.semantic[s]
+            if only[column, ring]:
+                start, way = (x, y, z + turn.lift[ring]), _way(turn, column, ring)
+                far, s = hits.range[column, ring], hits.solid[column, ring]
+                if not far < not_before(ground, start, way):
+                    met = cast_ground(ground, start, way, max_range)
+                    if s < 0 or np.float32(met.range) < np.float32(far):
+                        _write(hits, column, ring, Met(met.range, met.brightness, met.cosine, 0,
+                                                       met.semantic, -1))
+                        continue
+                if s >= 0:
+                    brightness, cosine = shade(shapes, s, way, since, turn.lift[ring],
+                                               ring * columns + column)
+                    _write(hits, column, ring, Met(far, brightness, cosine, shapes.owner[s],
+                                                   shapes.semantic[s], s))
+                else:
+                    _write(hits, column, ring, Met(np.inf, 0.0, 0.0, 0, 0, -1))
 
 
 @njit(cache=True, nogil=True)
 def _way(turn, column, ring):
     way = turn.direction[column, ring]
     return way[0], way[1], way[2]
-
-
-@njit(cache=True, nogil=True)
-def _draw_ground(hits, turn, only, ground, position, velocity, max_range):
-    for column in range(only.shape[0]):
-        since = turn.since[column]
-        x, y, z = (position[0] + velocity[0] * since, position[1] + velocity[1] * since,
-                   position[2] + velocity[2] * since)
-        for ring in range(only.shape[1]):
-            if only[column, ring]:
-                met = cast_ground(ground, (x, y, z + turn.lift[ring]), _way(turn, column, ring),
-                                  max_range)
-                hits.range[column, ring] = met.range
-                hits.brightness[column, ring] = met.brightness
-                hits.cosine[column, ring] = met.cosine
-                hits.semantic[column, ring] = met.semantic
-                hits.owner[column, ring] = 0
-                hits.solid[column, ring] = -1
 
 
 @njit(cache=True, nogil=True)
@@ -173,14 +168,9 @@ def _merge(hits, other, only, pulse, salt):
     for column in range(columns):
         for ring in range(rings):
             if only[column, ring]:
-                met = merged(_met(hits, column, ring), _met(other, column, ring), pulse,
-                             salt + np.uint64(ring * columns + column))
-                hits.range[column, ring] = met.range
-                hits.brightness[column, ring] = met.brightness
-                hits.cosine[column, ring] = met.cosine
-                hits.owner[column, ring] = met.owner
-                hits.semantic[column, ring] = met.semantic
-                hits.solid[column, ring] = met.solid
+                _write(hits, column, ring, merged(
+                    _met(hits, column, ring), _met(other, column, ring), pulse,
+                    salt + np.uint64(ring * columns + column)))
 
 
 @njit(cache=True, nogil=True)
@@ -188,3 +178,13 @@ def _met(hits, column, ring):
     return Met(hits.range[column, ring], hits.brightness[column, ring], hits.cosine[column, ring],
                np.int64(hits.owner[column, ring]), np.int64(hits.semantic[column, ring]),
                np.int64(hits.solid[column, ring]))
+
+
+@njit(cache=True, nogil=True)
+def _write(hits, column, ring, met):
+    hits.range[column, ring] = met.range
+    hits.brightness[column, ring] = met.brightness
+    hits.cosine[column, ring] = met.cosine
+    hits.owner[column, ring] = met.owner
+    hits.semantic[column, ring] = met.semantic
+    hits.solid[column, ring] = met.solid
