@@ -72,16 +72,20 @@ def meet(one: np.ndarray, many: np.ndarray, seconds: float, gap: float = 0.0) ->
 
 
 @njit(cache=True, nogil=True)
-def _meet_any(one, many, seconds, gap):
-    """Whether one meets any of many; those that never come near are soon told."""
-    size = math.hypot(one[LENGTH], one[WIDTH]) + one[SPEED] * seconds + gap
+def _meet_any(one, many, reach, seconds, gap):
+    """Whether one meets any of many; reach (M,): of these, see _reach."""
+    far = _reach(one, seconds) + gap
     for m in range(len(many)):
-        other = many[m]
-        reach = size + math.hypot(other[LENGTH], other[WIDTH]) + other[SPEED] * seconds
-        x, y = other[X] - one[X], other[Y] - one[Y]
-        if 0 <= reach and x * x + y * y <= reach * reach and _meet(one, other, seconds, gap):
+        x, y, near = many[m, X] - one[X], many[m, Y] - one[Y], far + reach[m]
+        if 0 <= near and x * x + y * y <= near * near and _meet(one, many[m], seconds, gap):
             return True
     return False
+
+
+@njit(cache=True, nogil=True)
+def _reach(one, seconds):
+    """How far from its first place any of a footprint ever gets."""
+    return math.hypot(one[LENGTH], one[WIDTH]) + one[SPEED] * seconds
 
 
 @njit(cache=True, nogil=True)
@@ -133,27 +137,32 @@ class Room:
         """keep_clear (M, 8): footprints that are taken from the start."""
         self.seconds = seconds
         self.actors: list[Actor] = []
-        self._taken, self._used = np.zeros((64, 8)), 0
-        self._take(keep_clear)
+        self._taken, self._reach, self._used = np.empty((64, 8)), np.empty(64), 0
+        for row in keep_clear:
+            self._take(row)
 
     def admit(self, *group: Actor, gap: float = 0.1) -> bool:
         """Adds the group if none of it ever comes within gap of anyone else, nor meets another of
         its own."""
-        rows, taken = np.array([a.footprint for a in group]), self._taken[:self._used]
-        if any(_meet_any(row, taken, self.seconds, gap)
-               or (i and _meet_any(row, rows[:i], self.seconds, 0.0))
-               for i, row in enumerate(rows)):
-            return False
-        self.add(*group)
+        before = self._used
+        for actor in group:
+            row, own = actor.footprint, slice(before, self._used)
+            if (_meet_any(row, self._taken[:before], self._reach, self.seconds, gap)
+                    or _meet_any(row, self._taken[own], self._reach[own], self.seconds, 0.0)):
+                self._used = before
+                return False
+            self._take(row)
+        self.actors += group
         return True
 
     def add(self, *group: Actor) -> None:
         """Adds a group unasked, such as people on a bench."""
         self.actors += group
-        self._take(np.array([a.footprint for a in group]).reshape(-1, 8))
+        for actor in group:
+            self._take(actor.footprint)
 
-    def _take(self, rows: np.ndarray) -> None:
-        end = self._used + len(rows)
-        while end > len(self._taken):
-            self._taken = np.concatenate([self._taken, np.zeros_like(self._taken)])
-        self._taken[self._used:end], self._used = rows, end
+    def _take(self, row: np.ndarray) -> None:
+        if self._used == len(self._taken):  # room for twice as many
+            self._taken, self._reach = np.tile(self._taken, (2, 1)), np.tile(self._reach, 2)
+        self._taken[self._used], self._reach[self._used] = row, _reach(row, self.seconds)
+        self._used += 1

@@ -75,43 +75,57 @@ def pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
 def _covered(build: Build) -> tuple[float, float]:
     """The least and largest x over a stride; both halves of it are alike."""
     body = build._replace(carried="backpack" if build.carried == "backpack" else "", phase=0.0)
-    poses = [i / 12 * build.step for i in range(12 if build.step else 1)]
-    hulls = [hull(walker(x, body)) for x in poses]
-    return min(h[0] for h in hulls), max(h[3] for h in hulls)
+    poses = [_limbs(i / 24, body) for i in range(12 if build.step else 1)]
+    rows = [row for limbs, _ in poses for row in limbs] + _trunk(body, 0.0)
+    low, _, _, high, _, _ = hull(parts(rows, PERSON))
+    return low, high
 
 
 def walker(travelled: float, build: Build) -> np.ndarray:
     """(P,) PART of a walker after so many metres; the last two rows before what is carried are the
     feet, right and left. A foot on the ground stays where it is, and the hips sink as far as the
     legs spread, so that the height is the box's when a leg is upright below the hips."""
-    h, w, _, _, hair, coat, trousers, carried, shift = build
     turns = build.phase + (travelled / (2 * build.step) if build.step else 0.0)
-    feet = [_foot((turns + half) % 1.0, 2 * build.step, h) for half in (0.0, 0.5)]
-    hip = min(HIP * h, *(z + sqrt((REACH * h) ** 2 - min(0.88 * abs(x), 0.9 * REACH * h) ** 2)
-                         for _, _, (x, z) in feet))
-    up = hip - HIP * h
-    rows = [
+    limbs, up = _limbs(turns, build)
+    trunk = _trunk(build, up)
+    made = parts(trunk[:5] + limbs + trunk[5:], PERSON)
+    made["centre"][:, 0] += build.shift
+    return made
+
+
+def _trunk(build: Build, up: float) -> list[tuple]:
+    """Head, neck, chest and hips, and what is carried, so much higher than at rest."""
+    h, w = build.height, build.width
+    return [
         part(ELLIPSOID, (0.012 * h, 0, 0.93 * h + up), (0.055 * h, 0.045 * h, 0.068 * h),
              reflectance=SKIN),
         part(ELLIPSOID, (-0.012 * h, 0, 0.948 * h + up), (0.05 * h, 0.047 * h, 0.052 * h),
-             reflectance=hair),
+             reflectance=build.hair),
         rod((0, 0, 0.8 * h + up), (0.005 * h, 0, 0.89 * h + up), 0.032 * h, reflectance=SKIN),
         part(ELLIPSOID, (0, 0, 0.70 * h + up), (0.08 * h, min(0.125 * h, 0.42 * w), 0.15 * h),
-             reflectance=coat),
+             reflectance=build.coat),
         part(ELLIPSOID, (0, 0, 0.54 * h + up), (0.075 * h, min(0.105 * h, 0.38 * w), 0.11 * h),
-             reflectance=trousers)]
+             reflectance=build.trousers),
+        *_load(build.carried, h, w, up, build.coat)]
+
+
+def _limbs(turns: float, build: Build) -> tuple[list[tuple], float]:
+    """Arms, legs and feet after so many strides, and how much higher than at rest the hips are."""
+    h = build.height
+    feet = [_foot((turns + half) % 1.0, 2 * build.step, h) for half in (0.0, 0.5)]
+    hip = min(HIP * h, *(z + sqrt((REACH * h) ** 2 - min(0.88 * abs(x), 0.9 * REACH * h) ** 2)
+                         for _, _, (x, z) in feet))
+    up, rows = hip - HIP * h, []
     for side, (u, left) in zip((-1, 1), ((turns + 0.5, False), (turns, True))):
         rows += _arm(side, u, build, up, left)
     for side, (_, _, ankle) in zip((-1, 1), feet):
-        rows += _leg(side, ankle, hip, h, trousers)
+        rows += _leg(side, ankle, hip, h, build.trousers)
     for side, (toe, tilt, _) in zip((-1, 1), feet):
         flat, steep, half = cos(tilt), sin(tilt), FOOT * h / 2
         rows.append(part(BOX, (toe[0] - half * flat + 0.02 * h * steep, side * 0.055 * h,
                                toe[1] + half * steep + 0.02 * h * flat),
                          (half, 0.03 * h, 0.02 * h), pitch=tilt, reflectance=RUBBER))
-    made = parts(rows + _load(carried, h, w, up, coat), PERSON)
-    made["centre"][:, 0] += shift
-    return made
+    return rows, up
 
 
 def _foot(u: float, stride: float, h: float) -> tuple[tuple, float, tuple]:
