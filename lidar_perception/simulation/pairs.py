@@ -40,17 +40,16 @@ class Shapes(NamedTuple):
 
 def shapes_of(solids: Solids, motion: Motion, salt: np.uint64) -> Shapes:
     """Solids in the sensor's frame at the stamp; salt: of the scan."""
-    matrix = np.ascontiguousarray(np.swapaxes(solids.axes, 1, 2)) / solids.half[:, :, None]
+    matrix = np.swapaxes(solids.axes, 1, 2) / solids.half[:, :, None]
     slides = np.asarray(motion.velocity, np.float64) - solids.velocity
-    salts = (np.arange(len(solids), dtype=np.uint64) << np.uint64(32)) + salt
-    reflectance = np.ascontiguousarray(solids.reflectance, np.float64)
+    # Copies, as compiled code is compiled anew for arrays that are read-only or lie otherwise.
+    density, transmission, reflectance = (np.array(part, np.float64) for part in (
+        solids.density, solids.transmission, solids.reflectance))
     return Shapes(
-        matrix, -np.einsum("pij,pj->pi", matrix, solids.centre),
-        np.einsum("pij,pj->pi", matrix, slides), np.ascontiguousarray(solids.kind),
-        np.ascontiguousarray(solids.density, np.float64),
-        np.ascontiguousarray(solids.transmission, np.float64), reflectance,
-        reflectance.view(np.uint64), np.ascontiguousarray(solids.owner),
-        np.ascontiguousarray(solids.semantic), salts)
+        np.array(matrix, order="C"), -np.einsum("pij,pj->pi", matrix, solids.centre),
+        np.einsum("pij,pj->pi", matrix, slides), np.array(solids.kind), density, transmission,
+        reflectance, reflectance.view(np.uint64), np.array(solids.owner), np.array(solids.semantic),
+        (np.arange(len(solids), dtype=np.uint64) << np.uint64(32)) + salt)
 
 
 @njit(cache=True, nogil=True)
@@ -79,13 +78,13 @@ def span(kind, start, way):
                 return np.inf, -np.inf
             enter, leave = max(enter, min(a, b)), min(leave, max(a, b))
     if kind != BOX:
-        flat = 0.0 if kind == CYLINDER else 1.0
         (x, y, z), (u, v, w) = start, way
-        z, w = flat * z, flat * w
+        if kind == CYLINDER:  # from the axis, not from the centre
+            z, w = 0.0, 0.0
         square = u * u + v * v + w * w
         middle = -(x * u + y * v + z * w) / square
         x, y, z = x + middle * u, y + middle * v, z + middle * w
-        half = (1 - (x * x + y * y + z * z)) / square  # z: from the axis or centre
+        half = (1 - (x * x + y * y + z * z)) / square
         if not half >= 0:
             return np.inf, -np.inf
         half = math.sqrt(half)

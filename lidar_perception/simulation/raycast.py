@@ -58,31 +58,29 @@ def cast(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sensor,
     salt = np.uint64(mixed(np.uint64(seed % (1 << 64))))
     made = rays(sensor, motion)
     turn = Turn(made.direction, made.since, sensor.origins()[:, 2].copy())
-    shapes = shapes_of(solids, motion, salt)
     seen = windows(solids, sensor, motion, sensor.divergence / 2)
-    order = np.lexsort((seen.near, solids.owner, solids.owner == 0))
-    world = compiled(ground), np.asarray(position, np.float64), np.asarray(motion.velocity, float)
+    scene = (shapes_of(solids, motion, salt), seen,
+             np.lexsort((seen.near, solids.owner, solids.owner == 0)), compiled(ground),
+             np.array(position, np.float64), np.array(motion.velocity, np.float64),
+             float(sensor.max_range), foliage.FILLED)
     shape = (sensor.columns, sensor.rings)
     hits = Hits(np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape, np.int32),
                 np.empty(shape, np.uint16), np.empty(shape, np.int32),
-                np.zeros(max(int(solids.owner.max(initial=0)), 0) + 1, np.int64))
-    everywhere = np.ones(shape, bool)
-    _first(hits, turn, everywhere, shapes, seen, order, *world, sensor.max_range, foliage.FILLED,
-           True)
+                np.zeros(int(solids.owner.max(initial=0)) + 1, np.int64))
+    _first(hits, turn, np.ones(shape, bool), *scene, True)
     if sensor.divergence:
-        edge = at_edges(hits.solid)
-        _aside(turn.direction, edge, sensor.divergence, salt)
-        other = Hits(*(np.empty_like(grid) for grid in hits))
-        _first(other, turn, edge, shapes, seen, order, *world, sensor.max_range, foliage.FILLED,
-               False)
-        _merge(hits, other, edge, sensor.pulse, salt)
+        edge, other = at_edges(hits.solid), Hits(*(np.empty_like(grid) for grid in hits))
+        _aside(turn.direction, edge, float(sensor.divergence), salt)
+        _first(other, turn, edge, *scene, False)
+        _merge(hits, other, edge, float(sensor.pulse), salt)
     return hits
 
 
 @njit(cache=True, nogil=True)
 def _first(hits, turn, only, shapes, seen, order, ground, position, velocity, max_range, filled,
            counting):
-    """Fills the hits of only those rays, (columns, rings) bool; reached only where counting."""
+    """Fills the hits of only those rays, (columns, rings) bool; reached only where counting.
+    order: owner by owner, then from near to far what has none."""
     hits.range[:] = np.inf
     hits.solid[:] = -1
     _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, counting)

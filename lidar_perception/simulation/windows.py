@@ -52,13 +52,15 @@ def windows(solids: Solids, sensor: Sensor, motion: Motion = STILL,
     rise, fall = (np.tan(np.clip(elevations + m, -limit, limit))
                   for m in (margin + 1e-9, -margin - 1e-9))
     grid = Grid(sensor.columns, float(sensor.rate), float(motion.stamp), float(motion.yaw_rate),
-                since.min(), since.max(), margin / np.cos(np.abs(elevations).max()),
+                float(since.min()), float(since.max()),
+                float(margin / np.cos(np.abs(elevations).max())),
                 float(sensor.max_range), bool(relative.any() or motion.yaw_rate),
                 sensor.origins()[:, 2].copy(), rise, fall)
     count = len(solids)
     found = Windows(np.empty(count, np.int64), np.empty(count, np.int64),
                     np.empty((count, sensor.rings), bool), np.empty(count))
-    _windows(found, grid, solids.kind, solids.centre, solids.half, solids.axes, relative)
+    shapes = (np.array(part, float) for part in (solids.centre, solids.half, solids.axes, relative))
+    _windows(found, grid, np.array(solids.kind), *shapes)
     return found
 
 
@@ -136,8 +138,8 @@ def _columns(corners, grid, begin, end):
     turned = grid.yaw_rate * begin, grid.yaw_rate * end
     low, high = low - max(turned) - grid.wide, high - min(turned) + grid.wide
     step = 2 * np.pi / grid.columns
-    first = int(math.floor((middle + low) / step))
-    count = int(math.ceil((middle + high) / step)) - first + 1
+    first = math.floor((middle + low) / step)
+    count = math.ceil((middle + high) / step) - first + 1
     if around or count >= grid.columns:
         return 0, grid.columns
     return first, count

@@ -31,9 +31,10 @@ def tree(rng: np.random.Generator, height: float | None = None) -> np.ndarray:
     leaves = [_foliage(rng, (0, 0, fork + 0.55 * tall), (wide, wide, 0.45 * tall), (0.4, 1.0))]
     for i, (a, b, c, up, *rest) in enumerate(rng.random((3, 7)).tolist()):
         at = turn + 1.0 + 2.1 * i
-        half = [height * between(*each) for each in ((a, 0.12, 0.2), (b, 0.12, 0.2), (c, 0.1, 0.16))]
-        leaves.append(_leaves(rest, (0.7 * wide * cos(at), 0.7 * wide * sin(at),
-                                     fork + tall * between(up, 0.25, 0.7)), tuple(half), (0.6, 2.0)))
+        centre = 0.7 * wide * cos(at), 0.7 * wide * sin(at), fork + tall * between(up, 0.25, 0.7)
+        half = (height * between(a, 0.12, 0.2), height * between(b, 0.12, 0.2),
+                height * between(c, 0.1, 0.16))
+        leaves.append(_leaves(rest, centre, half, (0.6, 2.0)))
     return parts(rows + leaves, VEGETATION)
 
 
@@ -52,8 +53,8 @@ def bush(rng: np.random.Generator) -> np.ndarray:
     high = rng.uniform(0.3, 1.0)
     rows = []
     for x, y, a, b, c, *rest in rng.random((3, 8)).tolist():
-        half = [high * between(*each) for each in ((a, 0.6, 1.1), (b, 0.6, 1.1), (c, 0.8, 1.2))]
-        rows.append(_leaves(rest, ((x - 0.5) * high, (y - 0.5) * high, 0.8 * high), tuple(half),
+        half = high * between(a, 0.6, 1.1), high * between(b, 0.6, 1.1), high * between(c, 0.8, 1.2)
+        rows.append(_leaves(rest, ((x - 0.5) * high, (y - 0.5) * high, 0.8 * high), half,
                             (1.5, 5.0)))
     return parts(rows, VEGETATION)
 
