@@ -118,26 +118,28 @@ def test_the_same_arguments_give_the_same_bytes_and_another_seed_others():
 @pytest.mark.parametrize("motion", [STILL, DRIVE])
 def test_what_is_cast_together_is_the_nearest_of_what_is_cast_alone(motion):
     """Neither the order in which solids are drawn nor what is skipped as hidden changes a byte:
-    solids alone, one ground alone, and the nearest of them for each ray."""
-    sensor = replace(SENSOR, azimuth_step=np.radians(2.0))
-    ground = FULL._replace(rough=0.4, litter=0.2, camber=0.03)
-    made = crowd(5)
-    made = replace(made, density=np.where(np.arange(60) % 3, np.inf, 1.0))
-    hits = cast(made, ground, OVER_ROAD, sensor, motion)
-    none = made.take(np.arange(0))
-    nearest = cast(none, ground, OVER_ROAD, sensor, motion)._asdict()
-    for i in range(len(made)):
-        # As the other solids are out of reach, solid i keeps its place among them.
-        alone = replace(made, centre=np.where(np.arange(60)[:, None] == i, made.centre, 1e4))
-        met = cast(alone, Ground(), NO_GROUND, sensor, motion)
+    a heap of solids, most of them without an owner, that overlap and lie in high grass."""
+    count, rng = 160, np.random.default_rng(0)
+    made = crowd(5, count)
+    far = np.linalg.norm(made.centre[:, :2], axis=1)[:, None]
+    made = replace(made, centre=made.centre * (5 + 0.3 * far) / far - [0, 0, 1],
+                   half=0.6 * made.half,
+                   density=np.where(rng.random(count) < 0.3, 1.0, np.inf),
+                   owner=np.where(rng.random(count) < 0.7, 0, made.owner).astype(np.int32))
+    ground = FULL._replace(rough=0.8, litter=0.6, camber=0.03, curb_left=3.0, curb_right=-2.0)
+    hits = cast(made, ground, OVER_ROAD, SENSOR, motion)
+    nearest = cast(made.take(np.arange(0)), ground, OVER_ROAD, SENSOR, motion)._asdict()
+    for i in range(count):
+        # The others are out of reach, so that solid i keeps its place among them.
+        alone = replace(made, centre=np.where(np.arange(count)[:, None] == i, made.centre, 1e4))
+        met = cast(alone, Ground(), NO_GROUND, SENSOR, motion)
         nearer = met.range < nearest["range"]
         assert (met.solid[nearer] == i).all()
-        for name, grid in nearest.items():
-            if name != "reached":
-                nearest[name] = np.where(nearer, getattr(met, name), grid)
-    assert 30 < len(np.unique(hits.solid)) and (hits.solid < 0).any()
-    for name, grid in nearest.items():
-        assert name == "reached" or np.array_equal(getattr(hits, name), grid), name
+        for name in nearest.keys() - {"reached"}:
+            nearest[name] = np.where(nearer, getattr(met, name), nearest[name])
+    assert len(np.unique(hits.solid)) > 80 and 0.1 < (hits.solid < 0).mean() < 0.9
+    for name in nearest.keys() - {"reached"}:
+        assert np.array_equal(getattr(hits, name), nearest[name]), name
 
 
 def test_order_of_solids_does_not_matter():
