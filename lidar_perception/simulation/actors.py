@@ -63,21 +63,13 @@ def centres(footprints: np.ndarray, t: np.ndarray) -> np.ndarray:
                      f[..., Y] + np.sin(f[..., HEADING]) * way], axis=-1)
 
 
-def meet(one: np.ndarray, many: np.ndarray, seconds: float, gap: float = 0.0) -> np.ndarray:
-    """(M,) bool: whether footprint one (8,) comes within gap metres of each of many (M, 8) at any
-    time in 0 .. seconds. Exact for gap 0: convex shapes that slide along straight lines touch
-    while their shadows on the normals of all sides do."""
-    one = np.ascontiguousarray(one)
-    return np.array([_meet(one, other, seconds, gap) for other in np.ascontiguousarray(many)], bool)
-
-
 @njit(cache=True, nogil=True)
 def _meet_any(one, many, reach, seconds, gap):
     """Whether one meets any of many; reach (M,): of these, see _reach."""
     far = _reach(one, seconds) + gap
     for m in range(len(many)):
         x, y, near = many[m, X] - one[X], many[m, Y] - one[Y], far + reach[m]
-        if 0 <= near and x * x + y * y <= near * near and _meet(one, many[m], seconds, gap):
+        if 0 <= near and x * x + y * y <= near * near and meet(one, many[m], seconds, gap):
             return True
     return False
 
@@ -89,7 +81,10 @@ def _reach(one, seconds):
 
 
 @njit(cache=True, nogil=True)
-def _meet(one, other, seconds, gap):
+def meet(one, other, seconds, gap):
+    """Whether two footprints (8,) come within gap metres of each other at any time in 0 .. seconds.
+    Exact for gap 0: convex shapes that slide along straight lines touch while their shadows on the
+    normals of all sides do."""
     times = np.empty(6)
     times[:] = (one[START], one[STOP], other[START], other[STOP], 0.0, seconds)
     for i in range(6):
