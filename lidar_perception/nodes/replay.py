@@ -57,7 +57,7 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
     with Bag(drive) as bag:
         poses = "odometry" if ODOMETRY in bag.topics else "kiss_icp" if has_odometry() else None
     tracker = {"ego.source": poses or "none",
-               **({} if real_time else {"input.max_wait": SILENCE_TIMEOUT})}
+               **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT})}
     with Processes(out / "logs", domain) as processes, Watch(domain, topics["final"]) as watch:
         for node, remap in graph.items():
             processes.start(node, remap, tracker if node == TRACKER else

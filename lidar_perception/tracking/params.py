@@ -123,7 +123,7 @@ class TrackingParams(Params):
         return self.vehicle, self.pedestrian, self.cyclist
 
 
-EGO_SOURCES = ("auto", "odometry", "kiss_icp", "none")
+EGO_SOURCES = ("auto", "odometry", "tf", "kiss_icp", "none")
 
 
 @dataclass(frozen=True)
@@ -131,12 +131,16 @@ class EgoParams(Params):
     """Where a node learns how the sensor moves."""
 
     source: str = param(
-        "auto", "auto: odometry as soon as some comes. odometry: ~/input/odometry. kiss_icp: from "
-        "the scans on ~/input/points, by the extra [odometry]. none: tracks are relative to the "
-        "sensor.", choices=EGO_SOURCES, fixed=True)
+        "auto", "odometry: ~/input/odometry. tf: TF, from `input.fixed_frame`. kiss_icp: from the "
+        "scans on ~/input/points, by the extra [odometry]. none: tracks are relative to the "
+        "sensor. auto: the odometry as soon as some comes; where none has come yet, TF if it "
+        "connects the sensor with `input.fixed_frame`; and after a second with neither, kiss_icp "
+        "if the extra is installed.", choices=EGO_SOURCES, fixed=True)
     max_gap: float = param(0.5, "Between two poses, and after the last one, a pose is taken to be "
                            "known for so long; beyond, max_ego_gap of the tracker goes on.",
                            unit="s", low=0.0, high=100.0)
+    max_wait: float = param(0.2, "A frame waits for its pose this long, where poses come but are a "
+                            "little behind.", unit="s", low=0.0, high=100.0)
 
 
 def tracking_of(detector: str, params: TrackingParams = TrackingParams()) -> TrackingParams:
