@@ -123,7 +123,8 @@ class TrackingParams(Params):
         return self.vehicle, self.pedestrian, self.cyclist
 
 
-EGO_SOURCES = ("auto", "odometry", "tf", "kiss_icp", "none")
+EGO_SOURCES = ("auto", "odometry", "tf", "kiss_icp", "none")  # of a node
+RECORDED_EGO = ("auto", "recording", "kiss_icp", "none")      # of a recording
 
 
 @dataclass(frozen=True)
