@@ -70,11 +70,8 @@ class ExistenceParams(Params):
 
     neutral: NeutralParams = NeutralParams()
     gain: float = param(1.0, "Weight of a score's log odds.", low=0.0, high=10.0)
-    correlation: float = param(0.8, "Of the evidence of looks from the same place: n of them count "
-                               "as n / (1 + (n - 1) correlation).", low=0.0, high=1.0)
-    new_view: float = param(0.35, "A change of the bearing under which it is seen (rad), or "
-                            "of the logarithm of its range, that makes a look a new one.",
-                            low=0.01, high=10.0)
+    correlation: float = param(0.8, "Of the evidence of looks at one object: n of them count as "
+                               "n / (1 + (n - 1) correlation).", low=0.0, high=1.0)
     memory: float = param(1.0, "Evidence fades with this time constant.", unit="s", low=0.05,
                           high=1000.0)
     prior: float = param(0.0, "Log odds of a track before any evidence.", low=-10.0, high=10.0)

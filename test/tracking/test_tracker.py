@@ -105,12 +105,11 @@ def test_a_weak_detection_keeps_a_track_alive_and_starts_none():
     assert tracks[-1].ids.tolist() == [1] and tracks[-1].seen[0]
 
 
-def test_looks_from_one_place_count_little_and_from_others_more():
+def test_looks_at_one_object_count_little_more_than_one():
     looks = np.arange(1.0, 500.0)
-    once = effective_looks(looks, np.zeros_like(looks), 0.5)
+    once = effective_looks(looks, 0.5)
     assert once[0] == 1 and (np.diff(once) > 0).all() and once[-1] < 1 / 0.5
-    assert (effective_looks(looks, np.ones_like(looks), 0.5)[5:] > 1.5 * once[5:]).all()
-    np.testing.assert_allclose(effective_looks(looks, np.zeros_like(looks), 0.0), looks)
+    np.testing.assert_allclose(effective_looks(looks, 0.0), looks)
 
 
 def test_a_post_that_is_doubtful_in_every_frame_never_becomes_sure():
