@@ -169,8 +169,9 @@ PAGES: dict[str, dict[str, Any]] = {
                  "as JSON. A frame without any is a DELETE or DELETEALL with its header."),
                 ("~/input/detections_3d", "vision_msgs/Detection3DArray", "Or this, where "
                  "vision_msgs is installed; one of both."),
-                ("~/input/points", "sensor_msgs/PointCloud2", "The scans, for `ego.source` "
-                 "kiss_icp, and auto where no poses come.")],
+                ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves, for `ego.source` "
+                 "auto and odometry. For kiss_icp, and auto where no poses come, ~/input/points "
+                 "(PointCloud2) has the scans.")],
         outputs=TRACKS_OUT),
     "evaluator": dict(
         params=params.EvaluatorParams(),
@@ -211,7 +212,9 @@ def page(name: str) -> str:
     node = PAGES[name]
     lines = [f"# {name}", "", node["what"], "",
              f"    ros2 run lidar_perception {name}      # or: lidar-perception run {name}", ""]
-    robot = ROBOT_IN if "base_frame" in node_parameters(name) else []
+    own = {topic for topic, *_ in node["inputs"]}
+    robot = [row for row in ROBOT_IN if "base_frame" in node_parameters(name)
+             and row[0] not in own]
     for title, rows in (("Subscribes", node["inputs"] + robot), ("Publishes", outputs(name)),
                         ("Services", MANAGED_SERVICES if _managed(name)
                          else node.get("services", []))):
