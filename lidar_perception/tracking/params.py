@@ -78,6 +78,9 @@ class ExistenceParams(Params):
     missed: float = param(-1.5, "Evidence of a look that found nothing.", low=-10.0, high=0.0)
     moves: float = param(1.0, "Evidence of motion, where poses say what stands: posts do not "
                          "walk.", low=0.0, high=10.0)
+    walking: float = param(3.0, "No pedestrian is faster.", unit="m/s", low=0.5, high=100.0)
+    faster: float = param(3.0, "Evidence against a pedestrian that is, where poses say what "
+                          "stands: riders look like people.", low=0.0, high=20.0)
     seen: float = param(2.0, "What a hit adds to the log odds of being there still.", low=0.0,
                         high=10.0)
     max_present: float = param(3.0, "These log odds are no higher.", low=0.0, high=20.0)

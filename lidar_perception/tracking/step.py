@@ -12,7 +12,7 @@ from lidar_perception.tracking import existence, motion
 from lidar_perception.tracking.association import FORBIDDEN, assigned, costs
 from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams
 from lidar_perception.tracking.state import States
-from lidar_perception.types import CLASSES
+from lidar_perception.types import CLASSES, PEDESTRIAN
 
 HEIGHT_NOISE = 0.2      # m, standard deviation of a measured z
 HEIGHT_DRIFT = 0.3      # m/s^0.5, of the z of an object
@@ -142,8 +142,12 @@ def alive(states: States, params: TrackingParams, fixed: bool) -> States:
 def probabilities(states: States, params: TrackingParams, fixed: bool) -> np.ndarray:
     """(N,) of being what is claimed, and there. fixed: whether the frame is one in which posts
     stand; if not, motion says nothing."""
-    claim = existence.real(states.total, states.looks,
-                           states.moving if fixed else np.zeros(len(states)), params.existence)
+    own, still = params.existence, np.zeros(len(states))
+    claim = existence.real(states.total, states.looks, states.moving if fixed else still, own)
+    if fixed:
+        rides = moving(states.means, states.covariances, own.walking)
+        rides *= KINDS[states.class_ids] == KIND_OF_CLASS[PEDESTRIAN]
+        claim -= own.faster * np.maximum(2.0 * rides - 1.0, 0.0)
     return existence.probability(claim) * existence.probability(states.present)
 
 

@@ -261,3 +261,17 @@ def test_a_detector_has_its_own_neutral_scores_unless_others_are_given():
     assert tracking_of("pointpillars") == tracking_of("of another program") == TrackingParams()
     given = with_values(TrackingParams(), {"existence.neutral.pedestrian": 0.7, "report": 0.1})
     assert tracking_of("pointnet", given) == given
+
+
+def test_who_is_faster_than_anyone_walks_is_no_pedestrian():
+    """Where poses say what stands; relative to a sensor that moves, all is fast."""
+    def score(speed, at):
+        frames = [cars(person(20 + 0.1 * speed * i), kind=PEDESTRIAN, scores=0.7)
+                  for i in range(20)]
+        tracker = Tracker(with_values(TrackingParams(), {"report": 0.0}))
+        for i, found in enumerate(frames):
+            tracks = tracker(found, START + i * TENTH, at)
+        assert tracks.ids.tolist() == [1]
+        return tracks.detections.scores[0]
+    assert score(1.5, pose(0)) > score(0.0, pose(0)) > score(4.0, pose(0))
+    assert score(4.0, pose(0)) < score(4.0, None)
