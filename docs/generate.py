@@ -43,8 +43,8 @@ ROBOT_IN = [
     ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves, for `input.deskew` "
      "odometry, and where there is a tracker for `ego.source` auto and odometry."),
     ("/tf, /tf_static", "tf2_msgs/TFMessage", "Where tf2_msgs is installed; /tf only with "
-     "`base_frame`, `target_frame`, `input.deskew` or `ego.source` tf, a click, or a tracker without "
-     "odometry."),
+     "`base_frame`, `target_frame`, `input.deskew` or `ego.source` tf, a click, or a tracker "
+     "without odometry."),
 ]
 DETECTIONS_3D = ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, where "
                  "vision_msgs is installed.")
@@ -160,7 +160,8 @@ PAGES: dict[str, dict[str, Any]] = {
         params=params.TrackerNodeParams(),
         what="Follows the detections of any detector: ids that stay, velocities, and scores that "
              "are the evidence over time, see [tracking](../tracking.md). A frame that was lost is "
-             "predicted over with the next one, and has no answer of its own; one that is late, or has the stamp of the last one, is not answered; "
+             "predicted over with the next one, and has no answer of its own; one that is late, or "
+             "has the stamp of the last one, is not answered; "
              "time that jumps, as of a bag that is played again, ends all tracks. Warns of "
              "what is wrong with a frame or the poses. The detector nodes do the same in their "
              "own process with `tracking.enabled`, then from weak detections too. Files: the "
