@@ -40,10 +40,11 @@ SEED_IN = [
      "click, in the frame of the cloud or, with TF, in any that is connected with it."),
 ]
 ROBOT_IN = [
-    ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves; only with `input.deskew` "
-     "odometry."),
+    ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves, for `input.deskew` "
+     "odometry, and where there is a tracker for `ego.source` auto and odometry."),
     ("/tf, /tf_static", "tf2_msgs/TFMessage", "Where tf2_msgs is installed; /tf only with "
-     "`base_frame`, `target_frame`, `input.deskew` tf, or a click."),
+     "`base_frame`, `target_frame`, `input.deskew` or `ego.source` tf, a click, or a tracker "
+     "without odometry."),
 ]
 DETECTIONS_3D = ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, where "
                  "vision_msgs is installed.")
@@ -159,7 +160,8 @@ PAGES: dict[str, dict[str, Any]] = {
         params=params.TrackerNodeParams(),
         what="Follows the detections of any detector: ids that stay, velocities, and scores that "
              "are the evidence over time, see [tracking](../tracking.md). A frame that was lost is "
-             "predicted over; one that is late, or has the stamp of the last one, is not answered; "
+             "predicted over with the next one, and has no answer of its own; one that is late, or "
+             "has the stamp of the last one, is not answered; "
              "time that jumps, as of a bag that is played again, ends all tracks. Warns of "
              "what is wrong with a frame or the poses. The detector nodes do the same in their "
              "own process with `tracking.enabled`, then from weak detections too. Files: the "
@@ -168,8 +170,9 @@ PAGES: dict[str, dict[str, Any]] = {
                  "as JSON. A frame without any is a DELETE or DELETEALL with its header."),
                 ("~/input/detections_3d", "vision_msgs/Detection3DArray", "Or this, where "
                  "vision_msgs is installed; one of both."),
-                ("~/input/odometry", "nav_msgs/Odometry", "How the sensor moves, for `ego.source` "
-                 "auto and odometry; for kiss_icp it is ~/input/points (PointCloud2).")],
+                ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves, for `ego.source` "
+                 "auto and odometry. For kiss_icp, and auto where no poses come, ~/input/points "
+                 "(PointCloud2) has the scans.")],
         outputs=TRACKS_OUT),
     "evaluator": dict(
         params=params.EvaluatorParams(),
@@ -210,7 +213,9 @@ def page(name: str) -> str:
     node = PAGES[name]
     lines = [f"# {name}", "", node["what"], "",
              f"    ros2 run lidar_perception {name}      # or: lidar-perception run {name}", ""]
-    robot = ROBOT_IN if "base_frame" in node_parameters(name) else []
+    own = {topic for topic, *_ in node["inputs"]}
+    robot = [row for row in ROBOT_IN if "base_frame" in node_parameters(name)
+             and row[0] not in own]
     for title, rows in (("Subscribes", node["inputs"] + robot), ("Publishes", outputs(name)),
                         ("Services", MANAGED_SERVICES if _managed(name)
                          else node.get("services", []))):

@@ -20,10 +20,9 @@ from lidar_perception.campaign.good import CLOUD, good, mutated
 from lidar_perception.campaign.mutation import mutate_bytes
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes import NODES
-from lidar_perception.nodes.ego import ODOMETRY
 from lidar_perception.nodes.graph import private_domain
 from lidar_perception.nodes.reception import Reception
-from lidar_perception.nodes.runtime import ERROR, MARKERS, OK
+from lidar_perception.nodes.runtime import ERROR, MARKERS, ODOMETRY, OK
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode
 from msg_utils.markers import from_marker_array

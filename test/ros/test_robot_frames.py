@@ -8,11 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-import rclpy
 from detection_samples import eager, frame, lively, tiny
-from rclpy.context import Context
-from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 from samples import WALKER
 from samples import scene as walker_scene
 from scipy.spatial.transform import Rotation
@@ -35,31 +31,6 @@ from msg_utils.stamps import header_message, time_message
 START = 1_700_000_000 * 10**9
 PERIOD = 10**8
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture
-def start(domain):
-    """Makes a node in this process; what it publishes grows in node.sent, by topic."""
-    context, nodes = Context(), []
-    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-
-    def make(kind, **values):
-        overrides = [Parameter(k, value=list(v) if isinstance(v, tuple) else v)
-                     for k, v in values.items() if v != ()]
-        node = kind(context=context, parameter_overrides=overrides)
-        nodes.append(node)
-        node.start()
-        assert node.active
-        node.sent = {}
-        for publisher in node._outputs:
-            publisher.publish = node.sent.setdefault(
-                publisher.topic_name.rpartition("/")[2], []).append
-        return node
-
-    yield make
-    for node in nodes:
-        node.destroy_node()
-    rclpy.try_shutdown(context=context)
 
 
 def give(node, msg):
