@@ -1,0 +1,43 @@
+"""How much each source counts: by class, the log-odds of the sources summed along fitted curves.
+
+Two sources that see the same thing are not independent, so a plain sum would be too sure; the curves
+were fitted together, to simulated scans that no source was trained on (scripts/fit_fusion.py), and
+so the sum is the probability there. fusion.json holds them.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+from scipy.special import expit
+
+from lidar_perception.candidates.curves import log_odds
+from lidar_perception.detectors.fused.evidence import Hypotheses
+from lidar_perception.types import CLASSES
+
+KNOTS = {  # source -> where its curve bends, log-odds
+    "network": (-4.0, -3.0, -2.0, -1.0, 0.0, 1.0, 2.0, 3.5),
+    "classifier": (-6.0, -4.0, -2.0, 0.0, 2.0, 4.0, 6.0),
+    "silhouette": (-4.0, -2.5, -1.0, 0.0, 1.0, 2.5),
+}
+
+
+def probabilities(found: Hypotheses) -> np.ndarray:
+    """(K,) float32 that each of K hypotheses is there, 0..1."""
+    result = np.zeros(len(found.class_ids), np.float32)
+    for class_id in np.unique(found.class_ids):
+        own = found.class_ids == class_id
+        features = {source: odds[own] for source, odds in found.evidence.items()}
+        result[own] = expit(log_odds(models()[CLASSES[class_id]], features))
+    return result
+
+
+@functools.cache
+def models() -> dict[str, Any]:
+    """By class, the curves."""
+    return json.loads((files("lidar_perception.detectors.fused") / "fusion.json").read_text())[
+        "classes"]
