@@ -30,7 +30,7 @@ def fit(features: Mapping[str, np.ndarray], hit: np.ndarray, weight: np.ndarray,
         direction = rising.get(name, 0)
         columns.append(np.column_stack([steps, unknown]) if unknown.any() else steps)
         bounds += [{1: (0, None), -1: (None, 0), 0: (None, None)}[direction]] * steps.shape[1]
-        bounds += [(None, None)] * unknown.any()
+        bounds += [(None, None)] * int(unknown.any())
         parts.append(columns[-1].shape[1])
     design, sign = np.concatenate(columns, axis=1), np.where(hit, 1.0, -1.0)
 

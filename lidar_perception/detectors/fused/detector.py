@@ -10,17 +10,12 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
+from lidar_perception.classes import CAR
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.fused.boxes import on_ground, on_points
-from lidar_perception.detectors.fused.evidence import (
-    Hypotheses,
-    columns_of,
-    distances,
-    hypotheses,
-    people_among,
-)
+from lidar_perception.detectors.fused.evidence import Evidence, distances, gathered
 from lidar_perception.detectors.fused.model import probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.nms import suppressed
@@ -36,18 +31,17 @@ from lidar_perception.detectors.view import (
     visible,
     with_intensity_scaled,
 )
-from lidar_perception.classes import CAR
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.surface import surface_under
-from lidar_perception.groups import renumbered
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, LidarFrame
 
 
 class Look(NamedTuple):
-    """A frame of N points in the network's range: found, what may be there; xyz (N, 3), ground (N,)
-    bool; why little can be detected, or None; ms of each step."""
+    """A frame of N points in the network's range: what is proposed, and what speaks for it; xyz
+    (N, 3), ground (N,) bool; why little can be detected, or None; ms of each step."""
 
-    found: Hypotheses
+    proposed: Detections
+    evidence: Evidence
     xyz: np.ndarray
     ground: np.ndarray
     problem: str | None
@@ -61,15 +55,21 @@ class FusedDetector(NetworkDetector):
     """
 
     group = "fused"  # of its params
+    params: FusedDetectorParams
 
     def __init__(self, proposer: PointPillarsDetector, classifier: PointNetDetector,
                  params: FusedDetectorParams = FusedDetectorParams()):
         super().__init__(proposer.header, proposer.device, params)
         self.proposer, self.classifier = proposer, classifier
 
+    @property
+    def settings(self) -> FusedParams:
+        """Its own group of params."""
+        return self.params.fused
+
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:
-        """Ground and clusters are computed where they are None, once for all parts."""
+        """Ground and PointPillars' clusters are computed where they are None."""
         look = self.look(frame, ground, cluster_ids)
         begin = perf_counter()
         detections, best = self._fused(look)
@@ -87,18 +87,15 @@ class FusedDetector(NetworkDetector):
         times.append(perf_counter())
         ground = (levelled_ground(seen, self.params.ground) if ground is None
                   else ground.take(indices).astype(bool))
-        cluster_ids = None if cluster_ids is None else renumbered(cluster_ids.take(indices))[0]
+        cluster_ids = None if cluster_ids is None else cluster_ids.take(indices)
         times.append(perf_counter())
         proposed = self._proposer()(seen, ground=ground, cluster_ids=cluster_ids)
         times.append(perf_counter())
-        if cluster_ids is None:
-            cluster_ids = cluster_obstacles(seen.xyz, ground, self.params.people)
-        points = columns_of(seen)
-        people = people_among(points, ground, cluster_ids)
+        people = cluster_obstacles(seen.xyz, ground, self.params.people)
         times.append(perf_counter())
-        found = hypotheses(proposed.detections, people, points, ground, self.classifier, settings)
+        evidence = gathered(proposed.detections, seen, ground, people, self.classifier)
         times.append(perf_counter())
-        return Look(found, seen.xyz, ground, proposed.problem,
+        return Look(proposed.detections, evidence, seen.xyz, ground, proposed.problem,
                     dict(zip(STEPS, (np.diff(times) * 1e3).tolist())))
 
     def _proposer(self) -> PointPillarsDetector:
@@ -113,20 +110,20 @@ class FusedDetector(NetworkDetector):
 
     def _fused(self, look: Look) -> tuple[Detections, dict[str, float]]:
         """The detections, best first, and where there are none the highest score of each class."""
-        settings, found, xyz, ground = self.settings, look.found, look.xyz, look.ground
-        every = Detections.of(found.boxes, found.class_ids, probabilities(found))
-        kept = settings.scores.passed(every)
-        if not kept.any():
-            return Detections.none(), {
+        settings, xyz, ground = self.settings, look.xyz, look.ground
+        every = Detections.of(look.proposed.boxes, look.proposed.class_ids,
+                              probabilities(look.proposed.class_ids, look.evidence))
+        found = every[settings.scores.passed(every)]
+        if len(found) == 0:
+            return found, {
                 name: float(every.scores[every.class_ids == CLASSES.index(name)].max(initial=0.0))
                 for name in self.classes}
-        boxes, class_ids, scores = found.boxes[kept], found.class_ids[kept], every.scores[kept]
-        cars = class_ids == CAR
+        boxes, cars = found.boxes.astype(np.float64), found.class_ids == CAR
         boxes[cars] = on_points(boxes[cars], xyz.compress(~ground, axis=0), settings.on_points)
         floors = surface_under(xyz.compress(ground, axis=0), boxes[:, :2])
-        boxes = on_ground(boxes, floors, settings.on_ground)
-        first = one_of_each(boxes, class_ids, scores, settings)
-        return Detections.of(boxes, class_ids, scores)[first], {}
+        moved = Detections.of(on_ground(boxes, floors, settings.on_ground), found.class_ids,
+                              found.scores)
+        return moved[one_of_each(moved, settings)], {}
 
     def bring_to(self, device: torch.device) -> None:
         """Bring both networks to a device."""
@@ -140,12 +137,12 @@ class FusedDetector(NetworkDetector):
         self(made_up_frame(self.params.ground.sensor_pose))
 
 
-def one_of_each(boxes: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
-                params: FusedParams) -> np.ndarray:
-    """(M,) int64 indices, best score first, of those of K boxes that are not a better one of their
+def one_of_each(found: Detections, params: FusedParams) -> np.ndarray:
+    """(M,) int64 indices, best score first, of the detections that are not a better one of their
     class once more: by their overlap, and but for cars by the distance of their centres."""
-    order = suppressed(boxes, scores, class_ids, params.nms.iou, params.nms.across_classes)
-    boxes, class_ids = boxes[order], class_ids[order]
+    order = suppressed(found.boxes, found.scores, found.class_ids, params.nms.iou,
+                       params.nms.across_classes)
+    boxes, class_ids = found.boxes[order], found.class_ids[order]
     again = (distances(boxes, boxes) < params.same_place) & (class_ids[:, None] == class_ids)
     again[class_ids == CAR] = False
     stays = np.ones(len(order), bool)

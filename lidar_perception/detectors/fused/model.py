@@ -1,8 +1,8 @@
 """How much each source counts: by class, the log-odds of the sources summed along fitted curves.
 
-Two sources that see the same thing are not independent, so a plain sum would be too sure; the curves
-were fitted together, to simulated scans that no source was trained on (scripts/fit_fusion.py), and
-so the sum is the probability there. fusion.json holds them.
+Two sources that see the same thing are not independent, so a plain sum would be too sure. The
+curves were fitted together, to simulated scans that no source was trained on, so that the sum is
+the probability there (scripts/fit_fusion.py). fusion.json holds them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import expit
 
 from lidar_perception.candidates.curves import log_odds
-from lidar_perception.detectors.fused.evidence import Hypotheses
+from lidar_perception.detectors.fused.evidence import Evidence
 from lidar_perception.types import CLASSES
 
 KNOTS = {  # source -> where its curve bends, log-odds
@@ -26,13 +26,15 @@ KNOTS = {  # source -> where its curve bends, log-odds
 }
 
 
-def probabilities(found: Hypotheses) -> np.ndarray:
-    """(K,) float32 that each of K hypotheses is there, 0..1."""
-    result = np.zeros(len(found.class_ids), np.float32)
-    for class_id in np.unique(found.class_ids):
-        own = found.class_ids == class_id
-        features = {source: odds[own] for source, odds in found.evidence.items()}
-        result[own] = expit(log_odds(models()[CLASSES[class_id]], features))
+def probabilities(class_ids: np.ndarray, evidence: Evidence) -> np.ndarray:
+    """(K,) float32, 0..1, that each of K proposals is of its class, class_ids (K,) into CLASSES; 0
+    for a class that nothing was fitted for."""
+    result = np.zeros(len(class_ids), np.float32)
+    for class_id in np.unique(class_ids):
+        own = class_ids == class_id
+        if CLASSES[class_id] in models():
+            result[own] = expit(log_odds(models()[CLASSES[class_id]],
+                                         {source: odds[own] for source, odds in evidence.items()}))
     return result
 
 

@@ -112,9 +112,9 @@ def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutSce
 
 
 def decoys(background: Clusters, boxes: np.ndarray, config: PointNetConfig) -> np.ndarray:
-    """(D, 7) boxes as large as objects, at most DECOYS, each at the mean of a background cluster and
-    on the ground there; none touches one of the boxes (M, 7) that are labelled. The same clusters
-    give the same."""
+    """(D, 7) boxes as large as objects, at most DECOYS, each at the mean of a background cluster
+    and on the ground there; none touches one of the boxes (M, 7) that are labelled. The same
+    clusters give the same."""
     rng = np.random.default_rng(len(background.points))
     chosen = rng.permutation(len(background))[:DECOYS]
     own = background.take(chosen)
