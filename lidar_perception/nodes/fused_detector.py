@@ -1,4 +1,4 @@
-"""~/input/points -> ~/output/detections: cars, pedestrians and cyclists, by all sources together."""
+"""~/input/points -> ~/output/detections: cars, pedestrians and cyclists, by several sources."""
 
 from __future__ import annotations
 
