@@ -29,8 +29,9 @@ def box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict
     its left (aside), bottom, sizes; yaw modulo half a turn. strict: by what is put right (RIGHT),
     the percentage of pairs beyond the strict overlap, in `space` and `above`. None without pairs.
     """
-    found, true = (np.concatenate([np.zeros((0, 7)), *boxes])
-                   for boxes in zip(*(_pairs(frame, name, min_score) for frame in frames)))
+    pairs = [_pairs(frame, name, min_score) for frame in frames]
+    found, true = (np.concatenate([np.zeros((0, 7)), *(pair[which] for pair in pairs)])
+                   for which in (0, 1))
     differences, away = _differences(found, true), horizontal_range(true)
     bands = {f"{low:g}-{high:g} m": (away >= low) & (away < high)
              for low, high in zip(RANGES, RANGES[1:])} | {"all": np.ones(len(true), bool)}
