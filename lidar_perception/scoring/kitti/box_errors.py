@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -34,7 +35,7 @@ def box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict
                    for which in (0, 1))
     differences, away = _differences(found, true), horizontal_range(true)
     bands = {f"{low:g}-{high:g} m": (away >= low) & (away < high)
-             for low, high in zip(RANGES, RANGES[1:])} | {"all": np.ones(len(true), bool)}
+             for low, high in pairwise(RANGES)} | {"all": np.ones(len(true), bool)}
     return {"min_score": min_score, "by_range": {
         title: {"pairs": int(own.sum()), **{
             error: {"median": _median(values[own]), "median_size": _median(np.abs(values[own]))}
