@@ -1,6 +1,6 @@
 """Makes docs/nodes/*.md from the parameter dataclasses, config/best.param.yaml from
-configurations.py, and config/pointpillars.param.yaml and config/pointnet.param.yaml from the
-detectors': python docs/generate.py
+configurations.py, and those of the detectors with a network from their parameters:
+python docs/generate.py
 
 test/test_docs.py holds that the pages are up to date and the topics those of the running nodes.
 """
@@ -15,14 +15,15 @@ import yaml
 from lidar_perception import params
 from lidar_perception.candidates.configurations import BEST_VALUES
 from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.detectors.fused.params import FusedDetectorParams
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
 from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.main import node_parameters
 from lidar_perception.param_fields import flatten
 
 CONFIG = Path(__file__).parents[1] / "config"
-BEST, POINTPILLARS, POINTNET = (CONFIG / f"{name}.param.yaml"
-                                for name in ("best", "pointpillars", "pointnet"))
+BEST = CONFIG / "best.param.yaml"
+NETWORKS = "pointpillars", "pointnet", "fused"  # detectors/NAME, the node NAME_detector
 FOLDER = Path(__file__).parent / "nodes"
 CLOUD, MARKERS = "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray"
 STRING_TIMES = "std_msgs/Float64"
@@ -156,6 +157,19 @@ PAGES: dict[str, dict[str, Any]] = {
         outputs=[*BOXES_OUT,
                  ("~/debug/preprocess_ms, ground_ms, clustering_ms, network_ms, postprocess_ms",
                   STRING_TIMES, "Time of each step.")]),
+    "fused_detector": dict(
+        params=FusedDetectorParams(),
+        what="Detects cars, pedestrians and cyclists: PointPillars proposes, silhouettes and the "
+             "cluster network judge, and the score is the probability that something is there, see "
+             "[fused](../fused.md). Loads and warms up before it subscribes. Without weights it "
+             "says so in a diagnostic and publishes nothing, and it warns as pointpillars_detector "
+             "does. Files: `launch/fused.launch.py`, `config/fused.param.yaml`.",
+        inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The columns "
+                 "`ground`, and for PointPillars `cluster_id`, are used where they are there; what "
+                 "is missing is computed, and so are the clusters of people.")],
+        outputs=[*BOXES_OUT,
+                 ("~/debug/preprocess_ms, ground_ms, proposals_ms, clusters_ms, evidence_ms, "
+                  "fusion_ms", STRING_TIMES, "Time of each step.")]),
     "tracker": dict(
         params=params.TrackerNodeParams(),
         what="Follows the detections of any detector: ids that stay, velocities, and scores that "
@@ -239,25 +253,19 @@ def best() -> str:
                            "configurations.py), for nodes", BEST_VALUES)
 
 
-def pointpillars() -> str:
-    """The parameter file of the PointPillars detector's graph."""
-    return _shared_numbers("The detector's experts (detectors/pointpillars/params.py)",
-                           DetectorParams())
+def config_file(network: str) -> Path:
+    """The parameter file of a detector's graph."""
+    return CONFIG / f"{network}.param.yaml"
 
 
-def pointnet() -> str:
-    """The parameter file of the PointNet detector's graph."""
-    return _shared_numbers("The ground and clusters of detectors/pointnet/params.py",
-                           PointNetDetectorParams())
-
-
-def _shared_numbers(what: str, detector: Any) -> str:
-    """A detector's numbers for the nodes that find ground and clusters."""
+def config(network: str) -> str:
+    """What is in it: the detector's numbers for the nodes that find ground and clusters."""
     shared = (params.GroundNodeParams(), params.ClusteringNodeParams())
     defaults = {key: value for group in shared for key, value in flatten(group).items()}
-    values = {key: value for key, value in flatten(detector).items()
+    values = {key: value for key, value in flatten(PAGES[f"{network}_detector"]["params"]).items()
               if key in defaults and value != defaults[key]}
-    return _parameter_file(f"{what}, for the nodes that find ground and clusters", values)
+    return _parameter_file(f"The ground and clusters of detectors/{network}/params.py, for the "
+                           "nodes that find ground and clusters", values)
 
 
 def _parameter_file(what: str, values: dict[str, Any]) -> str:
@@ -295,5 +303,5 @@ if __name__ == "__main__":
     for name in PAGES:
         (FOLDER / f"{name}.md").write_text(page(name))
     BEST.write_text(best())
-    POINTPILLARS.write_text(pointpillars())
-    POINTNET.write_text(pointnet())
+    for network in NETWORKS:
+        config_file(network).write_text(config(network))

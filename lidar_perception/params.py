@@ -136,8 +136,9 @@ class PerceptionRobotParams(DetectionNodeParams):
     obstacles: ObstacleParams = ObstacleParams()
 
 
-CANDIDATES, POINTPILLARS, POINTNET = (partial(DetectionNodeParams.of, name)
-                                      for name in ("candidates", "pointpillars", "pointnet"))
+CANDIDATES, POINTPILLARS, POINTNET, FUSED = (
+    partial(DetectionNodeParams.of, name)
+    for name in ("candidates", "pointpillars", "pointnet", "fused"))
 PERCEPTION = partial(PerceptionRobotParams.of, "candidates")
 
 

@@ -7,14 +7,18 @@ from pathlib import Path
 
 from lidar_perception.detectors.checkpoint import POINTNET, POINTPILLARS, network_of
 from lidar_perception.detectors.contract import Detector
+from lidar_perception.detectors.fused.detector import load_fused_detector
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointpillars.detector import load_detector
+
+FUSED = "fused"  # the default where one detector is wanted: all of them together
 
 # Each opens its detector: load(path, device), where an empty path means its own weights, if it has
 # any. A new detector is one line here.
 LOAD: dict[str, Callable[..., Detector]] = {
     POINTPILLARS: load_detector,
     POINTNET: load_pointnet_detector,
+    FUSED: load_fused_detector,
 }
 
 
