@@ -43,7 +43,7 @@ def measure_recording(recording: Recording) -> dict:
     in the labels."""
     if not recording.frames or not recording.frames[0].sequence:
         return {}
-    detector = open_detector(min_score=MIN_SCORE,
+    detector = open_detector("pointpillars", min_score=MIN_SCORE,
                              sensor_height=recording.frames[0].sensor_height)
     drives: dict[str, list[Seen]] = {}
     by_scans = ego_of(recording) == "kiss_icp"

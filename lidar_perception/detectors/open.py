@@ -22,7 +22,7 @@ LOAD: dict[str, Callable[..., Detector]] = {
 }
 
 
-def open_detector(weights: str | Path = POINTPILLARS, device: str = "auto", *,
+def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
                   sensor_height: float | None = None,
                   min_score: float | None = None) -> Detector:
     """A detector by its name, a key of LOAD, with what comes with the package; or by its weights: a

@@ -61,7 +61,7 @@ class NeutralParams(Params):
 
 
 # Of detectors whose scores mean something else than those of PointPillars, see docs/tracking.md.
-NEUTRAL = {"pointnet": NeutralParams(pedestrian=0.5)}
+NEUTRAL = {"pointnet": NeutralParams(pedestrian=0.5), "fused": NeutralParams(0.5, 0.5, 0.5)}
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,6 @@ def test_no_identity_switches_on_a_real_drive(data, ego):
     if ego == "auto" and POSES not in drive.has:
         assert ego_of(drive) == ("kiss_icp" if has_odometry() else "none")
     fill(report, drive,
-         by_tracker(partial(open_detector, min_score=MIN_SCORE), ego=ego), limit=20)
+         by_tracker(partial(open_detector, "pointpillars", min_score=MIN_SCORE), ego=ego), limit=20)
     cars = report.compute()["classes"]["Car"]
     assert cars["switches"] == 0 and cars["HOTA"] > 0.7

@@ -50,13 +50,13 @@ def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, d
       lidar-perception evaluate tracking --data drive --ego kiss_icp --weights v4.safetensors
     """
     from lidar_perception.data.frame import BOXES
-    from lidar_perception.detectors.checkpoint import NETWORKS, network_of
-    from lidar_perception.detectors.open import open_detector
+    from lidar_perception.detectors.checkpoint import network_of
+    from lidar_perception.detectors.open import LOAD, open_detector
     from lidar_perception.scoring.run import fill
     from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, ego_of
     from lidar_perception.scoring.tracking.tables import print_tracking_report
 
-    named = str(weights) in NETWORKS or weights.suffix == ".onnx"
+    named = str(weights) in LOAD or weights.suffix == ".onnx"
     params = tracking_of(str(weights) if named else network_of(weights), params)
     recording = opened(data, split=split)
     recording.require(BOXES, "evaluate tracking")
