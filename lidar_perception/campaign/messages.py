@@ -60,6 +60,7 @@ TRIED: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
     "evaluator": (8, {"input/ground_truth": MARKERS, "input/final": MARKERS}, [{}]),
     "pointnet_detector": (0.5, POINTS, [{}]),
     "pointpillars_detector": (0.2, POINTS, [{}]),
+    "fused_detector": (0.2, POINTS, [{}]),
 }
 THEN_GOOD = 0.125  # of the cases: the next good message must be served
 BUG = "this is a bug"  # what a node says of an exception that it did not expect

@@ -92,7 +92,7 @@ def test_all_detectors_are_compared_and_what_is_missing_is_listed(bare, weights,
     assert [*content["rows"]] == [
         *CANDIDATES, "PointPillars v0 compact", "PointNet", "PointPillars v0 compact #2",
         "STM-CPA + PointNet", "STM-CPA + PointNet, auto", "PP v0 compact + PointNet"]
-    assert {each["name"] for each in content["missing"]} == {
+    assert {each["name"] for each in content["missing"]} == {"fused"} | {
         f"PointPillars v{i} {size}" for i in range(5) for size in ("full", "compact")
         if (i, size) != (0, "compact")}
     assert (content["frames"], content["pedestrians"]) == (3, {"frames": 2, "ground_truth": 8})
@@ -118,7 +118,7 @@ def test_without_networks_the_candidates_are_compared_in_any_layout(bare, tmp_pa
                      "--png", tmp_path / "a.png")
     assert [*content["rows"]] == CANDIDATES and content["frames"] == 2
     reasons = {each["name"]: each["reason"] for each in content["missing"]}
-    assert len(reasons) == 14 and "no PointNet" in reasons["STM-CPA + PointNet"]
+    assert len(reasons) == 15 and "no PointNet" in reasons["STM-CPA + PointNet"]
     assert "--weights" in reasons["PointNet"]
     assert (tmp_path / "a.png").stat().st_size > 0
 

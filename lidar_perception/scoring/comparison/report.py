@@ -24,6 +24,7 @@ SHORT = {"bev": "BEV", "3d": "3D", "bev_relaxed": "BEV", "3d_relaxed": "3D"}
 FAMILIES = {  # beginning of a name -> colour (Okabe and Ito, 2008) and marker; the first that fits
     "STM-CPA +": ("#cc79a7", "D"), "PP ": ("#cc79a7", "D"), "STM-CPA": ("#009e73", "s"),
     "PointPillars": ("#0072b2", "o"), "PointNet": ("#d55e00", "^"),
+    "fused": ("#000000", "*"),
 }
 
 
