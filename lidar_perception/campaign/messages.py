@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import rclpy
 from rclpy.context import Context
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 
 from lidar_perception.campaign.case import FAILED, REFUSED, SURVIVED, Case, Outcome, generator, pick
 from lidar_perception.campaign.good import CLOUD, good, mutated
@@ -24,6 +22,7 @@ from lidar_perception.nodes.ego import ODOMETRY
 from lidar_perception.nodes.graph import private_domain
 from lidar_perception.nodes.reception import Reception
 from lidar_perception.nodes.runtime import ERROR, MARKERS, OK
+from lidar_perception.nodes.watch import new_context
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode
 from msg_utils.markers import from_marker_array
@@ -88,9 +87,7 @@ class Attempt:
 
     def __init__(self, folder: Path):
         os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=private_domain(),
-                   signal_handler_options=SignalHandlerOptions.NO)
+        self.context = new_context(private_domain())
         warm_up()
         self.nodes = {name: Tried(name, self.context) for name in TRIED}
 

@@ -10,3 +10,24 @@ def good_cloud(drive_bag):
     from lidar_perception.wire.topics import POINTS
     with Bag(drive_bag) as bag:
         return next(m for _, _, m in bag.messages({POINTS}))
+
+
+@pytest.fixture(scope="module")
+def found(request, shared_processes, shared_peer, weights):
+    """What the graph of the module's DETECTOR detects with its weights."""
+    from test_bad_input import MARKERS, QUIET
+
+    from lidar_perception.candidates.params import PipelineParams
+    from lidar_perception.cli.options import read_config
+    tested = request.module.DETECTOR
+    for node, remap in tested.graph.items():
+        shared_processes.start(node, remap, {**read_config(tested.stages, PipelineParams()), **(
+            {**tested.values(weights), **QUIET} if node == tested.node else {})})
+    return shared_peer.listen(f"/{tested.node}/output/detections", MARKERS)
+
+
+@pytest.fixture(scope="module")
+def talker(request, shared_peer, found):
+    """Straight to the detector."""
+    from test_bad_input import CLOUD
+    return shared_peer.talker(request.module.DETECTOR.between, CLOUD)

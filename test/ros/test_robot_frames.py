@@ -8,11 +8,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-import rclpy
 from detection_samples import eager, frame, lively, tiny
-from rclpy.context import Context
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 from samples import WALKER
 from samples import scene as walker_scene
 from scipy.spatial.transform import Rotation
@@ -22,6 +19,7 @@ from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
+from lidar_perception.nodes.watch import new_context
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.robot.deskew import skewed, steady
 from lidar_perception.robot.placing import tilted
@@ -40,8 +38,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.fixture
 def start(domain):
     """Makes a node in this process; what it publishes grows in node.sent, by topic."""
-    context, nodes = Context(), []
-    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    context, nodes = new_context(domain), []
 
     def make(kind, **values):
         overrides = [Parameter(k, value=list(v) if isinstance(v, tuple) else v)
@@ -59,7 +56,7 @@ def start(domain):
     yield make
     for node in nodes:
         node.destroy_node()
-    rclpy.try_shutdown(context=context)
+    context.try_shutdown()
 
 
 def give(node, msg):

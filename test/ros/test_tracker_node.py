@@ -17,6 +17,7 @@ from lidar_perception.candidates.configurations import BEST
 from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.graph import Processes, graph_of
 from lidar_perception.nodes.tracker import TrackerNode
+from lidar_perception.nodes.watch import new_context
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
@@ -218,10 +219,7 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
 
 def test_detection_arrays_are_tracked_as_markers_are(domain):
     """By the node in this process, as vision_msgs is not everywhere."""
-    import rclpy
-    from rclpy.context import Context
-    context, shown = Context(), []
-    rclpy.init(context=context, domain_id=domain)
+    context, shown = new_context(domain), []
     node, tracker = TrackerNode(context=context), Tracker()
     node.configure()
     node.tracks.markers = SimpleNamespace(publish=lambda data: shown.append(decode(data, MARKERS)))
@@ -240,4 +238,4 @@ def test_detection_arrays_are_tracked_as_markers_are(domain):
         assert read(shown[-1])[1] == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
         np.testing.assert_allclose(read(shown[-1])[2].boxes, tracks.detections.boxes, atol=1e-4)
     node.destroy_node()
-    rclpy.try_shutdown(context=context)
+    context.try_shutdown()
