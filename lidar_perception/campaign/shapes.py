@@ -107,8 +107,10 @@ CLUSTERINGS = _clusterings()
 STAGES = [*(f"ground {method}" for method in GROUND_METHODS),
           *(f"clusters {name}" for name in CLUSTERINGS),
           *(f"boxes {shape}" for shape in BOX_SHAPES)]
-PIPELINES = [f"pipeline {config}, {ground}, {clusters}" for config, ground, clusters in product(
-    CONFIGURATIONS, GROUND_METHODS, CLUSTERINGS)]
+# Each configuration with each clustering, and the grounds in turn: what a pipeline adds is how its
+# stages follow each other, as each stage is tried by itself.
+PIPELINES = [f"pipeline {config}, {GROUND_METHODS[(i + j) % len(GROUND_METHODS)]}, {clusters}"
+             for i, config in enumerate(CONFIGURATIONS) for j, clusters in enumerate(CLUSTERINGS)]
 NETWORKS = [*(f"network {name}" for name in LOAD), "network rescored", "network confirmed"]
 LOCAL = ("euclidean local", *NETWORKS)  # PointNet's own clusters are of that kind
 CASES = [(stage, arrangement, points) for stages, points in (
