@@ -148,13 +148,6 @@ def checkpoint_of_another_size(folder):
     return {"pointpillars.weights": str(path), "pointpillars.version": "v4"}
 
 
-def cut_checkpoint(folder):
-    checkpoint_of_another_size(folder)
-    whole = (folder / "v0.safetensors").read_bytes()
-    (folder / "cut.safetensors").write_bytes(whole[:len(whole) // 2])
-    return {"pointpillars.weights": str(folder / "cut.safetensors")}
-
-
 def broken_weights(folder):
     network = lively(tiny("v0"))
     network.head.scores.bias.fill_(np.nan)
@@ -162,11 +155,9 @@ def broken_weights(folder):
     return {"pointpillars.weights": str(folder / "nan.safetensors")}
 
 
-UNUSABLE = {  # parameters made in a folder; level, words of the diagnostic
+UNUSABLE = {  # parameters made in a folder; level, words; test_weights.py has more, without ROS
     "nowhere": (lambda folder: {"pointpillars.weights": "/nowhere.safetensors"}, 2,
                 "there is no checkpoint /nowhere.safetensors"),
-    "another version": (checkpoint_of_another_size, 2, "holds version v0, asked for was v4"),
-    "cut": (cut_checkpoint, 2, "is no checkpoint, or was cut short"),
     "no CUDA": (lambda folder: {**checkpoint_of_another_size(folder),
                                 "pointpillars.version": "auto", "pointpillars.device": "cuda:99",
                                 "pointpillars.cpu_fallback": False}, 2,
