@@ -152,7 +152,8 @@ class Attempt:
         if "Traceback" in (self.folder / "said").read_text(errors="replace"):
             return Outcome(FAILED, f"{work}: traceback after {fault.name}: {_said(self.folder)}")
         there = (self.folder / out).exists()
-        ended = code == 0 and _files(self.folder / out, pattern) == wanted
+        # A bag is whole once it has its name, also if the signal comes between that and the end.
+        ended = (code == 0 or work == "convert") and _files(self.folder / out, pattern) == wanted
         if not ended:
             code = _run(self.folder, (*command, *(resume if there else ())), out)
             if code:

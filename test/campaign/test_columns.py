@@ -72,8 +72,8 @@ def test_no_value_of_a_column_costs_memory_or_goes_unchecked(tried, name):
 @pytest.mark.parametrize("column", ["ground", "in_view", "cluster_id"])
 def test_a_column_of_several_numbers_a_point_is_refused(tried, column):
     plain = cloud("columns")
-    next(f for f in plain.fields if f.name == column).count = 2
-    plain.fields = [f for f in plain.fields if f.offset <= 12 or f.name == column]
+    plain.fields = [f for f in plain.fields if f.name in ("x", "y", "z", column)]
+    plain.fields[-1].offset, plain.fields[-1].datatype, plain.fields[-1].count = 12, 2, 2  # uint8
     verdicts = {name: outcome_of(tried[name], name, plain) for name in OF_CLOUDS}
     reading = {"ground": {"clustering"}, "in_view": set(OF_CLOUDS),
                "cluster_id": {"candidate_refinement", "pointnet_detector"}}[column]
