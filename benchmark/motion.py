@@ -20,8 +20,7 @@ from lidar_perception.robot.deskew import deskewed
 from lidar_perception.robot.poses import interpolated
 from lidar_perception.runs.terminal import console
 from lidar_perception.simulation.drive import truth
-from lidar_perception.simulation.pairs import View
-from lidar_perception.simulation.raycast import cast_batch
+from lidar_perception.simulation.raycast import cast
 from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.scene import make_scene
 from lidar_perception.simulation.sensor import HDL64E, Motion, rays
@@ -49,9 +48,8 @@ def turns(seed: int) -> Iterator[tuple]:
     the labels."""
     scene = make_scene(seed)
     moment = scene.at(5.0, HDL64E.height)
-    motions = [moment.motion._replace(yaw_rate=rate) for rate in YAW_RATES]
-    views = [View(moment.solids, scene.ground, moment.position, m, seed) for m in motions]
-    for motion, hits in zip(motions, cast_batch(views, HDL64E)):
+    for motion in (moment.motion._replace(yaw_rate=rate) for rate in YAW_RATES):
+        hits = cast(moment.solids, scene.ground, moment.position, HDL64E, motion, seed)
         met, reported = (returns_of(hits, HDL64E, motion, np.random.default_rng(seed), compensated)
                          for compensated in (True, False))
         way = odometry(motion)

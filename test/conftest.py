@@ -36,7 +36,7 @@ def one_thread():
 
 @pytest.fixture(scope="session")
 def streets():
-    """Each simulated street is made once in a session: it takes a second, and never changes."""
+    """Each simulated street is made once in a session, as it never changes."""
     from functools import cache
 
     from lidar_perception.simulation import drive

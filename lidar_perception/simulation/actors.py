@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from math import cos, sin
 
 import numpy as np
 from numba import njit
 
 from lidar_perception.simulation.shapes.thing import Thing, rigid
-from lidar_perception.simulation.solids import extents
+from lidar_perception.simulation.solids import hull
 
 HEAD_ROOM = 2.2  # metres; what hangs higher is in nobody's way
 SIGHT, FAR_SIGHT = 80.0, 120.0  # metres from the sensor; what is farther is left out of a moment;
@@ -37,15 +39,15 @@ class Actor:
     @cached_property
     def footprint(self) -> np.ndarray:
         """(8,) float64, see below; holds the box of a walker, which covers all poses."""
-        low, high = extents(self.thing.parts(0.0))
-        below = low[:, 2] < HEAD_ROOM
-        half = np.divide(self.thing.size[:2], 2)
-        low = np.minimum(low[below, :2].min(axis=0), -half)
-        high = np.maximum(high[below, :2].max(axis=0), half)
-        (x, y), (length, width) = (low + high) / 2, (high - low) / 2
-        cos, sin = np.cos(self.heading), np.sin(self.heading)
-        return np.array([self.x + cos * x - sin * y, self.y + sin * x + cos * y, self.heading,
-                         length, width, self.speed, self.start, self.stop])
+        x0, y0, _, x1, y1, _ = hull(self.thing.parts(0.0), HEAD_ROOM)
+        length, width, _ = self.thing.size
+        x0, x1 = min(x0, -length / 2), max(x1, length / 2)
+        y0, y1 = min(y0, -width / 2), max(y1, width / 2)
+        x, y = (x0 + x1) / 2, (y0 + y1) / 2
+        ahead, aside = cos(self.heading), sin(self.heading)
+        return np.array([self.x + ahead * x - aside * y, self.y + aside * x + ahead * y,
+                         self.heading, (x1 - x0) / 2, (y1 - y0) / 2, self.speed, self.start,
+                         self.stop])
 
 
 # A footprint is a row [x y heading, half length, half width, speed, start, stop]: the rectangle
@@ -61,44 +63,55 @@ def centres(footprints: np.ndarray, t: np.ndarray) -> np.ndarray:
                      f[..., Y] + np.sin(f[..., HEADING]) * way], axis=-1)
 
 
-def meet(one: np.ndarray, many: np.ndarray, seconds: float, gap: float = 0.0) -> np.ndarray:
-    """(M,) bool: whether footprint one (8,) comes within gap metres of each of many (M, 8) at any
-    time in 0 .. seconds. Exact for gap 0: convex shapes that slide along straight lines touch
-    while their shadows on the normals of all sides do."""
-    return _meet(np.ascontiguousarray(one), np.ascontiguousarray(many), seconds, gap)
+@njit(cache=True, nogil=True)
+def _meet_any(one, many, reach, seconds, gap):
+    """Whether one meets any of many; reach (M,): of these, see _reach."""
+    far = _reach(one, seconds) + gap
+    for m in range(len(many)):
+        x, y, near = many[m, X] - one[X], many[m, Y] - one[Y], far + reach[m]
+        if 0 <= near and x * x + y * y <= near * near and meet(one, many[m], seconds, gap):
+            return True
+    return False
 
 
 @njit(cache=True, nogil=True)
-def _meet(one, many, seconds, gap):
-    met = np.zeros(len(many), np.bool_)
+def _reach(one, seconds):
+    """How far from its first place any of a footprint ever gets."""
+    return math.hypot(one[LENGTH], one[WIDTH]) + one[SPEED] * seconds
+
+
+@njit(cache=True, nogil=True)
+def meet(one, other, seconds, gap):
+    """Whether two footprints (8,) come within gap metres of each other at any time in 0 .. seconds.
+    Exact for gap 0: convex shapes that slide along straight lines touch while their shadows on the
+    normals of all sides do."""
     times = np.empty(6)
-    for m in range(len(many)):
-        other = many[m]
-        times[:] = (one[START], one[STOP], other[START], other[STOP], 0.0, seconds)
-        for i in range(6):
-            times[i] = min(max(times[i], 0.0), seconds)
-        times.sort()
-        for i in range(5):  # straight in between
-            x, y = _apart(one, other, times[i])
-            next_x, next_y = _apart(one, other, times[i + 1])
-            enter, leave = 0.0, 1.0  # shares of this piece
-            for side in range(4):
-                angle = (one if side < 2 else other)[HEADING] + side % 2 * np.pi / 2
-                cos, sin = np.cos(angle), np.sin(angle)
-                reach = gap
-                for f in (one, other):
-                    turned = angle - f[HEADING]
-                    reach += f[LENGTH] * abs(np.cos(turned)) + f[WIDTH] * abs(np.sin(turned))
-                near = x * cos + y * sin
-                change = (next_x - x) * cos + (next_y - y) * sin
-                if abs(change) >= 1e-9:
-                    one_end, other_end = (-reach - near) / change, (reach - near) / change
-                    enter = max(enter, min(one_end, other_end))
-                    leave = min(leave, max(one_end, other_end))
-                elif abs(near) > reach:
-                    enter = 2.0
-            met[m] |= enter <= leave
-    return met
+    times[:] = (one[START], one[STOP], other[START], other[STOP], 0.0, seconds)
+    for i in range(6):
+        times[i] = min(max(times[i], 0.0), seconds)
+    times.sort()
+    for i in range(5):  # straight in between
+        x, y = _apart(one, other, times[i])
+        next_x, next_y = _apart(one, other, times[i + 1])
+        enter, leave = 0.0, 1.0  # shares of this piece
+        for side in range(4):
+            angle = (one if side < 2 else other)[HEADING] + side % 2 * np.pi / 2
+            cos, sin = math.cos(angle), math.sin(angle)
+            reach = gap
+            for f in (one, other):
+                turned = angle - f[HEADING]
+                reach += f[LENGTH] * abs(math.cos(turned)) + f[WIDTH] * abs(math.sin(turned))
+            near = x * cos + y * sin
+            change = (next_x - x) * cos + (next_y - y) * sin
+            if abs(change) >= 1e-9:
+                one_end, other_end = (-reach - near) / change, (reach - near) / change
+                enter = max(enter, min(one_end, other_end))
+                leave = min(leave, max(one_end, other_end))
+            elif abs(near) > reach:
+                enter = 2.0
+        if enter <= leave:
+            return True
+    return False
 
 
 @njit(cache=True, nogil=True)
@@ -106,10 +119,10 @@ def _apart(one, other, t):
     """From the centre of one to that of the other at time t."""
     way = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
     other_way = other[SPEED] * min(max(t - other[START], 0.0), other[STOP] - other[START])
-    return (other[X] + np.cos(other[HEADING]) * other_way
-            - one[X] - np.cos(one[HEADING]) * way,
-            other[Y] + np.sin(other[HEADING]) * other_way
-            - one[Y] - np.sin(one[HEADING]) * way)
+    return (other[X] + math.cos(other[HEADING]) * other_way
+            - one[X] - math.cos(one[HEADING]) * way,
+            other[Y] + math.sin(other[HEADING]) * other_way
+            - one[Y] - math.sin(one[HEADING]) * way)
 
 
 class Room:
@@ -119,25 +132,32 @@ class Room:
         """keep_clear (M, 8): footprints that are taken from the start."""
         self.seconds = seconds
         self.actors: list[Actor] = []
-        self.taken = keep_clear
+        self._taken, self._reach, self._used = np.empty((64, 8)), np.empty(64), 0
+        for row in keep_clear:
+            self._take(row)
 
     def admit(self, *group: Actor, gap: float = 0.1) -> bool:
         """Adds the group if none of it ever comes within gap of anyone else, nor meets another of
         its own."""
-        rows = np.array([a.footprint for a in group])
-        if any(self._meets(row, self.taken, gap) or self._meets(row, rows[:i], 0.0)
-               for i, row in enumerate(rows)):
-            return False
-        self.add(*group)
+        before = self._used
+        for actor in group:
+            row, own = actor.footprint, slice(before, self._used)
+            if (_meet_any(row, self._taken[:before], self._reach, self.seconds, gap)
+                    or _meet_any(row, self._taken[own], self._reach[own], self.seconds, 0.0)):
+                self._used = before
+                return False
+            self._take(row)
+        self.actors += group
         return True
 
     def add(self, *group: Actor) -> None:
         """Adds a group unasked, such as people on a bench."""
         self.actors += group
-        self.taken = np.concatenate([self.taken, *(a.footprint[None] for a in group)])
+        for actor in group:
+            self._take(actor.footprint)
 
-    def _meets(self, row: np.ndarray, taken: np.ndarray, gap: float) -> bool:
-        reach = (np.hypot(row[LENGTH], row[WIDTH]) + np.hypot(taken[:, LENGTH], taken[:, WIDTH])
-                 + (row[SPEED] + taken[:, SPEED]) * self.seconds + gap)
-        near = np.hypot(taken[:, X] - row[X], taken[:, Y] - row[Y]) <= reach
-        return bool(meet(row, taken[near], self.seconds, gap).any())
+    def _take(self, row: np.ndarray) -> None:
+        if self._used == len(self._taken):  # room for twice as many
+            self._taken, self._reach = np.tile(self._taken, (2, 1)), np.tile(self._reach, 2)
+        self._taken[self._used], self._reach[self._used] = row, _reach(row, self.seconds)
+        self._used += 1

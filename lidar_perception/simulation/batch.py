@@ -8,33 +8,26 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from lidar_perception.simulation.drive import scans_at
+from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.scene import ANY, Streets
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 
-TOGETHER = 8  # streets whose rays are cast at a time on CUDA
 
-
-def training_scans(seed: int = 0, sensor: Sensor = HDL64E, streets: Streets = ANY,
-                   device: str | torch.device | None = None,
-                   together: int = TOGETHER) -> Iterator[dict[str, torch.Tensor]]:
+def training_scans(seed: int = 0, sensor: Sensor = HDL64E,
+                   streets: Streets = ANY) -> Iterator[dict[str, torch.Tensor]]:
     """Without end: the first scan of the streets seed, seed + 1, ..., with all their labels.
 
     points (N, 4) float32 [x y z intensity], boxes (K, 7) float32 and class_ids (K,) int64 as in
     GroundTruth, num_points (K,) int64. In worker w of n of a DataLoader: every nth street from
-    seed + w on, so that the workers together give each street once. Rays are cast on the device,
-    on CUDA those of `together` streets at a time.
+    seed + w on, so that the workers together give each street once.
     """
     worker = torch.utils.data.get_worker_info()
     first, step = (worker.id, worker.num_workers) if worker else (0, 1)
-    place = torch.device(device or "cpu")
-    size = 1 if place.type == "cpu" else together
-    for street in itertools.count(seed + first, step * size):
-        places = [(street + step * k, 0) for k in range(size)]
-        for scan in scans_at(places, sensor, streets, str(place)):
-            arrays = {
-                "points": np.column_stack([scan.frame.xyz, scan.frame.intensity]),
-                "boxes": scan.truth.boxes.astype(np.float32),
-                "class_ids": scan.truth.class_ids.astype(np.int64),
-                "num_points": np.array([e["num_points"] for e in scan.truth.extras], np.int64)}
-            yield {name: torch.from_numpy(array).to(place) for name, array in arrays.items()}
+    for street in itertools.count(seed + first, step):
+        scan = scan_at(street, 0, sensor, streets)
+        arrays = {
+            "points": np.column_stack([scan.frame.xyz, scan.frame.intensity]),
+            "boxes": scan.truth.boxes.astype(np.float32),
+            "class_ids": scan.truth.class_ids.astype(np.int64),
+            "num_points": np.array([e["num_points"] for e in scan.truth.extras], np.int64)}
+        yield {name: torch.from_numpy(array) for name, array in arrays.items()}

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 
 from lidar_perception.data.semantickitti import MOVING
-from lidar_perception.simulation.pairs import View
-from lidar_perception.simulation.raycast import Hits, cast_batch
+from lidar_perception.simulation.raycast import Hits, cast
 from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.scene import ANY, SECONDS, Moment, Scene, Streets, make_scene
 from lidar_perception.simulation.sensor import HDL64E, Sensor
@@ -67,24 +66,10 @@ def scans(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
 
 def scan_at(seed: int, i: int, sensor: Sensor, streets: Streets = ANY) -> SimulatedScan:
     """Scan i of the drive along street seed, whatever was asked for before."""
-    return scans_at([(seed, i)], sensor, streets)[0]
-
-
-def scans_at(places: Sequence[tuple[int, int]], sensor: Sensor, streets: Streets = ANY,
-             device: str = "cpu") -> list[SimulatedScan]:
-    """Scan i of the drive along street seed, for each (seed, i), all cast together on the device.
-    On the CPU each is as if it were cast alone."""
-    scenes = [_street(seed, streets) for seed, _ in places]
-    moments = [scene.at(i / sensor.rate, sensor.height) for scene, (_, i) in zip(scenes, places)]
-    views = [View(moment.solids, scene.ground, moment.position, moment.motion, (seed << 20) + i)
-             for scene, moment, (seed, i) in zip(scenes, moments, places)]
-    hits = cast_batch(views, sensor, device)
-    return [_scan(seed, i, sensor, scene, moment, met)
-            for (seed, i), scene, moment, met in zip(places, scenes, moments, hits)]
-
-
-def _scan(seed: int, i: int, sensor: Sensor, scene: Scene, moment: Moment,
-          hits: Hits) -> SimulatedScan:
+    scene = _street(seed, streets)
+    moment = scene.at(i / sensor.rate, sensor.height)
+    hits = cast(moment.solids, scene.ground, moment.position, sensor, moment.motion,
+                (seed << 20) + i)
     got = returns_of(hits, sensor, moment.motion, np.random.default_rng([seed, i]))
     stamp = START_NS + round(i * 10**9 / sensor.rate)
     pose = np.eye(4)

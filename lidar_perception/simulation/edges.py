@@ -9,64 +9,68 @@ them, and the stronger one of the two otherwise.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
-import torch
+import numpy as np
+from numba import njit
 
 from lidar_perception.simulation.hashing import uniform
-from lidar_perception.simulation.pairs import CastScene
 
 OUTLIER = 1  # SemanticKITTI's class of returns that are from no surface
 
 
 class Met(NamedTuple):
-    """What R rays meet: range m, brightness and cosine of the incidence float64; solid int64, -1
-    where none; owner and semantic int32."""
+    """What a ray meets: range m, inf where nothing; brightness and cosine of the incidence; owner,
+    0 where no object; semantic class, 0 where nothing; solid, -1 where none."""
 
-    range: torch.Tensor
-    brightness: torch.Tensor
-    cosine: torch.Tensor
-    solid: torch.Tensor
-    owner: torch.Tensor
-    semantic: torch.Tensor
+    range: float
+    brightness: float
+    cosine: float
+    owner: int
+    semantic: int
+    solid: int
 
 
-def at_edges(solid: torch.Tensor) -> torch.Tensor:
-    """(views, rings, columns) bool: a neighbour has another solid."""
-    edge = torch.zeros_like(solid, dtype=torch.bool)
-    other = solid != solid.roll(1, dims=2)
-    edge |= other | other.roll(-1, dims=2)
+def at_edges(solid: np.ndarray) -> np.ndarray:
+    """(columns, rings) bool: a neighbour has another solid."""
+    edge = np.zeros(solid.shape, bool)
+    other = solid != np.roll(solid, 1, axis=0)
+    edge |= other | np.roll(other, -1, axis=0)
     other = solid[:, 1:] != solid[:, :-1]
     edge[:, 1:] |= other
     edge[:, :-1] |= other
     return edge
 
 
-def footprint(scene: CastScene, divergence: float) -> torch.Tensor:
-    """(3, R) directions to a random place, uniform in the disc of each ray's beam."""
-    x, y, z = scene.direction
-    radius = divergence / 2 * torch.sqrt(uniform(3, scene.ray_salt))
-    turn = 2 * torch.pi * uniform(4, scene.ray_salt)
-    aside, up, level = radius * torch.cos(turn), radius * torch.sin(turn), torch.hypot(x, y)
-    moved = torch.stack([x - aside * y / level - up * z * x / level,
-                         y + aside * x / level - up * z * y / level, z + up * level])
-    return moved / torch.linalg.norm(moved, dim=0)
+@njit(cache=True, nogil=True, error_model="numpy")
+def footprint(way, divergence, key):
+    """Direction to a random place, uniform in the disc of the beam along way (x, y, z)."""
+    x, y, z = way
+    radius = divergence / 2 * math.sqrt(uniform(3, key))
+    turn = 2 * np.pi * uniform(4, key)
+    aside, up, level = radius * math.cos(turn), radius * math.sin(turn), math.hypot(x, y)
+    a = x - aside * y / level - up * z * x / level
+    b = y + aside * x / level - up * z * y / level
+    c = z + up * level
+    long = math.sqrt(a * a + b * b + c * c)
+    return a / long, b / long, c / long
 
 
-def merged(scene: CastScene, one: Met, other: Met, pulse: float) -> Met:
-    """What the beams report whose two rays meet one and other."""
-    share = uniform(5, scene.ray_salt)  # of other
+@njit(cache=True, nogil=True, error_model="numpy")
+def merged(one, other, pulse, key):
+    """The Met of a beam whose two rays meet one and other."""
+    if one.solid == other.solid:
+        return one
+    share = uniform(5, key)  # of other
     first, second = one.brightness * (1 - share), other.brightness * share
-    both = torch.isfinite(one.range) & torch.isfinite(other.range)
-    between = both & ((one.range - other.range).abs() < pulse)
+    if one.range < np.inf and other.range < np.inf and abs(one.range - other.range) < pulse:
+        return Met(one.range * (1 - share) + other.range * share, first + second,
+                   one.cosine * (1 - share) + other.cosine * share,
+                   one.owner if one.owner == other.owner else 0,
+                   one.semantic if one.semantic == other.semantic else OUTLIER,
+                   other.solid if share > 0.5 else one.solid)
     # An empty ray has no power: 0 / inf.
-    stronger = second / other.range ** 2 > first / one.range ** 2
-    single = Met(*(torch.where(stronger, b, a) for a, b in zip(
-        one._replace(brightness=first), other._replace(brightness=second))))
-    mean = torch.where(both, one.range * (1 - share) + other.range * share, 0.0)
-    mixed = Met(mean, first + second, one.cosine * (1 - share) + other.cosine * share,
-                torch.where(share > 0.5, other.solid, one.solid),
-                torch.where(one.owner == other.owner, one.owner, 0),
-                torch.where(one.semantic == other.semantic, one.semantic, OUTLIER))
-    result = (torch.where(between, a, b) for a, b in zip(mixed, single))
-    return Met(*(torch.where(one.solid == other.solid, a, b) for a, b in zip(one, result)))
+    if second / other.range ** 2 > first / one.range ** 2:
+        return Met(other.range, second, other.cosine, other.owner, other.semantic, other.solid)
+    return Met(one.range, first, one.cosine, one.owner, one.semantic, one.solid)

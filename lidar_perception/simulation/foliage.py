@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import torch
+import math
+
+import numpy as np
+from numba import njit
 
 from lidar_perception.simulation.hashing import mixed, uniform
 
@@ -11,32 +14,26 @@ from lidar_perception.simulation.hashing import mixed, uniform
 # met or the beam is taken to pass.
 CLUMP, FILLED, STEPS = 0.5, 0.25, 12
 
-Triple = list[torch.Tensor]
 
+@njit(cache=True, nogil=True)
+def through_leaves(start, way, half, enter, leave, density, plant, key, filled):
+    """Range in metres at which leaves stop a ray, inf where it passes: delta tracking (Woodcock et
+    al., 1965) through a grid of full and empty cells.
 
-def through_leaves(start: Triple, way: Triple, half: Triple, enter: torch.Tensor,
-                   leave: torch.Tensor, density: torch.Tensor, plant: torch.Tensor,
-                   key: torch.Tensor) -> torch.Tensor:
-    """(n,) range in metres at which leaves stop rays, inf where they pass: delta tracking (Woodcock
-    et al., 1965) through a grid of full and empty cells.
-
-    start, way: three tensors (n,) each, rays in the frames of unit shapes; half: the half sizes of
-    these, m; enter, leave: ranges, m; density: mean, 1/m. plant (n,) int64: the same for all rays
-    of a plant, and all along a drive; key (n,) int64: of the random numbers of a pair.
+    start, way: three numbers each, the ray in the frame of a unit shape; half: the half sizes of
+    that, m; enter, leave: ranges, m; density: mean, 1/m; plant: uint64, the same for all rays of a
+    plant and all along a drive; key: uint64, of the random numbers of this ray and plant; filled:
+    share of the cells that hold leaves.
     """
-    met = torch.full_like(enter, torch.inf)
-    t, pair = enter.clip(min=0.0), torch.arange(len(enter), device=enter.device)
-    cells = [h / CLUMP for h in half]
+    t = max(enter, 0.0)
     for step in range(STEPS):
-        t = t - torch.log(uniform(10 + step, key)) * FILLED / density
+        t -= math.log(uniform(10 + step, key)) * filled / density
+        if not t < leave:
+            return np.inf
         cell = plant
-        for s, w, c in zip(start, way, cells):
-            cell = mixed(cell + torch.floor((s + t * w) * c).to(torch.int64))
-        inside = t < leave
-        stops = (uniform(1, cell) < FILLED) & inside
-        met[pair[stops]] = t[stops]
-        on = torch.nonzero(inside & ~stops)[:, 0]
-        t, leave, density, plant, key, pair = (
-            x[on] for x in (t, leave, density, plant, key, pair))
-        start, way, cells = ([x[on] for x in v] for v in (start, way, cells))
-    return met
+        for i in range(3):
+            place = math.floor((start[i] + t * way[i]) * (half[i] / CLUMP))
+            cell = mixed(cell + np.uint64(np.int64(place)))
+        if uniform(1, cell) < filled:
+            return t
+    return np.inf

@@ -1,36 +1,28 @@
-"""What the rays of a turn meet first, in torch: the same code on a CPU and a GPU.
+"""What the rays of a turn meet first, compiled.
 
-The nearest of all pairs of solid and ray that meet is kept per ray as in a depth buffer. Beams at
-the edges of things are cast once more, into their footprint: see edges.py.
+Solids are drawn into the grid of firings and beams as triangles are into a picture: each into its
+window (windows.py) of a depth buffer. Those that nobody labels come last and from near to far, so
+that most of their rays are found hidden with one comparison; then the ground, which takes longest,
+where it may be nearer.
+Beams at the edges of things are cast once more, into their footprint: see edges.py.
 Solids are in the sensor's frame at the stamp; the ground is in the world, whose axes are parallel.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
-import torch
+from numba import njit
 
+from lidar_perception.simulation import foliage
 from lidar_perception.simulation.edges import Met, at_edges, footprint, merged
-from lidar_perception.simulation.pairs import (
-    CastScene,
-    Runs,
-    View,
-    meetings,
-    runs_of,
-    scene_of,
-    shade,
-)
-from lidar_perception.simulation.sensor import STILL, Motion, Sensor
+from lidar_perception.simulation.hashing import mixed
+from lidar_perception.simulation.pairs import shade, shapes_of, span, stop, unit_ray
+from lidar_perception.simulation.sensor import STILL, Motion, Sensor, rays
 from lidar_perception.simulation.solids import Solids
-from lidar_perception.simulation.terrain import Ground, GroundHits, cast_ground
-
-CHUNK = 1 << 15  # pairs at a time: what they need stays within a CPU's cache
-GPU_CHUNK = 1 << 22  # about 1 GB
-NO_SOLID = (1 << 31) - 1
+from lidar_perception.simulation.terrain import Ground, cast_ground, compiled, not_before
+from lidar_perception.simulation.windows import windows
 
 
 class Hits(NamedTuple):
@@ -49,109 +41,148 @@ class Hits(NamedTuple):
     reached: np.ndarray
 
 
+class Turn(NamedTuple):
+    """The rays of a turn for compiled code: direction (columns, rings, 3) in the sensor's frame at
+    the stamp; since (columns,) s after the stamp; lift (rings,) m over the sensor's origin."""
+
+    direction: np.ndarray
+    since: np.ndarray
+    lift: np.ndarray
+
+
 def cast(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sensor,
-         motion: Motion = STILL, seed: int = 0, device: str = "cpu",
-         chunk: int | None = None) -> Hits:
-    """Cast all rays of one turn, see View and cast_batch."""
-    return cast_batch([View(solids, ground, position, motion, seed)], sensor, device, chunk)[0]
-
-
-def cast_batch(views: Sequence[View], sensor: Sensor, device: str = "cpu",
-               chunk: int | None = None) -> list[Hits]:
-    """Cast one turn in each of several scenes. Not many more than chunk pairs of solid and ray are
-    looked at at a time, which bounds the memory but changes no result: that depends on the view
-    and the device alone."""
-    if not views:
-        return []
-    chunk = chunk or (CHUNK if torch.device(device).type == "cpu" else GPU_CHUNK)
-    with _one_thread():
-        scene, runs = scene_of(views, sensor, device), runs_of(views, sensor, device)
-        met, reached = _first(views, scene, runs, sensor, chunk)
-        if sensor.divergence:
-            grid = met.solid.reshape(len(views), sensor.rings, sensor.columns)
-            edge = at_edges(grid).reshape(-1)
-            aside = scene._replace(direction=footprint(scene, sensor.divergence))
-            other, _ = _first(views, aside, runs, sensor, chunk, edge)
-            met = Met(*(torch.where(edge, new, old)
-                        for new, old in zip(merged(scene, met, other, sensor.pulse), met)))
-        return _unpacked(views, sensor, met, reached)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """torch with one thread: the arrays are small, and two that wait for each other take up to ten
-    times as long where other programs run as well. Cast scenes in processes of their own instead.
-    """
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-def _first(views: Sequence[View], scene: CastScene, runs: Runs, sensor: Sensor, chunk: int,
-           only: torch.Tensor | None = None) -> tuple[Met, list[np.ndarray]]:
-    """What all rays meet, or those of only (R,) bool; and how many rays meet each view's owners."""
-    ground = _grounds(views, scene, sensor, only)
-    keys = _key(ground.range, torch.full_like(scene.number, NO_SOLID))
-    rays, pairs = len(keys), []
-    for solid, ray, t in meetings(scene, runs, chunk, only):
-        near = torch.nonzero(t <= sensor.max_range)[:, 0]
-        solid, ray, t = solid[near], ray[near], t[near]
-        keys.scatter_reduce_(0, ray, _key(t, solid), "amin")
-        owner = scene.owner[solid].to(torch.int64)
-        owned = torch.nonzero(owner)[:, 0]
-        pairs.append(owner[owned] * rays + ray[owned])
-    once = torch.unique(torch.cat(pairs)) if pairs else keys[:0]
-    owner, view = once // rays, once % rays // (rays // len(views))
-    reached = [torch.bincount(owner[view == i]).cpu().numpy() for i in range(len(views))]
-    return _met(scene, ground, keys & NO_SOLID), reached
-
-
-def _key(t: torch.Tensor, solid: torch.Tensor) -> torch.Tensor:
-    """int64 that is lower for a nearer hit, and of hits closer than float32 tells for a lower
-    solid, so that the order of the hits does not matter."""
-    return (t.to(torch.float32).view(torch.int32).to(torch.int64) << 32) + solid
-
-
-def _grounds(views: Sequence[View], scene: CastScene, sensor: Sensor,
-             only: torch.Tensor | None) -> GroundHits:
-    """What the rays meet of their view's ground."""
-    found, size = [], scene.direction.shape[1] // len(views)
-    for i, view in enumerate(views):
-        mine = slice(i * size, (i + 1) * size)
-        position = torch.as_tensor(np.asarray(view.position, np.float64)).to(scene.lift.device)
-        start = scene.since[mine] * torch.as_tensor(view.motion.velocity).to(position)[:, None]
-        start = start + position[:, None]
-        start[2] += scene.lift[mine]
-        found.append(cast_ground(view.ground, start, scene.direction[:, mine], sensor.max_range,
-                                 None if only is None else only[mine]))
-    return GroundHits(*(torch.cat(part) for part in zip(*found)))
-
-
-def _met(scene: CastScene, ground: GroundHits, solid: torch.Tensor) -> Met:
-    """Everything about the solids (R,) that are nearest, or else the ground."""
-    met = Met(ground.range, ground.brightness, ground.cosine,
-              torch.where(solid == NO_SOLID, -1, solid), torch.zeros_like(ground.semantic),
-              ground.semantic)
-    lit = torch.nonzero(met.solid >= 0)[:, 0]
-    solid = solid[lit]
-    met.range[lit], met.brightness[lit], met.cosine[lit] = shade(scene, solid, lit)
-    met.owner[lit], met.semantic[lit] = scene.owner[solid], scene.semantic[solid]
-    return met
-
-
-def _unpacked(views: Sequence[View], sensor: Sensor, met: Met,
-              reached: list[np.ndarray]) -> list[Hits]:
-    shape, first, hits = (len(views), sensor.rings, sensor.columns), 0, []
-    grids = [np.swapaxes(part.cpu().numpy().reshape(shape), 1, 2) for part in met]
-    for i, (view, count) in enumerate(zip(views, reached)):
-        far, brightness, cosine, solid, owner, semantic = (
-            np.ascontiguousarray(grid[i]) for grid in grids)
-        most = max(int(view.solids.owner.max(initial=0)), 0) + 1
-        hits.append(Hits(far, brightness, cosine, owner, semantic.astype(np.uint16),
-                         np.where(solid < 0, -1, solid - first).astype(np.int32),
-                         np.pad(count, (0, most - len(count)))))
-        first += len(view.solids)
+         motion: Motion = STILL, seed: int = 0) -> Hits:
+    """Cast all rays of one turn of a sensor at position (3,) m in the world at the stamp, over the
+    road; motion: of the sensor; seed, a whole number (its lowest 64 bits count): of what is left to
+    chance."""
+    salt = np.uint64(mixed(np.uint64(seed % (1 << 64))))
+    made = rays(sensor, motion)
+    turn = Turn(made.direction, made.since, sensor.origins()[:, 2].copy())
+    seen = windows(solids, sensor, motion, sensor.divergence / 2)
+    scene = (shapes_of(solids, motion, salt), seen,
+             np.lexsort((seen.near, solids.owner, solids.owner == 0)), compiled(ground),
+             np.array(position, np.float64), np.array(motion.velocity, np.float64),
+             float(sensor.max_range), foliage.FILLED)
+    shape = (sensor.columns, sensor.rings)
+    hits = Hits(np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape, np.int32),
+                np.empty(shape, np.uint16), np.empty(shape, np.int32),
+                np.zeros(int(solids.owner.max(initial=0)) + 1, np.int64))
+    _first(hits, turn, np.ones(shape, bool), *scene, True)
+    if sensor.divergence:
+        edge, other = at_edges(hits.solid), Hits(*(np.empty_like(grid) for grid in hits))
+        _aside(turn.direction, edge, float(sensor.divergence), salt)
+        _first(other, turn, edge, *scene, False)
+        _merge(hits, other, edge, float(sensor.pulse), salt)
     return hits
+
+
+@njit(cache=True, nogil=True)
+def _first(hits, turn, only, shapes, seen, order, ground, position, velocity, max_range, filled,
+           counting):
+    """Fills the hits of only those rays, (columns, rings) bool; reached only where counting.
+    order: owner by owner, then from near to far what has none."""
+    hits.range[:] = np.inf
+    hits.solid[:] = -1
+    _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, counting)
+    columns, rings = only.shape
+    for column in range(columns):
+        since = turn.since[column]
+        x, y, z = (position[0] + velocity[0] * since, position[1] + velocity[1] * since,
+                   position[2] + velocity[2] * since)
+        for ring in range(rings):
+            if only[column, ring]:
+                start, way = (x, y, z + turn.lift[ring]), _way(turn, column, ring)
+                far, s = hits.range[column, ring], hits.solid[column, ring]
+                if not far < not_before(ground, start, way):
+                    met = cast_ground(ground, start, way, max_range)
+                    if s < 0 or np.float32(met.range) < np.float32(far):
+                        _write(hits, column, ring, Met(met.range, met.brightness, met.cosine, 0,
+                                                       met.semantic, -1))
+                        continue
+                if s >= 0:
+                    brightness, cosine = shade(shapes, s, way, since, turn.lift[ring],
+                                               ring * columns + column)
+                    _write(hits, column, ring, Met(far, brightness, cosine, shapes.owner[s],
+                                                   shapes.semantic[s], s))
+                else:
+                    _write(hits, column, ring, Met(np.inf, 0.0, 0.0, 0, 0, -1))
+
+
+@njit(cache=True, nogil=True)
+def _way(turn, column, ring):
+    way = turn.direction[column, ring]
+    return way[0], way[1], way[2]
+
+
+@njit(cache=True, nogil=True)
+def _draw_solids(hits, turn, only, shapes, seen, order, max_range, filled, counting):
+    columns, rings = only.shape
+    latest = np.zeros((columns, rings), np.int32)  # owner that a ray met; an owner's come together
+    for s in order:
+        owner, near = shapes.owner[s], seen.near[s]
+        counts = counting and owner > 0
+        for step in range(seen.count[s]):
+            column = (seen.first[s] + step) % columns
+            for ring in range(rings):
+                if not seen.beams[s, ring] or not only[column, ring]:
+                    continue
+                far = hits.range[column, ring]
+                if near > far and not counts:
+                    continue
+                start, way = unit_ray(shapes, s, _way(turn, column, ring), turn.since[column],
+                                      turn.lift[ring])
+                enter, leave = span(shapes.kind[s], start, way)
+                if not (enter <= leave and leave > 0) or (
+                        np.float32(enter) > np.float32(far) and not counts):
+                    continue
+                t = stop(shapes, s, start, way, enter, leave, ring * columns + column, filled)
+                if not t < leave or t > max_range:
+                    continue
+                if counts and latest[column, ring] != owner:
+                    latest[column, ring] = owner
+                    hits.reached[owner] += 1
+                # Of hits closer than float32 tells the lower solid wins, whatever the order.
+                t32, far32, before = np.float32(t), np.float32(far), hits.solid[column, ring]
+                if t32 < far32 or (t32 == far32 and (before < 0 or s < before)):
+                    hits.range[column, ring], hits.solid[column, ring] = t, s
+
+
+@njit(cache=True, nogil=True)
+def _aside(direction, only, divergence, salt):
+    """Turns only those rays into their beams' footprints."""
+    columns, rings = only.shape
+    for column in range(columns):
+        for ring in range(rings):
+            if only[column, ring]:
+                way = direction[column, ring]
+                way[0], way[1], way[2] = footprint((way[0], way[1], way[2]), divergence,
+                                                   salt + np.uint64(ring * columns + column))
+
+
+@njit(cache=True, nogil=True)
+def _merge(hits, other, only, pulse, salt):
+    """Joins what the two rays of only those beams meet, into hits."""
+    columns, rings = only.shape
+    for column in range(columns):
+        for ring in range(rings):
+            if only[column, ring]:
+                _write(hits, column, ring, merged(
+                    _met(hits, column, ring), _met(other, column, ring), pulse,
+                    salt + np.uint64(ring * columns + column)))
+
+
+@njit(cache=True, nogil=True)
+def _met(hits, column, ring):
+    return Met(hits.range[column, ring], hits.brightness[column, ring], hits.cosine[column, ring],
+               np.int64(hits.owner[column, ring]), np.int64(hits.semantic[column, ring]),
+               np.int64(hits.solid[column, ring]))
+
+
+@njit(cache=True, nogil=True)
+def _write(hits, column, ring, met):
+    hits.range[column, ring] = met.range
+    hits.brightness[column, ring] = met.brightness
+    hits.cosine[column, ring] = met.cosine
+    hits.owner[column, ring] = met.owner
+    hits.semantic[column, ring] = met.semantic
+    hits.solid[column, ring] = met.solid

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -11,7 +12,7 @@ import numpy as np
 from lidar_perception.simulation.actors import FAR_SIGHT, LARGE, SIGHT, Actor, Room
 from lidar_perception.simulation.roadside import furnish
 from lidar_perception.simulation.sensor import Motion
-from lidar_perception.simulation.solids import PART, Solids, extents, place
+from lidar_perception.simulation.solids import PART, Solids, hull, place
 from lidar_perception.simulation.street import KINDS, lay_out
 from lidar_perception.simulation.terrain import Ground, surface_height
 from lidar_perception.simulation.traffic import populate
@@ -78,9 +79,9 @@ class Scene:
         speed = np.where((a["start"] <= t) & (t < a["stop"]), a["speed"], 0.0)
         velocity = self._climbing(a["forward"] * speed[:, None])
 
-        made = [self.actors[i].thing.parts(s) for i, s in zip(near, way)]
+        made = [self.actors[i].thing.parts(s) for i, s in zip(near.tolist(), way.tolist())]
         whose = np.repeat(np.arange(len(made)), [len(m) for m in made])
-        solids = place(np.concatenate([np.zeros(0, PART), *made]), base[whose],
+        solids = place(_joined(made), base[whose],
                        a["heading"][whose], a["track"][whose], velocity[whose])
 
         known = np.flatnonzero(a["track"])
@@ -96,21 +97,22 @@ class Scene:
         has no label, which may be too long to stand on a slope; NaN for the rest."""
         rows = []
         for a in self.actors:
+            x0, y0, z0, x1, y1, z1 = hull(a.thing.parts(0.0))
+            level, span = math.hypot(x1 - x0, y1 - y0), max(x1 - x0, y1 - y0, z1 - z0)
             label = a.thing.label
-            low, high = extents(a.thing.parts(0.0))
-            span = high.max(axis=0) - low.min(axis=0)
-            sight = np.hypot(*span[:2]) / 2 + (FAR_SIGHT if span.max() > LARGE else SIGHT)
-            feet = (np.nan if a.speed or label else
-                    surface_height(self.ground, *_corners(a.footprint)).min())
-            rows.append(((a.x, a.y), a.heading, (np.cos(a.heading), np.sin(a.heading)), a.speed,
-                         a.start, a.stop, a.thing.size, CLASSES.index(label) if label else -1, 0,
-                         sight, feet))
+            rows.append(((a.x, a.y), a.heading, (math.cos(a.heading), math.sin(a.heading)),
+                         a.speed, a.start, a.stop, a.thing.size,
+                         CLASSES.index(label) if label else -1, 0,
+                         level / 2 + (FAR_SIGHT if span > LARGE else SIGHT), np.nan))
         table = np.array(rows, [
             ("xy", float, 2), ("heading", float), ("forward", float, 2), ("speed", float),
             ("start", float), ("stop", float), ("size", float, 3), ("class", np.int32),
             ("track", np.int32), ("sight", float), ("feet", float)])
         known = table["class"] >= 0
         table["track"] = np.where(known, np.cumsum(known), 0)
+        fixed = np.flatnonzero((table["speed"] == 0) & ~known)
+        corners = _corners(np.array([self.actors[i].footprint for i in fixed]).reshape(-1, 8))
+        table["feet"][fixed] = surface_height(self.ground, *corners).min(axis=1)
         return table
 
     def _climbing(self, flat: np.ndarray) -> np.ndarray:
@@ -119,12 +121,22 @@ class Scene:
         return np.column_stack([flat, flat @ slope])
 
 
-def _corners(f: np.ndarray) -> np.ndarray:
-    """(2, 4) x and y of the corners of a footprint (8,) at time 0."""
-    x, y, heading, length, width = f[:5]
+def _joined(made: list[np.ndarray]) -> np.ndarray:
+    """All parts (P,) PART in a row; np.concatenate takes as long as casting them."""
+    whole = np.empty(sum(map(len, made)), PART)
+    end = 0
+    for one in made:
+        begin, end = end, end + len(one)
+        whole[begin:end] = one
+    return whole
+
+
+def _corners(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """x and y (A, 4) of the corners of footprints (A, 8) at time 0."""
+    x, y, heading, length, width = f[:, :5, None].transpose(1, 0, 2)
     ahead, aside = length * np.array([1, 1, -1, -1]), width * np.array([1, -1, 1, -1])
-    return np.array([x + np.cos(heading) * ahead - np.sin(heading) * aside,
-                     y + np.sin(heading) * ahead + np.cos(heading) * aside])
+    return (x + np.cos(heading) * ahead - np.sin(heading) * aside,
+            y + np.sin(heading) * ahead + np.cos(heading) * aside)
 
 
 def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0) -> Scene:

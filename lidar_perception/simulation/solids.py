@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
+from numba import njit
 
 BOX, ELLIPSOID, CYLINDER = 0, 1, 2  # a cylinder stands along its z axis
 
@@ -81,11 +83,54 @@ def place(made: np.ndarray, base: np.ndarray, heading: np.ndarray, owner: np.nda
 
 def extents(made: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(P, 3) lower and (P, 3) upper bounds of each part, exact, in the thing's frame."""
-    solids = place(made, np.zeros((len(made), 3)), np.zeros(len(made)), np.zeros(len(made)),
-                   np.zeros((len(made), 3)))
-    reach = np.abs(solids.axes * solids.half[:, None])  # (P, 3 world, 3 own)
-    square = np.sqrt((reach ** 2).sum(axis=2))
-    disc = np.hypot(reach[..., 0], reach[..., 1]) + reach[..., 2]
-    half = np.where((made["kind"] == ELLIPSOID)[:, None], square,
-                    np.where((made["kind"] == CYLINDER)[:, None], disc, reach.sum(axis=2)))
-    return solids.centre - half, solids.centre + half
+    low, high = np.empty((len(made), 3)), np.empty((len(made), 3))
+    _extents(made, low, high)
+    return low, high
+
+
+def hull(made: np.ndarray, below: float = np.inf) -> tuple[float, ...]:
+    """Bounds of all parts (P,) PART of which something is lower than that: least x, y, z, greatest
+    x, y, z, in the thing's frame; inf and -inf where there are none."""
+    return _hull(made, below)
+
+
+@njit(cache=True, nogil=True)
+def _extents(made, low, high):
+    for p in range(len(made)):
+        reach = _reach(made[p])
+        for i in range(3):
+            low[p, i], high[p, i] = made[p].centre[i] - reach[i], made[p].centre[i] + reach[i]
+
+
+@njit(cache=True, nogil=True)
+def _hull(made, below):
+    low, high = (np.inf, np.inf, np.inf), (-np.inf, -np.inf, -np.inf)
+    for p in range(len(made)):
+        c, reach = made[p].centre, _reach(made[p])
+        if c[2] - reach[2] < below:
+            low = (min(low[0], c[0] - reach[0]), min(low[1], c[1] - reach[1]),
+                   min(low[2], c[2] - reach[2]))
+            high = (max(high[0], c[0] + reach[0]), max(high[1], c[1] + reach[1]),
+                    max(high[2], c[2] + reach[2]))
+    return (*low, *high)
+
+
+@njit(cache=True, nogil=True)
+def _reach(one):
+    """How far a part reaches along x, y, z from its centre."""
+    cos, sin, down, nose = (math.cos(one.yaw), math.sin(one.yaw), math.cos(one.pitch),
+                            math.sin(one.pitch))
+    a, b, c = one.half[0], one.half[1], one.half[2]
+    return (_along(one.kind, a * cos * down, b * sin, c * cos * nose),
+            _along(one.kind, a * sin * down, b * cos, c * sin * nose),
+            _along(one.kind, a * nose, 0.0, c * down))
+
+
+@njit(cache=True, nogil=True)
+def _along(kind, a, b, c):
+    """Half the extent of a part whose half axes reach so far in a direction."""
+    if kind == ELLIPSOID:
+        return math.sqrt(a * a + b * b + c * c)
+    if kind == CYLINDER:
+        return math.hypot(a, b) + abs(c)
+    return abs(a) + abs(b) + abs(c)

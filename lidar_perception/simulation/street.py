@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -94,7 +95,7 @@ class Side(NamedTuple):
         """An actor so far along the curb and out from it, turned against its line; parts (P,) PART
         are a thing without a label."""
         thing = prop(thing) if isinstance(thing, np.ndarray) else thing
-        cos, sin = np.cos(self.heading), np.sin(self.heading)
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
         return Actor(thing, self.x + cos * along - sin * out, self.y + sin * along + cos * out,
                      self.heading + turn, **moves)
 

@@ -9,10 +9,11 @@ meet what lies and grows there: bumps everywhere, tufts and litter in patches.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
-import torch
+from numba import njit
 
 from lidar_perception.simulation.hashing import uniform
 from lidar_perception.simulation.solids import RETROREFLECTOR
@@ -47,187 +48,209 @@ class Ground(NamedTuple):
     grass: float = 0.35
 
 
-class GroundHits(NamedTuple):
-    """Of N rays: range (N,) float64 m, inf where none; brightness and cosine of the incidence
-    (N,) float64, 0 where none; semantic (N,) int32, 0 where none."""
+class GroundHit(NamedTuple):
+    """What a ray meets of the ground: range m, inf where nothing; brightness and cosine of the
+    incidence, 0 where nothing; semantic class, 0 where nothing."""
 
-    range: torch.Tensor
-    brightness: torch.Tensor
-    cosine: torch.Tensor
-    semantic: torch.Tensor
+    range: float
+    brightness: float
+    cosine: float
+    semantic: int
 
 
+@njit(cache=True, nogil=True)
 def shine(reflectance, cosine):
     """Brightness, much softer than Lambert's law: on KITTI's scans the road has the same intensity
     at 20 m, where the rays graze it, as at 6 m. A retroreflector is as bright from anywhere."""
     return reflectance * (1 - 0.25 * (1 - cosine) * (reflectance < RETROREFLECTOR))
 
 
-def ground_height(ground: Ground, x, y):
-    """Height of the road, without curbs and roughness, at x, y in the world: arrays or tensors."""
-    return _relief(ground, x, y)[0]
+def compiled(ground: Ground) -> Ground:
+    """The same for compiled code: numbers, and crossings as an array (C, 2)."""
+    crossings = np.array(ground.crossings, np.float64).reshape(-1, 2)
+    return Ground(*map(float, ground._replace(crossings=0.0)))._replace(crossings=crossings)
 
 
-def surface_height(ground: Ground, x, y):
+def surface_height(ground: Ground, x, y) -> np.ndarray:
     """Height of what one stands on at x, y (arrays), without roughness: road, sidewalk, grass."""
-    x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
-    return ground_height(ground, x, y) + np.where(_raised(ground, x, y), ground.curb_height, 0.0)
+    x, y = np.broadcast_arrays(np.asarray(x, np.float64), np.asarray(y, np.float64))
+    return _heights(compiled(ground), x.ravel(), y.ravel()).reshape(x.shape)
 
 
-def cast_ground(ground: Ground, start: torch.Tensor, way: torch.Tensor, max_range: float,
-                only: torch.Tensor | None = None) -> GroundHits:
-    """What N rays, start and way (3, N) float64 in the world, that start above the road meet of
-    the ground within max_range; only (N,) bool: the rays to look at."""
-    hits = GroundHits(torch.full_like(way[0], torch.inf), torch.zeros_like(way[0]),
-                      torch.zeros_like(way[0]), torch.zeros_like(way[0], dtype=torch.int32))
-    falls = way[2] - ground.slope_x * way[0] - ground.slope_y * way[1] < -1e-3
-    falls = torch.nonzero(falls if only is None else falls & only)[:, 0]
-    start, way = start[:, falls], way[:, falls]
-    t = _meet(ground, start, way, 0.0, torch.zeros_like(start[0]), max_range)
-    edge = torch.zeros_like(t)  # the cosine at a curb, where one is met
-    if ground.curb_height:
-        t, edge = _meet_raised(ground, start, way, t, max_range)
-    near = torch.nonzero(t <= max_range)[:, 0]
-    falls, start, way, t, edge = falls[near], start[:, near], way[:, near], t[near], edge[near]
-
-    x, y = start[:2] + t * way[:2]
-    _, slope_x, slope_y = _relief(ground, x, y)
-    cosine = (slope_x * way[0] + slope_y * way[1] - way[2]).clip(1e-3, 1.0)
-    if ground.rough or ground.litter:
-        t = torch.where(edge > 0, t, _meet_tufts(ground, start, way, t, cosine))
-    cosine = torch.where(edge > 0, edge, cosine)
-    semantic, reflectance = _surface(ground, *(start[:2] + t * way[:2]), edge > 0)
-    hits.range[falls], hits.cosine[falls] = t, cosine
-    hits.brightness[falls] = shine(reflectance, cosine)
-    hits.semantic[falls] = semantic
-    return hits
-
-
-def _relief(ground: Ground, x, y):
-    """Height and slopes along x and y at x, y, without curbs: arrays or tensors."""
-    m = torch if isinstance(x, torch.Tensor) else np
-    middle, half = (ground.curb_left + ground.curb_right) / 2, (
-        ground.curb_left - ground.curb_right) / 2
-    height = ground.slope_x * x + ground.slope_y * y
-    slope_x, slope_y = ground.slope_x + 0 * x, ground.slope_y + 0 * y
-    if ground.camber:
-        aside = y - middle
-        height = height - ground.camber * abs(aside).clip(0.0, half)
-        slope_y = slope_y - ground.camber * m.sign(aside) * (abs(aside) < half)
-    if ground.wave:
-        turns = 2 * np.pi / ground.wavelength
-        a, b = turns * x, turns * y
-        sin, cos = m.sin(a), m.cos(b)
-        height = height + ground.wave * sin * cos
-        slope_x = slope_x + ground.wave * turns * m.cos(a) * cos
-        slope_y = slope_y - ground.wave * turns * sin * m.sin(b)
-    return height, slope_x, slope_y
-
-
-def _raised(ground: Ground, x, y):
-    """Whether x, y lie beyond the curbs and in no side street."""
-    raised = (y <= ground.curb_right) | (y >= ground.curb_left)
-    for low, high in ground.crossings:
-        raised = raised & ~((low < x) & (x < high))
-    return raised
-
-
-def _meet(ground: Ground, start: torch.Tensor, way: torch.Tensor, lift: float, t: torch.Tensor,
-          max_range: float) -> torch.Tensor:
-    """(N,) range of the relief raised by lift, searched from t by Newton's method; inf if none."""
-    t, left = t.clone(), torch.arange(len(t), device=t.device)
-    for _ in range(10):
-        at, ahead = t[left], way[:, left]
-        x, y, z = start[:, left] + at * ahead
-        height, slope_x, slope_y = _relief(ground, x, y)
-        gap = z - height - lift
-        closing = slope_x * ahead[0] + slope_y * ahead[1] - ahead[2]
-        t[left] = (at + gap / closing.clip(min=1e-4)).clip(0.0, 2 * max_range)
-        left = left[gap.abs() > 1e-4]  # what is left after that step is far less
-        if not len(left):
-            break
-    t[left] = torch.inf
-    return t
-
-
-def _meet_raised(ground: Ground, start: torch.Tensor, way: torch.Tensor, low: torch.Tensor,
-                 max_range: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Range with the curbs, given that of the relief, and the cosine where a curb is met, else 0
-    (N,)."""
-    high = _meet(ground, start, way, ground.curb_height, low.clip(max=max_range), max_range)
-    x, y = start[:2] + torch.where(high < torch.inf, high, 0.0) * way[:2]
-    on_top = _raised(ground, x, y) & (high < torch.inf)
-    t, edge = torch.where(on_top, high, low), torch.zeros_like(low)
-    lines = [(1, ground.curb_left), (1, ground.curb_right)]
-    lines += [(0, end) for crossing in ground.crossings for end in crossing]
-    for axis, line in lines:
-        at = (line - start[axis]) / way[axis]
-        x, y = start[:2] + (at + 1e-4) * way[:2]  # a hair beyond
-        meets = (high < at) & (at < t) & ~on_top & _raised(ground, x, y)
-        t, edge = torch.where(meets, at, t), torch.where(meets, way[axis].abs(), edge)
-    return t, edge
-
-
-def _meet_tufts(ground: Ground, start: torch.Tensor, way: torch.Tensor, t: torch.Tensor,
-                cosine: torch.Tensor) -> torch.Tensor:
-    """(N,) range of the first tuft or bump met before the ground at t, else t: looked for where a
-    ray is low enough, from the sensor on, in TUFT_STEPS steps."""
-    step = (max(ground.rough, ground.litter) / cosine).clip(max=TUFTS_HIDE) / TUFT_STEPS
-    met, ends = t.clone(), start[1] + torch.stack([t, t - TUFT_STEPS * step]) * way[1]
-    wayside = ((ends > ground.curb_left - ground.parking)
-               | (ends < ground.curb_right + ground.parking)).any(0)
-    left = torch.nonzero(wayside)[:, 0]  # the road itself is nowhere as high
-    for k in range(TUFT_STEPS - 1, -1, -1):
-        left = left if k else torch.nonzero(met == t)[:, 0]
-        back = k * step[left]
-        x, y = start[:2, left] + (t[left] - back) * way[:2, left]
-        top = tufts(ground, x, y, back * cosine[left])
-        above = top / cosine[left]  # the ray is as high so far before t
-        hit = above > back
-        found = left[hit]
-        met[found] = t[found] - torch.minimum(above[hit], back[hit] + step[found])
-        left = left[~hit]
-    return met
-
-
-def tufts(ground: Ground, x: torch.Tensor, y: torch.Tensor, least=0.0) -> torch.Tensor:
-    """(N,) height of what grows and lies at x, y, in patches with nearly bare ground between;
-    0 where it is surely not above least, a number or (N,)."""
-    height = torch.zeros_like(x)
-    patch = ((_bumps(x / PATCH, y / PATCH) - BARE) * RISE).clip(EVEN, 1.0)
-    high = torch.nonzero(patch * max(ground.rough, ground.litter) > least)[:, 0]
-    x, y, patch = x[high], y[high], patch[high]
-    semantic, _ = _surface(ground, x, y, torch.zeros_like(x, dtype=torch.bool))
-    paved = semantic == ROAD
-    most = torch.where(paved | (semantic == GRASS), ground.rough, ground.litter)
-    height[high] = torch.where(paved, PAVED, patch) * most * _bumps(x, y)
+@njit(cache=True, nogil=True)
+def _heights(ground, x, y):
+    height = np.empty(len(x))
+    for i in range(len(x)):
+        height[i] = _relief(ground, x[i], y[i])[0]
+        if _raised(ground, x[i], y[i]):
+            height[i] += ground.curb_height
     return height
 
 
-def _surface(ground: Ground, x: torch.Tensor, y: torch.Tensor,
-             curb: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Class and reflectance (N,) of the ground at x, y; curb (N,) bool: of the curb itself."""
-    raised = _raised(ground, x, y)
-    beyond = torch.maximum(y - ground.curb_left, ground.curb_right - y)
-    crossed = torch.zeros_like(raised)
-    for low, high in ground.crossings:
-        crossed |= (low < x) & (x < high)
-    semantic = torch.where(beyond < -ground.parking, ROAD, PARKING)
-    semantic = torch.where(crossed, ROAD, semantic)
-    semantic = torch.where(raised, torch.where(beyond < ground.walk, SIDEWALK, GRASS), semantic)
-    semantic = torch.where(curb, SIDEWALK, semantic)
-    reflectance = torch.where(semantic == SIDEWALK, ground.sidewalk,
-                              torch.where(semantic == GRASS, ground.grass, ground.road))
-    return semantic.to(torch.int32), reflectance.to(x)
+@njit(cache=True, nogil=True, error_model="numpy")
+def cast_ground(ground, start, way, max_range):
+    """The GroundHit of a ray, start and way (x, y, z) in the world, that starts above the road,
+    with a compiled ground within max_range."""
+    nothing = GroundHit(np.inf, 0.0, 0.0, 0)
+    if not way[2] - ground.slope_x * way[0] - ground.slope_y * way[1] < -1e-3:
+        return nothing
+    t, edge = _meet(ground, start, way, 0.0, 0.0, max_range), 0.0
+    if ground.curb_height and not (t <= max_range and _on_road(ground, start, way, t)):
+        t, edge = _meet_raised(ground, start, way, t, max_range)
+    if not t <= max_range:
+        return nothing
+    cosine = edge  # that at a curb, where one is met
+    if not edge:
+        _, slope_x, slope_y = _relief(ground, start[0] + t * way[0], start[1] + t * way[1])
+        cosine = min(max(slope_x * way[0] + slope_y * way[1] - way[2], 1e-3), 1.0)
+        if ground.rough or ground.litter:
+            t = _meet_tufts(ground, start, way, t, cosine)
+    semantic, reflectance = _surface(ground, start[0] + t * way[0], start[1] + t * way[1])
+    if edge:
+        semantic, reflectance = SIDEWALK, ground.sidewalk
+    return GroundHit(t, shine(reflectance, cosine), cosine, semantic)
 
 
-def _bumps(x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+@njit(cache=True, nogil=True, error_model="numpy")
+def not_before(ground, start, way):
+    """A range, as cheap as can be, before which the ray of cast_ground meets nothing; inf where it
+    does not fall."""
+    closing = ground.slope_x * way[0] + ground.slope_y * way[1] - way[2]
+    if closing <= 1e-3:
+        return np.inf
+    height = start[2] - ground.slope_x * start[0] - ground.slope_y * start[1] - abs(ground.wave)
+    height -= ground.curb_height + 0.01  # Newton's method stops within less of the relief
+    tall = max(ground.rough, ground.litter)
+    return max((height - tall) / closing, height / closing - TUFTS_HIDE)
+
+
+@njit(cache=True, nogil=True)
+def _on_road(ground, start, way, t):
+    """Whether a ray is between the curbs up to range t."""
+    y, end = start[1], start[1] + t * way[1]
+    return ground.curb_right < min(y, end) and max(y, end) < ground.curb_left
+
+
+@njit(cache=True, nogil=True)
+def _relief(ground, x, y):
+    """Height and slopes along x and y at x, y, without curbs."""
+    middle, half = (ground.curb_left + ground.curb_right) / 2, (
+        ground.curb_left - ground.curb_right) / 2
+    aside = y - middle
+    height = ground.slope_x * x + ground.slope_y * y - ground.camber * min(abs(aside), half)
+    slope_x, slope_y = ground.slope_x, ground.slope_y
+    if abs(aside) < half:
+        slope_y -= ground.camber * np.sign(aside)
+    if ground.wave:
+        turns = 2 * np.pi / ground.wavelength
+        a, b = turns * x, turns * y
+        sin, cos = math.sin(a), math.cos(b)
+        height += ground.wave * sin * cos
+        slope_x += ground.wave * turns * math.cos(a) * cos
+        slope_y -= ground.wave * turns * sin * math.sin(b)
+    return height, slope_x, slope_y
+
+
+@njit(cache=True, nogil=True)
+def _crossed(ground, x):
+    """Whether x lies in a side street."""
+    for i in range(len(ground.crossings)):
+        if ground.crossings[i, 0] < x < ground.crossings[i, 1]:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _raised(ground, x, y):
+    """Whether x, y lie beyond the curbs and in no side street."""
+    return (y <= ground.curb_right or y >= ground.curb_left) and not _crossed(ground, x)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _meet(ground, start, way, lift, t, max_range):
+    """Range of the relief raised by lift, searched from t by Newton's method; inf if none."""
+    for _ in range(10):
+        height, slope_x, slope_y = _relief(ground, start[0] + t * way[0], start[1] + t * way[1])
+        gap = start[2] + t * way[2] - height - lift
+        closing = slope_x * way[0] + slope_y * way[1] - way[2]
+        t = min(max(t + gap / max(closing, 1e-4), 0.0), 2 * max_range)
+        if abs(gap) <= 1e-4:  # what is left after that step is far less
+            return t
+    return np.inf
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _meet_raised(ground, start, way, low, max_range):
+    """Range with the curbs, given that of the relief, and the cosine where a curb is met, else
+    0."""
+    high = _meet(ground, start, way, ground.curb_height, min(low, max_range), max_range)
+    if high < np.inf and _raised(ground, start[0] + high * way[0], start[1] + high * way[1]):
+        return high, 0.0
+    t, edge = low, 0.0
+    for i in range(2 + 2 * len(ground.crossings)):
+        axis, line = 1, ground.curb_left if i == 0 else ground.curb_right
+        if i >= 2:
+            axis, line = 0, ground.crossings[(i - 2) // 2, i % 2]
+        at = (line - start[axis]) / way[axis]
+        if high < at < t:
+            beyond = at + 1e-4  # a hair
+            if _raised(ground, start[0] + beyond * way[0], start[1] + beyond * way[1]):
+                t, edge = at, abs(way[axis])
+    return t, edge
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _meet_tufts(ground, start, way, t, cosine):
+    """Range of the first tuft or bump met before the ground at t, else t: looked for where a ray is
+    low enough, from the sensor on, in TUFT_STEPS steps."""
+    step = min(max(ground.rough, ground.litter) / cosine, TUFTS_HIDE) / TUFT_STEPS
+    end, begin = start[1] + t * way[1], start[1] + (t - TUFT_STEPS * step) * way[1]
+    left, right = ground.curb_left - ground.parking, ground.curb_right + ground.parking
+    first = TUFT_STEPS - 1
+    if max(end, begin) <= left and min(end, begin) >= right:
+        first = 0  # the road itself is nowhere as high
+    for k in range(first, -1, -1):
+        back = k * step
+        top = tufts(ground, start[0] + (t - back) * way[0], start[1] + (t - back) * way[1],
+                    back * cosine)
+        above = top / cosine  # the ray is as high so far before t
+        if above > back:
+            return t - min(above, back + step)
+    return t
+
+
+@njit(cache=True, nogil=True)
+def tufts(ground, x, y, least):
+    """Height of what grows and lies at x, y, in patches with nearly bare ground between; 0 where it
+    is surely not above least."""
+    patch = min(max((_bumps(x / PATCH, y / PATCH) - BARE) * RISE, EVEN), 1.0)
+    if not patch * max(ground.rough, ground.litter) > least:
+        return 0.0
+    semantic, _ = _surface(ground, x, y)
+    most = ground.rough if semantic == ROAD or semantic == GRASS else ground.litter
+    return (PAVED if semantic == ROAD else patch) * most * _bumps(x, y)
+
+
+@njit(cache=True, nogil=True)
+def _surface(ground, x, y):
+    """Class and reflectance of the ground at x, y."""
+    beyond = max(y - ground.curb_left, ground.curb_right - y)
+    if _crossed(ground, x):
+        return ROAD, ground.road
+    if beyond >= 0:
+        return (SIDEWALK, ground.sidewalk) if beyond < ground.walk else (GRASS, ground.grass)
+    return ROAD if beyond < -ground.parking else PARKING, ground.road
+
+
+@njit(cache=True, nogil=True)
+def _bumps(x, y):
     """0 .. 1 at x, y: value noise, the same at a place for ever."""
     x, y = x / GRAIN, y / GRAIN
-    left, low = x.floor(), y.floor()
-    place = (left.long() << 32) + low.long()
+    left, low = math.floor(x), math.floor(y)
+    place = (np.int64(left) << 32) + np.int64(low)
     a, b = x - left, y - low
     a, b = a * a * (3 - 2 * a), b * b * (3 - 2 * b)
-    corner = [[uniform(0, place + (i << 32) + j) for j in (0, 1)] for i in (0, 1)]
-    return ((corner[0][0] * (1 - b) + corner[0][1] * b) * (1 - a)
-            + (corner[1][0] * (1 - b) + corner[1][1] * b) * a)
+    far = np.int64(1) << 32
+    near = uniform(0, np.uint64(place)) * (1 - b) + uniform(0, np.uint64(place + 1)) * b
+    next = uniform(0, np.uint64(place + far)) * (1 - b) + uniform(0, np.uint64(place + far + 1)) * b
+    return near * (1 - a) + next * a

@@ -2,23 +2,44 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from lidar_perception.simulation.sensor import STILL, Motion, Sensor
 from lidar_perception.simulation.solids import BOX, ELLIPSOID, Solids
 
-SIGNS = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).astype(np.float64)
-
 
 class Windows(NamedTuple):
     """Of P solids: first (P,) int64 column, 0 .. columns - 1, and how many from there count (P,)
-    int64, counted past the end; beams (P, rings) bool. No ray outside meets the solid."""
+    int64, counted past the end; beams (P, rings) bool. No ray outside meets the solid, and none
+    nearer than near (P,) m."""
 
     first: np.ndarray
     count: np.ndarray
     beams: np.ndarray
+    near: np.ndarray
+
+
+class Grid(NamedTuple):
+    """What the windows of all solids need of the sensor and its motion. rise and fall (rings,): the
+    steepest and the least steep of a beam's rays; lift (rings,) m; wide: margin in azimuth;
+    begin and end of the turn, seconds after the stamp; moves: whether anything does."""
+
+    columns: int
+    rate: float
+    stamp: float
+    yaw_rate: float
+    begin: float
+    end: float
+    wide: float
+    max_range: float
+    moves: bool
+    lift: np.ndarray
+    rise: np.ndarray
+    fall: np.ndarray
 
 
 def windows(solids: Solids, sensor: Sensor, motion: Motion = STILL,
@@ -27,77 +48,121 @@ def windows(solids: Solids, sensor: Sensor, motion: Motion = STILL,
     much from the sensor's. Beams that start over each other are taken as they are."""
     relative = solids.velocity - np.asarray(motion.velocity, np.float64)
     since = sensor.times() - motion.stamp / sensor.rate
-    whole = np.array([since.min(), since.max()])
-    still = not relative.any() and not motion.yaw_rate
-    span = np.tile(whole * (not still), (len(solids), 1))
-    # From the time of the whole turn a window; from it the time for which the sensor looks there.
-    for _ in range(1 if still else 3):
-        corners, sides = _hull(solids, relative, span)
-        first, count = _columns(corners, span * motion.yaw_rate, sensor, margin)
-        latest = sensor.columns // 2 - first
-        earliest = latest - count + 1
-        same_turn = latest // sensor.columns == earliest // sensor.columns
-        seen = np.stack([earliest, latest], axis=1) % sensor.columns / (
-            sensor.columns * sensor.rate) - motion.stamp / sensor.rate
-        span = np.where(same_turn[:, None], seen, whole)
-    near, beams = _beams(corners, sides, sensor, margin)
-    beams &= (near <= sensor.max_range)[:, None]
-    return Windows(first % sensor.columns, count, beams)
-
-
-def _hull(solids: Solids, relative: np.ndarray,
-          span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Corners (P, 16, 3) around a solid from one end of the span (P, 2) s to the other, and the
-    level directions (P, 3, 2) of its sides and of its bearing."""
-    ends = solids.centre[:, None] + relative[:, None] * span[..., None]
-    ahead = ends.mean(axis=1)[:, :2]
-    ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
-    zero = np.zeros(len(solids))
-    # Around what is round a box that faces the sensor is tighter than one along its axes.
-    facing = np.stack([np.column_stack([ahead, zero]),
-                       np.column_stack([-ahead[:, 1], ahead[:, 0], zero]),
-                       np.tile([0.0, 0.0, 1.0], (len(solids), 1))], axis=2)
-    reach = np.abs(np.swapaxes(facing, 1, 2) @ (solids.axes * solids.half[:, None]))
-    disc = np.hypot(reach[..., 0], reach[..., 1]) + reach[..., 2]
-    extent = np.where((solids.kind == ELLIPSOID)[:, None],
-                      np.sqrt((reach ** 2).sum(axis=2)), disc)
-    box = solids.kind == BOX
-    axes = np.where(box[:, None, None], solids.axes, facing)
-    half = np.where(box[:, None], solids.half, extent)
-    corners = np.swapaxes((axes * half[:, None]) @ SIGNS, 1, 2)
-    corners = (ends[:, :, None] + corners[:, None]).reshape(-1, 16, 3)
-    sides = np.stack([axes[:, :2, 0], axes[:, :2, 1], ahead], axis=1)
-    return corners, sides / np.maximum(np.linalg.norm(sides, axis=2), 1e-9)[..., None]
-
-
-def _columns(corners: np.ndarray, turned: np.ndarray, sensor: Sensor,
-             margin: float) -> tuple[np.ndarray, np.ndarray]:
-    """First column and how many, (P,) int64, for a sensor that has turned by (P, 2) radians."""
-    middle = np.arctan2(corners[..., 1].sum(axis=1), corners[..., 0].sum(axis=1))
-    bearing = np.arctan2(corners[..., 1], corners[..., 0]) - middle[:, None]
-    bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
-    low, high = bearing.min(axis=1), bearing.max(axis=1)
-    around = high - low >= np.pi  # the sensor is within the hull's shadow
-    wide = margin / np.cos(np.abs(sensor.elevations).max())
-    low, high = low - turned.max(axis=1) - wide, high - turned.min(axis=1) + wide
-    step = 2 * np.pi / sensor.columns
-    first = np.floor((middle + low) / step).astype(np.int64)
-    count = np.ceil((middle + high) / step).astype(np.int64) - first + 1
-    around |= count >= sensor.columns
-    return np.where(around, 0, first), np.where(around, sensor.columns, count)
-
-
-def _beams(corners: np.ndarray, sides: np.ndarray, sensor: Sensor,
-           margin: float) -> tuple[np.ndarray, np.ndarray]:
-    """How near the hull comes to the z axis (P,), and which beams reach its height (P, rings)."""
-    along = np.einsum("psi,pci->psc", sides, corners[..., :2])
-    near = np.maximum(along.min(axis=2), -along.max(axis=2)).max(axis=1).clip(0.0)
-    far = np.linalg.norm(corners[..., :2], axis=2).max(axis=1)
-    bottom, top = corners[..., 2].min(axis=1)[:, None], corners[..., 2].max(axis=1)[:, None]
-    lift = sensor.origins()[:, 2]
-    limit = np.pi / 2 - 1e-6
-    rise, fall = (np.tan(np.clip(np.asarray(sensor.elevations) + m, -limit, limit))
+    elevations, limit = np.asarray(sensor.elevations), np.pi / 2 - 1e-6
+    rise, fall = (np.tan(np.clip(elevations + m, -limit, limit))
                   for m in (margin + 1e-9, -margin - 1e-9))
-    highest = lift + np.maximum(near[:, None] * rise, far[:, None] * rise)
-    lowest = lift + np.minimum(near[:, None] * fall, far[:, None] * fall)
-    return near, (highest >= bottom) & (lowest <= top)
+    grid = Grid(sensor.columns, float(sensor.rate), float(motion.stamp), float(motion.yaw_rate),
+                float(since.min()), float(since.max()),
+                float(margin / np.cos(np.abs(elevations).max())),
+                float(sensor.max_range), bool(relative.any() or motion.yaw_rate),
+                sensor.origins()[:, 2].copy(), rise, fall)
+    count = len(solids)
+    found = Windows(np.empty(count, np.int64), np.empty(count, np.int64),
+                    np.empty((count, sensor.rings), bool), np.empty(count))
+    shapes = (np.array(part, float) for part in (solids.centre, solids.half, solids.axes, relative))
+    _windows(found, grid, np.array(solids.kind), *shapes)
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _windows(found, grid, kind, centre, half, axes, relative):
+    corners, facing, reach = np.empty((16, 3)), np.empty((3, 3)), np.empty(3)
+    for p in range(len(kind)):
+        # From the time of the whole turn a window; from it the time for which the sensor looks
+        # there.
+        begin, end = (grid.begin, grid.end) if grid.moves else (0.0, 0.0)
+        for _ in range(3 if grid.moves else 1):
+            ahead = _bearing(centre[p], relative[p], (begin + end) / 2)
+            _hull(corners, facing, reach, kind[p], centre[p], half[p], axes[p], relative[p], ahead,
+                  begin, end)
+            first, count = _columns(corners, grid, begin, end)
+            latest = grid.columns // 2 - first
+            earliest = latest - count + 1
+            begin, end = grid.begin, grid.end
+            if latest // grid.columns == earliest // grid.columns:
+                turn = grid.columns * grid.rate
+                begin = earliest % grid.columns / turn - grid.stamp / grid.rate
+                end = latest % grid.columns / turn - grid.stamp / grid.rate
+        found.first[p], found.count[p] = first % grid.columns, count
+        found.near[p] = _beams(corners, facing, ahead, grid, found.beams[p]) - 1e-6
+
+
+@njit(cache=True, nogil=True)
+def _bearing(centre, relative, since):
+    """The level direction to a solid."""
+    x, y = centre[0] + relative[0] * since, centre[1] + relative[1] * since
+    far = max(math.hypot(x, y), 1e-9)
+    return x / far, y / far
+
+
+@njit(cache=True, nogil=True)
+def _hull(corners, facing, reach, kind, centre, half, axes, relative, ahead, begin, end):
+    """Fills corners (16, 3) around a solid from begin to end, s, and the axes of the box that they
+    are: its own of a box; around what is round one that faces the sensor is tighter."""
+    if kind == BOX:
+        facing[:] = axes
+        reach[:] = half
+    else:
+        facing[:] = 0.0
+        facing[0, 0], facing[1, 0] = ahead
+        facing[0, 1], facing[1, 1] = -ahead[1], ahead[0]
+        facing[2, 2] = 1.0
+        for i in range(3):
+            a, b, c = 0.0, 0.0, 0.0
+            for j in range(3):
+                a += facing[j, i] * axes[j, 0] * half[0]
+                b += facing[j, i] * axes[j, 1] * half[1]
+                c += facing[j, i] * axes[j, 2] * half[2]
+            reach[i] = math.sqrt(a * a + b * b + (c * c)) if kind == ELLIPSOID else (
+                math.sqrt(a * a + b * b) + abs(c))
+    for n in range(16):
+        since = begin if n < 8 else end
+        for i in range(3):
+            corners[n, i] = centre[i] + relative[i] * since
+            for j in range(3):
+                corners[n, i] += facing[i, j] * (reach[j] if n >> j & 1 else -reach[j])
+
+
+@njit(cache=True, nogil=True)
+def _columns(corners, grid, begin, end):
+    """First column and how many, of a sensor that turns meanwhile."""
+    x, y = 0.0, 0.0
+    for n in range(16):
+        x, y = x + corners[n, 0], y + corners[n, 1]
+    middle, low, high = math.atan2(y, x), np.inf, -np.inf
+    for n in range(16):
+        bearing = math.atan2(corners[n, 1], corners[n, 0]) - middle
+        bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
+        low, high = min(low, bearing), max(high, bearing)
+    around = high - low >= np.pi  # the sensor is within the hull's shadow
+    turned = grid.yaw_rate * begin, grid.yaw_rate * end
+    low, high = low - max(turned) - grid.wide, high - min(turned) + grid.wide
+    step = 2 * np.pi / grid.columns
+    first = math.floor((middle + low) / step)
+    count = math.ceil((middle + high) / step) - first + 1
+    if around or count >= grid.columns:
+        return 0, grid.columns
+    return first, count
+
+
+@njit(cache=True, nogil=True)
+def _beams(corners, facing, ahead, grid, beams):
+    """Fills which beams (rings,) reach the height of the hull; how near that comes to the z
+    axis."""
+    near, far, bottom, top = 0.0, 0.0, np.inf, -np.inf
+    for side in range(3):  # level directions: of two sides of the hull and of its bearing
+        x, y = ahead if side == 2 else (facing[0, side], facing[1, side])
+        long = max(math.hypot(x, y), 1e-9)
+        least, most = np.inf, -np.inf
+        for n in range(16):
+            along = (x * corners[n, 0] + y * corners[n, 1]) / long
+            least, most = min(least, along), max(most, along)
+        near = max(near, least, -most)
+    for n in range(16):
+        far = max(far, math.hypot(corners[n, 0], corners[n, 1]))
+        bottom, top = min(bottom, corners[n, 2]), max(top, corners[n, 2])
+    for r in range(len(beams)):
+        highest = grid.lift[r] + max(near * grid.rise[r], far * grid.rise[r])
+        lowest = grid.lift[r] + min(near * grid.fall[r], far * grid.fall[r])
+        beams[r] = highest >= bottom and lowest <= top and near <= grid.max_range
+    return near

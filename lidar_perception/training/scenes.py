@@ -84,7 +84,7 @@ def random_split(names: tuple[str, ...], share: float,
 @dataclass(frozen=True)
 class SimulatedScenes:
     """count scans of the streets first, first + 1, ..., of each so many, spread over its drive. To
-    make a street takes longer than to scan it. cache: folder for scans, or None; from cache_gb on
+    make a street takes as long as to scan it. cache: folder for scans, or None; from cache_gb on
     nothing is added to it."""
 
     first: int

@@ -15,7 +15,7 @@ from lidar_perception.data.semantickitti import MOVING, THINGS
 from lidar_perception.geometry import box_corners, points_in_box, wrap_angle
 from lidar_perception.simulation.batch import training_scans
 from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
-from lidar_perception.simulation.drive import scan_at, scans, scans_at
+from lidar_perception.simulation.drive import scan_at, scans
 from lidar_perception.simulation.scene import CROWDED
 from lidar_perception.simulation.sensor import SENSORS
 
@@ -192,16 +192,6 @@ def test_labels_without_objects_read_back(tmp_path):
     text = write_kitti.tracking_label_text(0, nothing, FORWARD_CAMERA)
     (tmp_path / "0000.txt").write_text(text)
     assert read_tracking_labels(tmp_path / "0000.txt", np.eye(4)) == {}
-
-
-def test_scans_that_are_cast_together_are_those_cast_alone():
-    places = [(3, 0), (5, 0), (3, 2)]
-    for scan, place in zip(scans_at(places, TINY), places):
-        alone = scan_at(*place, TINY)
-        assert np.array_equal(scan.frame.xyz, alone.frame.xyz)
-        assert np.array_equal(scan.instance, alone.instance)
-        assert np.array_equal(scan.truth.boxes, alone.truth.boxes)
-        assert scan.truth.extras == alone.truth.extras
 
 
 def test_training_scans_are_the_streets_in_order():

@@ -216,7 +216,7 @@ def test_meet_equals_many_looks_at_short_intervals():
     rows[::3, SPEED] = 0.0
     rows[1::3, 6:] = 0.0, np.inf
     one, many = rows[0] + [0, 0, 0, 0, 0, 1, 0, 0], rows[1:]
-    fast = meet(one, many, 5.0)
+    fast = np.array([meet(one, row, 5.0, 0.0) for row in many])
     slow = np.zeros(len(many), bool)
     for t in np.linspace(0.0, 5.0, 501):
         boxes = flat_boxes(rows, t)
@@ -224,4 +224,4 @@ def test_meet_equals_many_looks_at_short_intervals():
         slow[[j - 1 for i, j in overlaps(boxes, 1)]] = True
     assert 20 < fast.sum() < 100
     assert (fast >= slow).all() and (fast != slow).sum() <= 2  # touched for less than an interval
-    assert np.array_equal(fast, [meet(row, one[None], 5.0)[0] for row in many])
+    assert np.array_equal(fast, [meet(row, one, 5.0, 0.0) for row in many])

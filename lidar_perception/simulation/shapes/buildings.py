@@ -19,12 +19,12 @@ def building(rng: np.random.Generator, length: float, depth: float, storeys: int
     front by up to 1.2 m; at most 40 parts for 15 m and four storeys."""
     x, tone = length / 2, rng.uniform(0.25, 0.55)  # half of SemanticKITTI's: 0.34 to 0.52
     ground, storey = rng.uniform(2.9, 3.8), rng.uniform(2.7, 3.2)
-    floors = ground + storey * np.arange(storeys)  # the upper faces of the ceilings
-    top = float(floors[-1])
+    floors = [ground + storey * i for i in range(storeys)]  # the upper faces of the ceilings
+    top = floors[-1]
     wall = dict(reflectance=tone)
     count = max(int(length / rng.uniform(2.8, 4.0)), 1)
     pitch, pier = length / count, rng.uniform(0.35, 0.6)
-    places = (np.arange(count + 1) - count / 2) * pitch
+    places = [(i - count / 2) * pitch for i in range(count + 1)]
     rows = [block((-x, ROOM, FOOT), (x, depth, top), reflectance=0.2)]
     rows += [block((max(at - pier * pitch / 2, -x), 0, FOOT), (min(at + pier * pitch / 2, x), 0.35,
                                                                top), **wall) for at in places]
@@ -50,7 +50,7 @@ def building(rng: np.random.Generator, length: float, depth: float, storeys: int
     return parts(rows, BUILDING)
 
 
-def _front_of(rng: np.random.Generator, below: float, sill: float, x: float, places: np.ndarray,
+def _front_of(rng: np.random.Generator, below: float, sill: float, x: float, places: list[float],
               pitch: float) -> list[tuple]:
     """A sill along an upper storey, or a balcony on it, or nothing."""
     pick = rng.random()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from math import cos, pi, sin
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +48,7 @@ class Rider(NamedTuple):
 def cyclist(rng: np.random.Generator) -> Thing:
     """Someone who rides; the box's length is the bicycle's, its width the handlebar's."""
     size = draw_size(rng, CLASSES[CYCLIST])
-    rider = Rider(size, rng.uniform(0.15, 0.6), rng.uniform(0, 2 * np.pi), rng.uniform(0.1, 0.8),
+    rider = Rider(size, rng.uniform(0.15, 0.6), rng.uniform(0, 2 * pi), rng.uniform(0.1, 0.8),
                   rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75), rng.uniform(0.15, 0.75),
                   ("", "basket", "backpack")[rng.integers(3)])
     return Thing(partial(riding, rider=rider), size, CLASSES[CYCLIST])
@@ -58,9 +59,9 @@ def riding(travelled: float, rider: Rider) -> np.ndarray:
     half of the beams pass."""
     length, width, height = rider.size
     seat = 0.53 * height
-    trunk = (height - seat) / (0.31 * np.cos(rider.lean) + 0.16)  # the rider's height
+    trunk = (height - seat) / (0.31 * cos(rider.lean) + 0.16)  # the rider's height
     hip = (-0.13 * length, seat)
-    ahead, up = np.sin(rider.lean), np.cos(rider.lean)
+    ahead, up = sin(rider.lean), cos(rider.lean)
 
     def along(share: float) -> tuple[float, float]:
         return hip[0] + share * trunk * ahead, seat + share * trunk * up
@@ -77,9 +78,9 @@ def riding(travelled: float, rider: Rider) -> np.ndarray:
              reflectance=rider.coat),
         part(ELLIPSOID, (hip[0], 0.0, seat + 0.02), (0.16, min(0.17, 0.4 * width), 0.11),
              reflectance=rider.trousers)]
-    turn = rider.phase + 2 * np.pi * travelled / GEAR
-    for side, at in ((-1, turn), (1, turn + np.pi)):
-        foot = (-0.02 * length + CRANK * np.sin(at), 0.17 * height + CRANK * np.cos(at))
+    turn = rider.phase + 2 * pi * travelled / GEAR
+    for side, at in ((-1, turn), (1, turn + pi)):
+        foot = (-0.02 * length + CRANK * sin(at), 0.17 * height + CRANK * cos(at))
         thigh, shank = THIGH * trunk, SHANK * trunk
         x, z = knee(hip, foot, thigh, shank)
         y = side * 0.11

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from math import cos, hypot, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,7 @@ from lidar_perception.simulation.shapes.thing import (
     rigid,
     rod,
 )
-from lidar_perception.simulation.solids import BOX, ELLIPSOID, extents, part, parts
+from lidar_perception.simulation.solids import BOX, ELLIPSOID, hull, part, parts
 
 PERSON, OTHER = 30, 99
 CARRIED = ("", "backpack", "bag", "umbrella", "trolley", "pram")
@@ -62,7 +63,7 @@ def pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
     if child:
         shrink = rng.uniform(0.62, 0.8)
         width, height = width * max(shrink, 0.7), height * shrink
-    step = min(np.sqrt(60 * 0.0065 * abs(speed)) * height / 1.72, 0.5 * height)
+    step = min(sqrt(60 * 0.0065 * abs(speed)) * height / 1.72, 0.5 * height)
     build = Build(height, max(width, 0.27 * height), step, rng.uniform(), rng.uniform(0.03, 0.3),
                   rng.uniform(0.2, 0.85), rng.uniform(0.15, 0.75), carried)
     low, high = _covered(build)
@@ -74,43 +75,57 @@ def pedestrian(rng: np.random.Generator, speed: float, child: bool = False,
 def _covered(build: Build) -> tuple[float, float]:
     """The least and largest x over a stride; both halves of it are alike."""
     body = build._replace(carried="backpack" if build.carried == "backpack" else "", phase=0.0)
-    poses = np.arange(12) / 12 * build.step if build.step else [0.0]
-    low, high = extents(np.concatenate([walker(x, body) for x in poses]))
-    return float(low[:, 0].min()), float(high[:, 0].max())
+    poses = [_limbs(i / 24, body) for i in range(12 if build.step else 1)]
+    rows = [row for limbs, _ in poses for row in limbs] + _trunk(body, 0.0)
+    low, _, _, high, _, _ = hull(parts(rows, PERSON))
+    return low, high
 
 
 def walker(travelled: float, build: Build) -> np.ndarray:
     """(P,) PART of a walker after so many metres; the last two rows before what is carried are the
     feet, right and left. A foot on the ground stays where it is, and the hips sink as far as the
     legs spread, so that the height is the box's when a leg is upright below the hips."""
-    h, w, _, _, hair, coat, trousers, carried, shift = build
     turns = build.phase + (travelled / (2 * build.step) if build.step else 0.0)
-    feet = [_foot((turns + half) % 1.0, 2 * build.step, h) for half in (0.0, 0.5)]
-    hip = min(HIP * h, *(z + np.sqrt((REACH * h) ** 2 - min(0.88 * abs(x), 0.9 * REACH * h) ** 2)
-                         for _, _, (x, z) in feet))
-    up = hip - HIP * h
-    rows = [
+    limbs, up = _limbs(turns, build)
+    trunk = _trunk(build, up)
+    made = parts(trunk[:5] + limbs + trunk[5:], PERSON)
+    made["centre"][:, 0] += build.shift
+    return made
+
+
+def _trunk(build: Build, up: float) -> list[tuple]:
+    """Head, neck, chest and hips, and what is carried, so much higher than at rest."""
+    h, w = build.height, build.width
+    return [
         part(ELLIPSOID, (0.012 * h, 0, 0.93 * h + up), (0.055 * h, 0.045 * h, 0.068 * h),
              reflectance=SKIN),
         part(ELLIPSOID, (-0.012 * h, 0, 0.948 * h + up), (0.05 * h, 0.047 * h, 0.052 * h),
-             reflectance=hair),
+             reflectance=build.hair),
         rod((0, 0, 0.8 * h + up), (0.005 * h, 0, 0.89 * h + up), 0.032 * h, reflectance=SKIN),
         part(ELLIPSOID, (0, 0, 0.70 * h + up), (0.08 * h, min(0.125 * h, 0.42 * w), 0.15 * h),
-             reflectance=coat),
+             reflectance=build.coat),
         part(ELLIPSOID, (0, 0, 0.54 * h + up), (0.075 * h, min(0.105 * h, 0.38 * w), 0.11 * h),
-             reflectance=trousers)]
+             reflectance=build.trousers),
+        *_load(build.carried, h, w, up, build.coat)]
+
+
+def _limbs(turns: float, build: Build) -> tuple[list[tuple], float]:
+    """Arms, legs and feet after so many strides, and how much higher than at rest the hips are."""
+    h = build.height
+    feet = [_foot((turns + half) % 1.0, 2 * build.step, h) for half in (0.0, 0.5)]
+    hip = min(HIP * h, *(z + sqrt((REACH * h) ** 2 - min(0.88 * abs(x), 0.9 * REACH * h) ** 2)
+                         for _, _, (x, z) in feet))
+    up, rows = hip - HIP * h, []
     for side, (u, left) in zip((-1, 1), ((turns + 0.5, False), (turns, True))):
         rows += _arm(side, u, build, up, left)
     for side, (_, _, ankle) in zip((-1, 1), feet):
-        rows += _leg(side, ankle, hip, h, trousers)
+        rows += _leg(side, ankle, hip, h, build.trousers)
     for side, (toe, tilt, _) in zip((-1, 1), feet):
-        cos, sin, half = np.cos(tilt), np.sin(tilt), FOOT * h / 2
-        rows.append(part(BOX, (toe[0] - half * cos + 0.02 * h * sin, side * 0.055 * h,
-                               toe[1] + half * sin + 0.02 * h * cos),
+        flat, steep, half = cos(tilt), sin(tilt), FOOT * h / 2
+        rows.append(part(BOX, (toe[0] - half * flat + 0.02 * h * steep, side * 0.055 * h,
+                               toe[1] + half * steep + 0.02 * h * flat),
                          (half, 0.03 * h, 0.02 * h), pitch=tilt, reflectance=RUBBER))
-    made = parts(rows + _load(carried, h, w, up, coat), PERSON)
-    made["centre"][:, 0] += shift
-    return made
+    return rows, up
 
 
 def _foot(u: float, stride: float, h: float) -> tuple[tuple, float, tuple]:
@@ -124,12 +139,12 @@ def _foot(u: float, stride: float, h: float) -> tuple[tuple, float, tuple]:
         v = (u - STANCE) / (1 - STANCE)
         smooth = v * v * (3 - 2 * v)
         x = stride * (STANCE * (smooth - 0.5))
-        lift, rise = 0.03 * stride * np.sin(np.pi * v), 1.0 - smooth
+        lift, rise = 0.03 * stride * sin(pi * v), 1.0 - smooth
     tilt = most * rise
     ahead = 0.7 * FOOT * h  # from the ankle to the tip
-    cos, sin = np.cos(tilt), np.sin(tilt)
+    flat, steep = cos(tilt), sin(tilt)
     toe = (x + ahead, lift)
-    ankle = (toe[0] - ahead * cos + ANKLE * h * sin, lift + ahead * sin + ANKLE * h * cos)
+    ankle = (toe[0] - ahead * flat + ANKLE * h * steep, lift + ahead * steep + ANKLE * h * flat)
     return toe, tilt, ankle
 
 
@@ -146,11 +161,11 @@ def _leg(side: int, ankle: tuple, hip: float, h: float, trousers: float) -> list
 def knee(hip: tuple, ankle: tuple, thigh: float, shank: float) -> tuple[float, float]:
     """Where the knee is (x, z) between a hip and an ankle (x, z)."""
     x, z = ankle[0] - hip[0], ankle[1] - hip[1]
-    far = np.hypot(x, z)
+    far = hypot(x, z)
     x, z = x / far, z / far
     far = min(far, 0.9999 * (thigh + shank))
     along = (thigh ** 2 - shank ** 2 + far ** 2) / (2 * far)
-    bend = np.sqrt(max(thigh ** 2 - along ** 2, 0.0))
+    bend = sqrt(max(thigh ** 2 - along ** 2, 0.0))
     return hip[0] + along * x - bend * z, hip[1] + along * z + bend * x
 
 
@@ -158,7 +173,7 @@ def _arm(side: int, u: float, build: Build, up: float, left: bool) -> list[tuple
     """Upper arm and forearm, which swings with the other leg, or holds what is carried. The
     forearm reaches the width of the box."""
     h, w, coat = build.height, build.width, build.coat
-    swing = 0.45 * min(build.step / (0.43 * h), 1.2) * np.cos(2 * np.pi * u)
+    swing = 0.45 * min(build.step / (0.43 * h), 1.2) * cos(2 * pi * u)
     bend = 0.3 if build.step else build.phase  # who stands holds the arms in many ways
     if build.carried == "pram" or (build.carried == "umbrella" and left):
         swing, bend = 0.2, (1.1 if build.carried == "pram" else 2.2)
@@ -167,9 +182,9 @@ def _arm(side: int, u: float, build: Build, up: float, left: bool) -> list[tuple
     radius = 0.03 * h
     y = side * (w / 2 - radius)
     shoulder = (0.0, side * min(0.115 * h, w / 2 - 2 * radius), SHOULDER * h + up)
-    elbow = (UPPER_ARM * h * np.sin(swing), y, shoulder[2] - UPPER_ARM * h * np.cos(swing))
-    hand = (elbow[0] + FOREARM * h * np.sin(swing + bend), y,
-            elbow[2] - FOREARM * h * np.cos(swing + bend))
+    elbow = (UPPER_ARM * h * sin(swing), y, shoulder[2] - UPPER_ARM * h * cos(swing))
+    hand = (elbow[0] + FOREARM * h * sin(swing + bend), y,
+            elbow[2] - FOREARM * h * cos(swing + bend))
     return [rod(shoulder, elbow, radius, reflectance=coat),
             rod(elbow, hand, radius, reflectance=coat)]
 

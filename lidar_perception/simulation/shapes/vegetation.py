@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from math import cos, pi, sin
+
 import numpy as np
 
-from lidar_perception.simulation.shapes.thing import rod
+from lidar_perception.simulation.shapes.thing import between, rod
 from lidar_perception.simulation.solids import BOX, ELLIPSOID, part, parts
 
 VEGETATION, TRUNK = 70, 71
 BARK, LEAVES = 0.31, 0.34  # medians of trunk and vegetation in a scan of SemanticKITTI
+WOOD = {"reflectance": BARK, "semantic": TRUNK}
 
 
 def tree(rng: np.random.Generator, height: float | None = None) -> np.ndarray:
@@ -18,38 +21,41 @@ def tree(rng: np.random.Generator, height: float | None = None) -> np.ndarray:
     height = rng.uniform(4.0, 11.0) if height is None else height
     fork, radius = height * rng.uniform(0.33, 0.42), height * rng.uniform(0.016, 0.026)
     top = (*rng.uniform(-0.03, 0.03, 2) * height, 0.75 * height)
-    rows = [rod((0, 0, -0.3), (0, 0, fork), radius, reflectance=BARK),
-            rod((0, 0, fork), top, 0.6 * radius, reflectance=BARK)]
+    rows = [rod((0, 0, -0.3), (0, 0, fork), radius, **WOOD),
+            rod((0, 0, fork), top, 0.6 * radius, **WOOD)]
     turn, spread = rng.uniform(0, 2 * np.pi), height * rng.uniform(0.1, 0.2)
-    for at in turn + np.arange(2) * np.pi:
-        end = (spread * np.cos(at), spread * np.sin(at), 0.62 * height)
-        rows.append(rod((0, 0, fork), end, 0.4 * radius, reflectance=BARK))
-    made = parts(rows, TRUNK)
+    for at in (turn, turn + pi):
+        end = (spread * cos(at), spread * sin(at), 0.62 * height)
+        rows.append(rod((0, 0, fork), end, 0.4 * radius, **WOOD))
     wide, tall = height * rng.uniform(0.2, 0.3), height - fork
     leaves = [_foliage(rng, (0, 0, fork + 0.55 * tall), (wide, wide, 0.45 * tall), (0.4, 1.0))]
-    for at in turn + 1.0 + np.arange(3) * 2.1:
-        small = height * rng.uniform((0.12, 0.12, 0.1), (0.2, 0.2, 0.16))
-        leaves.append(_foliage(rng, (0.7 * wide * np.cos(at), 0.7 * wide * np.sin(at),
-                                     fork + tall * rng.uniform(0.25, 0.7)), small, (0.6, 2.0)))
-    return np.concatenate([made, parts(leaves, VEGETATION)])
+    for i, (a, b, c, up, *rest) in enumerate(rng.random((3, 7)).tolist()):
+        at = turn + 1.0 + 2.1 * i
+        centre = 0.7 * wide * cos(at), 0.7 * wide * sin(at), fork + tall * between(up, 0.25, 0.7)
+        half = (height * between(a, 0.12, 0.2), height * between(b, 0.12, 0.2),
+                height * between(c, 0.1, 0.16))
+        leaves.append(_leaves(rest, centre, half, (0.6, 2.0)))
+    return parts(rows + leaves, VEGETATION)
 
 
 def conifer(rng: np.random.Generator) -> np.ndarray:
     """(P,) PART of a conifer with boughs down to the ground."""
     height = rng.uniform(2.5, 9.0)
-    stem = parts([rod((0, 0, -0.3), (0, 0, 0.8 * height), 0.015 * height, reflectance=BARK)], TRUNK)
+    stem = rod((0, 0, -0.3), (0, 0, 0.8 * height), 0.015 * height, **WOOD)
     tall = 0.2 * height
     rows = [_foliage(rng, (0, 0, max(z * height, tall + 0.1)), (r * height, r * height, tall),
                      (1.0, 2.0)) for z, r in ((0.2, 0.2), (0.4, 0.16), (0.6, 0.11), (0.8, 0.06))]
-    return np.concatenate([stem, parts(rows, VEGETATION)])
+    return parts([stem, *rows], VEGETATION)
 
 
 def bush(rng: np.random.Generator) -> np.ndarray:
     """(P,) PART of a bush, 0.6 to 2 m high: three overlapping balls of leaves."""
     high = rng.uniform(0.3, 1.0)
-    rows = [_foliage(rng, (*rng.uniform(-0.5, 0.5, 2) * high, 0.8 * high),
-                     high * rng.uniform((0.6, 0.6, 0.8), (1.1, 1.1, 1.2)), (1.5, 5.0))
-            for _ in range(3)]
+    rows = []
+    for x, y, a, b, c, *rest in rng.random((3, 8)).tolist():
+        half = high * between(a, 0.6, 1.1), high * between(b, 0.6, 1.1), high * between(c, 0.8, 1.2)
+        rows.append(_leaves(rest, ((x - 0.5) * high, (y - 0.5) * high, 0.8 * high), half,
+                            (1.5, 5.0)))
     return parts(rows, VEGETATION)
 
 
@@ -65,5 +71,11 @@ def hedge(rng: np.random.Generator, length: float) -> np.ndarray:
 
 
 def _foliage(rng: np.random.Generator, centre: tuple, half: tuple, density: tuple) -> tuple:
-    return part(ELLIPSOID, tuple(centre), tuple(half), yaw=rng.uniform(0, np.pi),
-                reflectance=LEAVES * rng.uniform(0.8, 1.25), density=rng.uniform(*density))
+    return _leaves(rng.random(3).tolist(), centre, half, density)
+
+
+def _leaves(drawn: list[float], centre: tuple, half: tuple, density: tuple) -> tuple:
+    """A ball of leaves; drawn: three numbers 0 .. 1 for its yaw, reflectance and density."""
+    turn, tone, thick = drawn
+    return part(ELLIPSOID, centre, half, yaw=turn * pi,
+                reflectance=LEAVES * between(tone, 0.8, 1.25), density=between(thick, *density))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import copysign
 from typing import NamedTuple
 
 import numpy as np
@@ -158,7 +159,7 @@ def body(size: tuple[float, float, float], style: Style, colour: float, glass: f
 
 def _bumper(x: float, y: float, height: float, surface: dict) -> tuple:
     """What reaches x in its middle, rounded seen from above and from the side."""
-    return part(ELLIPSOID, (x - np.sign(x) * 0.5, 0.0, BUMPER * height), (0.5, y, 0.17 * height),
+    return part(ELLIPSOID, (x - copysign(0.5, x), 0.0, BUMPER * height), (0.5, y, 0.17 * height),
                 **surface)
 
 
