@@ -68,7 +68,7 @@ _ready: dict = {}  # in a worker
 def _prepare(scans: list[LidarFrame]) -> None:
     import torch
     torch.set_num_threads(len(os.sched_getaffinity(0)))  # as the nodes do
-    _ready.update(detector=open_detector(), scans=scans)
+    _ready.update(detector=open_detector("pointpillars"), scans=scans)
 
 
 def _times() -> list[float]:

@@ -88,7 +88,7 @@ def detected(detector: Detector, xyz: np.ndarray, intensity: np.ndarray, labels)
 
 def measure(streets: int) -> None:
     """Print the table."""
-    detector = open_detector()
+    detector = open_detector("pointpillars")
     rows: dict[tuple, list[float]] = defaultdict(list)
     speeds = []
     for seed in range(streets):

@@ -16,7 +16,8 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.scoring.tracking.pairs import tracked_labels
-from lidar_perception.scoring.tracking.report import TrackingReport, observe
+from lidar_perception.scoring.tracking.report import TrackingReport, ego_of, observe
+from lidar_perception.tracking.ego import Odometry
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, GroundTruth
@@ -42,14 +43,18 @@ def measure_recording(recording: Recording) -> dict:
     in the labels."""
     if not recording.frames or not recording.frames[0].sequence:
         return {}
-    detector = open_detector(min_score=MIN_SCORE,
+    detector = open_detector("pointpillars", min_score=MIN_SCORE,
                              sensor_height=recording.frames[0].sensor_height)
     drives: dict[str, list[Seen]] = {}
+    by_scans = ego_of(recording) == "kiss_icp"
     for frame in track(recording, "detecting", len(recording)):
-        truth = frame.truth()
+        truth, scan = frame.truth(), frame.load()
         if truth is not None and all("track_id" in extra for extra in truth.extras):
+            if frame.sequence not in drives:
+                motion = Odometry() if by_scans else None
             drives.setdefault(frame.sequence, []).append(
-                Seen(detector(frame.load()).detections, truth, frame.stamp_ns, frame.pose()))
+                Seen(detector(scan).detections, truth, frame.stamp_ns,
+                     motion(scan.xyz) if motion else frame.pose()))
     return measure_tracking(drives, recording.frames[0].calibration()) if drives else {}
 
 

@@ -1,6 +1,6 @@
 """Makes docs/nodes/*.md from the parameter dataclasses, config/best.param.yaml from
-configurations.py, and config/pointpillars.param.yaml and config/pointnet.param.yaml from the
-detectors': python docs/generate.py
+configurations.py, and those of the detectors with a network from their parameters:
+python docs/generate.py
 
 test/test_docs.py holds that the pages are up to date and the topics those of the running nodes.
 """
@@ -15,14 +15,15 @@ import yaml
 from lidar_perception import params
 from lidar_perception.candidates.configurations import BEST_VALUES
 from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.detectors.fused.params import FusedDetectorParams
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
 from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.main import node_parameters
 from lidar_perception.param_fields import flatten
 
 CONFIG = Path(__file__).parents[1] / "config"
-BEST, POINTPILLARS, POINTNET = (CONFIG / f"{name}.param.yaml"
-                                for name in ("best", "pointpillars", "pointnet"))
+BEST = CONFIG / "best.param.yaml"
+NETWORKS = "pointpillars", "pointnet", "fused"  # detectors/NAME, the node NAME_detector
 FOLDER = Path(__file__).parent / "nodes"
 CLOUD, MARKERS = "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray"
 STRING_TIMES = "std_msgs/Float64"
@@ -40,10 +41,11 @@ SEED_IN = [
      "click, in the frame of the cloud or, with TF, in any that is connected with it."),
 ]
 ROBOT_IN = [
-    ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves; only with `input.deskew` "
-     "odometry."),
+    ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves, for `input.deskew` "
+     "odometry, and where there is a tracker for `ego.source` auto and odometry."),
     ("/tf, /tf_static", "tf2_msgs/TFMessage", "Where tf2_msgs is installed; /tf only with "
-     "`base_frame`, `target_frame`, `input.deskew` tf, or a click."),
+     "`base_frame`, `target_frame`, `input.deskew` or `ego.source` tf, a click, or a tracker "
+     "without odometry."),
 ]
 DETECTIONS_3D = ("~/output/detections_3d", "vision_msgs/Detection3DArray", "The same, where "
                  "vision_msgs is installed.")
@@ -155,11 +157,25 @@ PAGES: dict[str, dict[str, Any]] = {
         outputs=[*BOXES_OUT,
                  ("~/debug/preprocess_ms, ground_ms, clustering_ms, network_ms, postprocess_ms",
                   STRING_TIMES, "Time of each step.")]),
+    "fused_detector": dict(
+        params=FusedDetectorParams(),
+        what="Detects cars, pedestrians and cyclists: PointPillars proposes, silhouettes and the "
+             "cluster network judge, and the score is the probability that something is there, see "
+             "[fused](../fused.md). Loads and warms up before it subscribes. Without weights it "
+             "says so in a diagnostic and publishes nothing, and it warns as pointpillars_detector "
+             "does. Files: `launch/fused.launch.py`, `config/fused.param.yaml`.",
+        inputs=[("~/input/points", CLOUD, "Any field layout, byte order and shape. The columns "
+                 "`ground`, and for PointPillars `cluster_id`, are used where they are there; what "
+                 "is missing is computed, and so are the clusters of people.")],
+        outputs=[*BOXES_OUT,
+                 ("~/debug/preprocess_ms, ground_ms, proposals_ms, clusters_ms, evidence_ms, "
+                  "fusion_ms", STRING_TIMES, "Time of each step.")]),
     "tracker": dict(
         params=params.TrackerNodeParams(),
         what="Follows the detections of any detector: ids that stay, velocities, and scores that "
              "are the evidence over time, see [tracking](../tracking.md). A frame that was lost is "
-             "predicted over; one that is late, or has the stamp of the last one, is not answered; "
+             "predicted over with the next one, and has no answer of its own; one that is late, or "
+             "has the stamp of the last one, is not answered; "
              "time that jumps, as of a bag that is played again, ends all tracks. Warns of "
              "what is wrong with a frame or the poses. The detector nodes do the same in their "
              "own process with `tracking.enabled`, then from weak detections too. Files: the "
@@ -168,8 +184,9 @@ PAGES: dict[str, dict[str, Any]] = {
                  "as JSON. A frame without any is a DELETE or DELETEALL with its header."),
                 ("~/input/detections_3d", "vision_msgs/Detection3DArray", "Or this, where "
                  "vision_msgs is installed; one of both."),
-                ("~/input/odometry", "nav_msgs/Odometry", "How the sensor moves, for `ego.source` "
-                 "auto and odometry; for kiss_icp it is ~/input/points (PointCloud2).")],
+                ("~/input/odometry", "nav_msgs/Odometry", "How the robot moves, for `ego.source` "
+                 "auto and odometry. For kiss_icp, and auto where no poses come, ~/input/points "
+                 "(PointCloud2) has the scans.")],
         outputs=TRACKS_OUT),
     "evaluator": dict(
         params=params.EvaluatorParams(),
@@ -210,7 +227,9 @@ def page(name: str) -> str:
     node = PAGES[name]
     lines = [f"# {name}", "", node["what"], "",
              f"    ros2 run lidar_perception {name}      # or: lidar-perception run {name}", ""]
-    robot = ROBOT_IN if "base_frame" in node_parameters(name) else []
+    own = {topic for topic, *_ in node["inputs"]}
+    robot = [row for row in ROBOT_IN if "base_frame" in node_parameters(name)
+             and row[0] not in own]
     for title, rows in (("Subscribes", node["inputs"] + robot), ("Publishes", outputs(name)),
                         ("Services", MANAGED_SERVICES if _managed(name)
                          else node.get("services", []))):
@@ -234,25 +253,19 @@ def best() -> str:
                            "configurations.py), for nodes", BEST_VALUES)
 
 
-def pointpillars() -> str:
-    """The parameter file of the PointPillars detector's graph."""
-    return _shared_numbers("The detector's experts (detectors/pointpillars/params.py)",
-                           DetectorParams())
+def config_file(network: str) -> Path:
+    """The parameter file of a detector's graph."""
+    return CONFIG / f"{network}.param.yaml"
 
 
-def pointnet() -> str:
-    """The parameter file of the PointNet detector's graph."""
-    return _shared_numbers("The ground and clusters of detectors/pointnet/params.py",
-                           PointNetDetectorParams())
-
-
-def _shared_numbers(what: str, detector: Any) -> str:
-    """A detector's numbers for the nodes that find ground and clusters."""
+def config(network: str) -> str:
+    """What is in it: the detector's numbers for the nodes that find ground and clusters."""
     shared = (params.GroundNodeParams(), params.ClusteringNodeParams())
     defaults = {key: value for group in shared for key, value in flatten(group).items()}
-    values = {key: value for key, value in flatten(detector).items()
+    values = {key: value for key, value in flatten(PAGES[f"{network}_detector"]["params"]).items()
               if key in defaults and value != defaults[key]}
-    return _parameter_file(f"{what}, for the nodes that find ground and clusters", values)
+    return _parameter_file(f"The ground and clusters of detectors/{network}/params.py, for the "
+                           "nodes that find ground and clusters", values)
 
 
 def _parameter_file(what: str, values: dict[str, Any]) -> str:
@@ -290,5 +303,5 @@ if __name__ == "__main__":
     for name in PAGES:
         (FOLDER / f"{name}.md").write_text(page(name))
     BEST.write_text(best())
-    POINTPILLARS.write_text(pointpillars())
-    POINTNET.write_text(pointnet())
+    for network in NETWORKS:
+        config_file(network).write_text(config(network))

@@ -120,7 +120,7 @@ def make(folder: Path = FOLDER) -> None:
     """Simulate the scan, run the package on it, write the pictures."""
     frame = scan_at(SEED, 0, HDL64E, STREETS).frame
     params = DetectorParams()
-    found = open_detector()(frame).detections
+    found = open_detector("pointpillars")(frame).detections
     ground = segment_ground(frame, params.ground)
     cluster_ids = np.zeros(len(frame), np.int32)
     cluster_ids[~ground] = cluster(frame.xyz[~ground], params.clustering)

@@ -14,4 +14,4 @@ CONFIGS = Path(__file__).resolve().parents[1] / "config"
 
 
 def generate_launch_description():
-    return graph_launch(CONFIGS, "candidates,pointpillars,pointnet")
+    return graph_launch(CONFIGS, "fused")

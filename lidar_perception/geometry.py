@@ -37,6 +37,46 @@ def points_in_box(xyz: np.ndarray, box: np.ndarray, margin: float = 0.0) -> np.n
     return inside
 
 
+def points_in_boxes(xyz: np.ndarray, boxes: np.ndarray,
+                    margin: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """points_in_box of every box (K, 7) at once: indices (M,) int64 of points (N, 3), those of box
+    k from first[k] to first[k + 1], ascending, and first (K + 1,) int64. A point can be in
+    several. Time grows with K times N, so K is of detections, not of points."""
+    boxes = np.ascontiguousarray(boxes, np.float32).reshape(-1, 7)
+    order = np.argsort(xyz[:, 0], kind="stable")
+    ordered = np.ascontiguousarray(xyz[order, :3], np.float32)
+    reach = np.hypot(boxes[:, 3] / 2.0 + margin, boxes[:, 4] / 2.0 + margin) + 1e-3
+    begin = np.searchsorted(ordered[:, 0], boxes[:, 0] - reach, "left")
+    end = np.searchsorted(ordered[:, 0], boxes[:, 0] + reach, "right")
+    first = np.zeros(len(boxes) + 1, np.int64)
+    inside = _points_in_boxes(ordered, boxes, margin, begin, end, first)
+    indices = order[inside]
+    for k in range(len(boxes)):
+        indices[first[k]:first[k + 1]].sort()
+    return indices, first
+
+
+@njit(cache=True, nogil=True)
+def _points_in_boxes(xyz, boxes, margin, begin, end, first):
+    """Which of the points begin[k] .. end[k] are in box k, one box after the other; how many fills
+    first."""
+    inside = np.empty((end - begin).sum(), np.int64)
+    count = 0
+    for k in range(len(boxes)):
+        x, y, z, yaw = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 6]
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        length, width = boxes[k, 3] / 2.0 + margin, boxes[k, 4] / 2.0 + margin
+        height = boxes[k, 5] / 2.0 + margin
+        for i in range(begin[k], end[k]):
+            dx, dy = xyz[i, 0] - x, xyz[i, 1] - y
+            if (abs(cos * dx + sin * dy) <= length and abs(cos * dy - sin * dx) <= width
+                    and abs(xyz[i, 2] - z) <= height):
+                inside[count] = i
+                count += 1
+        first[k + 1] = count
+    return inside[:count]
+
+
 def box_corners(boxes: np.ndarray) -> np.ndarray:
     """(K, 8, 3) corners of boxes (K, 7): four at the bottom, counter-clockwise from front left
     (seen from above), then the four above them."""

@@ -58,8 +58,8 @@ class ReceptionParams(Params):
         "times and, odometry: ~/input/odometry (nav_msgs/Odometry), or tf: TF, from "
         "`input.fixed_frame`. off: they are used as they are.", choices=("off", "odometry", "tf"),
         fixed=True)
-    fixed_frame: str = param("odom", "For `input.deskew` tf: a frame in which the robot moves "
-                             "without jumps.", fixed=True)
+    fixed_frame: str = param("odom", "For `input.deskew` and `ego.source` tf: a frame in which the "
+                             "robot moves without jumps.", fixed=True)
 
 
 @dataclass(frozen=True)
@@ -136,17 +136,17 @@ class PerceptionRobotParams(DetectionNodeParams):
     obstacles: ObstacleParams = ObstacleParams()
 
 
-CANDIDATES, POINTPILLARS, POINTNET = (partial(DetectionNodeParams.of, name)
-                                      for name in ("candidates", "pointpillars", "pointnet"))
+CANDIDATES, POINTPILLARS, POINTNET, FUSED = (
+    partial(DetectionNodeParams.of, name)
+    for name in ("candidates", "pointpillars", "pointnet", "fused"))
 PERCEPTION = partial(PerceptionRobotParams.of, "candidates")
 
 
 @dataclass(frozen=True)
 class TrackInputParams(CloudNodeParams):
-    """What the tracker has besides its numbers. Each detection counts, so some may wait, and each
-    waits a little for its pose."""
+    """What the tracker has besides its numbers. Each detection counts, so some may wait."""
 
-    input: ReceptionParams = ReceptionParams(queue=10, max_wait=0.2)
+    input: ReceptionParams = ReceptionParams(queue=10)
     output: TrackMarkerParams = TrackMarkerParams()
 
 

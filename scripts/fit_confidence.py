@@ -15,8 +15,7 @@ from multiprocessing import Pool
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import minimize
-from scipy.special import expit
+from curves import fit
 
 from lidar_perception.candidates import confidence as module
 from lidar_perception.candidates.confidence import SEED_KNOTS, SHAPE_KNOTS, shape_features
@@ -34,7 +33,7 @@ from lidar_perception.scoring.centres.matching import match_centres, range_bins
 from lidar_perception.types import PEDESTRIAN, InputError
 
 KITTI_RANGES = np.array([2093, 1771, 468, 118, 37])  # paper A, Table 1
-PENALTY = 1.0  # chosen on streets left out
+RISING = {"similarity": 1, "height_difference_m": -1}  # more likeness is never less likely
 OUT = Path(module.__file__).with_name("confidence.json")
 
 
@@ -67,36 +66,6 @@ def seed_of(job: tuple[str, int]) -> Seed | None:
         return None
 
 
-def ramps(values: np.ndarray, knots: tuple[float, ...]) -> np.ndarray:
-    """(K, len(knots) - 1) how far each of K values has come from one knot to the next, 0..1."""
-    low, high = np.array(knots[:-1]), np.array(knots[1:])
-    return np.clip((values[:, None] - low) / (high - low), 0.0, 1.0)
-
-
-def fit(features: dict[str, np.ndarray], hit: np.ndarray, weight: np.ndarray,
-        knots: dict[str, tuple[float, ...]]) -> dict:
-    """One model, as confidence.json has it: logistic regression on the steps from knot to knot.
-    The penalty on them keeps curves level where there is nothing to learn from. More likeness is
-    never less likely."""
-    design = np.concatenate([ramps(features[name], k) for name, k in knots.items()], axis=1)
-    sign = np.where(hit, 1.0, -1.0)
-    rising = {"similarity": (0, None), "height_difference_m": (None, 0)}
-    bounds = [rising.get(name, (None, None)) for name, k in knots.items() for _ in k[1:]]
-
-    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
-        margin = sign * (design @ x[1:] + x[0])
-        slope = -weight * sign * expit(-margin)
-        return (weight @ np.logaddexp(0, -margin) + PENALTY / 2 * x[1:] @ x[1:],
-                np.concatenate([[slope.sum()], slope @ design + PENALTY * x[1:]]))
-
-    x = minimize(loss, np.zeros(design.shape[1] + 1), jac=True, method="L-BFGS-B",
-                 bounds=[(None, None), *bounds], options={"maxiter": 5000, "maxfun": 10000}).x
-    ends = np.cumsum([len(k) - 1 for k in knots.values()])[:-1]
-    return {"bias": round(float(x[0]), 4),
-            "curves": {name: {"knots": k, "values": [0.0, *np.round(np.cumsum(steps), 3).tolist()]}
-                       for (name, k), steps in zip(knots.items(), np.split(x[1:], ends))}}
-
-
 def work(job: tuple[tuple[str, int], Seed]) -> dict | None:
     """samples() of one frame, in a process of its own."""
     (root, number), seed = job
@@ -120,7 +89,7 @@ def main(roots: list[str]) -> None:
         "trained_on": {"frames": len(frames), "clusters": len(hit), "pedestrians": int(hit.sum()),
                        "of": int(truth.sum()), "weights_by_range": share.round(2).tolist()},
         "shape": fit(features, hit, weight, SHAPE_KNOTS),
-        "seed": fit(features, hit, weight, {**SHAPE_KNOTS, **SEED_KNOTS}),
+        "seed": fit(features, hit, weight, {**SHAPE_KNOTS, **SEED_KNOTS}, RISING),
     }
     write_text(OUT, json.dumps(models, indent=1))
     print(OUT, models["trained_on"])

@@ -42,7 +42,7 @@ def test_pages_are_made_from_the_code(generate, name):
 
 @pytest.mark.parametrize("name", ["ground_segmentation", "clustering", "candidate_refinement",
                                   "perception", "evaluator", "pointpillars_detector",
-                                  "pointnet_detector", "tracker"])
+                                  "pointnet_detector", "fused_detector", "tracker"])
 def test_documented_topics_are_the_nodes_own(generate, name, domain):
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     from lidar_perception.nodes.watch import new_context
@@ -85,14 +85,14 @@ def test_the_parameter_file_of_best_is_made_from_the_code(generate):
     assert read_config(Path("best"), PipelineParams()) == BEST_VALUES
 
 
-@pytest.mark.parametrize("network", ["pointpillars", "pointnet"])
+@pytest.mark.parametrize("network", ["pointpillars", "pointnet", "fused"])
 def test_the_nodes_before_a_detector_get_its_numbers(generate, network):
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
     from lidar_perception.param_fields import with_values
     from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
-    file = getattr(generate, network.upper())
-    assert file.read_text() == getattr(generate, network)(), "run: python docs/generate.py"
+    file = generate.config_file(network)
+    assert file.read_text() == generate.config(network), "run: python docs/generate.py"
     values = read_config(file, PipelineParams())
     detector = generate.PAGES[f"{network}_detector"]["params"]
     for params in GroundNodeParams(), ClusteringNodeParams():

@@ -18,10 +18,9 @@ from lidar_perception.campaign.good import CLOUD, good, mutated
 from lidar_perception.campaign.mutation import mutate_bytes
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes import NODES
-from lidar_perception.nodes.ego import ODOMETRY
 from lidar_perception.nodes.graph import private_domain
 from lidar_perception.nodes.reception import Reception
-from lidar_perception.nodes.runtime import ERROR, MARKERS, OK
+from lidar_perception.nodes.runtime import ERROR, MARKERS, ODOMETRY, OK
 from lidar_perception.nodes.watch import new_context
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode
@@ -34,7 +33,7 @@ CAMERA = {"input/camera_info": INFO, "input/extrinsics": TRANSFORM}
 SEED = {"input/ground_truth": MARKERS, "clicked_point": "geometry_msgs/msg/PointStamped"}
 POINTS = {"input/points": CLOUD}
 # Node -> how often it is drawn, its inputs with their types, settings of which each case has one.
-# PointPillars takes a tenth of a second, whatever the cloud.
+# PointPillars takes a tenth of a second, whatever the cloud, alone and fused.
 TRIED: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
     "ground_segmentation": (20, POINTS | CAMERA, [
         {"ground.method": "threshold", "view.enabled": False},
@@ -60,6 +59,7 @@ TRIED: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
     "evaluator": (8, {"input/ground_truth": MARKERS, "input/final": MARKERS}, [{}]),
     "pointnet_detector": (0.5, POINTS, [{}]),
     "pointpillars_detector": (0.2, POINTS, [{}]),
+    "fused_detector": (0.2, POINTS, [{}]),
 }
 THEN_GOOD = 0.125  # of the cases: the next good message must be served
 BUG = "this is a bug"  # what a node says of an exception that it did not expect

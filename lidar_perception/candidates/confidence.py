@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from lidar_perception.candidates.curves import log_odds
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.silhouette import (
     COLUMNS,
@@ -85,10 +86,7 @@ def confidence(shape: dict[str, np.ndarray], similarity: np.ndarray | None = Non
     if similarity is not None and height_difference is not None:
         features.update(similarity=similarity, height_difference_m=np.abs(height_difference))
     model = _models()["shape" if similarity is None else "seed"]
-    odds = np.full(len(shape["range_m"]), model["bias"])
-    for name, curve in model["curves"].items():
-        odds += np.interp(features[name], curve["knots"], curve["values"])
-    return 1.0 / (1.0 + np.exp(-odds))
+    return 1.0 / (1.0 + np.exp(-log_odds(model, features)))
 
 
 @functools.cache

@@ -40,7 +40,8 @@ dask_option = click.option("--dask", metavar="ADDRESS", help="Run on the workers
 json_option = click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
                            help="Write the scores to this file.")
 weights_option = a_path("--weights", "Run the detector of this checkpoint, or one by its name: "
-                        "pointpillars or pointnet, with the weights that come with the package.",
+                        "fused, pointpillars or pointnet, with the weights that come with the "
+                        "package.",
                         "FILE|NAME")
 
 

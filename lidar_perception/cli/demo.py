@@ -83,7 +83,7 @@ def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float
     console.print(f"{clouds} clouds replayed at {pace}; {content['results']} results; latency "
                   f"cloud to candidates median {latency['median']:.0f} ms, 95 % under "
                   f"{latency['p95']:.0f} ms; memory of the graph {content['memory_mb']:.0f} MB")
-    content["tracks"] = _print_tracks(out / "result", played)
+    content["tracks"] = _print_tracks(out / "result", played, content["poses"])
     write_text(out / "scores.json", json.dumps(content, indent=1))
     picture = _draw_best(out / "result", out / "birdseye.png", single)
     console.print(f"results in {out}: result (bag), scores.json, logs"
@@ -110,8 +110,14 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     return path
 
 
-def _print_tracks(result: Path, played: Recording) -> dict:
-    """Say how many pedestrians were tracked, and how well; the scores."""
+POSES = {"odometry": "poses of the recording",
+         "kiss_icp": "poses by KISS-ICP, as the recording has none",
+         None: "relative to the sensor, as the recording has no poses, and kiss-icp is not "
+               "installed: pip install 'lidar_perception[odometry]'"}
+
+
+def _print_tracks(result: Path, played: Recording, poses: str | None) -> dict:
+    """Say how many pedestrians were tracked, how well, and with which poses; the scores."""
     from lidar_perception.nodes.replay import TRACKS
     from lidar_perception.scoring.tracking.from_bag import recorded_tracks
     person = CLASSES[PEDESTRIAN]
@@ -121,7 +127,7 @@ def _print_tracks(result: Path, played: Recording) -> dict:
         f"{scores['true_tracks']} labelled; {scores['switches']} identity switches, HOTA "
         f"{100 * scores['HOTA']:.1f} (detection {100 * scores['DetA']:.1f}, association "
         f"{100 * scores['AssA']:.1f})")
-    console.print(f"tracks: {count} of pedestrians, {text}")
+    console.print(f"tracks: {count} of pedestrians, {text}; {POSES[poses]}")
     return {"found": count, "scores": scores}
 
 

@@ -24,9 +24,8 @@ Result = TypeVar("Result")
 
 
 class NetworkDetector:
-    """Base of the detectors. params, their parameters, may be replaced at any time; the group that
-    has the network's name is its own. fallback: why the CPU took over, or None.
-    """
+    """Base of the detectors. params, their parameters, may be replaced at any time. fallback:
+    why the CPU took over, or None."""
 
     def __init__(self, header: Header, device: torch.device, params: Any):
         self.header, self.config, self.params, self.device = header, header.config, params, device
@@ -49,9 +48,14 @@ class NetworkDetector:
         raise NotImplementedError
 
     @property
+    def group(self) -> str:
+        """The group of params that is its own: where it runs, and what counts as a detection."""
+        return self.header.network
+
+    @property
     def settings(self) -> NetworkParams:
-        """The network's own group of params."""
-        return getattr(self.params, self.header.network)
+        """The detector's own group of params."""
+        return getattr(self.params, self.group)
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -67,7 +71,7 @@ class NetworkDetector:
         """The same detector, of the same network, with this least score for every class."""
         other = copy.copy(self)
         settings = replace(self.settings, scores=ScoreParams.all_alike(min_score))
-        other.params = replace(self.params, **{self.header.network: settings})
+        other.params = replace(self.params, **{self.group: settings})
         return other
 
     def mounted_at(self, height: float) -> Self:

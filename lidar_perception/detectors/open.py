@@ -7,18 +7,22 @@ from pathlib import Path
 
 from lidar_perception.detectors.checkpoint import POINTNET, POINTPILLARS, network_of
 from lidar_perception.detectors.contract import Detector
+from lidar_perception.detectors.fused.detector import load_fused_detector
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointpillars.detector import load_detector
+
+FUSED = "fused"  # the default where one detector is wanted: all of them together
 
 # Each opens its detector: load(path, device), where an empty path means its own weights, if it has
 # any. A new detector is one line here.
 LOAD: dict[str, Callable[..., Detector]] = {
     POINTPILLARS: load_detector,
     POINTNET: load_pointnet_detector,
+    FUSED: load_fused_detector,
 }
 
 
-def open_detector(weights: str | Path = POINTPILLARS, device: str = "auto", *,
+def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
                   sensor_height: float | None = None,
                   min_score: float | None = None) -> Detector:
     """A detector by its name, a key of LOAD, with what comes with the package; or by its weights: a

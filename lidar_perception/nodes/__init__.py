@@ -18,5 +18,6 @@ NODES = {
                               "params.POINTPILLARS"),
     "pointnet_detector": ("PointNetNode", "detectors.pointnet.params.PointNetDetectorParams",
                           "params.POINTNET"),
+    "fused_detector": ("FusedNode", "detectors.fused.params.FusedDetectorParams", "params.FUSED"),
     "tracker": ("TrackerNode", "params.TrackerNodeParams", "params.TrackInputParams"),
 }

@@ -3,89 +3,155 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from time import monotonic
 from typing import Any
 
 import numpy as np
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from scipy.spatial.transform import Rotation
 
 from lidar_perception.nodes.runtime import CLOUD, LidarNode
-from lidar_perception.tracking.ego import Odometry
+from lidar_perception.robot.tree import Missing, TransformTree
+from lidar_perception.tracking.ego import Odometry, has_odometry
 from lidar_perception.tracking.params import EgoParams
-from lidar_perception.tracking.poses import PoseHistory
 from lidar_perception.types import InputError
-from lidar_perception.wire.messages import pose_of, to_frame
-from msg_utils.stamps import to_ns
+from lidar_perception.wire.messages import to_frame
+from msg_utils.stamps import SECOND, to_ns
 
-ODOMETRY = "nav_msgs/msg/Odometry"
-MANY = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # of a busy node
+START, SCAN = "start", "scan"  # frames of KISS-ICP
+GRACE_NS = SECOND  # of frames without a pose; then ego.source auto takes the scans
 
 
 class EgoInput:
     """Poses of the sensor in a fixed frame, by the stamps of its frames.
 
-    clouds: whether the node itself takes the scans and hands them to pose(); otherwise they come
-    from ~/input/points, for kiss_icp alone.
+    source: what they come from now, "" for nothing; carried: whether it is known where the sensor
+    is on what the odometry is of. clouds: whether the node itself takes the scans
+    and hands them to pose(); then these wait for their poses, too. Otherwise they come from
+    ~/input/points, for KISS-ICP alone.
     """
 
     def __init__(self, node: LidarNode, params: Callable[[], EgoParams], clouds: bool):
         self.node, self.params, self.clouds = node, params, clouds
-        self.history = PoseHistory()
-        self.child = self.fixed = ""  # the frame whose poses the odometry has, and in which
+        self.transforms = node.transforms
+        self.source, self.carried = "", True
         self.icp: Odometry | None = None
+        self.scans = TransformTree()
         self.scan_ns = 0  # of the last scan that KISS-ICP took
-        source = params().source
-        if source in ("auto", "odometry"):
-            node.input("odometry", ODOMETRY, self._on_odometry, MANY)
-        elif source == "kiss_icp":
-            self.icp = Odometry()
-            if not clouds:
-                node.input("points", CLOUD, self._on_cloud)
+        self.without_ns: int | None = None  # since when frames have had no pose, with auto
+        self.waits: tuple[int, float] | None = None  # a frame for its pose: stamp, since when
+        wanted = params().source
+        if wanted in ("auto", "odometry"):
+            self.transforms.hear_odometry()
+        elif wanted == "tf":
+            self.transforms.listen()
+        elif wanted == "kiss_icp":
+            self._take_scans()
+        if clouds:
+            self.transforms.needs.append(self.needed)
 
-    def pose(self, stamp_ns: int, frame_id: str,
-             xyz: np.ndarray | None = None) -> np.ndarray | None:
-        """(4, 4) at the stamp of a frame in frame_id; None where it is not known. xyz (N, 3) is its
-        scan, where the node takes the clouds."""
-        if self.fixed and frame_id == self.fixed:  # detections that are in the fixed frame already
-            return np.eye(4)
+    def pose(self, header: Any, xyz: np.ndarray | None = None) -> np.ndarray | None:
+        """(4, 4) of the frame with this header; None where it is not known. xyz (N, 3) is its scan,
+        where the node takes the clouds."""
+        frame_id, stamp = header.frame_id, to_ns(header.stamp)
         if self.icp is not None and self.clouds and xyz is not None:
-            self._register(stamp_ns, xyz)
-        return self.history.at(stamp_ns, self.params().max_gap)
+            self._register(stamp, xyz)
+        pose = None
+        try:
+            pose = self._of(self._source(frame_id, stamp), frame_id, stamp, self.params().max_gap)
+        except Missing:
+            pass
+        if self.params().source == "auto":
+            self._look_further(stamp, pose is not None)
+        return pose
 
-    def needed(self, stamp_ns: int) -> str | None:
-        """What a frame of this stamp should wait for: its pose, where poses come but are a little
-        behind."""
-        behind = stamp_ns - self.history.newest
-        return "the pose of its time" if 0 < behind <= self.params().max_gap * 1e9 else None
+    def needed(self, header: Any) -> str | None:
+        """What a frame with this header waits for, ego.max_wait seconds at most: its pose, where
+        poses come but are a little behind."""
+        stamp = to_ns(header.stamp)
+        try:
+            source = self._source(header.frame_id, stamp)
+            if source and not (source == "kiss_icp" and self.clouds):
+                self._of(source, header.frame_id, stamp, None)
+        except Missing as error:
+            if error.late:
+                if self.waits is None or self.waits[0] != stamp:
+                    self.waits = stamp, monotonic()
+                patient = monotonic() - self.waits[1] < self.params().max_wait
+                return "the pose of its time" if patient else None
+        self.waits = None
+        return None
 
     def problem(self, frame_id: str) -> str | None:
         """What is wrong with the poses for frames in frame_id, with the remedy."""
-        if self.child and frame_id and frame_id not in (self.child, self.fixed):
-            return (f"the odometry is of '{self.child}', the detections of '{frame_id}': they are "
-                    "taken to be in one place")
-        source = self.params().source
-        if not len(self.history) and source in ("odometry", "kiss_icp"):
-            topic = "odometry" if source == "odometry" else "points"
+        wanted, carrier = self.params().source, self.transforms.carrier
+        if wanted == "tf" and self.source != "tf":
+            fixed = self.node.robot.input.fixed_frame
+            return (f"TF does not connect '{frame_id}' with '{fixed}' (input.fixed_frame): tracks "
+                    "are relative to the sensor")
+        if wanted in ("odometry", "kiss_icp") and self.source != wanted:
+            topic = "odometry" if wanted == "odometry" else "points"
             return (f"no pose has come on {self.node.resolve_topic_name(f'~/input/{topic}')} yet: "
                     "tracks are relative to the sensor")
+        if not self.carried and carrier and frame_id:
+            return (f"the odometry is of '{carrier}', the detections of '{frame_id}', and TF does "
+                    "not connect them: they are taken to be in one place")
         return None
 
-    def _on_odometry(self, msg: Any) -> None:
-        pose = pose_of(msg.pose.pose)
-        self.child, self.fixed = msg.child_frame_id, msg.header.frame_id
-        self._add(to_ns(msg.header.stamp), pose)
+    def _source(self, frame_id: str, stamp: int) -> str:
+        """Of what there is, the best that ego.source allows; it is kept in self.source."""
+        wanted = self.params().source
+        self.carried = True
+        if wanted in ("auto", "odometry") and self.transforms.odometry_ns is not None:
+            self.source, self.carried = "odometry", self.transforms.carries(frame_id)
+            if not self.carried:
+                self.transforms.listen()
+        elif self.icp is not None and self.scan_ns:
+            self.source = "kiss_icp"
+        elif wanted in ("auto", "tf") and self.source != "tf":
+            try:
+                self._of("tf", frame_id, stamp, self.params().max_gap)
+                self.source = "tf"
+            except Missing as error:
+                self.source = "tf" if error.late else self.source
+        return self.source
+
+    def _of(self, source: str, frame_id: str, stamp: int,
+            max_gap: float | None) -> np.ndarray | None:
+        at = np.array([stamp])
+        if source == "kiss_icp":
+            return self.scans.lookup(START, SCAN, stamp, max_gap)
+        if source == "odometry" and not self.carried:
+            return self.transforms.odometry_poses(at, max_gap)[0]
+        return self.transforms.sensor_poses(source, frame_id, at, max_gap)[0] if source else None
+
+    def _look_further(self, stamp: int, known: bool) -> None:
+        """With auto: TF where no odometry comes, and KISS-ICP where TF says nothing either."""
+        if self.source in ("odometry", "tf") or known:
+            self.without_ns = None
+            return
+        self.transforms.listen()
+        if self.without_ns is None or stamp < self.without_ns:
+            self.without_ns = stamp
+        if stamp - self.without_ns >= GRACE_NS and self.icp is None and has_odometry():
+            self._take_scans()
+
+    def _take_scans(self) -> None:
+        self.icp = Odometry()
+        if not self.clouds:
+            self.node.input("points", CLOUD, self._on_cloud)
 
     def _on_cloud(self, msg: Any) -> None:
-        self._register(to_ns(msg.header.stamp), to_frame(msg)[0].xyz)
+        if self.source in ("", "kiss_icp"):  # auto may have found something better
+            self._register(to_ns(msg.header.stamp), to_frame(msg)[0].xyz)
 
     def _register(self, stamp_ns: int, xyz: np.ndarray) -> None:
         if not len(xyz):
             raise InputError("the cloud has no usable point, so the sensor's motion is not known")
-        gap = (stamp_ns - self.scan_ns) / 1e9
+        gap = (stamp_ns - self.scan_ns) / SECOND
         if not 0 < gap <= 2 * self.params().max_gap:  # a map of another place, or of another time
-            self.icp, self.history = Odometry(), PoseHistory()
+            self.icp, self.scans = Odometry(), TransformTree()
         self.scan_ns = stamp_ns
-        self._add(stamp_ns, self.icp(xyz))
-
-    def _add(self, stamp_ns: int, pose: np.ndarray) -> None:
-        self.history.add(stamp_ns, pose)
+        pose = self.icp(xyz)
+        self.scans.set(START, SCAN, stamp_ns, pose[:3, 3],
+                       Rotation.from_matrix(pose[:3, :3]).as_quat())
         self.node.counts["last_pose_ns"] = stamp_ns

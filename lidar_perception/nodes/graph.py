@@ -46,11 +46,13 @@ BEHIND = {
     "candidates": {"candidate_refinement": {**CLUSTERED, **TRUTH_IN}},
     "pointpillars": {"pointpillars_detector": CLUSTERED},
     "pointnet": {"pointnet_detector": CLUSTERED},
+    "fused": {"fused_detector": CLUSTERED},
 }
 ALONE = {
     "candidates": {"perception": {**CLOUDS, **TRUTH_IN, **CAMERA}},
     "pointpillars": {"pointpillars_detector": CLOUDS},
     "pointnet": {"pointnet_detector": CLOUDS},
+    "fused": {"fused_detector": CLOUDS},
 }
 
 

@@ -31,8 +31,9 @@ from lidar_perception.tracking.params import tracking_of
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import ODOMETRY, POINTS
 
-CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet"}
-NETWORKS = ("pointpillars", "pointnet")  # as their groups of parameters
+CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet",
+           "fused": "fused"}
+NETWORKS = ("pointpillars", "pointnet", "fused")  # as their groups of parameters
 
 SWITCHES = dict(default_value="false", choices=["true", "false"])
 ARGUMENTS = {

@@ -23,6 +23,7 @@ from lidar_perception.nodes.graph import (
 from lidar_perception.nodes.main import use_large_shared_memory
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors, progress
+from lidar_perception.tracking.ego import has_odometry
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, TRUTH
 
@@ -36,7 +37,8 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
            single: bool = False, record: bool = True, real_time: bool = False) -> dict:
     """Scores of a bag with `clouds` clouds, and how the run went: results, latency_ms (from the
     cloud's arrival in this process to its candidates'), memory_mb (proportional set size), slower
-    (how many times slower than asked for it was).
+    (how many times slower than asked for it was), and poses: whence the tracker had them, the
+    bag's odometry, KISS-ICP where there is none, or None where that is not installed either.
 
     A cloud is sent when those before have their candidates, so that none is lost on a slow
     machine; with real_time they come as from a sensor, whatever becomes of them.
@@ -53,11 +55,13 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
     evaluator_remap, evaluator_params = evaluation(scores.resolve(), single)
     recorded = [cloud_topic(single), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
     with Bag(drive) as bag:
-        moves = ODOMETRY in bag.topics
+        poses = "odometry" if ODOMETRY in bag.topics else "kiss_icp" if has_odometry() else None
+    tracker = {"ego.source": poses or "none",
+               **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT})}
     with Processes(out / "logs", domain) as processes, Watch(domain, topics["final"]) as watch:
         for node, remap in graph.items():
-            own = {} if node == TRACKER else {**flatten(params), "input.queue": AHEAD}
-            processes.start(node, remap, own)
+            processes.start(node, remap, tracker if node == TRACKER else
+                            {**flatten(params), "input.queue": AHEAD})
         processes.start("evaluator", evaluator_remap, evaluator_params)
         if record:
             processes.start("bag_recorder", {}, {"bag": str((out / "result").resolve()),
@@ -70,10 +74,10 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
         if not ready:
             raise InputError(f"the nodes did not find each other in {START_TIMEOUT:.0f} s: "
                              f"{list(watch.diagnostics) or 'none'} reported; see {out}/logs")
-        # The watch hears the clouds too, and the recorder the labels.
-        rules = wait_for(single, points=2, truth=2 + record)
+        # The watch hears the clouds too, as the tracker may, and the recorder the labels.
+        rules = wait_for(single, points=2 + (poses == "kiss_icp"), truth=2 + record)
         rules += [f"{relative(topics['final'])}:={3 + record}"]  # watch, evaluator, tracker
-        rules += [relative(ODOMETRY)] if moves else []
+        rules += [relative(ODOMETRY)] if poses == "odometry" else []
         processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
                                            "wait_for": rules,
                                            "follow": [] if real_time else [topics["final"]],
@@ -105,4 +109,4 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
             "latency_ms": {"median": median(latencies),
                            "p95": latencies[int(0.95 * (len(latencies) - 1))]},
             "slower": float(watch.value_of("bag_player", "slower") or 1.0),
-            "memory_mb": sum(memory.values()), "memory_mb_by_node": memory}
+            "memory_mb": sum(memory.values()), "memory_mb_by_node": memory, "poses": poses}

@@ -12,9 +12,9 @@ import numpy as np
 from lidar_perception.nodes.ego import EgoInput
 from lidar_perception.nodes.runtime import MARKERS, RELIABLE, LidarNode
 from lidar_perception.params import DetectionNodeParams, TrackerNodeParams
-from lidar_perception.tracking.poses import Trails
 from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.tracker import Tracker
+from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.track_markers import track_markers
@@ -54,9 +54,13 @@ class TrackOutputs:
         A frame that is older than the last one, or has its stamp, is not answered: what is known
         is of another time."""
         stamp, tracker = to_ns(header.stamp), self.tracker
-        problem = self._same_sensor(header.frame_id) or self.ego.problem(header.frame_id)
+        mixed, before = self._same_sensor(header.frame_id), (self.ego.source, self.ego.carried)
+        pose = self.ego.pose(header, xyz)
+        if before[0] and before != (self.ego.source, self.ego.carried):
+            tracker.reset()  # another fixed frame
+        problem = mixed or self.ego.problem(header.frame_id)
         tracker.params = self.params().tracking
-        tracks = tracker(detections, stamp, self.ego.pose(stamp, header.frame_id, xyz))
+        tracks = tracker(detections, stamp, pose)
         if tracker.taken:
             self._send(header, stamp, tracks)
         self._count(stamp, len(tracks))
@@ -95,8 +99,8 @@ class TrackOutputs:
         while now - self.counted[0][0] > RATE_OVER or len(self.counted) > 1000:
             self.counted.popleft()
         before, born, ended = self.counted[0]
-        self.node.counts.update(tracks=reported, alive=tracker.alive, born=tracker.born,
-                                ended=tracker.ended)
+        self.node.counts.update(ego=self.ego.source or "none", tracks=reported,
+                                alive=tracker.alive, born=tracker.born, ended=tracker.ended)
         if now > before:
             self.node.counts["born_per_s"] = f"{(tracker.born - born) / (now - before):.2f}"
             self.node.counts["ended_per_s"] = f"{(tracker.ended - ended) / (now - before):.2f}"

@@ -25,14 +25,11 @@ class TrackerNode(ManagedNode):
     def configure(self) -> None:
         self.tracks = TrackOutputs(self, lambda: self.params, clouds=False)
         self.input("detections", MARKERS, self.on_markers,
-                   needs=lambda m: self._needs(m.markers[:1]))
+                   needs=lambda m: self.tracks.ego.needed(m.markers[0].header)
+                   if m.markers else None)
         if has_detections_3d():
             self.input("detections_3d", DETECTIONS_3D, self.on_detections,
-                       needs=lambda m: self._needs([m]))
-
-    def _needs(self, messages: list[Any]) -> str | None:
-        """What a frame waits for, which messages with its header are of."""
-        return self.tracks.ego.needed(to_ns(messages[0].header.stamp)) if messages else None
+                       needs=lambda m: self.tracks.ego.needed(m.header))
 
     def on_markers(self, msg: Any) -> None:
         if not msg.markers:

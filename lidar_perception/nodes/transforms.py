@@ -6,6 +6,7 @@ The tree is our own, over /tf and /tf_static, so that it is the same with and wi
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
 from typing import Any
@@ -15,6 +16,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.nodes.reception import WARN, Problem
+from lidar_perception.nodes.runtime import ODOMETRY
 from lidar_perception.robot.crop import cropped
 from lidar_perception.robot.deskew import deskewed
 from lidar_perception.robot.placing import Placing, levelling, tilted
@@ -29,7 +31,7 @@ from msg_utils.stamps import SECOND, to_ns
 
 TF_QOS = QoSProfile(depth=100)
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-ODOMETRY_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)  # takes any
+ODOMETRY_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # takes any
 MOVING, STILL = "moving", "still"  # frames of the odometry, whatever the message calls them
 
 
@@ -42,12 +44,14 @@ class Transforms:
         self.tree, self.odometry = TransformTree(), TransformTree()
         self.base_frame = robot.base_frame.lstrip("/")
         self.target_frame = getattr(robot, "target_frame", "").lstrip("/")
-        self.carrier = ""  # the frame that the odometry is of
+        self.carrier = self.odometry_frame = ""  # what the odometry is of, and in which frame
+        self.odometry_ns: int | None = None  # the stamp of the last one
+        self.needs: list[Callable[[Any], str | None]] = []  # of a header: what else it waits for
         self.sweep = 0.0  # seconds from the stamp to the last point of a cloud
         self.lacking: dict[str, str] = {}  # what asked for it -> what is not there
         self.known: dict[str, Any] = {}  # for the diagnostics
         self._last: tuple[tuple[str, int], Placing] = (("", -1), Placing(""))
-        self._listening = False
+        self._listening = self._hearing = False
         self._installed = importlib.util.find_spec("tf2_msgs") is not None
         if self._installed:
             self._subscribe(TF_STATIC, STATIC_QOS, static=True)
@@ -57,7 +61,7 @@ class Transforms:
                 self.lacking["TF"] = ("tf2_msgs is not installed, so nothing is known of TF; "
                                       "install ROS 2's tf2_msgs")
         if robot.input.deskew == "odometry":
-            node.input("odometry", "nav_msgs/msg/Odometry", self.on_odometry, ODOMETRY_QOS)
+            self.hear_odometry()
 
     @property
     def in_use(self) -> bool:
@@ -72,6 +76,12 @@ class Transforms:
         self._listening = True
         if self._installed:
             self._subscribe(TF, TF_QOS, static=False)
+
+    def hear_odometry(self) -> None:
+        """Subscribe to the odometry; once."""
+        if not self._hearing:
+            self._hearing = True
+            self.node.input("odometry", ODOMETRY, self.on_odometry, ODOMETRY_QOS)
 
     def _subscribe(self, topic: str, qos: QoSProfile, static: bool) -> None:
         self.node.input(topic, "tf2_msgs/msg/TFMessage", lambda m: self.on_tf(m, static), qos,
@@ -94,9 +104,11 @@ class Transforms:
     def on_odometry(self, msg: Any) -> None:
         """A nav_msgs/Odometry: where its child frame is at its stamp."""
         p, q = msg.pose.pose.position, msg.pose.pose.orientation
+        stamp = to_ns(msg.header.stamp)
+        self.odometry.set(STILL, MOVING, stamp, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
         self.carrier = msg.child_frame_id.lstrip("/")
-        self.odometry.set(STILL, MOVING, to_ns(msg.header.stamp), (p.x, p.y, p.z),
-                          (q.x, q.y, q.z, q.w))
+        self.odometry_frame = msg.header.frame_id.lstrip("/")
+        self.odometry_ns = self.node.counts["last_pose_ns"] = stamp
         self._changed()
 
     def _changed(self) -> None:
@@ -106,6 +118,10 @@ class Transforms:
 
     def missing(self, cloud: Any) -> str | None:
         """What a cloud waits for, as it may still come; None if nothing."""
+        return self._missing_frame(cloud) or next(
+            filter(None, (need(cloud.header) for need in self.needs)), None)
+
+    def _missing_frame(self, cloud: Any) -> str | None:
         if not self.in_use:
             return None
         frame_id, stamp = cloud.header.frame_id, to_ns(cloud.header.stamp)
@@ -113,7 +129,8 @@ class Transforms:
             for frame in filter(None, (self.base_frame, self.target_frame)):
                 self.tree.lookup(frame, frame_id, stamp)
             if self.node.robot.input.deskew != "off":
-                self.sensor_poses(frame_id, np.array([stamp + round(self.sweep * SECOND)]))
+                self.sensor_poses(self.node.robot.input.deskew, frame_id,
+                                  np.array([stamp + round(self.sweep * SECOND)]))
         except Missing as error:
             return str(error) if error.late else None
         return None
@@ -176,27 +193,47 @@ class Transforms:
 
     # How the sensor moves
 
-    def sensor_poses(self, frame_id: str, at: np.ndarray) -> np.ndarray:
+    def sensor_poses(self, source: str, frame_id: str, at: np.ndarray,
+                     max_gap: float | None = None) -> np.ndarray:
         """(M, 4, 4): the poses of a frame of the robot at times (M,) ns, in one that does not
-        move: by input.deskew, the odometry's or TF's input.fixed_frame. Missing where they are not
-        known."""
-        params = self.node.robot.input
-        if params.deskew == "tf":
-            return self.tree.poses(params.fixed_frame, frame_id, at)
-        if not self.carrier:
+        move: by the source odometry or tf, the latter in input.fixed_frame. max_gap as in
+        TransformTree.poses. Missing where they are not known."""
+        if source == "tf":
+            return self.tree.poses(self.node.robot.input.fixed_frame, frame_id, at, max_gap)
+        if frame_id.lstrip("/") == self.odometry_frame != "":  # it does not move
+            return np.tile(np.eye(4), (len(at), 1, 1))
+        return self.odometry_poses(at, max_gap) @ self._on_carrier(frame_id, at, max_gap)
+
+    def odometry_poses(self, at: np.ndarray, max_gap: float | None = None) -> np.ndarray:
+        """(M, 4, 4): the poses at times (M,) ns of what the odometry is of. Missing as above."""
+        if self.odometry_ns is None:
             raise Missing(f"nothing has come on {self.node.resolve_topic_name('~/input/odometry')}"
                           "; remap it to the odometry's topic")
-        moved = self.odometry.poses(STILL, MOVING, at)
+        return self.odometry.poses(STILL, MOVING, at, max_gap)
+
+    def _on_carrier(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
+        """(M or 1, 4, 4): where on what the odometry is of a frame is at times (M,) ns."""
         if frame_id.lstrip("/") == self.carrier:
-            return moved
+            return np.eye(4)[None]
         try:
-            return moved @ self.tree.poses(self.carrier, frame_id, at)
+            return self.tree.poses(self.carrier, frame_id, at, max_gap)
         except Missing as error:
             pose = self._by_hand() if self.carrier == self.base_frame else None
             if pose is None:
                 raise Missing(f"the odometry is of '{self.carrier}': {error}",
                               error.late) from None
-            return moved @ pose
+            return pose[None]
+
+    def carries(self, frame_id: str) -> bool:
+        """Whether it is known how a frame moves with the odometry: it is that of the odometry, or
+        TF connects them."""
+        if frame_id.lstrip("/") in (self.carrier, self.odometry_frame):
+            return True
+        try:
+            self._on_carrier(frame_id, np.array([self.odometry_ns]), None)
+        except Missing as error:
+            return error.late
+        return True
 
     def _by_hand(self) -> np.ndarray | None:
         """The sensor's pose above the ground as the parameters have it."""
@@ -240,7 +277,8 @@ class Transforms:
             times = times._replace(seconds=times.seconds.take(kept))
         self.sweep = float(times.seconds.max())
         moved = deskewed(frame.xyz, times.seconds, lambda at: self.sensor_poses(
-            frame.frame_id, frame.stamp_ns + np.rint(at * SECOND).astype(np.int64)))
+            self.node.robot.input.deskew, frame.frame_id,
+            frame.stamp_ns + np.rint(at * SECOND).astype(np.int64)))
         return moved_cloud(msg, bag_message, indices, moved, times)
 
     # For the diagnostics

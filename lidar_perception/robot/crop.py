@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lidar_perception.robot.params import CropParams
+from lidar_perception.robot.poses import moved_points
 from lidar_perception.types import LidarFrame
 
 
@@ -23,8 +24,7 @@ def kept_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None = N
             if params.max_range:
                 kept &= square <= np.float32(params.max_range) ** 2
         if params.body:
-            at = xyz if base is None else xyz @ base[:3, :3].T.astype(xyz.dtype) + base[
-                :3, 3].astype(xyz.dtype)
+            at = xyz if base is None else moved_points(xyz, base)
             low, high = np.reshape(params.body, (2, 3)).astype(xyz.dtype)
             kept &= ~((at > low) & (at < high)).all(axis=1)
         if params.sectors:

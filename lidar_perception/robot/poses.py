@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from lidar_perception.types import InputError
 
@@ -26,14 +26,14 @@ def pose_of(translation: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
 
 
 def checked(translation: ArrayLike, quaternion: ArrayLike,
-            name: str) -> tuple[np.ndarray, np.ndarray]:
+            what: str) -> tuple[np.ndarray, np.ndarray]:
     """translation (3,) and quaternion (4,) [x y z w] as float64, the latter of length 1. InputError
-    with this name where they are no pose."""
+    that begins with `what` where they are no pose."""
     moved, turned = np.asarray(translation, np.float64), np.asarray(quaternion, np.float64)
     length = np.linalg.norm(turned)
     if not np.isfinite(moved).all() or not abs(length - 1.0) < NOT_UNIT:
-        raise InputError(f"the transform {name} has no unit quaternion, or is not finite; its "
-                         "publisher is wrong")
+        raise InputError(f"{what} has no unit quaternion, or is not finite; its publisher is "
+                         "wrong")
     return moved, turned / length
 
 
@@ -49,15 +49,18 @@ def inverse(pose: np.ndarray) -> np.ndarray:
 
 def interpolated(times: np.ndarray, translations: np.ndarray, quaternions: np.ndarray,
                  at: np.ndarray) -> np.ndarray:
-    """(M, 4, 4): the poses at times at (M,), all within times (K,), which ascend, K > 0. Straight
-    from one translation (K, 3) to the next, on the shorter arc between quaternions (K, 4) (slerp,
-    Shoemake 1985)."""
+    """(M, 4, 4): the poses at times at (M,) int; times (K,) int ascend, K > 0. Straight from one
+    translation (K, 3) to the next, on the shorter arc between quaternions (K, 4) (slerp, Shoemake
+    1985); before the first and after the last as between the two there."""
     if len(times) == 1:
         return np.broadcast_to(pose_of(translations[0], quaternions[0]), (len(at), 4, 4)).copy()
-    begin = times[0]  # nanoseconds since 1970 do not fit into a float64
-    times, at = (np.asarray(t - begin, np.float64) for t in (times, at))
-    moved = np.column_stack([np.interp(at, times, axis) for axis in np.transpose(translations)])
-    return pose_of(moved, Slerp(times, Rotation.from_quat(quaternions))(at).as_quat())
+    first = np.clip(np.searchsorted(times, at, "right") - 1, 0, len(times) - 2)
+    # Differences: nanoseconds since 1970 do not fit into a float64.
+    share = ((at - times[first]) / (times[first + 1] - times[first]))[:, None]
+    moved, turned = np.asarray(translations), Rotation.from_quat(quaternions)
+    turns = (turned[:-1].inv() * turned[1:]).as_rotvec()
+    return pose_of(moved[first] + share * (moved[first + 1] - moved[first]),
+                   (turned[first] * Rotation.from_rotvec(share * turns[first])).as_quat())
 
 
 def moved_points(xyz: np.ndarray, pose: np.ndarray) -> np.ndarray:

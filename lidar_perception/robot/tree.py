@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 
@@ -51,27 +53,35 @@ class _Link:
         if old > len(self.times) // 10:  # not with every message: that moves the whole list
             del self.times[:old], self.values[:old]
 
-    def poses(self, at: np.ndarray, name: str) -> np.ndarray:
-        """(M, 4, 4) at times (M,) ns. Missing outside of what is known: nothing is guessed."""
-        if not self.static:
-            first, last = self.times[0], self.times[-1]
-            if int(at.max()) > last:
-                ago = (int(at.max()) - last) / SECOND
-                raise Missing(f"the newest transform of {name} is {ago:.3f} s older than needed; "
-                              "is its publisher late, or has it stopped?", late=ago < 1.0)
-            if int(at.min()) < first:
-                raise Missing(f"the oldest transform of {name} is "
-                              f"{(first - int(at.min())) / SECOND:.3f} s newer than needed")
-            before = max(int(np.searchsorted(self.times, at.min(), "right")) - 1, 0)
-            behind = int(np.searchsorted(self.times, at.max(), "left")) + 1
-        else:
-            before, behind = 0, 1
-        values = np.array(self.values[before:behind])
-        return interpolated(np.array(self.times[before:behind]), values[:, :3], values[:, 3:], at)
+    def poses(self, at: np.ndarray, name: str, max_gap: float | None) -> np.ndarray:
+        """(M, 4, 4) at times (M,) ns, as TransformTree.poses has it."""
+        chosen = slice(0, 1) if self.static else self._around(int(at.min()), int(at.max()), name,
+                                                              max_gap)
+        values = np.array(self.values[chosen])
+        return interpolated(np.array(self.times[chosen]), values[:, :3], values[:, 3:], at)
+
+    def _around(self, begin: int, end: int, name: str, max_gap: float | None) -> slice:
+        """What is needed from one time to another, ns. Missing where it is not there."""
+        times, ago = self.times, (end - self.times[-1]) / SECOND
+        if ago > 0 and (max_gap is None or ago > max_gap or len(times) == 1):
+            raise Missing(f"the newest transform of {name} is {ago:.3f} s older than needed; "
+                          "is its publisher late, or has it stopped?", late=ago < 1.0)
+        if begin < times[0]:
+            raise Missing(f"the oldest transform of {name} is "
+                          f"{(times[0] - begin) / SECOND:.3f} s newer than needed")
+        first, last = bisect_right(times, begin) - 1, bisect_left(times, end)
+        if ago > 0:
+            first = min(first, len(times) - 2)
+        chosen = slice(first, last + 1)
+        gap = max((b - a for a, b in pairwise(times[chosen])), default=0) / SECOND
+        if max_gap is not None and gap > max_gap:
+            raise Missing(f"two transforms of {name} are {gap:.3f} s apart at the time needed")
+        return chosen
 
 
 class TransformTree:
-    """Frames, each in its parent; poses are interpolated between the stamps, never extrapolated.
+    """Frames, each in its parent; poses are interpolated between the stamps, and extrapolated only
+    for those who ask for it with max_gap.
 
     Transforms are kept for KEPT_NS. A stamp that is JUMP_NS or more before the last one of its
     frame is from a bag that starts again: all that moves is forgotten, what is fixed stays.
@@ -90,7 +100,7 @@ class TransformTree:
         name = f"'{parent}' -> '{child}'"
         if not parent or not child or parent == child:
             raise InputError(f"the transform {name} must be between two frames with names")
-        value = np.concatenate(checked(translation, quaternion, name))
+        value = np.concatenate(checked(translation, quaternion, f"the transform {name}"))
         link = self._links.get(child)
         if link is None and len(self._links) >= MAX_FRAMES:
             raise InputError(f"more than {MAX_FRAMES} frames in the tree; '{child}' is left out")
@@ -106,20 +116,25 @@ class TransformTree:
         self._links = {child: link for child, link in self._links.items() if link.static}
         self.jumps += 1
 
-    def lookup(self, target: str, source: str, stamp_ns: int) -> np.ndarray:
+    def lookup(self, target: str, source: str, stamp_ns: int,
+               max_gap: float | None = None) -> np.ndarray:
         """(4, 4): the pose of source in target at a time, which takes points of source to target.
         Missing where they are not connected at that time."""
-        return self.poses(target, source, np.array([stamp_ns]))[0]
+        return self.poses(target, source, np.array([stamp_ns]), max_gap)[0]
 
-    def poses(self, target: str, source: str, at: np.ndarray) -> np.ndarray:
-        """(M, 4, 4): as lookup, at times (M,) int ns, M > 0."""
+    def poses(self, target: str, source: str, at: np.ndarray,
+              max_gap: float | None = None) -> np.ndarray:
+        """(M, 4, 4): as lookup, at times (M,) int ns, M > 0. With max_gap, seconds, what moves goes
+        on after its newest transform as the last two do, for so long, and is not known between
+        two that are farther apart."""
         target, source = target.lstrip("/"), source.lstrip("/")
         up, down = self._chain(source), self._chain(target)
         common = next((frame for frame in up if frame in set(down)), None)
         if common is None:
             raise Missing(f"TF does not connect '{source}' with '{target}': "
                           f"{self._known(source, up)}, {self._known(target, down)}")
-        return inverse(self._along(down, common, at)) @ self._along(up, common, at)
+        return (inverse(self._along(down, common, at, max_gap))
+                @ self._along(up, common, at, max_gap))
 
     def _chain(self, frame: str) -> list[str]:
         """The frame, its parent, and so on to the root."""
@@ -137,9 +152,10 @@ class TransformTree:
         parents = {link.parent for link in self._links.values()}
         return f"'{frame}' is " + ("the root of a tree" if frame in parents else "not in TF")
 
-    def _along(self, chain: list[str], common: str, at: np.ndarray) -> np.ndarray:
+    def _along(self, chain: list[str], common: str, at: np.ndarray,
+               max_gap: float | None) -> np.ndarray:
         pose = np.broadcast_to(np.eye(4), (len(at), 4, 4))
         for child in chain[:chain.index(common)]:
             link = self._links[child]
-            pose = link.poses(at, f"'{link.parent}' -> '{child}'") @ pose
+            pose = link.poses(at, f"'{link.parent}' -> '{child}'", max_gap) @ pose
         return pose

@@ -6,6 +6,7 @@ sensor's own, and velocities are relative to it.
 
 from __future__ import annotations
 
+import importlib.util
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,6 +83,11 @@ def moved_boxes(boxes: np.ndarray, pose: np.ndarray) -> np.ndarray:
     moved[:, :3] = moved[:, :3] @ pose[:3, :3].T + pose[:3, 3]
     moved[:, 6] = wrap_angle(np.arctan2(flat[1], flat[0]))
     return moved
+
+
+def has_odometry() -> bool:
+    """Whether Odometry can be made: the extra [odometry] is installed."""
+    return importlib.util.find_spec("kiss_icp") is not None
 
 
 class Odometry:

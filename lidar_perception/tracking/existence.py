@@ -1,10 +1,9 @@
 """Is a track what it claims to be, and is it still there? Evidence in log odds.
 
-Two questions, two sums. A post that looks like a person does so in every frame: looks from the same
-place are correlated, so n of them count as n / (1 + (n - 1) correlation) (the design effect of
-cluster sampling; Kish, Survey Sampling, 1965), and a look from another bearing or range begins a
-new group. Whether the object is still there follows from hits and misses, with the probability of
-a hit as its own track shows it.
+Two questions, two sums. A post that looks like a person does so in every frame, and from every
+side: looks at one object are correlated, so n of them count as n / (1 + (n - 1) correlation) (the
+design effect of cluster sampling; Kish, Survey Sampling, 1965). Whether the object is still there
+follows from hits and misses, with the probability of a hit as its own track shows it.
 """
 
 from __future__ import annotations
@@ -36,20 +35,17 @@ def evidence(scores: np.ndarray, kinds: np.ndarray, params: ExistenceParams) -> 
     return params.gain * (log_odds(scores) - log_odds(neutral)[kinds])
 
 
-def effective_looks(looks: np.ndarray, views: np.ndarray, correlation: float) -> np.ndarray:
-    """(N,) how many independent looks these are: looks (N,), 0 or more, in 1 + views (N,) groups
-    of equal size, those of a group correlated."""
-    groups = 1.0 + views
-    return looks / (1.0 + np.maximum(looks / groups - 1.0, 0.0) * correlation)
+def effective_looks(looks: np.ndarray, correlation: float) -> np.ndarray:
+    """(N,) how many independent looks these are: looks (N,), 0 or more, that are correlated."""
+    return looks / (1.0 + np.maximum(looks - 1.0, 0.0) * correlation)
 
 
-def real(total: np.ndarray, looks: np.ndarray, views: np.ndarray, moving: np.ndarray,
+def real(total: np.ndarray, looks: np.ndarray, moving: np.ndarray,
          params: ExistenceParams) -> np.ndarray:
-    """(N,) log odds of being what is claimed: total (N,) evidence of looks (N,) in 1 + views (N,)
-    groups; moving (N,) probability of motion, which speaks for an object as far as it is above a
-    half."""
+    """(N,) log odds of being what is claimed: total (N,) evidence of looks (N,); moving (N,)
+    probability of motion, which speaks for an object as far as it is above a half."""
     mean = total / np.maximum(looks, 1e-9)
-    return (params.prior + mean * effective_looks(looks, views, params.correlation)
+    return (params.prior + mean * effective_looks(looks, params.correlation)
             + params.moves * np.maximum(2.0 * moving - 1.0, 0.0))
 
 
@@ -58,9 +54,3 @@ def absence(hits: np.ndarray, tries: np.ndarray, params: ExistenceParams) -> np.
     (N,): much where hits are the rule."""
     rate = np.minimum((hits + HITS) / (tries + TRIES), SURE)
     return np.minimum(-np.log(1.0 - rate), params.max_absence)
-
-
-def is_new_view(bearing: np.ndarray, log_range: np.ndarray, params: ExistenceParams) -> np.ndarray:
-    """(N,) bool: has the bearing (N,) rad, or the logarithm of the range (N,), changed so much
-    since the last group began that a new one does."""
-    return np.hypot(bearing, log_range) >= params.new_view

@@ -61,7 +61,7 @@ class NeutralParams(Params):
 
 
 # Of detectors whose scores mean something else than those of PointPillars, see docs/tracking.md.
-NEUTRAL = {"pointnet": NeutralParams(pedestrian=0.5)}
+NEUTRAL = {"pointnet": NeutralParams(pedestrian=0.5), "fused": NeutralParams(0.5, 0.5, 0.5)}
 
 
 @dataclass(frozen=True)
@@ -70,17 +70,17 @@ class ExistenceParams(Params):
 
     neutral: NeutralParams = NeutralParams()
     gain: float = param(1.0, "Weight of a score's log odds.", low=0.0, high=10.0)
-    correlation: float = param(0.8, "Of the evidence of looks from the same place: n of them count "
-                               "as n / (1 + (n - 1) correlation).", low=0.0, high=1.0)
-    new_view: float = param(0.35, "A change of the bearing under which it is seen (rad), or "
-                            "of the logarithm of its range, that makes a look a new one.",
-                            low=0.01, high=10.0)
+    correlation: float = param(0.8, "Of the evidence of looks at one object: n of them count as "
+                               "n / (1 + (n - 1) correlation).", low=0.0, high=1.0)
     memory: float = param(1.0, "Evidence fades with this time constant.", unit="s", low=0.05,
                           high=1000.0)
     prior: float = param(0.0, "Log odds of a track before any evidence.", low=-10.0, high=10.0)
     missed: float = param(-1.5, "Evidence of a look that found nothing.", low=-10.0, high=0.0)
     moves: float = param(1.0, "Evidence of motion, where poses say what stands: posts do not "
                          "walk.", low=0.0, high=10.0)
+    walking: float = param(3.0, "No pedestrian is faster.", unit="m/s", low=0.5, high=100.0)
+    faster: float = param(3.0, "Evidence against a pedestrian that is, where poses say what "
+                          "stands: riders look like people.", low=0.0, high=20.0)
     seen: float = param(2.0, "What a hit adds to the log odds of being there still.", low=0.0,
                         high=10.0)
     max_present: float = param(3.0, "These log odds are no higher.", low=0.0, high=20.0)
@@ -123,7 +123,8 @@ class TrackingParams(Params):
         return self.vehicle, self.pedestrian, self.cyclist
 
 
-EGO_SOURCES = ("auto", "odometry", "kiss_icp", "none")
+EGO_SOURCES = ("auto", "odometry", "tf", "kiss_icp", "none")  # of a node
+RECORDED_EGO = ("auto", "recording", "kiss_icp", "none")      # of a recording
 
 
 @dataclass(frozen=True)
@@ -131,12 +132,16 @@ class EgoParams(Params):
     """Where a node learns how the sensor moves."""
 
     source: str = param(
-        "auto", "auto: odometry as soon as some comes. odometry: ~/input/odometry. kiss_icp: from "
-        "the scans on ~/input/points, by the extra [odometry]. none: tracks are relative to the "
-        "sensor.", choices=EGO_SOURCES, fixed=True)
+        "auto", "odometry: ~/input/odometry. tf: TF, from `input.fixed_frame`. kiss_icp: from the "
+        "scans on ~/input/points, by the extra [odometry]. none: tracks are relative to the "
+        "sensor. auto: the odometry as soon as some comes; where none has come yet, TF if it "
+        "connects the sensor with `input.fixed_frame`; and after a second with neither, kiss_icp "
+        "if the extra is installed.", choices=EGO_SOURCES, fixed=True)
     max_gap: float = param(0.5, "Between two poses, and after the last one, a pose is taken to be "
                            "known for so long; beyond, max_ego_gap of the tracker goes on.",
                            unit="s", low=0.0, high=100.0)
+    max_wait: float = param(0.2, "A frame waits for its pose this long, where poses come but are a "
+                            "little behind.", unit="s", low=0.0, high=100.0)
 
 
 def tracking_of(detector: str, params: TrackingParams = TrackingParams()) -> TrackingParams:

@@ -15,10 +15,9 @@ class States:
 
     ids (N,) int64; means (N, 6), covariances (N, 6, 6) as in motion.py; heights (N,) z of the
     centre and height_variances (N,); sizes (N, 3) l w h, means with size_weights (N,);
-    class_evidence (N, CLASSES) and class_ids (N,) int32; total, looks, views (N,) as in
-    existence.py, sight (N, 2) bearing and logarithm of the range at which the last group of looks
-    began; present (N,) log odds of being there; hits, tries (N,); moving (N,) probability; ages
-    (N,) seconds since birth; unseen (N,) seconds since the last hit.
+    class_evidence (N, CLASSES) and class_ids (N,) int32; total, looks (N,) as in
+    existence.py; present (N,) log odds of being there; hits, tries (N,); moving (N,) probability;
+    ages (N,) seconds since birth; unseen (N,) seconds since the last hit.
     """
 
     ids: np.ndarray
@@ -32,8 +31,6 @@ class States:
     class_ids: np.ndarray
     total: np.ndarray
     looks: np.ndarray
-    views: np.ndarray
-    sight: np.ndarray
     present: np.ndarray
     hits: np.ndarray
     tries: np.ndarray
@@ -60,7 +57,7 @@ class States:
     @staticmethod
     def none() -> States:
         """No track."""
-        shapes = {"means": (6,), "covariances": (6, 6), "sizes": (3,), "sight": (2,),
+        shapes = {"means": (6,), "covariances": (6, 6), "sizes": (3,),
                   "class_evidence": (len(CLASSES),)}
         kinds = {"ids": np.int64, "class_ids": np.int32}
         return States(*(np.zeros((0, *shapes.get(f.name, ())), kinds.get(f.name, np.float64))

@@ -8,12 +8,11 @@ import numpy as np
 from scipy.special import ndtr
 
 from lidar_perception.detectors.nms import suppressed
-from lidar_perception.geometry import wrap_angle
 from lidar_perception.tracking import existence, motion
 from lidar_perception.tracking.association import FORBIDDEN, assigned, costs
 from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams
 from lidar_perception.tracking.state import States
-from lidar_perception.types import CLASSES
+from lidar_perception.types import CLASSES, PEDESTRIAN
 
 HEIGHT_NOISE = 0.2      # m, standard deviation of a measured z
 HEIGHT_DRIFT = 0.3      # m/s^0.5, of the z of an object
@@ -35,7 +34,7 @@ def predicted(states: States, seconds: float, params: TrackingParams) -> States:
     return replace(
         states, means=means, covariances=covariances, ages=states.ages + seconds,
         unseen=states.unseen + seconds, total=states.total * fade, looks=states.looks * fade,
-        views=states.views * fade, class_evidence=states.class_evidence * fade,
+        class_evidence=states.class_evidence * fade,
         height_variances=states.height_variances + HEIGHT_DRIFT ** 2 * seconds)
 
 
@@ -57,10 +56,9 @@ def matched(states: States, boxes: np.ndarray, class_ids: np.ndarray, scores: np
 
 
 def updated(states: States, i: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
-            scores: np.ndarray, sensor: np.ndarray, params: TrackingParams,
-            fixed: bool) -> States:
+            scores: np.ndarray, params: TrackingParams, fixed: bool) -> States:
     """The tracks after a frame in which those at i (P,) were hit by boxes (P, 7), and the others
-    missed; sensor (2,) its place. fixed: whether the frame stands, so that wheels and feet go
+    missed. fixed: whether the frame stands, so that wheels and feet go
     forward in it; seen from a car, those of parked cars do not."""
     new = states.copy()
     kinds = KINDS[states.class_ids[i]]
@@ -80,12 +78,12 @@ def updated(states: States, i: np.ndarray, boxes: np.ndarray, class_ids: np.ndar
     new.sizes[i] += weight[:, None] * (boxes[:, 3:6] - states.sizes[i])
     new.size_weights[i] = np.minimum(states.size_weights[i] + scores, MAX_SIZE_WEIGHT)
     new.moving[:] = moving(new.means, new.covariances, params.moving_speed)
-    _look(new, i, class_ids, scores, sensor, params)
+    _look(new, i, class_ids, scores, params)
     return new
 
 
 def _look(new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
-          sensor: np.ndarray, params: TrackingParams) -> None:
+          params: TrackingParams) -> None:
     """The evidence of one frame, into arrays of their own."""
     own = params.existence
     missed = np.ones(len(new), bool)
@@ -99,11 +97,6 @@ def _look(new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
     ahead = new.class_evidence[rows, best] > (
         new.class_evidence[rows, new.class_ids] + CLASS_LEAD)
     new.class_ids[ahead] = best[ahead]
-    sight = seen_from(new.means[i], sensor)
-    since = sight - new.sight[i]
-    fresh = existence.is_new_view(wrap_angle(since[:, 0]), since[:, 1], own)
-    new.views[i[fresh]] += 1.0
-    new.sight[i[fresh]] = sight[fresh]
     lost = existence.absence(new.hits, new.tries, own)
     new.present[missed] -= lost[missed]
     new.present[i] = np.minimum(new.present[i] + own.seen, own.max_present)
@@ -116,7 +109,7 @@ def _look(new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
 
 
 def born(first_id: int, boxes: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
-         sensor: np.ndarray, params: TrackingParams) -> States:
+         params: TrackingParams) -> States:
     """New tracks of detections (K, 7), standing as far as is known."""
     count, kinds = len(boxes), KINDS[class_ids]
     noise, heading, speed, turning = (_by_kind(params, name)[kinds] for name in (
@@ -132,8 +125,8 @@ def born(first_id: int, boxes: np.ndarray, class_ids: np.ndarray, scores: np.nda
     return States(
         first_id + np.arange(count), means, covariances, boxes[:, 2].copy(),
         np.full(count, HEIGHT_NOISE ** 2), boxes[:, 3:6].copy(), scores.copy(), votes,
-        class_ids.astype(np.int32), existence.evidence(scores, kinds, own), ones, zeros,
-        seen_from(means, sensor), np.full(count, own.seen / 2), ones.copy(), ones.copy(),
+        class_ids.astype(np.int32), existence.evidence(scores, kinds, own), ones,
+        np.full(count, own.seen / 2), ones.copy(), ones.copy(),
         moving(means, covariances, params.moving_speed), zeros.copy(), zeros.copy())
 
 
@@ -149,8 +142,12 @@ def alive(states: States, params: TrackingParams, fixed: bool) -> States:
 def probabilities(states: States, params: TrackingParams, fixed: bool) -> np.ndarray:
     """(N,) of being what is claimed, and there. fixed: whether the frame is one in which posts
     stand; if not, motion says nothing."""
-    claim = existence.real(states.total, states.looks, states.views,
-                           states.moving if fixed else np.zeros(len(states)), params.existence)
+    own, still = params.existence, np.zeros(len(states))
+    claim = existence.real(states.total, states.looks, states.moving if fixed else still, own)
+    if fixed:
+        rides = moving(states.means, states.covariances, own.walking)
+        rides *= KINDS[states.class_ids] == KIND_OF_CLASS[PEDESTRIAN]
+        claim -= own.faster * np.maximum(2.0 * rides - 1.0, 0.0)
     return existence.probability(claim) * existence.probability(states.present)
 
 
@@ -164,12 +161,6 @@ def moving(means: np.ndarray, covariances: np.ndarray, speed: float) -> np.ndarr
     variance = (ux * ux * covariances[:, 2, 2] + 2 * ux * uy * covariances[:, 2, 3]
                 + uy * uy * covariances[:, 3, 3])
     return ndtr((fast - speed) / np.sqrt(np.maximum(variance, 1e-12)))
-
-
-def seen_from(means: np.ndarray, sensor: np.ndarray) -> np.ndarray:
-    """(N, 2) bearing in the fixed frame, rad, and logarithm of the range in metres."""
-    x, y = means[:, 0] - sensor[0], means[:, 1] - sensor[1]
-    return np.column_stack([np.arctan2(y, x), np.log(np.maximum(np.hypot(x, y), 1.0))])
 
 
 def _by_kind(params: TrackingParams, name: str) -> np.ndarray:

@@ -69,15 +69,14 @@ class Tracker:
         boxes = moved_boxes(boxes, self._ego.pose)
         states = predicted(self._states, seconds, self.params)
         i, j = matched(states, boxes, class_ids, scores, self.params)
-        sensor = self._ego.pose[:2, 3]
-        states = updated(states, i, boxes[j], class_ids[j], scores[j], sensor, self.params,
+        states = updated(states, i, boxes[j], class_ids[j], scores[j], self.params,
                          self._ego.known)
         free = np.ones(len(boxes), bool)
         free[j] = False
         start = np.flatnonzero(free & (scores >= self.params.association.strong))
         before = len(states)
         states = states.followed_by(born(self._next, boxes[start], class_ids[start],
-                                         scores[start], sensor, self.params))
+                                         scores[start], self.params))
         self._next += len(start)
         seen = np.zeros(len(states), bool)
         seen[i], seen[before:] = True, True

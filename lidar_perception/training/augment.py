@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lidar_perception.geometry import bev_iou, to_box_frame, wrap_angle
-from lidar_perception.training.params import AugmentParams, NoiseParams
+from lidar_perception.training.params import AugmentParams, NoiseParams, ThingParams
 from lidar_perception.training.putting import TOUCH, inside
 
 STEP = np.radians(0.4)  # of elevation between two beams
@@ -117,6 +117,23 @@ def with_reflector(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     low, high = np.sort(rng.uniform(height.min(), height.max(), 2))
     points[(height >= low) & (height <= high), 3] = SHINING
     return points
+
+
+def varied(points: np.ndarray, foot: np.ndarray, params: ThingParams,
+           rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Points (N, 4) of one thing, N at least 1, that is wider, higher and brighter, or less so, and
+    the factors (3,) of its lengths about its foot (3,): up to exp(things_stretch) or its inverse,
+    the same along x and y; intensities likewise by things_intensity. With the chance things_shine
+    it shines between two heights."""
+    wide, high = np.exp(rng.uniform(-params.things_stretch, params.things_stretch, 2))
+    factors = np.array([wide, wide, high])
+    points = points.copy()
+    points[:, :3] = (points[:, :3] - foot) * factors + foot
+    factor = np.exp(rng.uniform(-params.things_intensity, params.things_intensity))
+    points[:, 3] = np.clip(points[:, 3] * factor, 0, 1)
+    if rng.random() < params.things_shine:
+        points = with_reflector(points, rng)
+    return points, factors
 
 
 def noisy(points: np.ndarray, params: NoiseParams, rng: np.random.Generator) -> np.ndarray:

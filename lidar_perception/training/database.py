@@ -12,7 +12,7 @@ import numpy as np
 from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN
 from lidar_perception.geometry import bev_iou
 from lidar_perception.runs.files import write_bytes
-from lidar_perception.training.augment import BORDER, TrainingScene, grown, turned, with_reflector
+from lidar_perception.training.augment import BORDER, TrainingScene, grown, turned, varied
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.putting import floor_under, put_among
 from lidar_perception.types import InputError
@@ -84,7 +84,7 @@ def with_objects(scene: TrainingScene, database: Database, params: AugmentParams
                 break
             box, own = database.boxes[i], database.points_of(i)
             if class_id == THING:
-                box, own = varied(box, own, params, rng)
+                box, own = varied_thing(box, own, params, rng)
             put = _put(box, own, points, taken, free, low, high, rng)
             if put is not None:
                 points, taken = put
@@ -98,22 +98,14 @@ def with_objects(scene: TrainingScene, database: Database, params: AugmentParams
                    wanted=np.concatenate([scene.wanted, np.ones(objects.sum(), bool)]))
 
 
-def varied(box: np.ndarray, points: np.ndarray, params: AugmentParams,
-           rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """A thing that is wider, higher and brighter, or less so: its lengths about the middle of its
-    floor times up to exp(things_stretch) or its inverse, the same along x and y; intensities
-    likewise by things_intensity. With the chance things_shine it shines between two heights."""
-    wide, high = np.exp(rng.uniform(-params.things_stretch, params.things_stretch, 2))
-    factors = np.array([wide, wide, high])
+def varied_thing(box: np.ndarray, points: np.ndarray, params: AugmentParams,
+                 rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """A thing with its box, varied about the middle of its floor, see augment.varied."""
     floor = box[:3] - [0, 0, box[5] / 2]
-    points, box = points.copy(), box.copy()
-    points[:, :3] = (points[:, :3] - floor) * factors + floor
+    points, factors = varied(points, floor, params, rng)
+    box = box.copy()
     box[3:6] *= factors
     box[2] = floor[2] + box[5] / 2
-    factor = np.exp(rng.uniform(-params.things_intensity, params.things_intensity))
-    points[:, 3] = np.clip(points[:, 3] * factor, 0, 1)
-    if rng.random() < params.things_shine:
-        points = with_reflector(points, rng)
     return box, points
 
 

@@ -68,7 +68,19 @@ class NoiseParams(Params):
 
 
 @dataclass(frozen=True)
-class AugmentParams(NoiseParams):
+class ThingParams(NoiseParams):
+    """How background is changed that is taken for objects."""
+
+    things_stretch: float = param(0.5, "Such things are stretched or shrunk, in width and height, "
+                                       "by factors of up to exp(this).", low=0.0, high=3.0)
+    things_intensity: float = param(0.8, "Their intensities are multiplied or divided by up to "
+                                         "exp(this).", low=0.0, high=3.0)
+    things_shine: float = param(0.25, "Probability that a part of such a thing is "
+                                      "retroreflective, as signs are.", low=0.0, high=1.0)
+
+
+@dataclass(frozen=True)
+class AugmentParams(ThingParams):
     """How scenes are changed. 0 switches a change off."""
 
     crowded: float = param(0.7, "Probability that objects from other scenes are pasted into a "
@@ -79,13 +91,6 @@ class AugmentParams(NoiseParams):
     cyclists: int = param(8, "Likewise cyclists.", low=0, high=100)
     things: int = param(12, "This many objects that resemble a standing person, such as posts, are "
                         "pasted in as background.", low=0, high=100)
-    things_stretch: float = param(0.5, "These objects are stretched or shrunk, in width and "
-                                       "height, by factors of up to exp(this).", low=0.0, high=3.0)
-    things_intensity: float = param(0.8, "Their intensities are multiplied or divided by up to "
-                                         "exp(this).", low=0.0, high=3.0)
-    things_shine: float = param(0.25, "Probability that a part of such an object is "
-                                      "retroreflective, as "
-                                "signs are.", low=0.0, high=1.0)
     database_scans: int = param(2000, "Pasted objects come from at most this many scenes.", low=0,
                                 high=10**6)
     object_turn: float = param(0.157, "Each object is rotated by up to this.", unit="rad", low=0.0,
@@ -152,9 +157,9 @@ class PointPillarsTraining(LoopParams):
 
 
 @dataclass(frozen=True)
-class ClusterAugmentParams(NoiseParams):
-    """Which clusters of a scene are trained on, and how they are changed. 0 switches a change
-    off."""
+class ClusterAugmentParams(ThingParams):
+    """Which clusters of a scene are trained on, and how they are changed; things are background
+    clusters. 0 switches a change off."""
 
     objects: int = param(24, "Clusters of each class taken from a scene, at most.", low=1,
                          high=1000)
@@ -170,8 +175,6 @@ class ClusterAugmentParams(NoiseParams):
     flip: float = param(0.5, "Probability that left and right are swapped.", low=0.0, high=1.0)
     intensity: float = param(0.2, "Intensities are multiplied by 1 plus or minus up to this.",
                              low=0.0, high=1.0)
-    shine: float = param(0.1, "Probability that a part of a background cluster is retroreflective, "
-                         "as signs are.", low=0.0, high=1.0)
     height: float = param(0.15, "The ground is assumed higher or lower by up to this, and for "
                                 "each cluster by up to half of it in addition.",
                           unit="m", low=0.0, high=2.0)

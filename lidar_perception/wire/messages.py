@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from lidar_perception.camera import Calibration, Camera
 from lidar_perception.groups import renumbered
+from lidar_perception.robot import poses
 from lidar_perception.types import (
     CLASSES,
     Detections,
@@ -119,19 +120,14 @@ def calibration_of(info: Any, transform: Any) -> Calibration:
     """From CameraInfo and the TransformStamped between the LiDAR frame and the camera's, in either
     direction. InputError when P is empty or the frames do not fit."""
     t, q = transform.transform.translation, transform.transform.rotation
-    rotation, translation = np.array([q.x, q.y, q.z, q.w]), np.array([t.x, t.y, t.z])
-    if not abs(np.linalg.norm(rotation) - 1) < 1e-3:
-        raise InputError("the LiDAR-to-camera transform has no unit quaternion")
+    lidar_to_camera = poses.pose_of(*poses.checked(
+        (t.x, t.y, t.z), (q.x, q.y, q.z, q.w), "the LiDAR-to-camera transform"))
     parent, child = transform.header.frame_id, transform.child_frame_id
-    lidar_to_camera = np.eye(4)
-    lidar_to_camera[:3, :3] = Rotation.from_quat(rotation).as_matrix()
-    lidar_to_camera[:3, 3] = translation
     if info.header.frame_id != parent:  # it is the camera's pose in the LiDAR frame: turn it round
         if info.header.frame_id != child:
             raise InputError(f"CameraInfo is in frame '{info.header.frame_id}' but the transform "
                              f"links '{parent}' and '{child}'")
-        lidar_to_camera[:3, :3] = lidar_to_camera[:3, :3].T
-        lidar_to_camera[:3, 3] = -lidar_to_camera[:3, :3] @ translation
+        lidar_to_camera = poses.inverse(lidar_to_camera)
     return calibrated(info, lidar_to_camera)
 
 
@@ -221,9 +217,4 @@ def pose_of(pose: Any) -> np.ndarray:
     """(4, 4) float64 of a geometry_msgs/Pose. InputError if it is not finite, or its quaternion is
     no rotation."""
     p, q = pose.position, pose.orientation
-    place, turn = np.array([p.x, p.y, p.z]), np.array([q.x, q.y, q.z, q.w])
-    if not np.isfinite(place).all() or not abs(np.linalg.norm(turn) - 1) < 1e-2:
-        raise InputError("a pose is not finite, or has no unit quaternion")
-    matrix = np.eye(4)
-    matrix[:3, :3], matrix[:3, 3] = Rotation.from_quat(turn).as_matrix(), place
-    return matrix
+    return poses.pose_of(*poses.checked((p.x, p.y, p.z), (q.x, q.y, q.z, q.w), "a pose"))

@@ -97,6 +97,40 @@ def test_nothing_is_guessed_beyond_what_is_known():
     assert np.isfinite(tree.lookup("lidar", "camera", 0)).all()  # fixed, so known at any time
 
 
+@given(seeds, st.floats(0.02, 0.4))
+def test_with_a_gap_allowed_what_moves_goes_on_as_it_did(seed, seconds):
+    """Along the way of its last two poses, evenly: as far again takes as long again."""
+    tree, _, (times, _, _) = chain(seed)
+    last, beyond = int(times[-1]), round(seconds * SECOND)
+    step = inverse(tree.lookup("odom", "base", int(times[-2]))) @ tree.lookup("odom", "base", last)
+    found = tree.lookup("odom", "base", last + beyond, 0.5)
+    turned = Rotation.from_matrix(step[:3, :3]).as_rotvec() * seconds / 0.02
+    expected = tree.lookup("odom", "base", last)[:3, :3] @ Rotation.from_rotvec(turned).as_matrix()
+    np.testing.assert_allclose(found[:3, :3], expected, atol=1e-6)
+    before, now = (tree.lookup("odom", "base", t)[:3, 3] for t in (int(times[-2]), last))
+    np.testing.assert_allclose(found[:3, 3], now + (now - before) * seconds / 0.02, atol=1e-6)
+    np.testing.assert_array_equal(tree.lookup("odom", "base", last, 0.5),
+                                  tree.lookup("odom", "base", last))
+
+
+def test_a_gap_that_is_too_long_is_not_bridged():
+    tree = TransformTree()
+    tree.set("odom", "base", START, [0, 0, 0], [0, 0, 0, 1])
+    for stamp in (START - 1, START + 1):  # one pose alone does not move
+        with pytest.raises(Missing):
+            tree.lookup("odom", "base", stamp, 0.5)
+    tree.set("odom", "base", START + SECOND // 10, [1, 0, 0], [0, 0, 0, 1])
+    assert tree.lookup("odom", "base", START + SECOND // 2, 0.5)[0, 3] == pytest.approx(5)
+    with pytest.raises(Missing, match="older than needed") as error:
+        tree.lookup("odom", "base", START + SECOND * 7 // 10, 0.5)
+    assert error.value.late
+    tree.set("odom", "base", START + 2 * SECOND, [2, 0, 0], [0, 0, 0, 1])
+    assert np.isfinite(tree.lookup("odom", "base", START + SECOND)).all()
+    with pytest.raises(Missing, match="s apart at the time"):
+        tree.lookup("odom", "base", START + SECOND, 0.5)
+    assert tree.lookup("odom", "base", START + SECOND // 10, 0.0)[0, 3] == 1  # its very stamp
+
+
 def test_what_is_not_connected_is_named():
     tree, _, _ = chain()
     tree.set("world", "tower", 0, [0, 0, 0], [0, 0, 0, 1], static=True)

@@ -1,4 +1,4 @@
-"""A cloud as a message, for all tests of nodes."""
+"""What tests of nodes share: a cloud as a message, nodes in this process."""
 
 import pytest
 
@@ -31,3 +31,30 @@ def talker(request, shared_peer, found):
     """Straight to the detector."""
     from test_bad_input import CLOUD
     return shared_peer.talker(request.module.DETECTOR.between, CLOUD)
+
+
+@pytest.fixture
+def start(domain):
+    """Makes a node in this process; what it publishes grows in node.sent, by topic."""
+    from rclpy.parameter import Parameter
+
+    from lidar_perception.nodes.watch import new_context
+    context, nodes = new_context(domain), []
+
+    def make(kind, **values):
+        overrides = [Parameter(k, value=list(v) if isinstance(v, tuple) else v)
+                     for k, v in values.items() if v != ()]
+        node = kind(context=context, parameter_overrides=overrides)
+        nodes.append(node)
+        node.start()
+        assert node.active
+        node.sent = {}
+        for publisher in node._outputs:
+            publisher.publish = node.sent.setdefault(
+                publisher.topic_name.rpartition("/")[2], []).append
+        return node
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+    context.try_shutdown()

@@ -9,7 +9,6 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from detection_samples import eager, frame, lively, tiny
-from rclpy.parameter import Parameter
 from samples import WALKER
 from samples import scene as walker_scene
 from scipy.spatial.transform import Rotation
@@ -19,7 +18,6 @@ from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
-from lidar_perception.nodes.watch import new_context
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.robot.deskew import skewed, steady
 from lidar_perception.robot.placing import tilted
@@ -33,30 +31,6 @@ from msg_utils.stamps import header_message, time_message
 START = 1_700_000_000 * 10**9
 PERIOD = 10**8
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-
-@pytest.fixture
-def start(domain):
-    """Makes a node in this process; what it publishes grows in node.sent, by topic."""
-    context, nodes = new_context(domain), []
-
-    def make(kind, **values):
-        overrides = [Parameter(k, value=list(v) if isinstance(v, tuple) else v)
-                     for k, v in values.items() if v != ()]
-        node = kind(context=context, parameter_overrides=overrides)
-        nodes.append(node)
-        node.start()
-        assert node.active
-        node.sent = {}
-        for publisher in node._outputs:
-            publisher.publish = node.sent.setdefault(
-                publisher.topic_name.rpartition("/")[2], []).append
-        return node
-
-    yield make
-    for node in nodes:
-        node.destroy_node()
-    context.try_shutdown()
 
 
 def give(node, msg):

@@ -15,9 +15,8 @@ from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, perso
 
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.data.bag import Bag
-from lidar_perception.nodes.graph import Processes, graph_of
+from lidar_perception.nodes.graph import ODOMETRY_IN, Processes, graph_of
 from lidar_perception.nodes.tracker import TrackerNode
-from lidar_perception.nodes.watch import new_context
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
@@ -85,10 +84,9 @@ def looped(domain, drive_bag, tmp_path_factory):
     with Processes(tmp_path_factory.mktemp("looped"), domain) as processes, Peer(domain) as peer:
         heard = {name: peer.listen(topic, MARKERS, ALL_OF_THEM) for name, topic in outputs.items()}
         for node, remap in graph.items():
-            # A cloud does not wait for its pose: the one in the process does without.
-            extra = ({**flatten(params), "tracking.enabled": True, "input.queue": 2,
-                      "ego.source": "none"} if node == "perception" else {})
-            processes.start(node, remap, extra)
+            extra = ({**flatten(params), "tracking.enabled": True, "input.queue": 2}
+                     if node == "perception" else {})
+            processes.start(node, {**remap, **ODOMETRY_IN}, {**extra, "ego.max_wait": 60.0})
         listeners = {"found": 2, "behind": 1, "inside": 1}  # as each node itself sees them
         peer.wait(lambda: all(
             int(peer.value_of(topic.split("/")[1], f"subscribers of {topic}") or 0)
@@ -96,7 +94,7 @@ def looped(domain, drive_bag, tmp_path_factory):
         processes.start("bag_player", {}, {
             "bag": str(drive_bag), "loop": True,
             "follow": [outputs[name].lstrip("/") for name in ("found", "behind")],
-            "wait_for": [POINTS, f"{ODOMETRY}:=1", f"{CAMERA_INFO}:=1", outputs["found"] + ":=3",
+            "wait_for": [POINTS, f"{ODOMETRY}:=2", f"{CAMERA_INFO}:=1", outputs["found"] + ":=3",
                          outputs["behind"] + ":=2"],
             "wait_timeout": 120.0})
         peer.wait(lambda: min(map(len, heard.values())) > 2.5 * clouds, "the drive, three times",
@@ -145,9 +143,10 @@ def test_ids_stay_with_the_people_of_the_drive(looped, drive_bag):
     assert people["switches"] == 0 and people["hits"] > clouds
 
 
-def test_in_one_process_with_the_detector_the_library_tracks_too(looped):
+def test_in_one_process_with_the_detector_the_library_tracks_too(looped, drive_bag):
+    """Each cloud waits for its pose, as the frames of a tracker do."""
     _, heard, _ = looped
-    shown = assert_tracked(heard["found"], heard["inside"], {},
+    shown = assert_tracked(heard["found"], heard["inside"], poses_of(drive_bag),
                            tracking_of("candidates"))
     assert any(t is not None and len(t) for t in shown)
 
@@ -217,13 +216,10 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
     assert "Traceback" not in (processes.logs / f"{NODE}.log").read_text()
 
 
-def test_detection_arrays_are_tracked_as_markers_are(domain):
+def test_detection_arrays_are_tracked_as_markers_are(start):
     """By the node in this process, as vision_msgs is not everywhere."""
-    context, shown = new_context(domain), []
-    node, tracker = TrackerNode(context=context), Tracker()
-    node.configure()
-    node.tracks.markers = SimpleNamespace(publish=lambda data: shown.append(decode(data, MARKERS)))
-    node.tracks.ego._on_odometry(odometry(pose(50, 0, 1), header(START, "lidar"), "base",
+    node, tracker = start(TrackerNode), Tracker()
+    node.transforms.on_odometry(odometry(pose(50, 0, 1), header(START, "lidar"), "base",
                                           bag_message))  # detections are in its fixed frame
     for i, found in enumerate(crowd()):
         boxes = [SimpleNamespace(
@@ -235,7 +231,6 @@ def test_detection_arrays_are_tracked_as_markers_are(domain):
         stamp = START + i * TENTH
         node.on_detections(SimpleNamespace(header=header(stamp), detections=boxes))
         tracks = tracker(found, stamp, np.eye(4))
-        assert read(shown[-1])[1] == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
-        np.testing.assert_allclose(read(shown[-1])[2].boxes, tracks.detections.boxes, atol=1e-4)
-    node.destroy_node()
-    context.try_shutdown()
+        shown = read(decode(node.sent["tracks"][-1], MARKERS))
+        assert shown[1] == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
+        np.testing.assert_allclose(shown[2].boxes, tracks.detections.boxes, atol=1e-4)

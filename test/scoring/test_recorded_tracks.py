@@ -9,8 +9,8 @@ from tracking_samples import START, TENTH, crowd
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.scoring.pictures import draw_frame
 from lidar_perception.scoring.tracking.from_bag import recorded_tracks
-from lidar_perception.tracking.poses import Trails
 from lidar_perception.tracking.tracker import Tracker
+from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import GroundTruth
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import truth_markers

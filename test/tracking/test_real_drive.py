@@ -4,16 +4,24 @@ from __future__ import annotations
 
 from functools import partial
 
+import pytest
 
-def test_no_identity_switches_on_a_real_drive_without_poses(data):
+
+@pytest.mark.parametrize("ego", ["none", "auto"])
+def test_no_identity_switches_on_a_real_drive(data, ego):
+    """Which has no poses: auto takes them from the scans."""
+    from lidar_perception.data.frame import POSES
     from lidar_perception.data.open import open_recording
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.detectors.params import MIN_SCORE
     from lidar_perception.scoring.run import fill
-    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
+    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, ego_of
+    from lidar_perception.tracking.ego import has_odometry
 
-    report = TrackingReport()
-    fill(report, open_recording(data / "kitti_tracking"),
-         by_tracker(partial(open_detector, min_score=MIN_SCORE)), limit=20)
+    report, drive = TrackingReport(), open_recording(data / "kitti_tracking")
+    if ego == "auto" and POSES not in drive.has:
+        assert ego_of(drive) == ("kiss_icp" if has_odometry() else "none")
+    fill(report, drive,
+         by_tracker(partial(open_detector, "pointpillars", min_score=MIN_SCORE), ego=ego), limit=20)
     cars = report.compute()["classes"]["Car"]
     assert cars["switches"] == 0 and cars["HOTA"] > 0.7

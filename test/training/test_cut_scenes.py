@@ -42,7 +42,8 @@ from lidar_perception.types import CLASSES, GroundTruth, InputError, LidarFrame
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = pointnet_config(**SMALL)
 STILL = ClusterAugmentParams(box_shift=0, farther=0, dropout=0, beam_noise=0, range_noise=0,
-                             scale=0, flip=0, intensity=0, height=0, shine=0)
+                             scale=0, flip=0, intensity=0, height=0, things_stretch=0,
+                             things_intensity=0, things_shine=0)
 
 
 @pytest.fixture
@@ -226,7 +227,7 @@ def test_background_shines_and_objects_do_not(rng):
     scene.clusters.points[:, 3] = 0.3
     before = scene.clusters.points.copy()
     for shine in (0.0, 1.0):
-        sample = ClusterPreparation(CONFIG, replace(STILL, shine=shine))(scene, rng)
+        sample = ClusterPreparation(CONFIG, replace(STILL, things_shine=shine))(scene, rng)
         bright = (sample.inputs.points[..., 3] > 0.9).any(axis=1)
         assert not bright[sample.has_box].any()
         assert bright[~sample.has_box].mean() >= 0.7 * shine  # no point may lie between the heights

@@ -26,7 +26,7 @@ from lidar_perception.training.augment import (
     with_moved_objects,
 )
 from lidar_perception.training.cut_objects import cut_objects
-from lidar_perception.training.database import THING, Database, varied, with_objects
+from lidar_perception.training.database import THING, Database, varied_thing, with_objects
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.putting import inside
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
@@ -296,7 +296,7 @@ def test_what_shines_of_a_thing_is_between_two_heights(seed):
     for box in scene.boxes:
         own = scene.points[inside(scene.points, box, 0.0)]
         own[:, 3] = 0.3
-        _, points = varied(box, own, replace(STILL_THINGS, things_shine=1), rng)
+        _, points = varied_thing(box, own, replace(STILL_THINGS, things_shine=1), rng)
         bright = points[:, 3] > 0.9
         assert (points[~bright, 3] == np.float32(0.3)).all()
         if bright.any():
@@ -311,12 +311,12 @@ def test_things_are_stretched_upon_their_floor(seed):
     changes = replace(STILL_THINGS, things_stretch=0.5, things_intensity=0.4)
     for box in scene.boxes:
         own = scene.points[inside(scene.points, box, 0.0)]
-        grown, points = varied(box, own, changes, rng)
+        grown, points = varied_thing(box, own, changes, rng)
         assert len(inside(points, grown, 1e-3)) == len(own)
         assert grown[2] - grown[5] / 2 == pytest.approx(box[2] - box[5] / 2)
         assert grown[[0, 1, 6]] == pytest.approx(box[[0, 1, 6]])
         assert (np.abs(np.log(grown[3:6] / box[3:6])) <= 0.5).all()
-        same, still = varied(box, own, STILL_THINGS, rng)
+        same, still = varied_thing(box, own, STILL_THINGS, rng)
         np.testing.assert_allclose(same, box, atol=1e-12)
         np.testing.assert_allclose(still, own, atol=1e-6)
 

@@ -6,8 +6,8 @@ import numpy as np
 from samples import each_make, header
 from tracking_samples import CAR, START, TENTH, crowd, pose
 
-from lidar_perception.tracking.poses import Trails
 from lidar_perception.tracking.tracker import Tracker
+from lidar_perception.tracking.trails import Trails
 from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import odometry, pose_of, to_detections

@@ -33,16 +33,22 @@ from lidar_perception.types import InputError
               "always the same. Default: 1.")
 @a_path("--write-results", "Write the detections of --weights as KITTI result files, also for "
                            "frames without labels.", "DIR")
+@click.option("--errors", is_flag=True, help="Also say where found boxes differ from the true "
+              "ones, by class and range, and what each difference costs.")
+@click.option("--errors-from", type=click.FloatRange(0, 1), default=0.2, show_default=True,
+              metavar="SCORE", help="With --errors: of boxes from this score on.")
 def detection(walk: Walk, results: Path | None, weights: Path | None, device: str,
-              min_score: float, keep: float, write_results: Path | None) -> None:
+              min_score: float, keep: float, write_results: Path | None, errors: bool,
+              errors_from: float) -> None:
     """Boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
 
     Average precision in the image, from above and in space, and of orientation, at 40 and 11
-    recall points; pedestrians by centre distance as in the STM-CPA paper. Scores either the result
-    files of any detector, or a checkpoint, which is run on every scan.
+    recall points; pedestrians by centre distance as in the STM-CPA paper. Scores the result files
+    of any detector, or runs one on every scan: a checkpoint, or without any the fused detector.
 
     \b
     Examples:
+      lidar-perception evaluate detection --data /data/kitti/object --errors
       lidar-perception evaluate detection --data /data/kitti/object --results out/data
       lidar-perception evaluate detection --data /data/kitti/object --weights v4.safetensors \\
           --split val.txt --json scores.json --write-results out/data
@@ -51,17 +57,21 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
     from lidar_perception.data.frame import BOXES
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.scoring.detections import by_detector, by_files
+    from lidar_perception.scoring.kitti.box_errors import box_errors, print_box_errors
+    from lidar_perception.scoring.kitti.protocol import SCORED
     from lidar_perception.scoring.kitti.report import DetectionReport
     from lidar_perception.scoring.kitti.tables import print_detection_report
 
-    if (results is None) == (weights is None):
+    if results is None:
+        weights = weights or Path("fused")
+    elif weights is not None:
         raise click.UsageError("give either --results DIR or --weights FILE")
     if write_results is not None and weights is None:
-        raise click.UsageError("--write-results writes the detections of --weights; --results DIR "
-                               "has "
-                               "its files already")
+        raise click.UsageError("--write-results writes the detections of a detector; --results DIR "
+                               "has its files already")
     if keep != 1 and weights is None:
-        raise click.UsageError("--keep thins the scans that --weights see; --results DIR sees none")
+        raise click.UsageError("--keep thins the scans that a detector sees; --results DIR sees "
+                               "none")
     recording = walk.opened(BOXES if write_results is None else None, scans=weights is not None)
     if results is not None:
         if not results.is_dir():
@@ -74,10 +84,13 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
     report = DetectionReport()
     walk.fill(report, recording, start)
     content = {"source": str(results or weights), "keep": keep, **report.compute()}
+    if errors:
+        content["errors"] = {name: box_errors(report.frames, name, errors_from) for name in SCORED}
     walk.write(content)
     if write_results is not None:
         console.print(f"result files: {write_results}")
     if report.frames:
         print_detection_report(content, console)
+        print_box_errors(content.get("errors", {}), console)
     elif write_results is None or report.skipped:
         raise no_labels(recording, report.skipped)

@@ -20,7 +20,7 @@ from lidar_perception.cli.data import (
 )
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.runs.terminal import console
-from lidar_perception.tracking.params import TrackingParams, tracking_of
+from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams, tracking_of
 
 
 @click.command()
@@ -31,38 +31,40 @@ from lidar_perception.tracking.params import TrackingParams, tracking_of
         "pointpillars or pointnet, with the weights that come with the package.", "FILE|NAME",
         default="pointpillars", show_default=True)
 @device_option
-@click.option("--odometry", is_flag=True, help="Take the sensor's motion from the scans, by "
-              "KISS-ICP, instead of the recording's poses. Needs the extra [odometry].")
+@click.option("--ego", type=click.Choice(RECORDED_EGO), default="auto", show_default=True,
+              help="The sensor's motion: from the recording's poses; from the scans, by KISS-ICP "
+              "(the extra [odometry]); or none, tracks are relative to the sensor then. auto: the "
+              "first of them that there is.")
 @json_option
 @parameter_options(TrackingParams())
 def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, device: str,
-             odometry: bool, json_file: Path | None, params: TrackingParams) -> None:
+             ego: str, json_file: Path | None, params: TrackingParams) -> None:
     """HOTA, CLEAR MOT and AB3DMOT's scores of Car, Pedestrian and Cyclist.
 
     The labels need track ids, and the frames of a drive come one after the other, so this runs in
-    one process. Without poses tracks are relative to the sensor.
+    one process.
 
     \b
     Examples:
       lidar-perception evaluate tracking --data /data/kitti/tracking --json tracks.json
-      lidar-perception evaluate tracking --data drive --odometry --weights v4.safetensors
+      lidar-perception evaluate tracking --data drive --ego kiss_icp --weights v4.safetensors
     """
     from lidar_perception.data.frame import BOXES
-    from lidar_perception.detectors.checkpoint import NETWORKS, network_of
-    from lidar_perception.detectors.open import open_detector
+    from lidar_perception.detectors.checkpoint import network_of
+    from lidar_perception.detectors.open import LOAD, open_detector
     from lidar_perception.scoring.run import fill
-    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
+    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, ego_of
     from lidar_perception.scoring.tracking.tables import print_tracking_report
 
-    named = str(weights) in NETWORKS or weights.suffix == ".onnx"
+    named = str(weights) in LOAD or weights.suffix == ".onnx"
     params = tracking_of(str(weights) if named else network_of(weights), params)
     recording = opened(data, split=split)
     recording.require(BOXES, "evaluate tracking")
     open_ = partial(open_detector, weights, device, min_score=params.min_score,
                     sensor_height=recording.frames[0].sensor_height)
-    report = TrackingReport()
-    fill(report, recording, by_tracker(open_, params, odometry), limit=limit)
-    content = {"source": str(weights), "odometry": odometry, **report.compute()}
+    report, ego = TrackingReport(), ego_of(recording, ego)
+    fill(report, recording, by_tracker(open_, params, ego), limit=limit)
+    content = {"source": str(weights), "ego": ego, **report.compute()}
     write_json(json_file, content)
     if not report.frames:
         raise no_labels(recording, report.skipped)

@@ -19,7 +19,7 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.hybrid.candidates import RescoredCandidates
 from lidar_perception.detectors.hybrid.params import ConfirmingParams, RescoringParams
 from lidar_perception.detectors.hybrid.proposals import ConfirmedProposals
-from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.open import FUSED, open_detector
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file as pointnet_file
@@ -82,6 +82,11 @@ def contenders(weights: Sequence[Path] = (), device: str = "auto",
     found = [each.contender() for each in opened]
     missing = [Missing(name, reason) for name, reason in absent.items()
                if name not in [each.name for each in opened]]
+    try:
+        found.append(always(FUSED, open_detector(FUSED, device, sensor_height=sensor_height),
+                            "those of PointPillars and PointNet"))
+    except InputError as error:
+        missing.append(Missing(FUSED, str(error)))
     hybrids, lacking = _hybrids(opened, _mounted(BEST, sensor_height))
     return [*_candidates(sensor_height), *found, *hybrids], [*missing, *lacking]
 

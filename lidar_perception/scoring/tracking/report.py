@@ -8,14 +8,14 @@ from functools import partial
 
 from lidar_perception.camera import Calibration
 from lidar_perception.classes import DETECTED
-from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.data.frame import POSES, Frame, Recording
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.run import Start
 from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
 from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
 from lidar_perception.scoring.tracking.over_recall import over_recall
 from lidar_perception.scoring.tracking.pairs import Pairs, pairs_of, tracked_labels, without_ignored
-from lidar_perception.tracking.ego import Odometry
+from lidar_perception.tracking.ego import Odometry, has_odometry
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import GroundTruth, InputError
@@ -39,15 +39,26 @@ def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
         raise InputError(f"{sequence}/{index}: {error}") from None
 
 
+def ego_of(recording: Recording, wanted: str = "auto") -> str:
+    """Whence the sensor's motion comes, of RECORDED_EGO all but auto, which is: the poses of the
+    recording, where it has any, else KISS-ICP, where that is installed, else none."""
+    if wanted != "auto":
+        return wanted
+    if POSES in recording.has:
+        return "recording"
+    return "kiss_icp" if has_odometry() else "none"
+
+
 def by_tracker(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
-               odometry: bool = False) -> Start:
+               ego: str = "auto") -> Start:
     """Track what the detector of open_() finds, one tracker a sequence, whose frames must come in
-    their order in one process; poses by KISS-ICP, or those of the recording where it has any."""
-    return partial(_by_tracker, open_, params, odometry)
+    their order in one process; ego, one of RECORDED_EGO, says whence the poses are, see ego_of."""
+    return partial(_by_tracker, open_, params, ego)
 
 
-def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, odometry: bool,
+def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, ego: str,
                 recording: Recording) -> Callable[[Frame], Observation | None]:
+    ego = ego_of(recording, ego)
     detector = open_()
     last, tracker, motion = None, Tracker(params), None
 
@@ -55,9 +66,9 @@ def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, odometry:
         nonlocal last, tracker, motion
         if frame.sequence != last:
             last, tracker = frame.sequence, Tracker(params)
-            motion = Odometry() if odometry else None
+            motion = Odometry() if ego == "kiss_icp" else None
         scan = frame.load()
-        pose = frame.pose() if motion is None else motion(scan.xyz)
+        pose = motion(scan.xyz) if motion else frame.pose() if ego == "recording" else None
         tracks = tracker(detector(scan).detections, frame.stamp_ns, pose)
         truth = frame.truth()
         if truth is None:

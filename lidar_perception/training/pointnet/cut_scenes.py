@@ -19,7 +19,7 @@ from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
 from lidar_perception.detectors.pointnet.config import PointNetConfig
-from lidar_perception.geometry import points_in_box
+from lidar_perception.geometry import bev_iou, points_in_boxes
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.scoring.points.clusters import labelled
@@ -27,13 +27,14 @@ from lidar_perception.training.augment import TrainingScene
 from lidar_perception.types import CLASSES, LidarFrame
 
 AROUND = 0.3  # m: points so near to an object are looked at, too
+DECOYS = 24   # in a scene
 
 
 @dataclass(frozen=True)
 class CutScene:
     """K clusters with labels (K,) int64 of scoring.points.clusters.labelled; boxes (K, 7) float64
     of the objects, 0 where there is none. loose (K,) bool: not made by clustering but all around an
-    object that is not ground."""
+    object, or decoy, that is not ground."""
 
     clusters: Clusters
     labels: np.ndarray
@@ -80,7 +81,8 @@ class CutScenes:
 
 
 def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutScene:
-    """The clusters of a scene, and after them the points around each object that is wanted."""
+    """The clusters of a scene; after them the points around each object that is wanted, and decoys:
+    background cut out in the same way, as the network judges what is in a detector's boxes, too."""
     frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
     ground = segment_ground(frame, config.ground)
     clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering),
@@ -88,22 +90,43 @@ def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutSce
     labels, owners = labelled(clusters, scene.boxes, scene.class_ids, config.classes)
     boxes = np.zeros((len(clusters), 7))
     boxes[owners >= 0] = scene.boxes[owners[owners >= 0]]
-    ids, around = np.zeros(len(frame), np.int64), []
-    for i in np.flatnonzero(scene.wanted):
-        name = CLASSES[scene.class_ids[i]]
-        inside = points_in_box(frame.xyz, scene.boxes[i], AROUND) & (ids == 0) & ~ground
-        if name in config.classes and inside.sum() >= min_points:
-            around.append(i)
-            ids[inside] = len(around)
-    loose = clusters_of(frame, ids, ground=ground)
-    of_loose = [config.classes.index(CLASSES[scene.class_ids[i]]) for i in around]
+    background = len(config.classes)
+    wanted = [i for i in np.flatnonzero(scene.wanted)
+              if CLASSES[scene.class_ids[i]] in config.classes]
+    around = np.concatenate([scene.boxes[wanted].reshape(-1, 7), decoys(
+        clusters.take(np.flatnonzero(labels == background)), scene.boxes, config)])
+    of_around = np.append([config.classes.index(CLASSES[scene.class_ids[i]]) for i in wanted],
+                          np.full(len(around) - len(wanted), background)).astype(np.int64)
+    xyz = frame.xyz.compress(~ground, axis=0)
+    indices, first = points_in_boxes(xyz, around, AROUND)
+    kept = np.flatnonzero(np.diff(first) >= min_points)
+    points = scene.points.compress(~ground, axis=0)[indices].astype(np.float32)
+    loose = Clusters(points, first, np.full(len(around), -1)).take(kept).on(
+        frame.xyz.compress(ground, axis=0))
     both = Clusters(np.concatenate([clusters.points, loose.points]),
                     np.concatenate([clusters.first, clusters.first[-1] + loose.first[1:]]),
-                    np.concatenate([clusters.ids, np.full(len(loose), -1)]),
+                    np.concatenate([clusters.ids, loose.ids]),
                     np.concatenate([clusters.ground, loose.ground]))
-    return CutScene(both, np.concatenate([labels, np.array(of_loose, np.int64)]),
-                    np.concatenate([boxes, scene.boxes[around].reshape(-1, 7)]),
-                    np.arange(len(both)) >= len(clusters))
+    return CutScene(both, np.concatenate([labels, of_around[kept]]),
+                    np.concatenate([boxes, around[kept]]), np.arange(len(both)) >= len(clusters))
+
+
+def decoys(background: Clusters, boxes: np.ndarray, config: PointNetConfig) -> np.ndarray:
+    """(D, 7) boxes as large as objects, at most DECOYS, each at the mean of a background cluster
+    and on the ground there; none touches one of the boxes (M, 7) that are labelled. The same
+    clusters give the same."""
+    rng = np.random.default_rng(len(background.points))
+    chosen = rng.permutation(len(background))[:DECOYS]
+    own = background.take(chosen)
+    middles = np.add.reduceat(own.points[:, :2], own.first[:-1], axis=0) / own.sizes[:, None] if (
+        len(own)) else np.zeros((0, 2))
+    sizes = np.array(config.sizes)[rng.integers(len(config.sizes), size=len(own))]
+    sizes = sizes * rng.uniform(0.9, 1.15, sizes.shape)
+    found = np.column_stack([middles + rng.normal(0, 0.2, middles.shape),
+                             own.floor + sizes[:, 2] / 2, sizes,
+                             rng.uniform(-np.pi, np.pi, len(own))])
+    room = boxes + [0, 0, 0, 2 * AROUND, 2 * AROUND, 0, 0]
+    return found[~(bev_iou(found, room) > 0).any(axis=1)]
 
 
 def _write(path: Path, scene: CutScene) -> None:

@@ -23,7 +23,7 @@ from lidar_perception.detectors.pointnet.predict import found, outputs_of, predi
 from lidar_perception.geometry import points_in_box
 from lidar_perception.scoring.detections import Detected
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.training.augment import noisy, with_reflector
+from lidar_perception.training.augment import noisy, varied
 from lidar_perception.training.data import Batches, ReadScenes, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes
@@ -61,9 +61,10 @@ class ClusterPreparation:
         labels, boxes = scene.labels[chosen], scene.boxes[chosen].copy()
         clusters = scene.clusters.take(chosen)
         background = np.flatnonzero(labels == len(self.config.classes))
-        for k in background[rng.random(len(background)) < self.augment.shine]:
+        for k in background:
             own = slice(clusters.first[k], clusters.first[k + 1])
-            clusters.points[own] = with_reflector(clusters.points[own], rng)
+            foot = np.append(clusters.points[own, :2].mean(axis=0), clusters.floor[k])
+            clusters.points[own], _ = varied(clusters.points[own], foot, self.augment, rng)
         clusters, boxes = changed(clusters, boxes, scene.loose[chosen], self.augment, rng)
         inputs = network_input(clusters, self.config.points, int(rng.integers(1 << 30)))
         has_box = (labels >= 0) & (labels < len(self.config.classes))

@@ -1,0 +1,1 @@
+"""One detector of several: PointPillars, the cluster network and silhouettes, weighed together."""

@@ -1,0 +1,168 @@
+"""A cloud in, boxes out: PointPillars, the cluster network and silhouettes in one detector."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from lidar_perception.classes import CAR
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.fused.boxes import on_ground, on_points
+from lidar_perception.detectors.fused.evidence import Evidence, distances, gathered
+from lidar_perception.detectors.fused.model import probabilities
+from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
+from lidar_perception.detectors.nms import suppressed
+from lidar_perception.detectors.params import ScoreParams
+from lidar_perception.detectors.pointnet.detector import PointNetDetector, load_pointnet_detector
+from lidar_perception.detectors.pointnet.params import PointNetDetectorParams, PointNetParams
+from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, load_detector
+from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
+from lidar_perception.detectors.view import (
+    in_sensor_frame,
+    levelled_ground,
+    made_up_frame,
+    visible,
+    with_intensity_scaled,
+)
+from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.ground.surface import surface_under
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, LidarFrame
+
+
+class Look(NamedTuple):
+    """A frame of N points in the network's range: what is proposed, and what speaks for it; xyz
+    (N, 3), ground (N,) bool; why little can be detected, or None; ms of each step."""
+
+    proposed: Detections
+    evidence: Evidence
+    xyz: np.ndarray
+    ground: np.ndarray
+    problem: str | None
+    ms: dict[str, float]
+
+
+class FusedDetector(NetworkDetector):
+    """A detector, see contract.py, of what PointPillars detects, where its range is.
+
+    proposer, classifier: loaded; their thresholds and mounting are this detector's.
+    """
+
+    group = "fused"  # of its params
+    params: FusedDetectorParams
+
+    def __init__(self, proposer: PointPillarsDetector, classifier: PointNetDetector,
+                 params: FusedDetectorParams = FusedDetectorParams()):
+        super().__init__(proposer.header, proposer.device, params)
+        self.proposer, self.classifier = proposer, classifier
+
+    @property
+    def settings(self) -> FusedParams:
+        """Its own group of params."""
+        return self.params.fused
+
+    def detect(self, frame: LidarFrame, ground: np.ndarray | None,
+               cluster_ids: np.ndarray | None) -> Found:
+        """Ground and PointPillars' clusters are computed where they are None."""
+        look = self.look(frame, ground, cluster_ids)
+        begin = perf_counter()
+        detections, best = self._fused(look)
+        detections = in_sensor_frame(detections, self.params.ground.sensor_pose)
+        ms = {**look.ms, STEPS[-1]: (perf_counter() - begin) * 1e3}
+        return Found(detections, ms, look.problem or self.fallback, best)
+
+    def look(self, frame: LidarFrame, ground: np.ndarray | None = None,
+             cluster_ids: np.ndarray | None = None) -> Look:
+        """What all sources say of a frame, before it is weighed."""
+        times = [perf_counter()]
+        settings = self.settings
+        indices, seen = visible(frame, self.config, self.params.ground.sensor_pose)
+        seen = with_intensity_scaled(seen, settings.intensity_scale)
+        times.append(perf_counter())
+        ground = (levelled_ground(seen, self.params.ground) if ground is None
+                  else ground.take(indices).astype(bool))
+        cluster_ids = None if cluster_ids is None else cluster_ids.take(indices)
+        times.append(perf_counter())
+        proposed = self._proposer()(seen, ground=ground, cluster_ids=cluster_ids)
+        times.append(perf_counter())
+        people = cluster_obstacles(seen.xyz, ground, self.params.people)
+        times.append(perf_counter())
+        evidence = gathered(proposed.detections, seen, ground, people, self.classifier)
+        times.append(perf_counter())
+        return Look(proposed.detections, evidence, seen.xyz, ground, proposed.problem,
+                    dict(zip(STEPS, (np.diff(times) * 1e3).tolist())))
+
+    def _proposer(self) -> PointPillarsDetector:
+        """The proposer, told what this detector is told; what it sees is level already."""
+        settings = self.settings
+        self.proposer.params = DetectorParams(
+            ground=replace(self.params.ground, sensor_pose=SensorPoseParams(height=SENSOR_HEIGHT)),
+            clustering=self.params.clustering,
+            pointpillars=PointPillarsParams(scores=ScoreParams.all_alike(settings.proposals),
+                                            nms=settings.nms, cpu_fallback=settings.cpu_fallback))
+        return self.proposer
+
+    def _fused(self, look: Look) -> tuple[Detections, dict[str, float]]:
+        """The detections, best first, and where there are none the highest score of each class."""
+        settings, xyz, ground = self.settings, look.xyz, look.ground
+        every = Detections.of(look.proposed.boxes, look.proposed.class_ids,
+                              probabilities(look.proposed.class_ids, look.evidence))
+        found = every[settings.scores.passed(every)]
+        if len(found) == 0:
+            return found, {
+                name: float(every.scores[every.class_ids == CLASSES.index(name)].max(initial=0.0))
+                for name in self.classes}
+        boxes, cars = found.boxes.astype(np.float64), found.class_ids == CAR
+        boxes[cars] = on_points(boxes[cars], xyz.compress(~ground, axis=0), settings.on_points)
+        floors = surface_under(xyz.compress(ground, axis=0), boxes[:, :2])
+        moved = Detections.of(on_ground(boxes, floors, settings.on_ground), found.class_ids,
+                              found.scores)
+        return moved[one_of_each(moved, settings)], {}
+
+    def bring_to(self, device: torch.device) -> None:
+        """Bring both networks to a device."""
+        self.proposer.bring_to(device)
+        self.classifier.bring_to(device)
+
+    def warm_up(self) -> None:
+        """Run every part once on made-up points, so that what is compiled is compiled."""
+        self.proposer.warm_up()
+        self.classifier.warm_up()
+        self(made_up_frame(self.params.ground.sensor_pose))
+
+
+def one_of_each(found: Detections, params: FusedParams) -> np.ndarray:
+    """(M,) int64 indices, best score first, of the detections that are not a better one of their
+    class once more: by their overlap, and but for cars by the distance of their centres."""
+    order = suppressed(found.boxes, found.scores, found.class_ids, params.nms.iou,
+                       params.nms.across_classes)
+    boxes, class_ids = found.boxes[order], found.class_ids[order]
+    again = (distances(boxes, boxes) < params.same_place) & (class_ids[:, None] == class_ids)
+    again[class_ids == CAR] = False
+    stays = np.ones(len(order), bool)
+    for i in range(len(order)):  # of the few that are left
+        if stays[i]:
+            stays[i + 1:] &= ~again[i, i + 1:]
+    return order[stays][:params.nms.max_boxes]
+
+
+def load_fused_detector(path: str | Path = "", device: str = "auto",
+                        params: FusedDetectorParams = FusedDetectorParams()) -> FusedDetector:
+    """The detector with the weights of PointPillars at path; with an empty one those that params
+    name, or else those that come with the package. InputError as of load_detector and
+    load_pointnet_detector."""
+    settings = params.fused
+    proposer = load_detector(path, device, DetectorParams(pointpillars=PointPillarsParams(
+        weights=settings.weights, threads=settings.threads, warm_up=False)))
+    classifier = load_pointnet_detector(settings.classifier, device, PointNetDetectorParams(
+        pointnet=PointNetParams(warm_up=False)))
+    detector = FusedDetector(proposer, classifier, params)
+    if settings.warm_up:
+        detector.warm_up()
+    return detector

@@ -1,0 +1,85 @@
+"""What each source says of every proposal: PointPillars itself, the silhouettes of the clusters
+there, and the cluster network, which judges the points in the box.
+
+Everything is in the frame of a level sensor at SENSOR_HEIGHT. Clusters where PointPillars proposes
+nothing, even at the least score, are not looked at: they added nothing to what is found, on
+simulated scans or real ones.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import logit
+
+from lidar_perception.candidates.confidence import confidence, shape_features
+from lidar_perception.candidates.configurations import BEST
+from lidar_perception.candidates.segmented import grounded_boxes
+from lidar_perception.detectors.hybrid.rescoring import known
+from lidar_perception.detectors.pointnet.clusters import Clusters
+from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.detectors.pointnet.predict import predict
+from lidar_perception.geometry import points_in_boxes
+from lidar_perception.groups import group_points
+from lidar_perception.types import CLASSES, Detections, LidarFrame
+
+HEIGHTS, LENGTH = (0.8, 2.6), 2.8  # metres, of clusters that may be a person or a cyclist
+SAME_PLACE = 0.6            # metres from the centre of a proposal to that of a cluster, at most
+MARGIN = 0.2                # metres around a proposal: its points, for the classifier
+FEWEST = 3                  # points that it says something of
+LEAST, MOST = 0.001, 0.999  # probabilities: no source is certain
+
+Evidence = dict[str, np.ndarray]
+
+
+def gathered(proposed: Detections, seen: LidarFrame, ground: np.ndarray, cluster_ids: np.ndarray,
+             classifier: PointNetDetector) -> Evidence:
+    """By source, the log-odds (K,) float64 that each of K proposals is what it is proposed as; NaN
+    where the source is silent. ground (N,) bool and cluster_ids (N,), 1..J for people, of the
+    frame's N points."""
+    return {"network": log_odds(proposed.scores),
+            "silhouette": log_odds(silhouette_at(proposed.boxes, seen.xyz, ground, cluster_ids)),
+            "classifier": log_odds(judged(proposed, seen, ground, classifier))}
+
+
+def silhouette_at(boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray,
+                  cluster_ids: np.ndarray) -> np.ndarray:
+    """(K,) float64: the greatest confidence that a cluster at boxes (K, 7) is a pedestrian, 0 where
+    there is none that may be."""
+    found = grounded_boxes(xyz, ground, cluster_ids, BEST.boxes.shape)
+    chosen = np.flatnonzero((found[:, 5] >= HEIGHTS[0]) & (found[:, 5] <= HEIGHTS[1])
+                            & (found[:, 3:5].max(axis=1, initial=0.0) <= LENGTH))
+    own, start = group_points(xyz, cluster_ids, chosen + 1)
+    confidences = confidence(shape_features(own, start, found[chosen], BEST))
+    near = distances(boxes, found[chosen]) <= SAME_PLACE
+    return (near * confidences).max(axis=1, initial=0.0)
+
+
+def judged(proposed: Detections, seen: LidarFrame, ground: np.ndarray,
+           classifier: PointNetDetector) -> np.ndarray:
+    """(K,) the probability of the class of each of K proposals, for the points in its box; NaN
+    where the classifier does not know the class, or there are less than FEWEST points."""
+    obstacles = seen.take(np.flatnonzero(~ground))
+    indices, first = points_in_boxes(obstacles.xyz, proposed.boxes, MARGIN)
+    points = np.zeros((len(indices), 4), np.float32)
+    points[:, :3] = obstacles.xyz[indices]
+    if obstacles.intensity is not None:
+        points[:, 3] = obstacles.intensity[indices]
+    clusters = Clusters(points, first, np.arange(1, len(proposed) + 1))
+    asked = np.flatnonzero((clusters.sizes >= FEWEST) & known(classifier, proposed.class_ids))
+    labels = np.array([classifier.classes.index(CLASSES[i]) for i in proposed.class_ids[asked]],
+                      np.int64)
+    clusters = clusters.take(asked).on(seen.xyz.compress(ground, axis=0))
+    probabilities = np.full(len(proposed), np.nan)
+    probabilities[asked] = classifier.guarded(
+        lambda: predict(classifier.network, clusters, labels=labels)).scores
+    return probabilities
+
+
+def distances(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(K, M) metres from above between the centres of boxes (K, 7) and others (M, 7)."""
+    return np.hypot(*(boxes[:, None, :2] - others[None, :, :2]).transpose(2, 0, 1))
+
+
+def log_odds(probabilities: np.ndarray) -> np.ndarray:
+    """(K,) float64; NaN stays."""
+    return logit(np.clip(np.asarray(probabilities, np.float64), LEAST, MOST))

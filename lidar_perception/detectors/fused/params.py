@@ -1,0 +1,61 @@
+"""Parameters of the detector: flags, ROS parameters and docs are made from these fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from lidar_perception.candidates.configurations import BEST
+from lidar_perception.clustering.params import ClusteringParams
+from lidar_perception.detectors.params import NetworkParams, ScoreParams
+from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.pointnet.weights_file import weights_file as classifier_file
+from lidar_perception.detectors.pointpillars.params import (
+    EXPERT_CLUSTERING,
+    EXPERT_GROUND,
+    PointPillarsParams,
+)
+from lidar_perception.detectors.pointpillars.weights_file import weights_file as proposer_file
+from lidar_perception.ground.params import GroundParams
+from lidar_perception.param_fields import param
+from lidar_perception.robot.params import CropParams
+from lidar_perception.wire.params import InputParams
+
+STEPS = ("preprocess", "ground", "proposals", "clusters", "evidence", "fusion")
+
+
+@dataclass(frozen=True)
+class FusedParams(NetworkParams):
+    """What proposes, what judges, and what counts as a detection. weights: PointPillars'. A score
+    is the probability that the object is there."""
+
+    classifier: str = param("", "Checkpoint of the cluster network; empty: the one that comes with "
+                            "the package.", fixed=True)
+    scores: ScoreParams = ScoreParams.all_alike(0.4)
+    proposals: float = param(0.02, "Least score of PointPillars for a box to be looked at.",
+                             low=0.001, high=1.0)
+    same_place: float = param(0.6, "People, and cyclists, whose centres are nearer than this are "
+                                   "one.", unit="m", low=0.0, high=10.0)
+    on_ground: float = param(0.5, "How far boxes are moved to the ground that is seen around "
+                             "them; 0: not at all, 1: onto it.", low=0.0, high=1.0)
+    on_points: float = param(0.75, "How far cars are moved so that their points begin at the "
+                             "faces that are seen; 0: not at all.", low=0.0, high=1.0)
+
+
+def weights_file(params: FusedParams) -> Path:
+    """The file of PointPillars' weights. InputError if it, or the classifier's, is not there."""
+    classifier_file(PointNetParams(weights=params.classifier))
+    return proposer_file(PointPillarsParams(weights=params.weights))
+
+
+@dataclass(frozen=True)
+class FusedDetectorParams:
+    """All groups of the detector; ground is for all its parts, clustering draws PointPillars' map,
+    and people are looked for among clusters of their own."""
+
+    input: InputParams = InputParams()
+    crop: CropParams = CropParams()
+    ground: GroundParams = EXPERT_GROUND
+    clustering: ClusteringParams = EXPERT_CLUSTERING
+    people: ClusteringParams = BEST.clustering
+    fused: FusedParams = FusedParams()

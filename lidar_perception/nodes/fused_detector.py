@@ -1,0 +1,34 @@
+"""~/input/points -> ~/output/detections: cars, pedestrians and cyclists, by several sources."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, weights_file
+from lidar_perception.nodes.detector_node import DetectorNode
+from lidar_perception.params import FUSED
+
+if TYPE_CHECKING:
+    from lidar_perception.detectors.fused.detector import FusedDetector
+    from lidar_perception.detectors.pointpillars.config import NetworkConfig
+
+
+class FusedNode(DetectorNode):
+    """Reads the columns of PointPillars' experts where the cloud has them."""
+
+    group = "fused"
+    steps = STEPS
+
+    def __init__(self, **options: Any):
+        super().__init__("fused_detector", FusedDetectorParams(), FUSED(), **options)
+
+    def weights(self) -> Path:
+        return weights_file(self.params.fused)
+
+    def load(self, weights: Path, device: str) -> FusedDetector:
+        from lidar_perception.detectors.fused.detector import load_fused_detector
+        return load_fused_detector(weights, device, self.params)
+
+    def name_of(self, config: NetworkConfig) -> str:
+        return f"PointPillars {config.version} {config.size} and PointNet"

@@ -1,0 +1,110 @@
+"""Where found boxes differ from the true ones, and what each difference costs."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from lidar_perception.classes import DETECTED
+from lidar_perception.geometry import bev_and_3d_iou, horizontal_range, wrap_angle
+from lidar_perception.scoring.kitti.protocol import METRICS, ComparedFrame
+from lidar_perception.scoring.tables import narrow_table
+from lidar_perception.types import CLASSES
+
+RANGES = (0.0, 15.0, 30.0, 45.0, np.inf)  # metres
+ERRORS = ("away", "aside", "bottom", "length", "width", "height", "yaw")
+# What is put right -> the columns of a box.
+RIGHT = {"as it is": [], "z": [2], "x, y": [0, 1], "x, y, z": [0, 1, 2], "length": [3],
+         "width": [4], "height": [5], "yaw": [6]}
+
+
+def box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict[str, Any]:
+    """Of the class called name, true boxes paired with the found box of min_score or more that
+    overlaps them most from above, if by more than the relaxed overlap of the class.
+
+    by_range: for each of RANGES and for all `pairs`, and of each error the `median` and the
+    `median_size`, m and rad: found minus true, centre along the ray from the sensor (away) and to
+    its left (aside), bottom, sizes; yaw modulo half a turn. strict: by what is put right (RIGHT),
+    the percentage of pairs beyond the strict overlap, in `space` and `above`. None without pairs.
+    """
+    pairs = [_pairs(frame, name, min_score) for frame in frames]
+    found, true = (np.concatenate([np.zeros((0, 7)), *(pair[which] for pair in pairs)])
+                   for which in (0, 1))
+    differences, away = _differences(found, true), horizontal_range(true)
+    bands = {f"{low:g}-{high:g} m": (away >= low) & (away < high)
+             for low, high in pairwise(RANGES)} | {"all": np.ones(len(true), bool)}
+    return {"min_score": min_score, "by_range": {
+        title: {"pairs": int(own.sum()), **{
+            error: {"median": _median(values[own]), "median_size": _median(np.abs(values[own]))}
+            for error, values in differences.items()}} for title, own in bands.items()},
+        "strict": {title: _reached(found, true, columns, DETECTED[name].strict)
+                   for title, columns in RIGHT.items()}}
+
+
+def _pairs(frame: ComparedFrame, name: str, min_score: float) -> tuple[np.ndarray, np.ndarray]:
+    """(P, 7) found boxes and the true ones."""
+    found = np.flatnonzero((frame.found.class_ids == CLASSES.index(name))
+                           & (frame.found.scores >= min_score))
+    true = np.flatnonzero(frame.true.class_ids == CLASSES.index(name))
+    overlaps = frame.overlaps[METRICS.index("bev")][np.ix_(found, true)]
+    matched = np.flatnonzero(overlaps.max(axis=0, initial=0.0) > DETECTED[name].relaxed)
+    best = overlaps[:, matched].argmax(axis=0) if len(matched) else matched
+    return frame.found.boxes[found[best]], frame.true.boxes[true[matched]]
+
+
+def _differences(found: np.ndarray, true: np.ndarray) -> dict[str, np.ndarray]:
+    """By ERRORS, (P,)."""
+    azimuth = np.arctan2(true[:, 1], true[:, 0])
+    x, y, z, *sizes, yaw = (found - true).T
+    half_turn = (wrap_angle(2 * yaw) / 2)
+    return dict(zip(ERRORS, (np.cos(azimuth) * x + np.sin(azimuth) * y,
+                             np.cos(azimuth) * y - np.sin(azimuth) * x, z - sizes[2] / 2, *sizes,
+                             half_turn)))
+
+
+def _reached(found: np.ndarray, true: np.ndarray, columns: list[int],
+             least: float) -> dict[str, float | None]:
+    """Percentage of pairs beyond the overlap, once these columns are the true ones."""
+    if len(found) == 0:
+        return {"space": None, "above": None}
+    boxes = found.copy()
+    boxes[:, columns] = true[:, columns]
+    above, space = np.array([[iou[0, 0] for iou in bev_and_3d_iou(a[None], b[None])]
+                             for a, b in zip(boxes, true)]).T
+    return {"space": 100 * float((space > least).mean()),
+            "above": 100 * float((above > least).mean())}
+
+
+def _median(values: np.ndarray) -> float | None:
+    return float(np.median(values)) if len(values) else None
+
+
+def print_box_errors(errors: dict[str, dict[str, Any]], console: Console) -> None:
+    """Two tables for each class with pairs."""
+    for name, content in errors.items():
+        if content["by_range"]["all"]["pairs"] == 0:
+            continue
+        table = narrow_table(f"{name}: found minus true, median, and median of its size",
+                             "metres, yaw in radians", "pairs", *ERRORS, width=7)
+        for title, row in content["by_range"].items():
+            table.add_row(title, str(row["pairs"]), *(_signed(row[e]["median"]) for e in ERRORS))
+            table.add_row("", "", *(_size(row[e]["median_size"]) for e in ERRORS), style="dim")
+        table.caption = (f"Boxes with a score of {content['min_score']:g} or more. away, aside: of "
+                         "the centre, along the ray from the sensor and to its left.")
+        console.print(table)
+        table = narrow_table(f"{name}: pairs beyond the overlap {DETECTED[name].strict:g}, %",
+                             "put right", *RIGHT, width=8)
+        for view, title in (("space", "in space"), ("above", "from above")):
+            table.add_row(title, *(f"{row[view]:.0f}" for row in content["strict"].values()))
+        console.print(table)
+
+
+def _signed(value: float | None) -> str:
+    return "" if value is None else f"{value:+.2f}"
+
+
+def _size(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f}"

@@ -1,0 +1,51 @@
+"""Additive models of log-odds, as candidates/curves.py reads them, fitted to samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit
+
+PENALTY = 1.0  # chosen on streets left out
+
+
+def ramps(values: np.ndarray, knots: tuple[float, ...]) -> np.ndarray:
+    """(K, len(knots) - 1) how far each of K values has come from one knot to the next, 0..1; NaN
+    has not begun."""
+    low, high = np.array(knots[:-1]), np.array(knots[1:])
+    return np.nan_to_num(np.clip((values[:, None] - low) / (high - low), 0.0, 1.0))
+
+
+def fit(features: Mapping[str, np.ndarray], hit: np.ndarray, weight: np.ndarray,
+        knots: Mapping[str, tuple[float, ...]], rising: Mapping[str, int] = {}) -> dict:
+    """The model of samples with features (K,), by name, hit (K,) bool and weights (K,): logistic
+    regression on the steps from knot to knot, and one for NaN where there is any. The penalty on
+    them keeps curves level where there is nothing to learn from. rising: features whose curves
+    never fall, 1, or never rise, -1."""
+    columns, bounds, parts = [], [], []
+    for name, own in knots.items():
+        steps, unknown = ramps(features[name], own), np.isnan(features[name])[:, None]
+        direction = rising.get(name, 0)
+        columns.append(np.column_stack([steps, unknown]) if unknown.any() else steps)
+        bounds += [{1: (0, None), -1: (None, 0), 0: (None, None)}[direction]] * steps.shape[1]
+        bounds += [(None, None)] * int(unknown.any())
+        parts.append(columns[-1].shape[1])
+    design, sign = np.concatenate(columns, axis=1), np.where(hit, 1.0, -1.0)
+
+    def loss(x: np.ndarray) -> tuple[float, np.ndarray]:
+        margin = sign * (design @ x[1:] + x[0])
+        slope = -weight * sign * expit(-margin)
+        return (weight @ np.logaddexp(0, -margin) + PENALTY / 2 * x[1:] @ x[1:],
+                np.concatenate([[slope.sum()], slope @ design + PENALTY * x[1:]]))
+
+    x = minimize(loss, np.zeros(design.shape[1] + 1), jac=True, method="L-BFGS-B",
+                 bounds=[(None, None), *bounds], options={"maxiter": 5000, "maxfun": 10000}).x
+    curves = {}
+    for (name, own), steps in zip(knots.items(), np.split(x[1:], np.cumsum(parts)[:-1])):
+        rises = steps[:len(own) - 1]
+        curves[name] = {"knots": own, "values": [0.0, *np.round(np.cumsum(rises), 3).tolist()]}
+        if len(steps) > len(rises):
+            curves[name]["unknown"] = round(float(steps[-1]), 3)
+    return {"bias": round(float(x[0]), 4), "curves": curves}

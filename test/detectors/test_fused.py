@@ -1,0 +1,182 @@
+"""The fused detector: boxes come to the points and the ground, more evidence is never less likely,
+and the whole is a detector like any other."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from detection_samples import frame, random_detector, same
+from hypothesis import given
+from hypothesis import strategies as st
+from pointnet_samples import random_detector as random_classifier
+
+from lidar_perception.classes import CAR
+from lidar_perception.detectors.fused.boxes import FRONT, MARGIN, SIDE, on_ground, on_points
+from lidar_perception.detectors.fused.detector import FusedDetector, one_of_each
+from lidar_perception.detectors.fused.evidence import LEAST, log_odds
+from lidar_perception.detectors.fused.model import KNOTS, models, probabilities
+from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
+from lidar_perception.geometry import points_in_box, points_in_boxes
+from lidar_perception.ground.surface import FEWEST, surface_under
+from lidar_perception.param_fields import with_values
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def random_boxes(rng, count: int) -> np.ndarray:
+    return np.column_stack([rng.uniform(-20, 20, (count, 2)), rng.uniform(-1.5, 0, count),
+                            rng.uniform(0.3, 5, (count, 3)), rng.uniform(-4, 4, count)])
+
+
+@given(SEEDS, st.integers(0, 2000), st.integers(0, 30), st.floats(0, 0.5))
+def test_all_boxes_at_once_hold_what_each_holds(seed, count, boxes, margin):
+    rng = np.random.default_rng(seed)
+    xyz = rng.uniform([-22, -22, -2], [22, 22, 2], (count, 3)).astype(np.float32)
+    boxes = random_boxes(rng, boxes).astype(np.float32)
+    indices, first = points_in_boxes(xyz, boxes, margin)
+    assert first[0] == 0 and first[-1] == len(indices) and len(first) == len(boxes) + 1
+    for k, box in enumerate(boxes):
+        np.testing.assert_array_equal(indices[first[k]:first[k + 1]],
+                                      np.flatnonzero(points_in_box(xyz, box, margin)))
+
+
+@given(SEEDS, st.floats(-0.25, 0.25), st.floats(-0.1, 0.1))
+def test_the_ground_of_a_slope_is_the_slope(seed, along, across):
+    rng = np.random.default_rng(seed)
+    xy = rng.uniform(-20, 20, (12000, 2))
+    ground = np.column_stack([xy, xy @ [along, across] - 1.7])
+    places = rng.uniform(-15, 15, (10, 2))
+    heights = surface_under(ground, places)
+    np.testing.assert_allclose(heights, places @ [along, across] - 1.7, atol=1e-4)
+    # Order does not matter, nor what lies elsewhere; without ground nothing is known.
+    np.testing.assert_allclose(surface_under(ground[::-1], places), heights, atol=1e-9)
+    far = np.concatenate([ground, ground + [200, 0, 9]])
+    np.testing.assert_allclose(surface_under(far, places), heights, atol=1e-9)
+    assert np.isnan(surface_under(ground, places + 500)).all()
+    assert np.isnan(surface_under(ground[:FEWEST - 1], places)).all()
+    line = np.column_stack([np.linspace(-2, 2, 50), np.zeros(50), np.linspace(0, 9, 50)])
+    assert surface_under(line, np.array([[0, 1.0]])) == pytest.approx(line[:, 2].mean())
+
+
+def shell(box: np.ndarray, rng, count: int = 400) -> np.ndarray:
+    """Points of the two faces of a box that a sensor at 0 sees, as deep as those of cars."""
+    sensor = np.array([[np.cos(box[6]), np.sin(box[6])], [-np.sin(box[6]), np.cos(box[6])]]) @ (
+        -box[:2])
+    flat = rng.uniform(-0.5, 0.5, (count, 3)) * box[3:6]
+    half = np.arange(count) < count // 2
+    for axis, depth in ((0, FRONT), (1, SIDE)):
+        own = half == (axis == 0)
+        flat[own, axis] = np.sign(sensor[axis]) * (box[3 + axis] / 2 - depth)
+    cos, sin = np.cos(box[6]), np.sin(box[6])
+    return (np.column_stack([cos * flat[:, 0] - sin * flat[:, 1],
+                             sin * flat[:, 0] + cos * flat[:, 1], flat[:, 2]]) + box[:3])
+
+
+@given(SEEDS)
+def test_a_car_that_is_off_comes_to_its_points_and_one_that_is_right_stays(seed):
+    rng = np.random.default_rng(seed)
+    away = rng.uniform(8, 30)
+    way = rng.uniform(-np.pi, np.pi)
+    box = np.array([away * np.cos(way), away * np.sin(way), -0.9, 4.0, 1.7, 1.5,
+                    way + rng.choice([-1, 1]) * rng.uniform(0.6, 0.9)])  # two faces are seen
+    points = shell(box, rng)
+    off = box.copy()
+    off[:2] += rng.uniform(-0.2, 0.2, 2)
+    both = on_points(np.stack([box, off]), points, 1.0)
+    np.testing.assert_allclose(both, [box, box], atol=0.02)
+    half = on_points(off[None], points, 0.5)[0]
+    np.testing.assert_allclose(half, (off + box) / 2, atol=0.02)
+    np.testing.assert_array_equal(on_points(off[None], points, 0.0)[0], off)
+    np.testing.assert_array_equal(on_points(off[None], points[:0], 1.0)[0], off)
+    # Never farther than the margin, however far the points are.
+    assert np.hypot(*(on_points(off[None], points + [0.3, 0, 0], 1.0) - off)[0, :2]) <= 2 * MARGIN
+
+
+def test_boxes_stand_on_the_ground_where_it_is_known():
+    boxes = random_boxes(np.random.default_rng(0), 20)
+    floors = np.where(np.arange(20) % 4, boxes[:, 2] - 1, np.nan)
+    on = on_ground(boxes, floors, 1.0)
+    known = np.isfinite(floors)
+    np.testing.assert_allclose((on[:, 2] - on[:, 5] / 2)[known], floors[known])
+    np.testing.assert_array_equal(on[~known], boxes[~known])
+    np.testing.assert_array_equal(on_ground(boxes, floors, 0.0), boxes)
+
+
+@given(SEEDS)
+def test_more_evidence_is_never_less_likely_and_silence_is_neither(seed):
+    rng = np.random.default_rng(seed)
+    class_ids = rng.choice([CLASSES.index(name) for name in models()], 50)
+    evidence = {source: log_odds(rng.uniform(0, 1, 50)) for source in KNOTS}
+    before = probabilities(class_ids, evidence)
+    assert ((before >= 0) & (before <= 1)).all() and before.dtype == np.float32
+    for source in KNOTS:
+        more = {**evidence, source: evidence[source] + rng.uniform(0, 3, 50)}
+        assert (probabilities(class_ids, more) >= before - 1e-6).all()
+        silent = {**evidence, source: np.full(50, np.nan)}
+        assert np.isfinite(probabilities(class_ids, silent)).all()
+    unknown = np.full(50, CLASSES.index("Tram"))
+    assert not probabilities(unknown, evidence).any()
+    np.testing.assert_allclose(log_odds([0, 0.5, 1]), [log_odds(LEAST), 0, -log_odds(LEAST)],
+                               atol=1e-9)
+
+
+def test_people_at_one_place_are_one_and_cars_are_told_apart_by_their_overlap():
+    boxes = np.array([[10, 0, 0, 0.6, 0.6, 1.8, 0], [10.5, 0.2, 0, 0.6, 0.6, 1.8, 0],
+                      [10, 5, 0, 4, 1.7, 1.5, 0], [10, 6.8, 0, 4, 1.7, 1.5, 0],
+                      [10.3, 5.1, 0, 4, 1.7, 1.5, 0], [10.2, 0, 0, 1.7, 0.6, 1.8, 0]])
+    ids = np.array([PEDESTRIAN] * 2 + [CAR] * 3 + [CLASSES.index("Cyclist")])
+    found = Detections.of(boxes, ids, [0.5, 0.8, 0.9, 0.7, 0.95, 0.4])
+    assert one_of_each(found, FusedParams()).tolist() == [4, 1, 3, 5]
+    assert len(one_of_each(found[:0], FusedParams())) == 0
+
+
+@pytest.fixture(scope="module")
+def detector():
+    eager = with_values(FusedDetectorParams(), {
+        f"fused.scores.{name}": 0.0 for name in ("car", "pedestrian", "cyclist", "other")})
+    return FusedDetector(random_detector("v4"), random_classifier(), eager)
+
+
+def test_every_part_of_the_contract(detector):
+    scan = frame()
+    found = detector(scan)
+    assert len(found.detections) > 3 and tuple(found.ms) == STEPS
+    assert (np.diff(found.detections.scores) <= 0).all()
+    assert same(detector(scan), found)  # nothing is left on it
+    middle = float(np.median(found.detections.scores))
+    strict = detector.with_min_score(middle)
+    assert set(strict.min_scores.values()) == {middle}
+    assert same(strict(scan), found.detections[found.detections.scores >= middle])
+    assert same(detector(scan), found)
+    nothing = detector.with_min_score(1.0)(scan)
+    assert len(nothing.detections) == 0 and set(nothing.best) == set(detector.classes)
+    empty = detector(LidarFrame(np.zeros((0, 3), np.float32), np.zeros(0, np.float32)))
+    assert len(empty.detections) == 0 and "no finite point" in empty.problem
+    with pytest.raises(InputError, match="ground has 3 values"):
+        detector(scan, ground=np.zeros(3, bool))
+
+
+def test_a_higher_sensor_and_given_columns_change_nothing(detector):
+    scan = frame()
+    found = detector(scan).detections
+    high = replace(scan, xyz=scan.xyz - np.array([0, 0, 0.5], np.float32))
+    above = detector.mounted_at(1.73 + 0.5)(high).detections
+    np.testing.assert_allclose(above.boxes + [0, 0, 0.5, 0, 0, 0, 0], found.boxes, atol=2e-3)
+    np.testing.assert_allclose(above.scores, found.scores, atol=2e-3)
+    look = detector.look(scan)
+    ground = np.ones(len(scan), bool)  # of what the network does not see nothing is asked
+    inside = np.isin(scan.xyz.view("V12").ravel(), look.xyz.view("V12").ravel())
+    ground[inside] = look.ground
+    assert same(detector(scan, ground=ground), found)
+
+
+def test_parameters_may_change_between_two_clouds(detector):
+    other = copy.copy(detector)
+    other.params = with_values(detector.params, {"fused.proposals": 0.6})
+    assert len(other(frame()).detections) < len(detector(frame()).detections)
+    assert same(detector(frame()), detector(frame()))

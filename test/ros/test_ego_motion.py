@@ -1,0 +1,143 @@
+"""Where trackers in nodes, each in this process, have the sensor's motion from, against the library
+with the poses that were meant."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from rclpy.parameter import Parameter
+from test_robot_frames import message, mounted, odometry, transforms, walker
+from tracking_samples import START, TENTH, crowd, pose
+
+from lidar_perception.nodes.perception import Perception
+from lidar_perception.nodes.runtime import MARKERS
+from lidar_perception.nodes.tracker import TrackerNode
+from lidar_perception.robot.poses import inverse
+from lidar_perception.tracking.ego import has_odometry, moved_boxes
+from lidar_perception.tracking.tracker import Tracker
+from lidar_perception.types import Detections
+from lidar_perception.wire.codec import bag_message, decode, encode
+from lidar_perception.wire.messages import detection_markers
+from msg_utils.markers import from_marker_array
+from msg_utils.stamps import header_message
+
+SENSOR = mounted(1.2, 0.3, 1.8, 0.6, 0.0, 0.0)  # on the base
+
+
+def base_at(i):
+    return pose(0.8 * i, 0.05 * i, 0.02 * i)
+
+
+def header(stamp, frame_id="lidar"):
+    return header_message(stamp, frame_id, bag_message)
+
+
+def tracked(node):
+    return from_marker_array(decode(node.sent["tracks"][-1], MARKERS))
+
+
+def drive(node, tell, poses, frame_id="lidar"):
+    """Frames of a crowd, as a sensor at poses (K, 4, 4) sees it, to the node after tell(i, stamp);
+    its tracks are those of the library with `poses`."""
+    library = Tracker()
+    for i, (found, at) in enumerate(zip(crowd(frames=len(poses)), poses)):
+        stamp = START + i * TENTH
+        tell(i, stamp)
+        seen = Detections.of(moved_boxes(found.boxes, inverse(at)), found.class_ids, found.scores)
+        node.on_markers(detection_markers(seen, header(stamp, frame_id), bag_message))
+        tracks, shown = library(seen, stamp, at), tracked(node)
+        assert shown.ids.tolist() == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
+        np.testing.assert_allclose(shown.boxes, tracks.detections.boxes, atol=1e-4)
+        np.testing.assert_allclose([extra["velocity"] for extra in shown.extras],
+                                   tracks.velocities, atol=2e-3)
+
+
+@pytest.mark.parametrize("source", ["odometry", "tf", "auto"])
+def test_a_sensor_that_is_mounted_anywhere_has_the_motion_of_its_place(start, source):
+    """By TF from what the odometry is of to the sensor, or all of it by TF."""
+    node = start(TrackerNode, **{"ego.source": source})
+    node.transforms.on_tf(transforms(("base", "lidar", SENSOR, 0)), static=True)
+
+    def tell(i, stamp):
+        if source == "odometry":
+            node.transforms.on_odometry(odometry(base_at(i), stamp))
+        else:
+            node.transforms.on_tf(transforms(("odom", "base", base_at(i), stamp)), static=False)
+    drive(node, tell, [base_at(i) @ SENSOR for i in range(20)])
+    assert node.counts["ego"] == ("odometry" if source == "odometry" else "tf")
+    assert node.state[1] == "tracking"
+
+
+def test_detections_in_the_frame_of_the_odometry_do_not_move(start):
+    node = start(TrackerNode)
+    drive(node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp)),
+          np.tile(np.eye(4), (20, 1, 1)), "odom")
+
+
+def test_without_a_way_from_the_odometry_to_the_sensor_they_are_in_one_place_and_it_is_said(start):
+    node = start(TrackerNode)
+    drive(node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp)),
+          [base_at(i) for i in range(10)])
+    assert "odometry is of 'base', the detections of 'lidar'" in node.state[1]
+    node.transforms.on_tf(transforms(("base", "lidar", SENSOR, 0)), static=True)
+    stamp = START + 10 * TENTH
+    node.transforms.on_odometry(odometry(base_at(10), stamp))
+    found = next(crowd())
+    node.on_markers(detection_markers(found, header(stamp), bag_message))
+    assert min(tracked(node).ids) > 6  # the poses are others from here on: all tracks ended
+
+
+def test_what_tf_lacks_is_named(start):
+    node = start(TrackerNode, **{"ego.source": "tf", "input.fixed_frame": "map"})
+    node.on_markers(detection_markers(next(crowd()), header(START), bag_message))
+    assert "TF does not connect 'lidar' with 'map'" in node.state[1]
+
+
+def test_auto_takes_the_scans_after_a_second_without_poses_and_odometry_when_it_comes(start):
+    if not has_odometry():
+        pytest.skip("needs kiss-icp, the extra [odometry]")
+    node = start(TrackerNode)
+    xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
+
+    def frames(first, count):
+        for i in range(first, first + count):
+            if len(node._receptions()) > node_inputs:
+                give_to_points(message(xyz, START + i * TENTH))
+            node.on_markers(detection_markers(next(crowd()), header(START + i * TENTH),
+                                              bag_message))
+
+    def give_to_points(cloud):
+        points = next(r for r in node._receptions() if r.topic.endswith("/points"))
+        points.deliver(encode(cloud), False)
+
+    node_inputs = len(node._receptions())
+    frames(0, 10)
+    assert node.counts["ego"] == "none" and len(node._receptions()) == node_inputs
+    frames(10, 4)
+    assert node.counts["ego"] == "kiss_icp"
+    before = max(tracked(node).ids)
+    for i in (13, 14, 15):
+        node.transforms.on_odometry(odometry(base_at(i), START + i * TENTH, "lidar"))
+    frames(14, 2)
+    assert node.counts["ego"] == "odometry" and min(tracked(node).ids) > before
+
+
+def test_in_a_detectors_process_a_cloud_waits_for_its_pose_and_not_for_ever(start):
+    node = start(Perception, **{"tracking.enabled": True, "ego.max_wait": 100.0})
+    deliver = node._receptions()[0].deliver
+    xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
+    clouds = [encode(message(xyz, START + i * TENTH)) for i in range(20)]
+    assert deliver(clouds[0], True) is None  # nobody sends poses so far
+    node.transforms.on_odometry(odometry(base_at(0), START, "lidar"))
+    assert deliver(clouds[1], True) == "the pose of its time"
+    node.transforms.on_odometry(odometry(base_at(1), START + TENTH, "lidar"))
+    assert deliver(clouds[1], True) is None and len(node.sent["tracks"]) == 2
+    np.testing.assert_allclose(node.outputs.final.tracks.tracker.pose, base_at(1), atol=1e-9)
+    assert deliver(clouds[2], True) == "the pose of its time"
+    assert node.set_parameters([Parameter("ego.max_wait", value=0.0)])[0].successful
+    assert deliver(clouds[2], True) is None  # it has waited for long enough
+    assert deliver(clouds[19], True) is None  # the odometry has stopped
+    assert len(node.sent["tracks"]) == 4

@@ -1,0 +1,68 @@
+"""How found boxes differ from the true ones: what was put in comes out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lidar_perception.classes import CAR, DETECTED
+from lidar_perception.scoring.kitti.box_errors import ERRORS, RANGES, box_errors
+from lidar_perception.scoring.kitti.camera_objects import camera_objects, scored_labels
+from lidar_perception.scoring.kitti.protocol import compared
+from lidar_perception.types import Detections, GroundTruth
+
+
+def frame(true: np.ndarray, found: np.ndarray, scores=0.9):
+    truth = GroundTruth.of(true, np.full(len(true), CAR))
+    detections = Detections.of(found, CAR, scores)
+    return compared(camera_objects(truth, None), camera_objects(scored_labels(detections), None))
+
+
+def cars(count: int, rng) -> np.ndarray:
+    """On a circle spiralling outwards, so that none touches another."""
+    way, away = np.linspace(-1, 1, count), np.linspace(8, 70, count)
+    return np.column_stack([away * np.cos(way), away * np.sin(way), np.full(count, -0.9),
+                            np.tile([4.0, 1.7, 1.5], (count, 1)), rng.uniform(-3, 3, count)])
+
+
+def moved(boxes: np.ndarray, away=0.0, aside=0.0, **sizes) -> np.ndarray:
+    """Boxes that are off along the ray and to its left, with bottoms where they were."""
+    azimuth = np.arctan2(boxes[:, 1], boxes[:, 0])
+    off = boxes.copy()
+    off[:, 0] += np.cos(azimuth) * away - np.sin(azimuth) * aside
+    off[:, 1] += np.sin(azimuth) * away + np.cos(azimuth) * aside
+    off[:, 3] += sizes.get("length", 0)
+    off[:, 5] += sizes.get("height", 0)
+    off[:, 2] += sizes.get("height", 0) / 2 + sizes.get("bottom", 0)
+    off[:, 6] += np.pi + sizes.get("yaw", 0)  # front and rear are the same box
+    return off
+
+
+def test_errors_are_those_that_were_made():
+    true = cars(20, np.random.default_rng(0))
+    made = dict(away=0.12, aside=-0.07, bottom=0.1, length=-0.2, width=0.0, height=0.06, yaw=0.05)
+    errors = box_errors([frame(true, moved(true, **made))], "Car", 0.2)
+    for title, row in errors["by_range"].items():
+        for name in ERRORS:
+            assert row[name]["median"] == pytest.approx(made[name], abs=1e-5), (title, name)
+            assert row[name]["median_size"] == pytest.approx(abs(made[name]), abs=1e-5)
+    counts = [row["pairs"] for row in errors["by_range"].values()]
+    assert len(counts) == len(RANGES) and sum(counts[:-1]) == counts[-1] == 20
+
+
+def test_what_is_put_right_counts_and_what_is_not_found_does_not():
+    true = cars(12, np.random.default_rng(1))
+    off = moved(true)
+    off[:4, 2] += 0.6    # in space only
+    off[4:8, :2] += 0.3  # from above as well
+    found, scores = np.concatenate([off, off[:1] + [0, 200, 0, 0, 0, 0, 0]]), np.full(13, 0.9)
+    scores[11] = 0.1     # too weak to count
+    content = box_errors([frame(true, found, scores)], "Car", 0.2)
+    assert content["by_range"]["all"]["pairs"] <= 11
+    strict = content["strict"]
+    assert strict["z"]["space"] > strict["as it is"]["space"]
+    assert strict["x, y, z"]["space"] == strict["x, y"]["above"] == 100
+    assert strict["z"]["above"] == strict["as it is"]["above"] < 100
+    assert box_errors([frame(true, off[:0])], "Car", 0.2)["strict"]["z"]["space"] is None
+    assert box_errors([], "Pedestrian", 0.2)["by_range"]["all"]["pairs"] == 0
+    assert DETECTED["Car"].strict == 0.7
