@@ -44,18 +44,16 @@ def test_pages_are_made_from_the_code(generate, name):
                                   "perception", "evaluator", "pointpillars_detector",
                                   "pointnet_detector", "fused_detector", "tracker"])
 def test_documented_topics_are_the_nodes_own(generate, name, domain):
-    rclpy = pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
-    from rclpy.context import Context
-    from rclpy.signals import SignalHandlerOptions
-    context = Context()
-    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+    from lidar_perception.nodes.watch import new_context
+    context = new_context(domain)
     module = importlib.import_module(f"lidar_perception.nodes.{name}")
     node = getattr(module, NODES[name][0])(context=context)
     node.start()
     listed = {t for t, _ in [*node.get_publisher_names_and_types_by_node(name, "/"),
                              *node.get_subscriber_names_and_types_by_node(name, "/")]}
     node.destroy_node()
-    rclpy.try_shutdown(context=context)
+    context.try_shutdown()
     documented = set()
     entry = generate.PAGES[name]
     for topics, kind, _ in entry["inputs"] + generate.outputs(name):

@@ -337,16 +337,15 @@ def test_an_old_name_of_others_parameters_is_nobodys(tmp_path):
 
 @each_renamed
 def test_a_node_answers_an_old_name_with_the_new_one(old, new, value, kind, domain):
-    rclpy = pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+    pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
     from rclpy.parameter import Parameter
-    from rclpy.signals import SignalHandlerOptions
 
     from lidar_perception.nodes.runtime import LidarNode
-    context = rclpy.context.Context()
-    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    from lidar_perception.nodes.watch import new_context
+    context = new_context(domain)
     given = Parameter(old, value=flatten(kind())[new])
     try:
         with pytest.raises(InputError, match=f"'{old}' is called '{new}' now"):
             LidarNode("old", kind(), context=context, parameter_overrides=[given])
     finally:
-        rclpy.try_shutdown(context=context)
+        context.try_shutdown()

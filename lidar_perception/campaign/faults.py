@@ -15,7 +15,7 @@ from time import monotonic, sleep
 
 from lidar_perception.campaign.case import FAILED, REFUSED, SKIPPED, SURVIVED, Case, Outcome
 from lidar_perception.campaign.command import load_all, run_command
-from lidar_perception.campaign.graph import Graph, graph_nodes
+from lidar_perception.campaign.graph import LazyGraph, graph_nodes
 from lidar_perception.types import InputError
 
 SECONDS, MEGABYTES = 240.0, 4000.0
@@ -78,8 +78,7 @@ class Attempt:
                 shutil.copyfile(folder / f"kitti/training/{part}/{i % 2:06}.{ending}", target)
         os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
         load_all()
-        self.graph: Graph | None = None
-        self.starts = 0
+        self.graph = LazyGraph(folder)
         self.wholes: dict[str, tuple[float, dict[str, bytes]]] = {}
 
     def __call__(self, case: Case) -> Outcome:
@@ -94,31 +93,26 @@ class Attempt:
 
     def close(self) -> None:
         """End the nodes."""
-        if self.graph is not None:
-            self.graph.__exit__()
-            self.graph = None
+        self.graph.close()
 
     def _node(self, name: str, fault: signal.Signals) -> Outcome:
         """The others live on, and all serve a good cloud once the node is there again."""
-        if self.graph is None:
-            self.starts += 1
-            self.graph = Graph(self.folder / f"graph{self.starts}", graph_nodes())
-            self.graph.__enter__()
-        process = self.graph.processes.running[name]
+        graph = self.graph()
+        process = graph.processes.running[name]
         process.send_signal(fault)
         try:
             if fault == signal.SIGSTOP:
-                self.graph.spin(STOPPED)
+                graph.spin(STOPPED)
                 process.send_signal(signal.SIGCONT)
             else:
                 code = process.wait(30.0)
                 if code not in (0, -signal.SIGKILL):
                     return Outcome(FAILED, f"{name} ended with code {code} at {fault.name}")
-                del self.graph.processes.running[name]
-                shutil.rmtree(self.folder / f"graph{self.starts}/recorded", ignore_errors=True)
-                self.graph.processes.check()  # the others
-                self.graph.start(name)
-            self.graph.alive()
+                del graph.processes.running[name]
+                shutil.rmtree(graph.folder / "recorded", ignore_errors=True)
+                graph.processes.check()  # the others
+                graph.start(name)
+            graph.alive()
         except (InputError, subprocess.TimeoutExpired) as error:
             self.close()
             return Outcome(FAILED, f"{name}, {fault.name}: {error}")
@@ -158,7 +152,8 @@ class Attempt:
         if "Traceback" in (self.folder / "said").read_text(errors="replace"):
             return Outcome(FAILED, f"{work}: traceback after {fault.name}: {_said(self.folder)}")
         there = (self.folder / out).exists()
-        ended = code == 0 and _files(self.folder / out, pattern) == wanted
+        # A bag is whole once it has its name, also if the signal comes between that and the end.
+        ended = (code == 0 or work == "convert") and _files(self.folder / out, pattern) == wanted
         if not ended:
             code = _run(self.folder, (*command, *(resume if there else ())), out)
             if code:

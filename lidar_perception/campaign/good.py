@@ -74,9 +74,6 @@ def _good(kind: str) -> bytes:
                                                                  bag_message), bag_message))
     if kind == "geometry_msgs/msg/TransformStamped":
         return encode(extrinsics(FORWARD_CAMERA, header(), bag_message))
-    if kind == "tf2_msgs/msg/TFMessage":
-        return encode(bag_message(kind, transforms=[extrinsics(FORWARD_CAMERA, header(),
-                                                               bag_message)]))
     if kind == "geometry_msgs/msg/PointStamped":
         x, y, z = map(float, PERSON[:3])
         return encode(bag_message(kind, header=header(), point=bag_message(
@@ -85,8 +82,6 @@ def _good(kind: str) -> bytes:
         message = bag_message(kind, header=header(), child_frame_id="lidar")
         message.pose.pose.orientation.w = 1.0
         return encode(message)
-    if kind == "std_msgs/msg/Float64":
-        return encode(bag_message(kind, data=1.5))
     raise LookupError(f"there is no good message of type {kind}")
 
 

@@ -9,8 +9,6 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from rclpy.qos import QoSProfile
-
 from lidar_perception.campaign.good import good, markers
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.graph import (
@@ -41,16 +39,15 @@ SPEAKING = {"evaluator", "bag_recorder"}  # have no clouds of which to name the 
 class Graph:
     """Nodes that are running, and what they say. A context manager that ends them."""
 
-    def __init__(self, folder: Path, chosen: tuple[str, ...], params: Mapping[str, Any] = {}):
+    def __init__(self, folder: Path, chosen: tuple[str, ...]):
+        self.folder = folder
         use_large_shared_memory()
         warm_up()  # once, not by every node
-        self.domain, self.params = private_domain(), dict(params)
+        self.domain = private_domain()
         self.processes = Processes(folder / "logs", self.domain)
-        self.processes.environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         remap, own = evaluation(folder / "scores.json")
         self.nodes: dict[str, tuple[Mapping[str, str], dict[str, Any]]] = {
-            **{name: (rules, self.params) for name, rules in {
-                **POINTNET, **STAGES, **SINGLE}.items()},
+            **{name: (rules, {}) for name, rules in {**POINTNET, **STAGES, **SINGLE}.items()},
             "evaluator": (remap, own),
             "bag_recorder": ({}, {"bag": str(folder / "recorded"),
                                   "topics": [POINTS, "/clustering/output/points"]})}
@@ -62,9 +59,13 @@ class Graph:
         for name in self.nodes:
             self.start(name)
         self.publishers = {topic: self.outside.node.create_publisher(
-            message_class(kind), topic, LATCHED if "camera" in topic else QoSProfile(
-                depth=10, reliability=RELIABLE.reliability)) for topic, kind in TOPICS.items()}
-        self.alive(START_SECONDS)
+            message_class(kind), topic, LATCHED if "camera" in topic else RELIABLE)
+            for topic, kind in TOPICS.items()}
+        try:
+            self.alive(START_SECONDS)
+        except BaseException:  # nothing goes on that nobody can end
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -120,6 +121,26 @@ class Graph:
             found += [f"{name}: {line[-300:]}" for line in text.splitlines()
                       if "this is a bug" in line]
         return found
+
+
+class LazyGraph:
+    """All nodes in one graph, started when it is asked for, and again once it has been closed."""
+
+    def __init__(self, folder: Path):
+        self.folder, self.starts = folder, 0
+        self.running: Graph | None = None
+
+    def __call__(self) -> Graph:
+        if self.running is None:
+            self.starts += 1
+            self.running = Graph(self.folder / f"graph{self.starts}", graph_nodes()).__enter__()
+        return self.running
+
+    def close(self) -> None:
+        """End the nodes."""
+        if self.running is not None:
+            self.running.__exit__()
+            self.running = None
 
 
 def stamped(data: bytes, stamp_ns: int) -> bytes:

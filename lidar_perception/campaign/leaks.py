@@ -11,9 +11,6 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
-import rclpy
-from rclpy.context import Context
-from rclpy.signals import SignalHandlerOptions
 
 from lidar_perception.campaign.case import FAILED, SKIPPED, SURVIVED, Case, Outcome
 from lidar_perception.campaign.good import CLOUD, STAMP, cloud, good, markers, street
@@ -22,6 +19,7 @@ from lidar_perception.campaign.shapes import NETWORKS, work_of
 from lidar_perception.campaign.worker import memory_mb
 from lidar_perception.nodes.graph import private_domain
 from lidar_perception.nodes.runtime import MARKERS
+from lidar_perception.nodes.watch import new_context
 from lidar_perception.types import LidarFrame
 from lidar_perception.wire.codec import encode
 
@@ -55,16 +53,14 @@ class Attempt:
     def __call__(self, case: Case) -> Outcome:
         kind, _, name = case.settings["what"].partition(" ")
         if kind == "node":
-            context = Context()
-            rclpy.init(context=context, domain_id=private_domain(),
-                       signal_handler_options=SignalHandlerOptions.NO)
+            context = new_context(private_domain())
             tried = Tried(name, context)
             tried.set(TRIED[name][2][case.settings["variant"]])
             try:
                 return _repeated(case.name, partial(_frame_of_node, tried))
             finally:
                 tried.node.destroy_node()
-                rclpy.try_shutdown(context=context)
+                context.try_shutdown()
         work = work_of(case.settings["what"])
         frames = [LidarFrame.of(street(i), np.full(len(street(i)), 0.3, np.float32))
                   for i in range(20)]

@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 from rich.box import SIMPLE_HEAD
 from rich.markup import escape
+from rich.progress import TaskID
 from rich.table import Table
 
 from lidar_perception.campaign.case import FAILED, REFUSED, SKIPPED, SURVIVED
@@ -52,7 +53,7 @@ def campaign(minutes: float, seed: int, only: tuple[str, ...], cases: int | None
                              f"{f': {outcome.reason}' if outcome.reason else ''}"))
         raise SystemExit(1 if outcome.verdict == FAILED else 0)
     with progress() as bar:
-        tasks: dict[str, object] = {}
+        tasks: dict[str, TaskID] = {}
 
         def watch(tally: Tally, share: float) -> None:
             if tally.part not in tasks:

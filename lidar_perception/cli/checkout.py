@@ -16,6 +16,16 @@ from lidar_perception.types import InputError
 ROOT = Path(__file__).resolve().parents[2]
 MAX_WORKERS = 4  # each holds torch and compiles what it runs
 WITH_PROCESSES = ("test/ros", "test/launch", "test/testing")
+# What Numba compiles for all of this is cached beside the source, for each process after this one.
+COMPILE = """
+from lidar_perception.candidates.warm_up import warm_up
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.simulation.to_bag import simulated_scans
+warm_up()
+for frame in simulated_scans(1, 1):
+    for name in ("pointpillars", "pointnet"):
+        open_detector(name)(frame.load())
+"""
 PASS_ON = dict(ignore_unknown_options=True, help_option_names=[])
 
 
@@ -25,8 +35,9 @@ def test(arguments: tuple[str, ...]) -> None:
     """Run the tests of this checkout; ARGUMENTS go to pytest.
 
     Without ARGUMENTS ruff, mypy, and all tests: those of the core on all cores, and beside them,
-    one by one, those with processes that talk to each other. The lines that they run are measured,
-    in all processes, and at least as many as setup.cfg says must be.
+    one by one, those with processes that talk to each other. What Numba compiles is compiled before
+    them, once, while ruff and mypy run. The lines that the tests run are measured, in all
+    processes, and at least as many as setup.cfg says must be.
 
     \b
     Examples:
@@ -35,41 +46,52 @@ def test(arguments: tuple[str, ...]) -> None:
     """
     if arguments:
         sys.exit(_run("test", ["-m", "pytest", *arguments]))
-    failed = [name for name in ("ruff check", "mypy")
-              if _run("test", ["-m", *name.split()])]
+    _needed("test")
     with tempfile.TemporaryDirectory() as folder:
-        failed += _tests(Path(folder))
+        failed = _everything(Path(folder))
     if failed:
         errors.print(f"[red]failed:[/] {', '.join(failed)}")
     sys.exit(bool(failed))
 
 
-def _tests(folder: Path) -> list[str]:
-    """Run all tests, those of nodes beside the others, since they mostly wait. What failed; the
-    measured coverage lies in folder for a while."""
+class Beside:
+    """A Python command that runs beside others; what it says is shown when it has ended."""
+
+    def __init__(self, *words: str, environment: dict[str, str] | None = None):
+        self.said = tempfile.TemporaryFile("w+")
+        self.process = subprocess.Popen([sys.executable, *words], cwd=ROOT, env=environment,
+                                        stdout=self.said, stderr=subprocess.STDOUT)
+
+    def failed(self) -> bool:
+        """Wait for its end."""
+        code = self.process.wait()
+        self.said.seek(0)
+        print(self.said.read(), end="", flush=True)
+        return bool(code)
+
+
+def _everything(folder: Path) -> list[str]:
+    """Run all that is tested. What failed; the measured coverage lies in folder for a while."""
     environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
     if sys.version_info >= (3, 12):
         environment["COVERAGE_CORE"] = "sysmon"  # lines are noticed once, and then cost nothing
-    pytest = [sys.executable, "-m", "pytest", "--cov", "--cov-report=", "--cov-fail-under=0"]
+    pytest = ("-m", "pytest", "--cov", "--cov-report=", "--cov-fail-under=0")
     nodes = [name for name in WITH_PROCESSES if (ROOT / name).is_dir()]
     workers = min(os.cpu_count() or 1, MAX_WORKERS)
-    with (folder / "said").open("w+") as said:
-        beside = subprocess.Popen([*pytest, *nodes], cwd=ROOT, stdout=said,
-                                  stderr=subprocess.STDOUT,
-                                  env={**environment, "COVERAGE_FILE": str(folder / "nodes")})
-        core = subprocess.run([*pytest, "-n", str(workers), "--dist", "loadfile",
-                               *(f"--ignore={name}" for name in nodes)], cwd=ROOT, env=environment)
-        beside.wait()
-        said.seek(0)
-        print(said.read())
-    coverage = [sys.executable, "-m", "coverage"]
+    running = {"ruff": Beside("-m", "ruff", "check"), "mypy": Beside("-m", "mypy")}
+    subprocess.run([sys.executable, "-c", COMPILE], cwd=ROOT)  # tests say what is wrong, if it is
+    # Nodes mostly wait, so their tests run beside the others.
+    running["tests of nodes"] = Beside(*pytest, *nodes, environment={
+        **environment, "COVERAGE_FILE": str(folder / "nodes")})
+    core = subprocess.run([sys.executable, *pytest, "-n", str(workers), "--dist", "loadfile",
+                           *(f"--ignore={name}" for name in nodes)], cwd=ROOT, env=environment)
+    failed = ["tests"] * bool(core.returncode)
+    failed += [name for name, command in running.items() if command.failed()]
+    coverage, environment["COVERAGE_FILE"] = [sys.executable, "-m", "coverage"], str(folder / "all")
     subprocess.run([*coverage, "combine", "--quiet", "--keep", str(folder / "coverage"),
-                    str(folder / "nodes")], cwd=ROOT, env={**environment, "COVERAGE_FILE":
-                                                           str(folder / "all")})
-    covered = subprocess.run([*coverage, "report"], cwd=ROOT, env={
-        **environment, "COVERAGE_FILE": str(folder / "all")})
-    return [name for name, done in (("tests", core), ("tests of nodes", beside),
-                                    ("coverage", covered)) if done.returncode]
+                    str(folder / "nodes")], cwd=ROOT, env=environment)
+    covered = subprocess.run([*coverage, "report"], cwd=ROOT, env=environment)
+    return [*failed, *["coverage"] * bool(covered.returncode)]
 
 
 @click.command(context_settings=PASS_ON)
@@ -81,7 +103,11 @@ def benchmark(arguments: tuple[str, ...]) -> None:
 
 def _run(folder: str, command: list[str]) -> int:
     """The exit code."""
+    _needed(folder)
+    return subprocess.run([sys.executable, *command], cwd=ROOT).returncode
+
+
+def _needed(folder: str) -> None:
     if not (ROOT / folder).is_dir():
         raise InputError(f"'{folder}' needs a checkout of the repository, and {ROOT} has no "
                          f"folder {folder}/")
-    return subprocess.run([sys.executable, *command], cwd=ROOT).returncode

@@ -17,8 +17,9 @@ The equations are missing from the text of the paper; this is our reading of wha
 So the clusters do not depend on the order of the points. No pairs are stored: memory grows with
 the number of points only. Where the grid takes more than PATIENCE distances a point, because it
 is crowded with points out of reach of each other, a tree finds the same. Only the local threshold
-has to look at every pair: it is exact up to WORK distances a cloud, twice what the densest scan
-known takes; of denser clouds it takes a sample of each cell, the same of the same points.
+has to look at every pair: it is exact up to DENSE distances a point, where real scans take less
+than 1,000, and WORK a cloud, twice what the densest scan known takes; of denser clouds it takes a
+sample of each cell, the same of the same points.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ from lidar_perception.clustering.tree import crowded as count_crowded
 SAMPLE, SIDES = 64, 5  # the first cells are 5 medians of a sample's nearest distances wide
 BUDGET = 20_000_000    # distances that are rather computed than to sort points into larger cells
 WORK = 2**32           # distances for local thresholds
+DENSE = 2**15          # of them a point
 
 
 def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
@@ -62,6 +64,7 @@ def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
         cells, reach = cells_of(xyz, params.distance), np.full(n, params.distance)
     else:
         cells, reach = cells_of(xyz, params.radius), np.empty(n)
+        work = min(work, DENSE * n)
         means = (_means(cells, params.radius ** 2) if around(cells) * n <= work else
                  _means_of_sample(cells, sample_of(cells, work), params.radius ** 2))
         reach[cells.order] = np.float32(params.alpha * means)

@@ -38,8 +38,9 @@ class Stop:
         for number in signals:
             waited_for[(number - 1) // 8] |= 1 << (number - 1) % 8
         self._awake, write = os.pipe()
-        for target, arguments in [(_guard, (self._state, waited_for, write)), (self._wait, ())]:
-            threading.Thread(target=target, args=arguments, daemon=True).start()
+        guarded = self._state, waited_for, write
+        threading.Thread(target=_guard, args=guarded, daemon=True).start()
+        threading.Thread(target=self._wait, daemon=True).start()
 
     def _wait(self) -> None:
         os.read(self._awake, 1)

@@ -23,15 +23,21 @@ from lidar_perception.wire.topics import POINTS
 DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
 
+def new_context(domain: int | None) -> Context:
+    """A ROS context of its own, without signal handlers, on a domain; None is that of the
+    environment. context.try_shutdown() ends it."""
+    context = Context()
+    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    return context
+
+
 class Outside:
     """A node of a program that starts other nodes: a ROS context of its own, spun by hand, no
     signal handlers; on a domain, None for that of the environment. A context manager. diagnostics
     holds the last status of every node."""
 
     def __init__(self, domain: int | None, name: str):
-        self.context = Context()
-        rclpy.init(context=self.context, domain_id=domain,
-                   signal_handler_options=SignalHandlerOptions.NO)
+        self.context = new_context(domain)
         self.node = rclpy.create_node(name, context=self.context)
         self.executor = SingleThreadedExecutor(context=self.context)
         self.executor.add_node(self.node)
@@ -44,7 +50,7 @@ class Outside:
     def __exit__(self, *_: Any) -> None:
         self.executor.shutdown()
         self.node.destroy_node()
-        rclpy.try_shutdown(context=self.context)
+        self.context.try_shutdown()
 
     def _on_status(self, msg: Any) -> None:
         for status in msg.status:

@@ -95,8 +95,9 @@ def thin_cloud(msg: Any, xyz: np.ndarray, indices: np.ndarray, make: Any) -> Any
     for name in [n for n in INTENSITY_FIELDS if n in names][:1]:
         fields["intensity"] = _single(to_array(msg), name).take(indices)
     points = np.empty(len(xyz), [(name, "<f4") for name in fields])
-    for name, values in fields.items():
-        points[name] = values
+    with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf
+        for name, values in fields.items():
+            points[name] = values
     return from_array(points, msg.header, make)
 
 

@@ -185,25 +185,6 @@ def test_time_and_memory_that_grow_too_fast_are_failures():
     assert judged(case, [(9.0, 9000.0)], n).verdict == FAILED
 
 
-def test_every_input_of_a_node_is_tried(domain):
-    messages = pytest.importorskip("lidar_perception.campaign.messages", reason="needs ROS 2",
-                                   exc_type=ImportError)
-    import rclpy
-    from rclpy.context import Context
-    from rclpy.signals import SignalHandlerOptions
-
-    from lidar_perception.nodes import NODES
-    assert set(messages.TRIED) == set(NODES) - {"bag_player", "bag_recorder"}
-    context = Context()
-    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
-    for name, (_, inputs, _) in messages.TRIED.items():
-        tried = messages.Tried(name, context)
-        assert set(inputs) == {topic for topic in tried.calls if "parameter" not in topic
-                               and topic not in ("clock", "tf", "tf_static")}
-        tried.node.destroy_node()
-    rclpy.try_shutdown(context=context)
-
-
 # The short form. Worker processes do what a long run does, with seeds that stay.
 @pytest.mark.parametrize("part, cases", [("messages", 100), ("files", 60), ("shapes", 15)])
 def test_the_short_campaign_finds_nothing(part, cases, tmp_path):

@@ -169,22 +169,6 @@ def test_a_bag_that_was_cut_anywhere_is_damaged(written, tmp_path, folder):
             message_bytes(tmp_path if folder else path)
 
 
-def test_a_byte_that_flipped_is_never_a_traceback(written, tmp_path):
-    raw = (written / "drive.mcap").read_bytes()
-    with open(written / "drive.mcap", "rb") as stream:
-        chunk = make_reader(stream).get_summary().chunk_indexes[0].chunk_start_offset
-    damaged, path = 0, tmp_path / "drive.mcap"
-    for at in [*range(chunk, chunk + 100), *range(0, len(raw), len(raw) // 30)]:
-        path.write_bytes(raw[:at] + bytes([raw[at] ^ 0x55]) + raw[at + 1:])
-        try:
-            with Bag(path) as bag:
-                list(bag.messages(bag.topics))
-        except InputError as error:
-            damaged += 1
-            assert "\n" not in str(error)
-    assert damaged > 40
-
-
 def read_or_named(path):
     """The messages, or None where the bag says in one line that it is damaged."""
     try:
@@ -206,10 +190,14 @@ DAMAGES = {
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
 def test_a_damaged_byte_never_changes_what_is_read_without_a_word(written, tmp_path, damage):
-    """In the data and in the index, from which readers take where the messages are."""
+    """In the data, at the head of a chunk, and in the index, from which readers take where the
+    messages are."""
     raw, before = (written / "drive.mcap").read_bytes(), message_bytes(written)
     path, named = tmp_path / "drive.mcap", 0
-    places = [*range(8, len(raw), len(raw) // 40), *range(len(raw) - 4000, len(raw), 23)]
+    with open(written / "drive.mcap", "rb") as stream:
+        chunk = make_reader(stream).get_summary().chunk_indexes[0].chunk_start_offset
+    places = [*range(8, len(raw), len(raw) // 40), *range(chunk, chunk + 60, 3),
+              *range(len(raw) - 4000, len(raw), 41)]
     for at in places:
         path.write_bytes(damage(raw, at))
         rows = read_or_named(path)

@@ -34,12 +34,16 @@ def test_each_says_what_it_was_trained_on_and_how_it_scores(file):
     assert str(header.training["steps"]) in card and header.commit in card
 
 
+@pytest.fixture(scope="module")
+def scans(streets):
+    return [scan_at(street, 0, HDL64E) for street in (0, 12, 15)]
+
+
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_each_finds_most_cars_that_are_plain_to_see(file):
+def test_each_finds_most_cars_that_are_plain_to_see(file, scans):
     detector = open_detector(file, "cpu")
     found = hits = 0
-    for street in (0, 12, 15):
-        scan = scan_at(street, 0, HDL64E)
+    for scan in scans:
         cars = scan.truth.class_ids == CLASSES.index("Car")
         plain = np.array([e["num_points"] > 100 and e["visible"] > 0.5 for e in scan.truth.extras])
         ahead = (scan.truth.boxes[:, 0] > 5) & (scan.truth.boxes[:, 0] < 35) & (

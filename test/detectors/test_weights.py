@@ -15,7 +15,7 @@ from detection_samples import eager, frame, lively, random_detector, same, tiny
 from lidar_perception.cli.main import cli
 from lidar_perception.detectors.checkpoint import Header, adopt, read_header, save_checkpoint
 from lidar_perception.detectors.pointpillars import weights_file as weights_module
-from lidar_perception.detectors.pointpillars.config import VERSIONS, NetworkConfig, network_config
+from lidar_perception.detectors.pointpillars.config import NetworkConfig, network_config
 from lidar_perception.detectors.pointpillars.detector import (
     CPU,
     PointPillarsDetector,
@@ -159,9 +159,8 @@ def test_weights_that_do_not_come_with_the_package_are_asked_for(tmp_path, monke
 # export
 
 @needs_onnx
-@pytest.mark.parametrize("version, changes", [
-    *((version, {}) for version in VERSIONS),
-    ("v0", dict(max_points=3, zero_row=True, middle_z=True))])
+@pytest.mark.parametrize("version, changes", [  # the versions between have parts of the last
+    ("v0", dict(max_points=3, zero_row=True, middle_z=True)), ("v2", {}), ("v4", {})])
 def test_an_exported_network_finds_the_same(version, changes, tmp_path):
     from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork, export_onnx
     config = tiny(version, anchors=tiny().anchors[:1 + int(version[1])][-2:], **changes)

@@ -93,6 +93,7 @@ def test_far_on_a_drive(streets, tmp_path):
     pytest.importorskip("kiss_icp", reason="needs kiss-icp, the extra [odometry]")
     made = CliRunner().invoke(simulate, ["--format", "kitti-tracking", "--frames", "5", "--seed",
                                          "33", "--street", "zone", "--people", "3", "--jobs", "1",
+                                         "--sensor", "generic:32,-25,3,0.4,10",
                                          "--out", str(tmp_path / "drive")])
     assert made.exit_code == 0, made.output
     frames = open_recording(tmp_path / "drive").frames

@@ -12,15 +12,34 @@ def good_cloud(drive_bag):
         return next(m for _, _, m in bag.messages({POINTS}))
 
 
+@pytest.fixture(scope="module")
+def found(request, shared_processes, shared_peer, weights):
+    """What the graph of the module's DETECTOR detects with its weights."""
+    from test_bad_input import MARKERS, QUIET
+
+    from lidar_perception.candidates.params import PipelineParams
+    from lidar_perception.cli.options import read_config
+    tested = request.module.DETECTOR
+    for node, remap in tested.graph.items():
+        shared_processes.start(node, remap, {**read_config(tested.stages, PipelineParams()), **(
+            {**tested.values(weights), **QUIET} if node == tested.node else {})})
+    return shared_peer.listen(f"/{tested.node}/output/detections", MARKERS)
+
+
+@pytest.fixture(scope="module")
+def talker(request, shared_peer, found):
+    """Straight to the detector."""
+    from test_bad_input import CLOUD
+    return shared_peer.talker(request.module.DETECTOR.between, CLOUD)
+
+
 @pytest.fixture
 def start(domain):
     """Makes a node in this process; what it publishes grows in node.sent, by topic."""
-    import rclpy
-    from rclpy.context import Context
     from rclpy.parameter import Parameter
-    from rclpy.signals import SignalHandlerOptions
-    context, nodes = Context(), []
-    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+
+    from lidar_perception.nodes.watch import new_context
+    context, nodes = new_context(domain), []
 
     def make(kind, **values):
         overrides = [Parameter(k, value=list(v) if isinstance(v, tuple) else v)
@@ -38,4 +57,4 @@ def start(domain):
     yield make
     for node in nodes:
         node.destroy_node()
-    rclpy.try_shutdown(context=context)
+    context.try_shutdown()

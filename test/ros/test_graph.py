@@ -31,7 +31,6 @@ PAPER = with_values(PipelineParams(), {"view.enabled": True, "seed.source": "gro
 
 
 RUNS = {  # one process?, parameters beside the protocol
-    "three nodes": (False, {}),
     "three nodes of paper C": (False, {"ground.method": "cloth", "clustering.method": "euclidean",
                                        "boxes.shape": "l_shape"}),
     "one node, patchwork": (True, {"ground.method": "patchwork", "boxes.shape": "min_area",

@@ -9,11 +9,12 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from detector_node import REMAP, assert_equal, message, received
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.parameter import Parameter
 from test_bad_input import CLOUD, MARKERS
-from test_pointpillars_node import NODE, REMAP, assert_equal, message, offline, received, values
+from test_pointpillars_node import DETECTOR, NODE, offline
 
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
@@ -48,10 +49,11 @@ def later(tmp_path_factory):
 @pytest.fixture(scope="module")
 def nodes(shared_processes, weights, later):
     """All at once: with its weights, without, without and by itself, without their template."""
-    driven = {**values(weights), "autostart": False}
+    values = DETECTOR.values(weights)
+    driven = {**values, "autostart": False}
     shared_processes.start(NODE, {}, driven, "ready")
     shared_processes.start(NODE, {}, {**driven, "pointpillars.weights": str(later)}, "waits")
-    shared_processes.start(NODE, {}, {**values(weights), "pointpillars.weights": str(later)},
+    shared_processes.start(NODE, {}, {**values, "pointpillars.weights": str(later)},
                            "tries")
     for name in ("perception", "candidate_refinement"):
         shared_processes.start(name, {}, {"autostart": False, "seed.source": "file",
@@ -138,7 +140,7 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
 
 
 def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
-    node = here(PointPillarsNode, {**values(weights), "autostart": False}, REMAP)
+    node = here(PointPillarsNode, {**DETECTOR.values(weights), "autostart": False}, REMAP)
     talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
     empty, names = entities(node), set(vars(node))
     for stamp in (1, 2):

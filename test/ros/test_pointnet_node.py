@@ -12,9 +12,9 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 from detection_samples import frame
 from detection_samples import lively as lively_pointpillars
 from detection_samples import tiny as tiny_pointpillars
+from detector_node import REMAP, DetectorUnderTest, assert_equal, message, received
 from pointnet_samples import eager, lively, small
-from test_bad_input import BAD, CLOUD, MARKERS, QUIET, cloud
-from test_pointpillars_node import REMAP, assert_equal, message, received
+from test_bad_input import BAD, CLOUD, MARKERS, cloud
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
@@ -22,16 +22,17 @@ from lidar_perception.cli.options import read_config
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.checkpoint import Header as PointPillarsHeader
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
-from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams
+from lidar_perception.detectors.pointnet.params import STEPS
 from lidar_perception.nodes.graph import POINTNET
 from lidar_perception.nodes.main import run
-from lidar_perception.param_fields import flatten, with_values
+from lidar_perception.param_fields import with_values
 from lidar_perception.wire.messages import column, to_frame
 from lidar_perception.wire.topics import POINTS
 
 NODE = "pointnet_detector"
 SHARED = Path(__file__).resolve().parents[2] / "config" / "pointnet.param.yaml"
-BETWEEN, FOUND = POINTNET[NODE]["~/input/points"], f"/{NODE}/output/detections"
+DETECTOR = DetectorUnderTest(NODE, POINTNET, SHARED, eager(), load_pointnet_detector)
+BETWEEN, offline = DETECTOR.between, DETECTOR.offline
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -44,38 +45,9 @@ def weights(tmp_path_factory) -> Path:
     return path
 
 
-def values(weights):
-    """Parameters of the node, as flat as a launch file has them; unchanged ones are left out."""
-    params = with_values(eager(), {"pointnet.weights": str(weights), "pointnet.threads": 1})
-    defaults = flatten(PointNetDetectorParams())
-    return {k: v for k, v in flatten(params).items() if v != defaults[k]}
-
-
-def offline(weights, msg, cluster_ids=None):
-    params = with_values(eager(), {"pointnet.threads": 1})
-    detector = load_pointnet_detector(weights, "cpu", params)
-    scan = to_frame(msg, params.input.intensity_max)[0]
-    return detector(scan, cluster_ids=cluster_ids).detections
-
-
 @pytest.fixture(scope="module")
 def peer(shared_peer):
     return shared_peer
-
-
-@pytest.fixture(scope="module")
-def found(shared_processes, peer, weights):
-    """What the graph of three nodes detects, with the detector's numbers."""
-    for node, remap in POINTNET.items():
-        shared_processes.start(node, remap, {**read_config(SHARED, PipelineParams()), **(
-            {**values(weights), **QUIET} if node == NODE else {})})
-    return peer.listen(FOUND, MARKERS)
-
-
-@pytest.fixture(scope="module")
-def talker(peer, found):
-    """Straight to the detector."""
-    return peer.talker(BETWEEN, CLOUD)
 
 
 def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, peer, weights):
@@ -93,7 +65,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
     assert segmented.ground.any() and segmented.cluster_ids.max() >= 5
     np.testing.assert_array_equal(column(points[-1], "cluster_id", np.arange(len(scan))),
                                   segmented.cluster_ids)
-    expected = offline(weights, message(1), segmented.cluster_ids)
+    expected = offline(weights, message(1), cluster_ids=segmented.cluster_ids)
     assert_equal(received(found, 1), expected)
     assert received(found, 1).frame_id == "lidar"
 
@@ -104,7 +76,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
     halves[segmented.cluster_ids == 0] = 0
     peer.send(talker, message(3, cluster_id=halves.astype(np.uint32)),
               lambda: received(found, 3), "detections of a cloud with clusters")
-    other = offline(weights, message(3), halves)
+    other = offline(weights, message(3), cluster_ids=halves)
     assert_equal(received(found, 3), other)
     assert not np.array_equal(other.boxes, expected.boxes)
 

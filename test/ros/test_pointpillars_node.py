@@ -10,8 +10,9 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from detection_samples import eager, frame, lively, tiny
+from detector_node import REMAP, DetectorUnderTest, assert_equal, message, received
 from rcl_interfaces.srv import DescribeParameters
-from test_bad_input import BAD, CLOUD, MARKERS, QUIET, cloud
+from test_bad_input import BAD, CLOUD, MARKERS, cloud
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
@@ -22,17 +23,14 @@ from lidar_perception.detectors.pointpillars.detector import STEPS, load_detecto
 from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.graph import POINTPILLARS
 from lidar_perception.nodes.main import run
-from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.testing.clouds import cloud_message
-from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import column, to_detections, to_frame
+from lidar_perception.param_fields import with_values
+from lidar_perception.wire.messages import column, to_frame
 from lidar_perception.wire.topics import POINTS
-from msg_utils.markers import box_pose, from_marker_array, pose_yaw
 
 NODE = "pointpillars_detector"
 EXPERTS = Path(__file__).resolve().parents[2] / "config" / "pointpillars.param.yaml"
-REMAP = {"~/input/points": "/in", "~/output/detections": "/found"}
-BETWEEN, FOUND = POINTPILLARS[NODE]["~/input/points"], f"/{NODE}/output/detections"
+DETECTOR = DetectorUnderTest(NODE, POINTPILLARS, EXPERTS, eager(), load_detector)
+BETWEEN, offline = DETECTOR.between, DETECTOR.offline
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -45,59 +43,9 @@ def weights(tmp_path_factory) -> Path:
     return path
 
 
-def values(weights, **changes):
-    """Parameters of the node, as flat as a launch file has them; unchanged ones are left out."""
-    params = with_values(eager(), {"pointpillars.weights": str(weights), "pointpillars.threads": 1,
-                                   **changes})
-    defaults = flatten(DetectorParams())
-    return {k: v for k, v in flatten(params).items() if v != defaults[k]}
-
-
-def message(stamp, **columns):
-    """The scan of detection_samples, with columns of its own."""
-    return cloud_message(np.column_stack([frame().xyz, frame().intensity]), stamp, **columns)
-
-
-def received(messages, stamp):
-    """What came for the cloud of a stamp."""
-    return next((m for m in map(from_marker_array, messages) if m.stamp_ns == stamp), None)
-
-
-def offline(weights, msg, ground=None, cluster_ids=None):
-    params = with_values(eager(), {"pointpillars.threads": 1})
-    detector = load_detector(weights, "cpu", params)
-    scan = to_frame(msg, params.input.intensity_max)[0]
-    return detector(scan, ground=ground, cluster_ids=cluster_ids).detections
-
-
-def assert_equal(objects, expected):
-    found = to_detections(objects)
-    assert len(expected) > 3
-    np.testing.assert_array_equal(found.boxes[:, :6], expected.boxes[:, :6])
-    yaws = [pose_yaw(box_pose(box, bag_message)) for box in expected.boxes]  # -pi .. pi
-    np.testing.assert_array_equal(found.boxes[:, 6], np.float32(yaws))
-    np.testing.assert_array_equal(found.scores, expected.scores)
-    np.testing.assert_array_equal(found.class_ids, expected.class_ids)
-
-
 @pytest.fixture(scope="module")
 def peer(shared_peer):
     return shared_peer
-
-
-@pytest.fixture(scope="module")
-def found(shared_processes, peer, weights):
-    """What the graph of three nodes detects, with the experts' numbers."""
-    for node, remap in POINTPILLARS.items():
-        shared_processes.start(node, remap, {**read_config(EXPERTS, PipelineParams()), **(
-            {**values(weights), **QUIET} if node == NODE else {})})
-    return peer.listen(FOUND, MARKERS)
-
-
-@pytest.fixture(scope="module")
-def talker(peer, found):
-    """Straight to the detector."""
-    return peer.talker(BETWEEN, CLOUD)
 
 
 def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, peer, weights):
@@ -113,12 +61,12 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
     params = with_values(PipelineParams(), read_config(EXPERTS, PipelineParams()))
     scan = to_frame(message(1), 0.0)[0]
     segmented = segment(scan, None, params)
-    columns = segmented.ground, segmented.cluster_ids
+    columns = {"ground": segmented.ground, "cluster_ids": segmented.cluster_ids}
     assert segmented.ground.any() and segmented.cluster_ids.max() >= 2
     marked, indices = points[-1], np.arange(len(scan))
     np.testing.assert_array_equal(column(marked, "ground", indices) > 0, segmented.ground)
     np.testing.assert_array_equal(column(marked, "cluster_id", indices), segmented.cluster_ids)
-    assert_equal(received(found, 1), offline(weights, message(1), *columns))
+    assert_equal(received(found, 1), offline(weights, message(1), **columns))
     assert received(found, 1).frame_id == "lidar"
 
     peer.send(talker, message(2), lambda: received(found, 2), "detections of a plain cloud")
@@ -128,7 +76,7 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, pe
     ids = cluster_obstacles(scan.xyz, nowhere > 0, DetectorParams().clustering)
     peer.send(talker, message(3, ground=nowhere, cluster_id=ids.astype(np.uint32)),
               lambda: received(found, 3), "detections of a cloud with columns")
-    other = offline(weights, message(3), nowhere > 0, ids)
+    other = offline(weights, message(3), ground=nowhere > 0, cluster_ids=ids)
     assert_equal(received(found, 3), other)
     assert not np.array_equal(other.boxes, offline(weights, message(2)).boxes)
 
@@ -200,13 +148,6 @@ def checkpoint_of_another_size(folder):
     return {"pointpillars.weights": str(path), "pointpillars.version": "v4"}
 
 
-def cut_checkpoint(folder):
-    checkpoint_of_another_size(folder)
-    whole = (folder / "v0.safetensors").read_bytes()
-    (folder / "cut.safetensors").write_bytes(whole[:len(whole) // 2])
-    return {"pointpillars.weights": str(folder / "cut.safetensors")}
-
-
 def broken_weights(folder):
     network = lively(tiny("v0"))
     network.head.scores.bias.fill_(np.nan)
@@ -214,11 +155,9 @@ def broken_weights(folder):
     return {"pointpillars.weights": str(folder / "nan.safetensors")}
 
 
-UNUSABLE = {  # parameters made in a folder; level, words of the diagnostic
+UNUSABLE = {  # parameters made in a folder; level, words; test_weights.py has more, without ROS
     "nowhere": (lambda folder: {"pointpillars.weights": "/nowhere.safetensors"}, 2,
                 "there is no checkpoint /nowhere.safetensors"),
-    "another version": (checkpoint_of_another_size, 2, "holds version v0, asked for was v4"),
-    "cut": (cut_checkpoint, 2, "is no checkpoint, or was cut short"),
     "no CUDA": (lambda folder: {**checkpoint_of_another_size(folder),
                                 "pointpillars.version": "auto", "pointpillars.device": "cuda:99",
                                 "pointpillars.cpu_fallback": False}, 2,

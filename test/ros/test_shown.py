@@ -14,11 +14,8 @@ import yaml
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-import rclpy
-from rclpy.context import Context
 from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy
 from rclpy.qos import qos_check_compatible as compatible
-from rclpy.signals import SignalHandlerOptions
 
 from lidar_perception.data.bag import Bag
 from lidar_perception.ground.above import obstacles
@@ -26,6 +23,7 @@ from lidar_perception.ground.params import ObstacleParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.graph import BEHIND, SINGLE, graph_of
+from lidar_perception.nodes.watch import new_context
 from lidar_perception.wire.messages import to_frame
 from lidar_perception.wire.topics import POINTS
 from msg_utils.point_cloud2 import to_array
@@ -57,8 +55,7 @@ RVIZ = {"rviz_default_plugins/PointCloud2": CLOUD, "rviz_default_plugins/MarkerA
 def graph(domain):
     """topic -> type, and topic -> QoS of the publishers, of all nodes with the names that launch
     files give their topics, what they listen to included."""
-    context = Context()
-    rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
+    context = new_context(domain)
     nodes, types, offered = [], {}, {}
     for name, remap in {**graph_of([*BEHIND]), **SINGLE,
                         **graph_of(["candidates"], tracking=True)}.items():
@@ -75,7 +72,7 @@ def graph(domain):
     yield types, offered
     for node in nodes:
         node.destroy_node()
-    rclpy.try_shutdown(context=context)
+    context.try_shutdown()
 
 
 def rviz_manager():

@@ -248,18 +248,15 @@ def test_what_lies_among_uncertain_real_samples_is_plausible():
 
 
 def test_content_survives_json_and_is_shown(tmp_path):
-    import matplotlib.pyplot as plt
     content = side_by_side(street(), measured_scans(map(recorded, range(3)), PAPER))
     again = json.loads(json.dumps(content, allow_nan=False))
     assert again == content
     shown = StringIO()
     print_realism(again, Console(file=shown, width=100))
     assert f"{content['within']} of {content['judged']} bins" in shown.getvalue()
-    draw_realism(tmp_path / "new/realism.png", side_by_side(street(), measured_scans([], PAPER)))
-    picture = plt.imread(tmp_path / "new/realism.png")
-    assert min(picture.shape[:2]) > 1000 and picture[..., :3].std() > 0.05
+    (tmp_path / "file").touch()
     with pytest.raises(InputError, match="cannot write"):
-        draw_realism(tmp_path / "new/realism.png/no.png", again)
+        draw_realism(tmp_path / "file/no.png", side_by_side(street(), measured_scans([], PAPER)))
 
 
 def tracking_folder(root):
@@ -307,13 +304,16 @@ def test_of_a_large_folder_an_even_choice_is_compared(tmp_path):
 
 
 def test_the_command_compares(tmp_path):
+    import matplotlib.pyplot as plt
     root, made = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "made"
     result = CliRunner().invoke(cli, [
         "simulate", "--compare", str(root), "--frames", "1", "--json", str(made / "realism.json"),
         "--png", str(made / "realism.png")], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     content = json.loads((made / "realism.json").read_text())
-    assert set(content["curves"]) == set(CURVES) and (made / "realism.png").stat().st_size > 1e5
+    assert set(content["curves"]) == set(CURVES)
+    picture = plt.imread(made / "realism.png")
+    assert min(picture.shape[:2]) > 1000 and picture[..., :3].std() > 0.05
     assert content["real"]["scans"] == content["simulated"]["scans"] == 1
 
 

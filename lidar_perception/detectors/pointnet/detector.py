@@ -32,7 +32,7 @@ from lidar_perception.types import LidarFrame
 class PointNetDetector(NetworkDetector):
     """Paper C's detector, see contract.py. The whole cloud is looked at.
 
-    network: as loaded or trained; its norms are folded into its layers, in where.
+    network: as loaded or trained; its norms are folded into its layers, in place.
     """
 
     def __init__(self, network: PointNet, header: Header, device: torch.device = CPU,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
@@ -22,6 +23,8 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, range_bins
 from lidar_perception.types import PEDESTRIAN, GroundTruth, InputError
+
+TIMES = 10_000  # of a step that are kept
 
 
 def pedestrians(truth: GroundTruth | None) -> np.ndarray:
@@ -82,30 +85,30 @@ def seed_source(truth: np.ndarray, template: Seed | None, params: PipelineParams
 
 @dataclass
 class CandidateReport:
-    """Scores of the stages over the frames with a pedestrian; times of the steps."""
+    """Scores of the stages over the frames with a pedestrian; times of the steps. It holds sums,
+    and the reasons of frames that were skipped, so it does not grow with the frames of a node that
+    runs for days; medians are of the last TIMES of each step."""
 
+    frames: int = 0
     scores: dict[str, Score] = field(default_factory=dict)
-    times: dict[str, list[float]] = field(default_factory=dict)
-    truth: list[np.ndarray] = field(default_factory=list)
+    times: dict[str, deque[float]] = field(default_factory=dict)
+    true_by_range: np.ndarray = field(default_factory=lambda: np.zeros(len(RANGE_NAMES), int))
     skipped: list[str] = field(default_factory=list)
-    names: list[str] = field(default_factory=list)
-
-    @property
-    def frames(self) -> int:
-        return len(self.truth)
+    most: tuple[int, str | None] = 0, None
 
     def with_most(self) -> str | None:
         """Name of the frame with most pedestrians, the first of several, of those where nothing
         was wrong; None without one."""
-        counts = {name: len(truth) for name, truth in zip(self.names, self.truth) if name}
-        return max(counts, key=counts.__getitem__, default=None)
+        return self.most[1]
 
     def update(self, result: CandidateResult) -> None:
         """One frame."""
         if result.problem is not None:
             self.skipped.append(result.problem)
-        self.truth.append(result.truth)
-        self.names.append(result.name)
+        self.frames += 1
+        self.true_by_range += np.bincount(range_bins(result.truth), minlength=len(RANGE_NAMES))
+        if result.name and len(result.truth) > self.most[0]:
+            self.most = len(result.truth), result.name
         for stage, boxes in result.boxes.items():
             self.scores.setdefault(stage, Score()).update(boxes, result.truth)
         if result.ms:
@@ -114,16 +117,14 @@ class CandidateReport:
     def update_times(self, ms: dict[str, float]) -> None:
         """Times of steps that come by themselves, as from the topics of nodes."""
         for step, value in ms.items():
-            self.times.setdefault(step, []).append(value)
+            self.times.setdefault(step, deque(maxlen=TIMES)).append(value)
 
     def compute(self) -> dict:
         """What the JSON file holds."""
-        truth = np.concatenate(self.truth) if self.truth else np.zeros((0, 7))
-        by_range = np.bincount(range_bins(truth), minlength=len(RANGE_NAMES))
         return {
             "frames": self.frames,
-            "ground_truth": len(truth),
-            "ground_truth_by_range": dict(zip(RANGE_NAMES, by_range.tolist())),
+            "ground_truth": int(self.true_by_range.sum()),
+            "ground_truth_by_range": dict(zip(RANGE_NAMES, self.true_by_range.tolist())),
             **{stage: score.table() for stage, score in self.scores.items()},
             "ms": {step: float(np.median(values)) for step, values in self.times.items()},
             "skipped": self.skipped,

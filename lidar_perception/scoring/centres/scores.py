@@ -30,12 +30,12 @@ class CentreScores:
     def best_score(self) -> float | None:
         """The score from which detections are kept for the greatest F1; the highest of several.
         None without detections."""
-        scores, hits = [np.zeros(0)], [np.zeros(0, int)]
+        each_scores, each_hits = [np.zeros(0)], [np.zeros(0, int)]
         for truth, boxes, found_scores in self.frames:
             found = [len(match_centres(boxes[:n], truth)[0]) for n in range(len(boxes) + 1)]
-            scores.append(found_scores)
-            hits.append(np.diff(found))
-        scores, hits = np.concatenate(scores), np.concatenate(hits)
+            each_scores.append(found_scores)
+            each_hits.append(np.diff(found))
+        scores, hits = np.concatenate(each_scores), np.concatenate(each_hits)
         if len(scores) == 0:
             return None
         order = np.argsort(-scores, kind="stable")

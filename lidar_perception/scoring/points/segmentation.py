@@ -22,6 +22,7 @@ import numpy as np
 
 from lidar_perception.data.semantickitti import GROUND, MOVING, THINGS, UNLABELLED, VEGETATION
 from lidar_perception.geometry import horizontal_range, points_in_box
+from lidar_perception.groups import renumbered
 from lidar_perception.types import CLASSES, GroundTruth
 
 PROTOCOLS = ("without vegetation", "with vegetation", "vegetation not ground")
@@ -168,24 +169,27 @@ class ClusterScore:
 
 
 def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
-    """cluster_ids (N,) int, 0 = none; which number a cluster has does not matter."""
-    clusters = len(np.unique(cluster_ids[cluster_ids > 0]))
-    ids, owner, region, near = (a.compress(objects.counted) for a in (
-        cluster_ids, objects.owner, objects.region, objects.near))
-    size = np.bincount(ids, minlength=1)
-    shape = (len(objects.classes) + 1, len(size))
-    inside, common = (np.bincount(o * shape[1] + ids.astype(np.int64),
-                                  minlength=shape[0] * shape[1]).reshape(shape)[1:]
-                      for o in (region, owner))
-    points = common.sum(axis=1, keepdims=True)
-    common[:, 0] = 0  # no cluster
-    iou = common / (size + points - inside)
-    piece = (common > 0) & (common >= PIECE * points)
-    best = iou.max(axis=1, keepdims=True)
-    shared = (iou == best) & piece & (piece.sum(axis=0) > 1)
+    """cluster_ids (N,) int, 0 = none; which number a cluster has does not matter, nor does memory
+    follow it: of objects and clusters only the pairs that share points are looked at."""
+    labels, numbers = renumbered(cluster_ids)
+    ids, owner, region, near = (a.compress(objects.counted).astype(np.int64) for a in (
+        labels, objects.owner, objects.region, objects.near))
+    size, rows = np.bincount(ids, minlength=len(numbers) + 1), len(objects.classes) + 1
+    points = np.bincount(owner, minlength=rows)
+    both = (owner > 0) & (ids > 0)
+    pairs, common = np.unique(owner[both] * len(size) + ids[both], return_counts=True)
+    touched, inside = np.unique(region * len(size) + ids, return_counts=True)
+    thing, cluster = np.divmod(pairs, len(size))
+    # A point of an object is in its region, so each pair is among those of the regions.
+    iou = common / (size[cluster] + points[thing] - inside[np.searchsorted(touched, pairs)])
+    piece = common >= PIECE * points[thing]
+    best = np.zeros(rows)
+    np.maximum.at(best, thing, iou)
+    several = np.bincount(cluster[piece], minlength=len(size)) > 1
+    shared = np.bincount(thing[(iou == best[thing]) & piece & several[cluster]], minlength=rows) > 0
     judged = 2 * np.bincount(ids, near, minlength=1)[1:] > size[1:]
-    return ClusterScore(best[:, 0], piece.sum(axis=1), shared.any(axis=1), clusters,
-                        int(judged.sum()))
+    return ClusterScore(best[1:], np.bincount(thing[piece], minlength=rows)[1:], shared[1:],
+                        len(numbers), int(judged.sum()))
 
 
 @dataclass
