@@ -64,14 +64,15 @@ def launched(monkeypatch):
 
 
 FILES = {"perception": "candidates", "pointpillars": "pointpillars", "pointnet": "pointnet",
-         "detectors": "candidates,pointpillars,pointnet"}
+         "fused": "fused", "detectors": "fused"}
+SEVERAL = "candidates,pointpillars,pointnet"
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched):
     _, nodes = launched(name)
     detectors = FILES[name].split(",")
-    config = str(ROOT / "config" / f"{'perception' if name == 'detectors' else name}.param.yaml")
+    config = str(ROOT / "config" / f"{'fused' if name == 'detectors' else name}.param.yaml")
     started = nodes(points="/cloud", use_sim_time="true", log_level="debug", reliability="reliable")
     assert list(started) == list(graph_of(detectors))
     assert list(nodes(single="true")) == list(graph_of(detectors, single=True))
@@ -137,9 +138,9 @@ def test_a_second_sensor_has_names_of_its_own(launched):
 def test_tracking_puts_a_tracker_behind_each_detector(launched):
     _, nodes = launched("detectors")
     started = nodes(tracking="true", odometry="/odometry", points="/cloud", namespace="left",
-                    name_prefix="a_")
+                    name_prefix="a_", detectors=SEVERAL)
     trackers = {name: node for name, node in started.items() if node.executable == "tracker"}
-    assert list(trackers) == [f"a_{name}_tracker" for name in FILES["detectors"].split(",")]
+    assert list(trackers) == [f"a_{name}_tracker" for name in SEVERAL.split(",")]
     behind = trackers["a_pointnet_tracker"]
     found = "a_pointnet_detector/output/detections"
     assert dict(behind.remappings) == {"~/input/points": "/cloud", "~/input/odometry": "/odometry",
@@ -165,35 +166,38 @@ def test_tracking_in_one_process_is_a_parameter_of_the_detector(launched):
 def test_rviz_follows_the_names_of_the_graph(launched):
     _, nodes = launched("detectors")
     assert "rviz2" not in nodes()
-    plain = nodes(rviz="true", points="/cloud", rviz_frame="base_link", namespace="left")["rviz2"]
+    plain = nodes(rviz="true", detectors=SEVERAL, points="/cloud", rviz_frame="base_link", namespace="left")["rviz2"]
     assert dict(plain.remappings) == {
         "points": "/cloud", "tracker/output/tracks": "candidates_tracker/output/tracks"}
     assert plain.namespace == "left"
     assert plain.arguments == ["-d", str(ROOT / "config/lidar_perception.rviz"), "-f", "base_link"]
-    prefixed = dict(nodes(rviz="true", name_prefix="left_")["rviz2"].remappings)
+    prefixed = dict(nodes(rviz="true", detectors=SEVERAL, name_prefix="left_")["rviz2"].remappings)
     assert prefixed["clustering/output/points"] == "left_clustering/output/points"
     assert prefixed["tracker/output/tracks"] == "left_candidates_tracker/output/tracks"
     assert not {"points", "clicked_point"} & set(prefixed)  # of no node of ours
-    single = dict(nodes(rviz="true", single="true")["rviz2"].remappings)
+    single = dict(nodes(rviz="true", detectors=SEVERAL, single="true")["rviz2"].remappings)
     assert single["clustering/output/points"] == "perception/output/points"
     assert single["candidate_refinement/output/detections"] == "perception/output/detections"
     assert single["tracker/output/tracks"] == "perception/output/tracks"
     assert "pointnet_detector/output/detections" not in single
 
 
-@pytest.mark.parametrize("name", ["pointpillars", "pointnet"])
+@pytest.mark.parametrize("name", ["pointpillars", "pointnet", "fused"])
 def test_weights_and_device_of_a_detector_are_arguments(name, launched):
     expected = {f"{name}.weights": "w.safetensors", f"{name}.device": "cpu",
                 "use_sim_time": False}
     for file, weights in (name, "w.safetensors"), ("detectors", f"{name}=w.safetensors"):
         _, nodes = launched(file)
-        assert nodes(weights=weights, device="cpu")[f"{name}_detector"].parameters[1] == expected
+        started = nodes(weights=weights, device="cpu", detectors=name if file == name else
+                        "pointnet,pointpillars,fused")
+        assert started[f"{name}_detector"].parameters[1] == expected
 
 
 @pytest.mark.parametrize("given, words", [
     ({"detectors": "candidates,dream"}, "'dream' is none of candidates, pointpillars, pointnet"),
     ({"detectors": ""}, "detectors is empty"),
-    ({"weights": "w.safetensors"}, "NAME=FILE"), ({"weights": "v5=w"}, "'v5' is none of"),
+    ({"detectors": SEVERAL, "weights": "w.safetensors"}, "NAME=FILE"),
+    ({"detectors": SEVERAL, "weights": "v5=w"}, "'v5' is none of"),
     ({"experts": "pointnets"}, "no parameter file pointnets, nor a detector"),
 ])
 def test_what_cannot_be_started_is_refused_by_name(given, words, launched):

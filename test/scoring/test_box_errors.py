@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.scoring.kitti.box_errors import ERRORS, RANGES, box_errors
 from lidar_perception.scoring.kitti.camera_objects import camera_objects, scored_labels
-from lidar_perception.scoring.kitti.protocol import compared
+from lidar_perception.scoring.kitti.protocol import Comparison, compared
+from lidar_perception.scoring.kitti.reliability import reliability
 from lidar_perception.types import Detections, GroundTruth
 
 
@@ -36,6 +39,22 @@ def moved(boxes: np.ndarray, away=0.0, aside=0.0, **sizes) -> np.ndarray:
     off[:, 2] += sizes.get("height", 0) / 2 + sizes.get("bottom", 0)
     off[:, 6] += np.pi + sizes.get("yaw", 0)  # front and rear are the same box
     return off
+
+
+@settings(max_examples=10)
+@given(st.integers(0, 2**32 - 1))
+def test_scores_that_are_the_share_of_right_boxes_are_reliable_and_others_are_not(seed):
+    rng = np.random.default_rng(seed)
+    true = cars(400, rng)
+    true[:, :2] *= 20  # far apart
+    share = rng.uniform(0.05, 1, 400)
+    found = true.copy()
+    found[rng.random(400) >= share] += [1e4, 0, 0, 0, 0, 0, 0]
+    honest, modest = (reliability(Comparison.of([frame(true, found, scores)]), "Car")
+                      for scores in (share, 0.05 + share / 10))
+    assert sum(row["boxes"] for row in honest["bins"]) == 400
+    assert honest["error"] < 12 and modest["error"] > 30
+    assert reliability(Comparison.of([frame(true, found[:0])]), "Car")["error"] is None
 
 
 def test_errors_are_those_that_were_made():

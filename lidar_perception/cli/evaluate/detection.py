@@ -34,7 +34,8 @@ from lidar_perception.types import InputError
 @a_path("--write-results", "Write the detections of --weights as KITTI result files, also for "
                            "frames without labels.", "DIR")
 @click.option("--errors", is_flag=True, help="Also say where found boxes differ from the true "
-              "ones, by class and range, and what each difference costs.")
+              "ones, by class and range, what each difference costs, and whether scores are the "
+              "share of boxes that are right.")
 @click.option("--errors-from", type=click.FloatRange(0, 1), default=0.2, show_default=True,
               metavar="SCORE", help="With --errors: of boxes from this score on.")
 def detection(walk: Walk, results: Path | None, weights: Path | None, device: str,
@@ -58,7 +59,8 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.scoring.detections import by_detector, by_files
     from lidar_perception.scoring.kitti.box_errors import box_errors, print_box_errors
-    from lidar_perception.scoring.kitti.protocol import SCORED
+    from lidar_perception.scoring.kitti.protocol import SCORED, Comparison
+    from lidar_perception.scoring.kitti.reliability import print_reliability, reliability
     from lidar_perception.scoring.kitti.report import DetectionReport
     from lidar_perception.scoring.kitti.tables import print_detection_report
 
@@ -84,13 +86,17 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
     report = DetectionReport()
     walk.fill(report, recording, start)
     content = {"source": str(results or weights), "keep": keep, **report.compute()}
-    if errors:
+    if errors and report.frames:
+        together = Comparison.of(report.frames)
         content["errors"] = {name: box_errors(report.frames, name, errors_from) for name in SCORED}
+        content["reliability"] = {name: reliability(together, name) for name in SCORED}
     walk.write(content)
     if write_results is not None:
         console.print(f"result files: {write_results}")
     if report.frames:
         print_detection_report(content, console)
-        print_box_errors(content.get("errors", {}), console)
+    if "errors" in content:
+        print_box_errors(content["errors"], console)
+        print_reliability(content["reliability"], console)
     elif write_results is None or report.skipped:
         raise no_labels(recording, report.skipped)

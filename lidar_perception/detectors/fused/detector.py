@@ -95,7 +95,8 @@ class FusedDetector(NetworkDetector):
         times.append(perf_counter())
         evidence = gathered(proposed.detections, seen, ground, people, self.classifier)
         times.append(perf_counter())
-        return Look(proposed.detections, evidence, seen.xyz, ground, proposed.problem,
+        return Look(proposed.detections, evidence, seen.xyz, ground,
+                    self.proposer.out_of_sight(frame, seen) or proposed.problem,
                     dict(zip(STEPS, (np.diff(times) * 1e3).tolist())))
 
     def _proposer(self) -> PointPillarsDetector:

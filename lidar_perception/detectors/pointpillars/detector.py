@@ -123,7 +123,8 @@ class PointPillarsDetector(NetworkDetector):
         detections = best_of_each(boxes, scores, labels, self.config.classes, settings.nms)
         return detections, best_scores, broken
 
-    def _problem(self, frame: LidarFrame, seen: LidarFrame, inputs: NetworkInput) -> str | None:
+    def out_of_sight(self, frame: LidarFrame, seen: LidarFrame) -> str | None:
+        """Why nothing of the frame is seen, with the remedy; None where something is."""
         if len(frame) == 0:
             return "the cloud is empty or has no finite point, or crop.* leaves none"
         if len(seen) == 0:
@@ -131,6 +132,11 @@ class PointPillarsDetector(NetworkDetector):
             return (f"no point lies in the network's range, x {low[0]:g} .. {high[0]:g}, y "
                     f"{low[1]:g} .. {high[1]:g}, z {low[2]:g} .. {high[2]:g} m under a sensor "
                     f"{SENSOR_HEIGHT} m high; is x forward, and ground.sensor_pose right?")
+        return None
+
+    def _problem(self, frame: LidarFrame, seen: LidarFrame, inputs: NetworkInput) -> str | None:
+        if blind := self.out_of_sight(frame, seen):
+            return blind
         if len(inputs.points) == 0:
             return ("every point in the network's range is ground; is the sensor mounted at "
                     "another height or angle? set ground.sensor_pose")

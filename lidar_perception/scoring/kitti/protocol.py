@@ -151,6 +151,18 @@ def precision(frames: Comparison, name: str, metric: str, overlap: float,
                      *averages(at_recall(right, objects, official=True)))
 
 
+def hits_and_wrong(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str,
+                   thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two (T,) float64: how many detections of a score of thresholds (T,) or more are right, and
+    how many are wrong, by the rules of precision(); those that are ignored are neither."""
+    true, found = frames.true, frames.found
+    excused = (frames.excused if metric == "image" else np.zeros(len(found))) > overlap
+    return _counts(frames.overlaps[METRICS.index(metric)], overlap,
+                   true_states(true, name, difficulty), found_states(found, name, difficulty),
+                   found.scores, frames.first_true, frames.first_found, frames.first_pair,
+                   np.asarray(thresholds, np.float64), excused, true.alpha, found.alpha)[:2]
+
+
 @njit(cache=True, nogil=True)
 def _hit_scores(overlaps, least, true_states, found_states, scores, first_true, first_found,
                 first_pair):

@@ -1,0 +1,67 @@
+"""fused_detector as a real process, against the offline detector with the same weights."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from detection_samples import frame, lively, tiny
+from detector_node import DetectorUnderTest, assert_equal, message, received
+from test_bad_input import BAD, cloud
+
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
+from lidar_perception.detectors.fused.detector import load_fused_detector
+from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
+from lidar_perception.nodes.graph import graph_of
+from lidar_perception.param_fields import with_values
+
+NODE = "fused_detector"
+FILE = Path(__file__).resolve().parents[2] / "config" / "fused.param.yaml"
+EAGER = with_values(FusedDetectorParams(), {
+    f"fused.scores.{name}": 0.0 for name in ("car", "pedestrian", "cyclist", "other")})
+DETECTOR = DetectorUnderTest(NODE, graph_of(["fused"], single=True), FILE, EAGER,
+                             load_fused_detector)
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> Path:
+    """A small v4 with random weights, which proposes something; the classifier is the package's."""
+    path = tmp_path_factory.mktemp("weights") / "v4.safetensors"
+    save_checkpoint(path, lively(tiny("v4")), Header(tiny("v4")))
+    return path
+
+
+def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, shared_peer, weights):
+    times = {step: shared_peer.listen(f"/{NODE}/debug/{step}_ms", "std_msgs/msg/Float64")
+             for step in STEPS}
+    shared_peer.wait_for_diagnostics(NODE, "waiting for input")
+    shared_peer.send(talker, message(1), lambda: received(found, 1), "detections")
+    assert_equal(received(found, 1), DETECTOR.offline(weights, message(1)))
+    # Columns are believed, here those of a cloud that has no ground.
+    none = np.zeros(len(frame()), np.uint8)
+    shared_peer.send(talker, message(2, ground=none), lambda: received(found, 2), "detections")
+    other = DETECTOR.offline(weights, message(2), ground=none > 0)
+    assert_equal(received(found, 2), other)
+    assert not np.array_equal(other.scores, DETECTOR.offline(weights, message(2)).scores)
+    shared_peer.wait(lambda: all(times.values()), "the times of the steps")
+    assert "PointNet" in shared_peer.value_of(NODE, "network")
+
+
+def test_no_cloud_ends_the_detector(talker, found, shared_processes, shared_peer, weights):
+    strange = {**{name: bad for name, bad in BAD.items() if name != "one point"},
+               "out of range": (cloud(frame().xyz + [500, 0, 0]), "network's range"),
+               "all is ground": (message(1, ground=np.ones(len(frame()), "u1")), "is ground")}
+    for name, (msg, words) in strange.items():
+        shared_peer.diagnostics.clear()
+        shared_peer.send(talker, msg, lambda w=words: w in shared_peer.message_of(NODE),
+                         f"'{words}': {name}")
+    shared_peer.send(talker, message(7), lambda: received(found, 7), "detections of a good cloud")
+    assert_equal(received(found, 7), DETECTOR.offline(weights, message(7)))
+    log = shared_processes.log(NODE)
+    assert "Traceback" not in log and "Warning" not in log
