@@ -166,7 +166,8 @@ def test_tracking_in_one_process_is_a_parameter_of_the_detector(launched):
 def test_rviz_follows_the_names_of_the_graph(launched):
     _, nodes = launched("detectors")
     assert "rviz2" not in nodes()
-    plain = nodes(rviz="true", detectors=SEVERAL, points="/cloud", rviz_frame="base_link", namespace="left")["rviz2"]
+    plain = nodes(rviz="true", detectors=SEVERAL, points="/cloud", rviz_frame="base_link",
+                  namespace="left")["rviz2"]
     assert dict(plain.remappings) == {
         "points": "/cloud", "tracker/output/tracks": "candidates_tracker/output/tracks"}
     assert plain.namespace == "left"

@@ -34,7 +34,7 @@ def box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict
     found, true = (np.concatenate([np.zeros((0, 7)), *(pair[which] for pair in pairs)])
                    for which in (0, 1))
     differences, away = _differences(found, true), horizontal_range(true)
-    bands = {f"{low:g}-{high:g} m": (away >= low) & (away < high)
+    bands = {f"{low:g}-{high:g} m".replace("-inf m", " m -"): (away >= low) & (away < high)
              for low, high in pairwise(RANGES)} | {"all": np.ones(len(true), bool)}
     return {"min_score": min_score, "by_range": {
         title: {"pairs": int(own.sum()), **{
@@ -88,15 +88,16 @@ def print_box_errors(errors: dict[str, dict[str, Any]], console: Console) -> Non
         if content["by_range"]["all"]["pairs"] == 0:
             continue
         table = narrow_table(f"{name}: found minus true, median, and median of its size",
-                             "metres, yaw in radians", "pairs", *ERRORS, width=7)
+                             "", "pairs", *ERRORS, width=6)
         for title, row in content["by_range"].items():
             table.add_row(title, str(row["pairs"]), *(_signed(row[e]["median"]) for e in ERRORS))
             table.add_row("", "", *(_size(row[e]["median_size"]) for e in ERRORS), style="dim")
-        table.caption = (f"Boxes with a score of {content['min_score']:g} or more. away, aside: of "
-                         "the centre, along the ray from the sensor and to its left.")
+        table.caption = (f"Metres, yaw in radians; boxes with a score of {content['min_score']:g} "
+                         "or more. away, aside: of the centre, along the ray from the sensor and "
+                         "to its left.")
         console.print(table)
         table = narrow_table(f"{name}: pairs beyond the overlap {DETECTED[name].strict:g}, %",
-                             "put right", *RIGHT, width=8)
+                             "put right", *RIGHT, width=7)
         for view, title in (("space", "in space"), ("above", "from above")):
             table.add_row(title, *(f"{row[view]:.0f}" for row in content["strict"].values()))
         console.print(table)
