@@ -95,8 +95,8 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
         console.print(f"result files: {write_results}")
     if report.frames:
         print_detection_report(content, console)
-    if "errors" in content:
-        print_box_errors(content["errors"], console)
-        print_reliability(content["reliability"], console)
+        if errors:
+            print_box_errors(content["errors"], console)
+            print_reliability(content["reliability"], console)
     elif write_results is None or report.skipped:
         raise no_labels(recording, report.skipped)

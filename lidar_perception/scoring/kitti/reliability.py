@@ -20,7 +20,8 @@ def reliability(frames: Comparison, name: str) -> dict[str, Any]:
     between the middle of a bin and the share of its boxes that are right, weighted by boxes, in
     percent. Boxes that KITTI's protocol ignores do not count; a second box of one object is
     wrong."""
-    at_least = hits_and_wrong(frames, name, "bev", DETECTED[name].relaxed, "hard", EDGES)
+    at_least = hits_and_wrong(frames, name, "bev", DETECTED[name].relaxed, "hard",
+                              np.array(EDGES))
     hits, wrong = (np.maximum(-np.diff(np.append(count, 0.0)), 0.0) for count in at_least)
     boxes = hits + wrong
     right = hits / np.maximum(boxes, 1)
