@@ -152,7 +152,7 @@ def _draw_best(result: Path, picture: Path, single: bool) -> bool:
                 for stamp, f in frames.items() if len(f) == 2 and len(f[TRUTH])}
         if not hits:
             return False
-        best = max(hits, key=lambda s: hits[s])
+        best = max(hits, key=lambda s: (hits[s], s))  # the last of them: its trails are longest
         for _, _, msg in bag.messages({cloud_topic(single)}):
             frame, indices = to_frame(msg)
             if frame.stamp_ns == best:
