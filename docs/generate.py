@@ -18,12 +18,12 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.detectors.fused.params import FusedDetectorParams
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
 from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.nodes.graph import NETWORKS
 from lidar_perception.nodes.main import node_parameters
 from lidar_perception.param_fields import flatten
 
 CONFIG = Path(__file__).parents[1] / "config"
 BEST = CONFIG / "best.param.yaml"
-NETWORKS = "pointpillars", "pointnet", "fused"  # detectors/NAME, the node NAME_detector
 FOLDER = Path(__file__).parent / "nodes"
 CLOUD, MARKERS = "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray"
 STRING_TIMES = "std_msgs/Float64"

@@ -26,8 +26,7 @@ from lidar_perception.geometry import bev_iou
 from lidar_perception.runs.files import write_text
 from lidar_perception.types import CLASSES
 
-OVERLAP = {True: 0.5, False: 0.25}  # from above, of a car and of others, that makes a hit
-NEAR = 0.5                          # metres from the centre of another, which is one, too
+NEAR = 0.5  # metres from the centre of another, which is one, too
 OUT = Path(module.__file__).with_name("fusion.json")
 
 
@@ -40,7 +39,7 @@ def samples(frame: Frame, look: Look) -> list[tuple[int, bool, dict[str, float]]
         own = np.flatnonzero((found.class_ids == class_id) & in_image)
         own = own[np.argsort(-found.scores[own], kind="stable")]
         boxes = truth.of_class(class_id)
-        hits = bev_iou(found.boxes[own], boxes) > OVERLAP[class_id == CAR]
+        hits = bev_iou(found.boxes[own], boxes) > DETECTED[CLASSES[class_id]].relaxed
         if class_id != CAR:
             hits |= distances(found.boxes[own], boxes) < NEAR
         taken = np.zeros(len(boxes), bool)

@@ -19,11 +19,11 @@ WITH_PROCESSES = ("test/ros", "test/launch", "test/testing")
 # What Numba compiles for all of this is cached beside the source, for each process after this one.
 COMPILE = """
 from lidar_perception.candidates.warm_up import warm_up
-from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.open import LOAD, open_detector
 from lidar_perception.simulation.to_bag import simulated_scans
 warm_up()
 for frame in simulated_scans(1, 1):
-    for name in ("pointpillars", "pointnet"):
+    for name in LOAD:
         open_detector(name)(frame.load())
 """
 PASS_ON = dict(ignore_unknown_options=True, help_option_names=[])

@@ -36,16 +36,18 @@ def suppressed(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: f
     stays = np.ones(len(order), np.bool_)
     for label in np.unique(group):
         members = np.flatnonzero(group == label)
-        stays[members] = _greedy(bev_iou(ordered[members], ordered[members]), iou)
+        stays[members] = first_of_each(bev_iou(ordered[members], ordered[members]) > iou)
     return order[stays]
 
 
 @njit(cache=True, nogil=True)
-def _greedy(overlap, limit):
-    stays = np.ones(len(overlap), np.bool_)
-    for i in range(len(overlap)):
+def first_of_each(again):
+    """(N,) bool: which stay of N things, again (N, N) bool: one goes that is one which stays, and
+    stands before it, again."""
+    stays = np.ones(len(again), np.bool_)
+    for i in range(len(again)):
         if stays[i]:
-            for j in range(i + 1, len(overlap)):
-                if overlap[i, j] > limit:
+            for j in range(i + 1, len(again)):
+                if again[i, j]:
                     stays[j] = False
     return stays

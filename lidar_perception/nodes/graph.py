@@ -56,6 +56,10 @@ ALONE = {
 }
 
 
+# The detectors with a network, whose names are those of their groups of parameters.
+NETWORKS = tuple(name for name, nodes in ALONE.items() if f"{name}_detector" in nodes)
+
+
 def graph_of(detectors: Sequence[str], single: bool = False,
              tracking: bool = False) -> dict[str, Mapping[str, str]]:
     """The nodes of one or several detectors, each started once; with tracking a tracker behind each

@@ -15,6 +15,7 @@ from lidar_perception.nodes.graph import (
     ALONE,
     BEHIND,
     EXPERTS,
+    NETWORKS,
     ODOMETRY_IN,
     SINGLE,
     STAGES,
@@ -33,7 +34,6 @@ from lidar_perception.wire.topics import ODOMETRY, POINTS
 
 CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet",
            "fused": "fused"}
-NETWORKS = ("pointpillars", "pointnet", "fused")  # as their groups of parameters
 
 SWITCHES = dict(default_value="false", choices=["true", "false"])
 ARGUMENTS = {

@@ -16,7 +16,7 @@ from pointnet_samples import random_detector as random_classifier
 from lidar_perception.classes import CAR
 from lidar_perception.detectors.fused.boxes import FRONT, MARGIN, SIDE, on_ground, on_points
 from lidar_perception.detectors.fused.detector import FusedDetector, one_of_each
-from lidar_perception.detectors.fused.evidence import LEAST, log_odds
+from lidar_perception.detectors.fused.evidence import LEAST, clipped_logit
 from lidar_perception.detectors.fused.model import KNOTS, models, probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.geometry import points_in_box, points_in_boxes
@@ -111,7 +111,7 @@ def test_boxes_stand_on_the_ground_where_it_is_known():
 def test_more_evidence_is_never_less_likely_and_silence_is_neither(seed):
     rng = np.random.default_rng(seed)
     class_ids = rng.choice([CLASSES.index(name) for name in models()], 50)
-    evidence = {source: log_odds(rng.uniform(0, 1, 50)) for source in KNOTS}
+    evidence = {source: clipped_logit(rng.uniform(0, 1, 50)) for source in KNOTS}
     before = probabilities(class_ids, evidence)
     assert ((before >= 0) & (before <= 1)).all() and before.dtype == np.float32
     for source in KNOTS:
@@ -121,8 +121,8 @@ def test_more_evidence_is_never_less_likely_and_silence_is_neither(seed):
         assert np.isfinite(probabilities(class_ids, silent)).all()
     unknown = np.full(50, CLASSES.index("Tram"))
     assert not probabilities(unknown, evidence).any()
-    np.testing.assert_allclose(log_odds([0, 0.5, 1]), [log_odds(LEAST), 0, -log_odds(LEAST)],
-                               atol=1e-9)
+    least = clipped_logit(LEAST)
+    np.testing.assert_allclose(clipped_logit([0, 0.5, 1]), [least, 0, -least], atol=1e-9)
 
 
 def test_people_at_one_place_are_one_and_cars_are_told_apart_by_their_overlap():

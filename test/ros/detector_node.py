@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from detection_samples import frame
+from detection_samples import frame, lively, tiny
 
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.wire.codec import bag_message
@@ -54,6 +55,13 @@ class DetectorUnderTest:
         detector = self.load(weights, "cpu", with_values(self.params, {
             f"{self.network}.threads": 1}))
         return detector(to_frame(msg, self.params.input.intensity_max)[0], **columns).detections
+
+
+def small_v4(folder: Path) -> Path:
+    """The file of a small v4 with random weights, which finds something."""
+    path = folder / "v4.safetensors"
+    save_checkpoint(path, lively(tiny("v4")), Header(tiny("v4")))
+    return path
 
 
 def message(stamp, **columns):

@@ -9,11 +9,10 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from detection_samples import frame, lively, tiny
-from detector_node import DetectorUnderTest, assert_equal, message, received
+from detection_samples import frame
+from detector_node import DetectorUnderTest, assert_equal, message, received, small_v4
 from test_bad_input import BAD, cloud
 
-from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.fused.detector import load_fused_detector
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
 from lidar_perception.nodes.graph import graph_of
@@ -31,10 +30,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory) -> Path:
-    """A small v4 with random weights, which proposes something; the classifier is the package's."""
-    path = tmp_path_factory.mktemp("weights") / "v4.safetensors"
-    save_checkpoint(path, lively(tiny("v4")), Header(tiny("v4")))
-    return path
+    return small_v4(tmp_path_factory.mktemp("weights"))
 
 
 def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, shared_peer, weights):

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from detection_samples import eager, frame, lively, tiny
-from detector_node import REMAP, DetectorUnderTest, assert_equal, message, received
+from detector_node import REMAP, DetectorUnderTest, assert_equal, message, received, small_v4
 from rcl_interfaces.srv import DescribeParameters
 from test_bad_input import BAD, CLOUD, MARKERS, cloud
 
@@ -37,10 +37,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory) -> Path:
-    """A small v4 with random weights, which finds something."""
-    path = tmp_path_factory.mktemp("weights") / "v4.safetensors"
-    save_checkpoint(path, lively(tiny("v4")), Header(tiny("v4")))
-    return path
+    return small_v4(tmp_path_factory.mktemp("weights"))
 
 
 @pytest.fixture(scope="module")

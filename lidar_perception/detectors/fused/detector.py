@@ -18,7 +18,7 @@ from lidar_perception.detectors.fused.boxes import on_ground, on_points
 from lidar_perception.detectors.fused.evidence import Evidence, distances, gathered
 from lidar_perception.detectors.fused.model import probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
-from lidar_perception.detectors.nms import suppressed
+from lidar_perception.detectors.nms import first_of_each, suppressed
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.detectors.pointnet.detector import PointNetDetector, load_pointnet_detector
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams, PointNetParams
@@ -133,9 +133,7 @@ class FusedDetector(NetworkDetector):
 
     def warm_up(self) -> None:
         """Run every part once on made-up points, so that what is compiled is compiled."""
-        self.proposer.warm_up()
-        self.classifier.warm_up()
-        self(made_up_frame(self.params.ground.sensor_pose))
+        self.with_min_score(0.0)(made_up_frame(self.params.ground.sensor_pose))
 
 
 def one_of_each(found: Detections, params: FusedParams) -> np.ndarray:
@@ -146,11 +144,7 @@ def one_of_each(found: Detections, params: FusedParams) -> np.ndarray:
     boxes, class_ids = found.boxes[order], found.class_ids[order]
     again = (distances(boxes, boxes) < params.same_place) & (class_ids[:, None] == class_ids)
     again[class_ids == CAR] = False
-    stays = np.ones(len(order), bool)
-    for i in range(len(order)):  # of the few that are left
-        if stays[i]:
-            stays[i + 1:] &= ~again[i, i + 1:]
-    return order[stays][:params.nms.max_boxes]
+    return order[first_of_each(again)][:params.nms.max_boxes]
 
 
 def load_fused_detector(path: str | Path = "", device: str = "auto",

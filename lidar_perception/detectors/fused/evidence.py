@@ -14,13 +14,11 @@ from scipy.special import logit
 from lidar_perception.candidates.confidence import confidence, shape_features
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.segmented import grounded_boxes
-from lidar_perception.detectors.hybrid.rescoring import known
-from lidar_perception.detectors.pointnet.clusters import Clusters
+from lidar_perception.detectors.hybrid.rescoring import known, rescored_by
+from lidar_perception.detectors.pointnet.clusters import points_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
-from lidar_perception.detectors.pointnet.predict import predict
-from lidar_perception.geometry import points_in_boxes
 from lidar_perception.groups import group_points
-from lidar_perception.types import CLASSES, Detections, LidarFrame
+from lidar_perception.types import Detections, LidarFrame
 
 HEIGHTS, LENGTH = (0.8, 2.6), 2.8  # metres, of clusters that may be a person or a cyclist
 SAME_PLACE = 0.6            # metres from the centre of a proposal to that of a cluster, at most
@@ -36,9 +34,10 @@ def gathered(proposed: Detections, seen: LidarFrame, ground: np.ndarray, cluster
     """By source, the log-odds (K,) float64 that each of K proposals is what it is proposed as; NaN
     where the source is silent. ground (N,) bool and cluster_ids (N,), 1..J for people, of the
     frame's N points."""
-    return {"network": log_odds(proposed.scores),
-            "silhouette": log_odds(silhouette_at(proposed.boxes, seen.xyz, ground, cluster_ids)),
-            "classifier": log_odds(judged(proposed, seen, ground, classifier))}
+    return {"network": clipped_logit(proposed.scores),
+            "silhouette": clipped_logit(
+                silhouette_at(proposed.boxes, seen.xyz, ground, cluster_ids)),
+            "classifier": clipped_logit(judged(proposed, seen, ground, classifier))}
 
 
 def silhouette_at(boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray,
@@ -59,19 +58,11 @@ def judged(proposed: Detections, seen: LidarFrame, ground: np.ndarray,
     """(K,) the probability of the class of each of K proposals, for the points in its box; NaN
     where the classifier does not know the class, or there are less than FEWEST points."""
     obstacles = seen.take(np.flatnonzero(~ground))
-    indices, first = points_in_boxes(obstacles.xyz, proposed.boxes, MARGIN)
-    points = np.zeros((len(indices), 4), np.float32)
-    points[:, :3] = obstacles.xyz[indices]
-    if obstacles.intensity is not None:
-        points[:, 3] = obstacles.intensity[indices]
-    clusters = Clusters(points, first, np.arange(1, len(proposed) + 1))
+    clusters = points_of(proposed.boxes, obstacles, obstacles, MARGIN)
     asked = np.flatnonzero((clusters.sizes >= FEWEST) & known(classifier, proposed.class_ids))
-    labels = np.array([classifier.classes.index(CLASSES[i]) for i in proposed.class_ids[asked]],
-                      np.int64)
     clusters = clusters.take(asked).on(seen.xyz.compress(ground, axis=0))
     probabilities = np.full(len(proposed), np.nan)
-    probabilities[asked] = classifier.guarded(
-        lambda: predict(classifier.network, clusters, labels=labels)).scores
+    probabilities[asked] = rescored_by(classifier, proposed[asked], clusters, 1.0)[0].scores
     return probabilities
 
 
@@ -80,6 +71,6 @@ def distances(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
     return np.hypot(*(boxes[:, None, :2] - others[None, :, :2]).transpose(2, 0, 1))
 
 
-def log_odds(probabilities: np.ndarray) -> np.ndarray:
+def clipped_logit(probabilities: np.ndarray) -> np.ndarray:
     """(K,) float64; NaN stays."""
     return logit(np.clip(np.asarray(probabilities, np.float64), LEAST, MOST))

@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
 
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
-from lidar_perception.detectors.pointnet.params import PointNetParams
-from lidar_perception.detectors.pointnet.weights_file import weights_file as classifier_file
-from lidar_perception.detectors.pointpillars.params import (
-    EXPERT_CLUSTERING,
-    EXPERT_GROUND,
-    PointPillarsParams,
-)
-from lidar_perception.detectors.pointpillars.weights_file import weights_file as proposer_file
+from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
 from lidar_perception.robot.params import CropParams
@@ -40,12 +32,6 @@ class FusedParams(NetworkParams):
                              "them; 0: not at all, 1: onto it.", low=0.0, high=1.0)
     on_points: float = param(0.75, "How far cars are moved so that their points begin at the "
                              "faces that are seen; 0: not at all.", low=0.0, high=1.0)
-
-
-def weights_file(params: FusedParams) -> Path:
-    """The file of PointPillars' weights. InputError if it, or the classifier's, is not there."""
-    classifier_file(PointNetParams(weights=params.classifier))
-    return proposer_file(PointPillarsParams(weights=params.weights))
 
 
 @dataclass(frozen=True)

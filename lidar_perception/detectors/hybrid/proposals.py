@@ -10,10 +10,9 @@ import numpy as np
 from lidar_perception.detectors.contract import Detector, Found
 from lidar_perception.detectors.hybrid.params import ConfirmingParams
 from lidar_perception.detectors.hybrid.rescoring import known, rescored_by, seen_by
-from lidar_perception.detectors.pointnet.clusters import Clusters
+from lidar_perception.detectors.pointnet.clusters import points_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.view import levelled_ground
-from lidar_perception.geometry import points_in_box
 from lidar_perception.types import Detections, LidarFrame
 
 
@@ -80,17 +79,3 @@ class ConfirmedProposals:
             ("proposals", t1 - t0), ("ground", t2 - t1), ("clusters", t3 - t2),
             ("network", perf_counter() - t3))}
         return Found(proposals, ms, proposed.problem, proposed.best)
-
-
-def points_of(boxes: np.ndarray, frame: LidarFrame, seen: LidarFrame, margin: float) -> Clusters:
-    """One cluster for each of boxes (K, 7), in their order: the points of a frame within it, grown
-    by margin metres, with the coordinates and the intensity that `seen` has of the same points. A
-    point can be in several, and a cluster can be without points."""
-    inside = [np.flatnonzero(points_in_box(frame.xyz, box, margin)) for box in boxes]
-    rows = np.concatenate([np.zeros(0, np.int64), *inside])
-    points = np.zeros((len(rows), 4), np.float32)
-    points[:, :3] = seen.xyz[rows]
-    if seen.intensity is not None:
-        points[:, 3] = seen.intensity[rows]
-    first = np.concatenate([[0], np.cumsum([len(indices) for indices in inside])]).astype(np.int64)
-    return Clusters(points, first, np.arange(1, len(boxes) + 1))

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
+from lidar_perception.geometry import points_in_boxes
 from lidar_perception.groups import groups_of
 from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
 
@@ -51,12 +52,12 @@ class Clusters:
         """At most so many, those whose means are nearest to the sensor, in their order."""
         if len(self) <= most:
             return self
-        away = np.hypot(*_middles(self.points, self.first).T)
+        away = np.hypot(*middles(self.points, self.first).T)
         return self.take(np.sort(np.argsort(away, kind="stable")[:most]))
 
     def on(self, ground: np.ndarray) -> Clusters:
         """The same clusters, none of them empty, over the ground's points (G, 3)."""
-        return replace(self, ground=ground_under(ground, _middles(self.points, self.first)))
+        return replace(self, ground=ground_under(ground, middles(self.points, self.first)))
 
     @property
     def floor(self) -> np.ndarray:
@@ -96,6 +97,18 @@ def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, min_points: int = 1,
     return found if ground is None else found.on(frame.xyz.compress(ground, axis=0))
 
 
+def points_of(boxes: np.ndarray, frame: LidarFrame, seen: LidarFrame, margin: float) -> Clusters:
+    """One cluster for each of boxes (K, 7), in their order: the points of a frame within it, grown
+    by margin metres, with the coordinates and the intensity that `seen` has of the same points. A
+    point can be in several, and a cluster can be without points."""
+    indices, first = points_in_boxes(frame.xyz, boxes, margin)
+    points = np.zeros((len(indices), 4), np.float32)
+    points[:, :3] = seen.xyz[indices]
+    if seen.intensity is not None:
+        points[:, 3] = seen.intensity[indices]
+    return Clusters(points, first, np.arange(1, len(boxes) + 1))
+
+
 def ground_under(xyz: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """(K,) float64: the mean z of the ground's points (G, 3) around each position xy (K, 2), within
     the first of NEAR that has FEWEST of them; -SENSOR_HEIGHT where none has. Metres."""
@@ -133,7 +146,7 @@ def _ground_under(xyz, cell, shape, low, xy):
     return heights
 
 
-def _middles(points: np.ndarray, first: np.ndarray) -> np.ndarray:
+def middles(points: np.ndarray, first: np.ndarray) -> np.ndarray:
     """(K, 2) means of x and y of clusters, none of them empty."""
     if len(first) == 1:
         return np.zeros((0, 2))

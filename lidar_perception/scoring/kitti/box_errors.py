@@ -10,9 +10,9 @@ from rich.console import Console
 
 from lidar_perception.classes import DETECTED
 from lidar_perception.geometry import bev_and_3d_iou, horizontal_range, wrap_angle
-from lidar_perception.scoring.kitti.protocol import METRICS, ComparedFrame
+from lidar_perception.scoring.kitti.matched_heights import matched_boxes
+from lidar_perception.scoring.kitti.protocol import ComparedFrame
 from lidar_perception.scoring.tables import narrow_table
-from lidar_perception.types import CLASSES
 
 RANGES = (0.0, 15.0, 30.0, 45.0, np.inf)  # metres
 ERRORS = ("away", "aside", "bottom", "length", "width", "height", "yaw")
@@ -30,9 +30,7 @@ def box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict
     its left (aside), bottom, sizes; yaw modulo half a turn. strict: by what is put right (RIGHT),
     the percentage of pairs beyond the strict overlap, in `space` and `above`. None without pairs.
     """
-    pairs = [_pairs(frame, name, min_score) for frame in frames]
-    found, true = (np.concatenate([np.zeros((0, 7)), *(pair[which] for pair in pairs)])
-                   for which in (0, 1))
+    found, true = matched_boxes(frames, name, min_score)
     differences, away = _differences(found, true), horizontal_range(true)
     bands = {f"{low:g}-{high:g} m".replace("-inf m", " m -"): (away >= low) & (away < high)
              for low, high in pairwise(RANGES)} | {"all": np.ones(len(true), bool)}
@@ -44,22 +42,11 @@ def box_errors(frames: list[ComparedFrame], name: str, min_score: float) -> dict
                    for title, columns in RIGHT.items()}}
 
 
-def _pairs(frame: ComparedFrame, name: str, min_score: float) -> tuple[np.ndarray, np.ndarray]:
-    """(P, 7) found boxes and the true ones."""
-    found = np.flatnonzero((frame.found.class_ids == CLASSES.index(name))
-                           & (frame.found.scores >= min_score))
-    true = np.flatnonzero(frame.true.class_ids == CLASSES.index(name))
-    overlaps = frame.overlaps[METRICS.index("bev")][np.ix_(found, true)]
-    matched = np.flatnonzero(overlaps.max(axis=0, initial=0.0) > DETECTED[name].relaxed)
-    best = overlaps[:, matched].argmax(axis=0) if len(matched) else matched
-    return frame.found.boxes[found[best]], frame.true.boxes[true[matched]]
-
-
 def _differences(found: np.ndarray, true: np.ndarray) -> dict[str, np.ndarray]:
     """By ERRORS, (P,)."""
     azimuth = np.arctan2(true[:, 1], true[:, 0])
     x, y, z, *sizes, yaw = (found - true).T
-    half_turn = (wrap_angle(2 * yaw) / 2)
+    half_turn = wrap_angle(2 * yaw) / 2
     return dict(zip(ERRORS, (np.cos(azimuth) * x + np.sin(azimuth) * y,
                              np.cos(azimuth) * y - np.sin(azimuth) * x, z - sizes[2] / 2, *sizes,
                              half_turn)))

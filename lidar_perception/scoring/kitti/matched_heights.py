@@ -17,25 +17,30 @@ def matched_heights(frames: list[ComparedFrame], name: str) -> dict:
     above (relaxed overlap). z_error_m, abs_z_error_m: median height of the found centre above the
     true one, and of its absolute value; height_error_m: median of found height minus true height;
     height_m: median true height. None without pairs."""
-    errors = [_pairs(frame, CLASSES.index(name), RELAXED[name]) for frame in frames]
-    z, taller, height = np.concatenate([np.zeros((3, 0)), *errors], axis=1)
+    found, true = matched_boxes(frames, name)
+    z, taller, height = found[:, 2] - true[:, 2], found[:, 5] - true[:, 5], true[:, 5]
     rows = {"z_error_m": z, "abs_z_error_m": np.abs(z), "height_error_m": taller,
             "height_m": height}
     return {"pairs": len(z),
             **{key: float(np.median(v)) if len(z) else None for key, v in rows.items()}}
 
 
-def _pairs(frame: ComparedFrame, class_id: int, least: float) -> np.ndarray:
-    """(3, P) centre error, error of the height, true height."""
-    overlaps = frame.overlaps[METRICS.index("bev")]
-    overlaps = np.where((frame.found.class_ids == class_id)[:, None], overlaps, 0)
-    overlaps = overlaps[:, frame.true.class_ids == class_id]
-    if overlaps.size == 0:
-        return np.zeros((3, 0))
-    matched = overlaps.max(axis=0) > least
-    found = frame.found.boxes[overlaps.argmax(axis=0)[matched]]
-    true = frame.true.boxes[frame.true.class_ids == class_id][matched]
-    return np.stack([found[:, 2] - true[:, 2], found[:, 5] - true[:, 5], true[:, 5]])
+def matched_boxes(frames: list[ComparedFrame], name: str,
+                  min_score: float = -np.inf) -> tuple[np.ndarray, np.ndarray]:
+    """(P, 7) found boxes and the true ones of the class called name: for each true one the found
+    one, of min_score or more, that overlaps it most from above, if beyond the relaxed overlap."""
+    class_id, pairs = CLASSES.index(name), []
+    for frame in frames:
+        found = np.flatnonzero((frame.found.class_ids == class_id)
+                               & (frame.found.scores >= min_score))
+        true = np.flatnonzero(frame.true.class_ids == class_id)
+        overlaps = frame.overlaps[METRICS.index("bev")][np.ix_(found, true)]
+        matched = np.flatnonzero(overlaps.max(axis=0, initial=0.0) > RELAXED[name])
+        best = overlaps[:, matched].argmax(axis=0) if len(matched) else matched
+        pairs.append((frame.found.boxes[found[best]], frame.true.boxes[true[matched]]))
+    none = np.zeros((0, 7))
+    return (np.concatenate([none, *(found for found, _ in pairs)]),
+            np.concatenate([none, *(true for _, true in pairs)]))
 
 
 def heights_off(name: str, rows: dict, matched: dict) -> str:

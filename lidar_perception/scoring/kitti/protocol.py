@@ -134,16 +134,12 @@ def precision(frames: Comparison, name: str, metric: str, overlap: float,
               difficulty: str) -> Precision | None:
     """Average precision of the class called name at an overlap above the given one; None where
     there is nothing to find. Orientation is NaN where a hit has no angle."""
-    true, found = frames.true, frames.found
-    states = true_states(true, name, difficulty), found_states(found, name, difficulty)
-    objects = int((states[0] == COUNTED).sum())
+    pairs = _pairs_of(frames, name, metric, overlap, difficulty)
+    objects = int((pairs[2] == COUNTED).sum())
     if objects == 0:
         return None
-    pairs = (frames.overlaps[METRICS.index(metric)], overlap, *states, found.scores,
-             frames.first_true, frames.first_found, frames.first_pair)
     thresholds = recall_thresholds(_hit_scores(*pairs), objects)
-    excused = (frames.excused if metric == "image" else np.zeros(len(found))) > overlap
-    hits, wrong, turned = _counts(*pairs, thresholds, excused, true.alpha, found.alpha)
+    hits, wrong, turned = _counted(frames, pairs, metric, thresholds)
     right = hits / np.maximum(hits + wrong, 1)
     turned = turned / np.maximum(hits + wrong, 1)
     return Precision(objects, *averages(at_recall(right, objects)),
@@ -155,12 +151,22 @@ def hits_and_wrong(frames: Comparison, name: str, metric: str, overlap: float, d
                    thresholds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two (T,) float64: how many detections of a score of thresholds (T,) or more are right, and
     how many are wrong, by the rules of precision(); those that are ignored are neither."""
-    true, found = frames.true, frames.found
-    excused = (frames.excused if metric == "image" else np.zeros(len(found))) > overlap
-    return _counts(frames.overlaps[METRICS.index(metric)], overlap,
-                   true_states(true, name, difficulty), found_states(found, name, difficulty),
-                   found.scores, frames.first_true, frames.first_found, frames.first_pair,
-                   np.asarray(thresholds, np.float64), excused, true.alpha, found.alpha)[:2]
+    pairs = _pairs_of(frames, name, metric, overlap, difficulty)
+    return _counted(frames, pairs, metric, np.asarray(thresholds, np.float64))[:2]
+
+
+def _pairs_of(frames: Comparison, name: str, metric: str, overlap: float, difficulty: str) -> tuple:
+    """What _hit_scores takes."""
+    return (frames.overlaps[METRICS.index(metric)], overlap,
+            true_states(frames.true, name, difficulty),
+            found_states(frames.found, name, difficulty),
+            frames.found.scores, frames.first_true, frames.first_found, frames.first_pair)
+
+
+def _counted(frames: Comparison, pairs: tuple, metric: str, thresholds: np.ndarray) -> tuple:
+    """What _counts gives of pairs at thresholds (T,)."""
+    excused = (frames.excused if metric == "image" else np.zeros(len(frames.found))) > pairs[1]
+    return _counts(*(*pairs, thresholds, excused, frames.true.alpha, frames.found.alpha))
 
 
 @njit(cache=True, nogil=True)

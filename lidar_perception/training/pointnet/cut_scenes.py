@@ -17,9 +17,9 @@ import numpy as np
 from lidar_perception import __version__
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame
-from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
+from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of, middles, points_of
 from lidar_perception.detectors.pointnet.config import PointNetConfig
-from lidar_perception.geometry import bev_iou, points_in_boxes
+from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.scoring.points.clusters import labelled
@@ -97,15 +97,13 @@ def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutSce
         clusters.take(np.flatnonzero(labels == background)), scene.boxes, config)])
     of_around = np.append([config.classes.index(CLASSES[scene.class_ids[i]]) for i in wanted],
                           np.full(len(around) - len(wanted), background)).astype(np.int64)
-    xyz = frame.xyz.compress(~ground, axis=0)
-    indices, first = points_in_boxes(xyz, around, AROUND)
-    kept = np.flatnonzero(np.diff(first) >= min_points)
-    points = scene.points.compress(~ground, axis=0)[indices].astype(np.float32)
-    loose = Clusters(points, first, np.full(len(around), -1)).take(kept).on(
-        frame.xyz.compress(ground, axis=0))
+    obstacles = frame.take(np.flatnonzero(~ground))
+    loose = points_of(around, obstacles, obstacles, AROUND)
+    kept = np.flatnonzero(loose.sizes >= min_points)
+    loose = loose.take(kept).on(frame.xyz.compress(ground, axis=0))
     both = Clusters(np.concatenate([clusters.points, loose.points]),
                     np.concatenate([clusters.first, clusters.first[-1] + loose.first[1:]]),
-                    np.concatenate([clusters.ids, loose.ids]),
+                    np.concatenate([clusters.ids, np.full(len(loose), -1)]),
                     np.concatenate([clusters.ground, loose.ground]))
     return CutScene(both, np.concatenate([labels, of_around[kept]]),
                     np.concatenate([boxes, around[kept]]), np.arange(len(both)) >= len(clusters))
@@ -118,11 +116,10 @@ def decoys(background: Clusters, boxes: np.ndarray, config: PointNetConfig) -> n
     rng = np.random.default_rng(len(background.points))
     chosen = rng.permutation(len(background))[:DECOYS]
     own = background.take(chosen)
-    middles = np.add.reduceat(own.points[:, :2], own.first[:-1], axis=0) / own.sizes[:, None] if (
-        len(own)) else np.zeros((0, 2))
+    places = middles(own.points, own.first)
     sizes = np.array(config.sizes)[rng.integers(len(config.sizes), size=len(own))]
     sizes = sizes * rng.uniform(0.9, 1.15, sizes.shape)
-    found = np.column_stack([middles + rng.normal(0, 0.2, middles.shape),
+    found = np.column_stack([places + rng.normal(0, 0.2, places.shape),
                              own.floor + sizes[:, 2] / 2, sizes,
                              rng.uniform(-np.pi, np.pi, len(own))])
     room = boxes + [0, 0, 0, 2 * AROUND, 2 * AROUND, 0, 0]

@@ -16,7 +16,12 @@ from lidar_perception.camera import Calibration
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.box_head import BoxTargets, cluster_loss, encode
 from lidar_perception.detectors.pointnet.calibration import calibrate, calibration_error
-from lidar_perception.detectors.pointnet.clusters import ClusterInput, Clusters, network_input
+from lidar_perception.detectors.pointnet.clusters import (
+    ClusterInput,
+    Clusters,
+    middles,
+    network_input,
+)
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
 from lidar_perception.detectors.pointnet.predict import found, outputs_of, predict
@@ -61,10 +66,10 @@ class ClusterPreparation:
         labels, boxes = scene.labels[chosen], scene.boxes[chosen].copy()
         clusters = scene.clusters.take(chosen)
         background = np.flatnonzero(labels == len(self.config.classes))
+        feet = np.column_stack([middles(clusters.points, clusters.first), clusters.floor])
         for k in background:
             own = slice(clusters.first[k], clusters.first[k + 1])
-            foot = np.append(clusters.points[own, :2].mean(axis=0), clusters.floor[k])
-            clusters.points[own], _ = varied(clusters.points[own], foot, self.augment, rng)
+            clusters.points[own], _ = varied(clusters.points[own], feet[k], self.augment, rng)
         clusters, boxes = changed(clusters, boxes, scene.loose[chosen], self.augment, rng)
         inputs = network_input(clusters, self.config.points, int(rng.integers(1 << 30)))
         has_box = (labels >= 0) & (labels < len(self.config.classes))
