@@ -25,6 +25,7 @@ HESAI = dict(intensity=("intensity", "u1", 255), ring=("channel", "<u2", 1),
              time=("time_stamp", "<u4", 1e9))
 KITTI = dict(intensity=("intensity", "<f4", 1), ring=None, time=None)
 BARE = dict(intensity=None, ring=None, time=None)
+EVEN = dict(camber=0.0, wave=0.0, rough=0.0, litter=0.0)  # of a street
 MOUNTS = {  # of eight sensors
     "hdl-64e": (KITTI, 1.5, -2.0, 1.73), "hdl-32e": (VELODYNE, -3.0, 4.0, 1.9),
     "vlp-16": (VELODYNE, 5.0, 8.0, 0.6), "vlp-32c": (VELODYNE, -6.0, -3.0, 1.1),
@@ -68,10 +69,10 @@ def _ground_hits(ground, start, way, since, velocity, lift, max_range):
 def tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int, even: bool = True,
            compensated: bool = False):
     """Returns of one turn of a sensor that leans against the road beneath it, degrees, at
-    sensor.height above it; even: streets slope, but do not wave or fall to their curbs;
+    sensor.height above it; even: streets slope and have curbs, and are smooth otherwise;
     compensated: as in returns_of."""
     scene = drive._street(street, ANY)
-    ground = scene.ground._replace(camber=0.0, wave=0.0) if even else scene.ground
+    ground = scene.ground._replace(**EVEN) if even else scene.ground
     scene = replace(scene, ground=ground)
     sensor = sensor.at_turn(number)
     moment = scene.at(number / sensor.rate, sensor.height)

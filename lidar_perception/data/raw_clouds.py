@@ -85,8 +85,11 @@ def _of_files(path: Path, files: list[Path]) -> RawClouds:
         points = read_pcd(files[i]) if files[i].suffix == ".pcd" else _of_records(files[i])
         if missing := {"x", "y", "z"} - set(points.dtype.names or ()):
             raise InputError(f"{files[i]} has no field {min(missing)}; it is no cloud of points")
+        # A PointCloud2 has no whole numbers of 64 bits: times as float64 keep their microseconds.
+        kinds = [(name, points.dtype[name].base.str.replace("i8", "f8").replace("u8", "f8"),
+                  points.dtype[name].shape) for name in points.dtype.names or ()]
         try:
-            return from_array(points, header_message(0, "", bag_message), bag_message)
+            return from_array(points.astype(kinds), header_message(0, "", bag_message), bag_message)
         except ValueError as error:
             raise InputError(f"{files[i]}: {error}") from None
     return RawClouds(path, f"{len(files)} {files[0].suffix} file{'s' * (len(files) != 1)}",

@@ -134,18 +134,18 @@ def _blocked(blind: np.ndarray, seen: np.ndarray,
              body: np.ndarray) -> list[tuple[int, float, float]]:
     """Where all beams from one on are blind, as sectors. Beams that hardly see anything, as those
     to the sky, say nothing."""
-    says = (seen > 0).mean(axis=1) >= SEEN
+    open_ = (seen > 0).any(axis=0)
+    says = (seen[:, open_] > 0).mean(axis=1) >= SEEN if open_.any() else np.zeros(len(seen), bool)
     if not says.any():
         return []
-    # From the lowest beam that says something upwards: the first that sees in each sector.
+    # From the lowest beam upwards: the first that sees in each sector, of those that say something.
     hidden = np.where(says[:, None], blind, True)
-    count = np.cumprod(hidden[::-1], axis=0).sum(axis=0)
-    first = len(blind) - count
-    known = np.flatnonzero(says)
-    # Up to the highest row that is hidden itself; what says nothing above it stays open.
-    first = np.array([known[np.searchsorted(known, f)] if f <= known[-1] else len(blind)
-                      for f in first])
-    first = np.where((seen == 0).all(axis=0), 0, first)
+    lowest = len(blind) - np.cumprod(hidden[::-1], axis=0).sum(axis=0)
+    known = np.append(np.flatnonzero(says), len(blind))
+    first = known[np.searchsorted(known, lowest)]
+    for row in range(len(blind) - 2, -1, -1):  # what meets the robot is hidden, whatever it says
+        first = np.where((first == row + 1) & body[row], row, first)
+    first = np.where(open_, first, 0)
     out = []
     step = max(1, len(blind) // 16)  # so that neighbours join
     level = np.where(first < len(blind), -(-first // step) * step, len(blind))

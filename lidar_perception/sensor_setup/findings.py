@@ -77,8 +77,8 @@ def findings(m: Measured) -> list[Finding]:
     out += _mount(m)
     t = m.timing
     out.append(Finding("rate", "not known" if np.isnan(t.rate) else
-                       f"{t.rate:.2f} turns a second", f"from {t.by}", SURE if t.by == "stamps" else FAIR if np.isfinite(t.rate)
-                       else DOUBTFUL))
+                       f"{t.rate:.2f} turns a second", f"from {t.by}",
+                       {"stamps": SURE, "nothing": DOUBTFUL}.get(t.by, FAIR)))
     if t.turns and m.beams is not None and m.beams.how != "order":
         out.append(Finding("turns", t.turns, "by the points' " + (
             "times" if m.scans[0].seconds is not None else "order"), FAIR))
@@ -103,7 +103,8 @@ def _columns(m: Measured) -> list[Finding]:
     i = m.intensity
     if i is not None:
         kind = " in whole numbers" if i.whole else ""
-        out.append(Finding("intensity", f"0 to {i.full:g}{kind}", f"up to {i.greatest:.4g}; 0 for {100 * i.zeros:.1f} %, median "
+        out.append(Finding("intensity", f"0 to {i.full:g}{kind}",
+                           f"up to {i.greatest:.4g}; 0 for {100 * i.zeros:.1f} %, median "
                            f"{i.quantiles[50]:.3g}, {100 * i.bright:.2f} % as bright as "
                            "retroreflectors", SURE if i.sure else DOUBTFUL))
     if scan.seconds is not None:
@@ -188,7 +189,7 @@ def doubts(m: Measured) -> list[str]:
     c = m.coverage
     if len(c.box) and not body_fits(m):
         out.append(f"{100 * c.others:.0f} % of the points in the box around the robot's own "
-                   "returns are not its own, so no crop.body is set; set one by hand, see the report")
+                   "returns are not its own, so no crop.body is set; set one by hand by the report")
     if m.twice > 0.05:
         out.append(f"{100 * m.twice:.0f} % of the points share the direction of another, as second "
                    "returns do; turn them off if the detectors need not see through dust or glass")
