@@ -10,8 +10,8 @@ import numpy as np
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.sensor_setup.findings import SMALL_ROOM, body_fits, doubts
-from lidar_perception.sensor_setup.measure import Measured, sensor_of
+from lidar_perception.sensor_setup.findings import body_fits, doubts
+from lidar_perception.sensor_setup.measure import SMALL_ROOM, Measured, sensor_of
 from lidar_perception.simulation.sensor import Sensor
 
 WIDTH = 98

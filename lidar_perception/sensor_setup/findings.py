@@ -9,8 +9,10 @@ import numpy as np
 
 from lidar_perception.sensor_setup.coverage import ALWAYS, ARM
 from lidar_perception.sensor_setup.measure import SMALL_ROOM, Measured
-from lidar_perception.sensor_setup.scans import INTENSITY_FIELDS, RINGS, TIMES
+from lidar_perception.sensor_setup.scans import RINGS
 from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.wire.messages import INTENSITY_FIELDS
+from lidar_perception.wire.point_times import NAMES as TIMES
 
 SURE, FAIR, DOUBTFUL = "sure", "fair", "doubtful"
 FEW_SCANS = 5

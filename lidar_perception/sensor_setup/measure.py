@@ -145,7 +145,7 @@ def sensor_of(found: Measured) -> Sensor:
     divergence of the beams, is that of the model with the same beams, or the default. Without beams
     there is a grid of the same view whose beams wander, with as many points in a turn."""
     known = sensor_named(found.model) if found.model else None
-    fields: dict = {} if known is None else {name: getattr(known, name) for name in (
+    fields: dict[str, Any] = {} if known is None else {name: getattr(known, name) for name in (
         "divergence", "reach", "pulse", "max_range", "range_noise", "rate", "silent", "floor",
         "fade")}
     if np.isfinite(found.noise):
@@ -169,7 +169,7 @@ def sensor_of(found: Measured) -> Sensor:
     return Sensor(tuple(up.tolist()), float(np.radians(step)), **fields)
 
 
-def _grid(found: Measured, fields: dict) -> Sensor:
+def _grid(found: Measured, fields: dict[str, Any]) -> Sensor:
     up = np.concatenate([scan.elevation for scan in found.scans])
     high, low = np.percentile(up, [99.8, 0.2])
     points = np.median([len(scan.xyz) for scan in found.scans])
