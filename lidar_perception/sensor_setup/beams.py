@@ -156,7 +156,7 @@ def _fitted(scans: Sequence[Scan], labels: list[np.ndarray], how: str) -> Beams 
     if len(known) < 2:
         return None
     beams = [_Points(*map(np.concatenate, zip(*rows[k]))) for k in known]
-    lifts = _lifts(beams)
+    lifts, sure = _lifts(beams)
     elevations, spread, error = (np.empty(len(known)) for _ in range(3))
     for n, (beam, lift) in enumerate(zip(beams, lifts)):
         up = beam.elevation(lift)
@@ -165,6 +165,8 @@ def _fitted(scans: Sequence[Scan], labels: list[np.ndarray], how: str) -> Beams 
         part = beam.place // SECTORS if len(scans) >= 5 else beam.place // (SECTORS // 4)
         middles = np.array([np.median(up[part == i]) for i in np.unique(part)])
         error[n] = 1.2533 * 1.4826 * _mad(middles) / np.sqrt(len(middles))
+        if lifts.any() and not sure[n]:
+            error[n] += np.degrees(MAX_LIFT_ERROR / np.median(beam.distance))
     down = np.argsort(-elevations, kind="stable")
     # Beams that cannot be told apart by their elevations are one, as two with the same angle.
     rank = np.empty(len(known), np.int64)
@@ -177,10 +179,10 @@ def _fitted(scans: Sequence[Scan], labels: list[np.ndarray], how: str) -> Beams 
                  how == "ring" and bool(elevations[0] > elevations[-1]))
 
 
-def _lifts(beams: list[_Points]) -> np.ndarray:
+def _lifts(beams: list[_Points]) -> tuple[np.ndarray, np.ndarray]:
     """(B,) m where each beam starts on the axis: of the line z = lift + tan(elevation) * distance.
     All 0 unless the beams that say it well are apart: those of which the points stand at many
-    distances. The others have the lift of their neighbours."""
+    distances, (B,) bool. The others have the lift of their neighbours."""
     lift, sure = np.zeros(len(beams)), np.zeros(len(beams), bool)
     for n, beam in enumerate(beams):
         every = max(1, len(beam.z) // 20_000)
@@ -200,11 +202,11 @@ def _lifts(beams: list[_Points]) -> np.ndarray:
         sure[n] = reach > 0.04 and scatter / reach / np.sqrt(
             len(np.unique(beam.place))) < MAX_LIFT_ERROR
     if not sure.any() or np.median(np.abs(lift[sure])) < MIN_LIFT:
-        return np.zeros(len(beams))
+        return np.zeros(len(beams)), sure
     known = np.flatnonzero(sure)
     for n in np.flatnonzero(~sure).tolist():
         lift[n] = np.median(lift[known[np.argsort(np.abs(known - n))[:5]]])
-    return lift
+    return lift, sure
 
 
 def _mad(values: np.ndarray) -> float:

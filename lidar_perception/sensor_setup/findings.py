@@ -8,14 +8,13 @@ from typing import NamedTuple
 import numpy as np
 
 from lidar_perception.sensor_setup.coverage import ALWAYS, ARM
-from lidar_perception.sensor_setup.measure import SMALL_ROOM, Measured
+from lidar_perception.sensor_setup.measure import FEW_SCANS, SMALL_ROOM, Measured
 from lidar_perception.sensor_setup.scans import RINGS
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.wire.messages import INTENSITY_FIELDS
 from lidar_perception.wire.point_times import NAMES as TIMES
 
 SURE, FAIR, DOUBTFUL = "sure", "fair", "doubtful"
-FEW_SCANS = 5
 SLOPE = 1.0         # degrees by which the ground leans from scan to scan, from which on it slopes
 STEEP_MOUNT = 6.0   # degrees of roll or pitch: either mounted so, or all of it on a slope
 NOT_AHEAD = 20.0    # degrees between x and where the robot drives

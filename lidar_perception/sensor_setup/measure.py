@@ -19,6 +19,7 @@ from lidar_perception.types import InputError
 
 FLAT = 1.0          # degrees: a sensor whose returns are within this sees in one plane
 SAME_MODEL = 0.15   # degrees between beams, the median, of sensors of one model
+FEW_SCANS = 5       # fewer say little of what is the robot's and what is the place's
 SMALL_ROOM = 30.0   # metres: where nothing is farther, the room ends the range and not the sensor
 TURNED = 0.01       # degrees by which points of a beam scatter, from which on they have been moved
 AROUND = (-15.0, 5.0)  # degrees: where people are, in which the distance of beams is measured
@@ -159,7 +160,9 @@ def sensor_of(found: Measured) -> Sensor:
     fields["min_range"] = float(np.floor(100 * min(found.least, fields["max_range"] / 2)) / 100)
     if found.beams is None:
         return _grid(found, fields)
-    fields["blocked"] = tuple(found.coverage.blocked)
+    # What one place hides is not what the robot hides: there only the ends of the view count.
+    places = found.coverage.still is False and len(found.scans) >= FEW_SCANS
+    fields["blocked"] = tuple(b for b in found.coverage.blocked if places or b[0] == 0)
     up, lifts = np.radians(np.round(found.beams.elevations, 4)), np.round(found.beams.lifts, 4)
     if found.as_model and known is not None:
         up, lifts = np.array(known.elevations), np.array(known.lifts)
