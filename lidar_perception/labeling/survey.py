@@ -71,7 +71,8 @@ def _described(xyz: Array, cluster_ids: Array, boxes: Array, numbers: Array,
     return images, shape_features(points, start, boxes, params)
 
 
-def surveyed(drive: Drive, weights: str, here: bool = False) -> Generator[tuple[int, Look], None, None]:
+def surveyed(drive: Drive, weights: str,
+             here: bool = False) -> Generator[tuple[int, Look], None, None]:
     """(number, look) of all frames, in their order, with the detector of these weights, "" for
     none; in a process of its own, which ends with the iterator, or with `here` in this one.
     InputError where a frame or the weights cannot be read."""
