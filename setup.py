@@ -41,7 +41,8 @@ setup(
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "msg_utils*"]),
     package_data={NAME: ["nodes/*.xml", "candidates/*.json", "reproduction/*.html",
-                         "detectors/*/weights/*", "detectors/fused/*.json"]},
+                         "detectors/*/weights/*", "detectors/fused/*.json",
+                         "labeling/page/*"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
@@ -50,10 +51,10 @@ setup(
         (f"lib/{NAME}", node_executables()),
     ],
     install_requires=[
-        "click>=8.1", "jinja2>=3.1", "matplotlib>=3.7", "lz4>=4.0", "mcap>=1.2", "numba>=0.59",
-        "numpy>=1.26", "pypatchworkpp>=1.0", "pyyaml>=6", "rich>=13", "rosbags>=0.11.6",
-        "safetensors>=0.4", "scikit-learn>=1.3", "scipy>=1.11", "threadpoolctl>=3.1",
-        "torch>=2.2", "zstandard>=0.21",
+        "aiohttp>=3.10", "click>=8.1", "jinja2>=3.1", "matplotlib>=3.7", "lz4>=4.0", "mcap>=1.2",
+        "numba>=0.59", "numpy>=1.26", "pypatchworkpp>=1.0", "pyyaml>=6", "rich>=13",
+        "rosbags>=0.11.6", "safetensors>=0.4", "scikit-learn>=1.3", "scipy>=1.11",
+        "threadpoolctl>=3.1", "torch>=2.2", "zstandard>=0.21",
     ],
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],

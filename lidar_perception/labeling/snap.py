@@ -1,0 +1,94 @@
+"""Boxes put right by the points: around the cluster, onto the ground, to a size."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.candidates.params import SeedParams
+from lidar_perception.candidates.seeds import clicked_cluster
+from lidar_perception.classes import DETECTED, Size
+from lidar_perception.clustering.shapes import oriented_boxes
+from lidar_perception.geometry import points_in_box, wrap_angle
+from lidar_perception.ground.surface import surface_under
+from lidar_perception.labeling.drive import Scan
+from lidar_perception.types import InputError
+
+Array = np.ndarray[Any, Any]
+MARGIN = 0.3       # metres around a box within which its cluster is looked for
+PIECE = 0.2        # of the points of the largest cluster there: smaller ones are something else
+HIDDEN = 0.25      # metres: what lies so near to the usual size has its far side hidden
+
+
+def around_click(scan: Scan, click: Array, class_name: str) -> Array:
+    """(7,) the box of the cluster at a point (3,), on the ground and as large as the class usually
+    is. InputError where no cluster is near."""
+    label = clicked_cluster(click, scan.xyz, scan.cluster_ids, SeedParams().click_radius)
+    return completed(_around(scan, scan.cluster_ids == label), class_name)
+
+
+def to_cluster(scan: Scan, box: Array) -> Array:
+    """(7,) the L-shape of the cluster in a box (7,), headed as that is. InputError where no cluster
+    is in it."""
+    near = points_in_box(scan.xyz, box, MARGIN) & (scan.cluster_ids > 0)
+    counts = np.bincount(scan.cluster_ids[near])
+    if not counts.any():
+        raise InputError("there is no cluster in the box; move it onto one")
+    return headed(_around(scan, near & (counts[scan.cluster_ids] >= PIECE * counts.max())), box[6])
+
+
+def to_ground(scan: Scan, box: Array) -> Array:
+    """(7,) the box with its bottom on the ground under it. InputError where none is seen there."""
+    floor = float(surface_under(scan.xyz[scan.ground], box[None, :2])[0])
+    if not np.isfinite(floor):
+        raise InputError("no ground is seen around the box; move it by hand")
+    return np.array([*box[:2], floor + box[5] / 2, *box[3:]])
+
+
+def to_size(box: Array, size: Array) -> Array:
+    """(7,) the box with another length, width and height; the corner that is nearest to the sensor
+    stays where it is, and so does the bottom."""
+    cos, sin = np.cos(box[6]), np.sin(box[6])
+    seen = np.array([-(cos * box[0] + sin * box[1]), sin * box[0] - cos * box[1]])
+    away = -np.where(np.abs(seen) > box[3:5] / 2, np.sign(seen), 0.0)
+    along, across = away * (size[:2] - box[3:5]) / 2
+    return np.array([box[0] + cos * along - sin * across, box[1] + sin * along + cos * across,
+                     box[2] + (size[2] - box[5]) / 2, *size, box[6]])
+
+
+def headed(box: Array, yaw: float) -> Array:
+    """(7,) the same box, of the four ways to say it that whose yaw is nearest."""
+    turns = round(float(wrap_angle(yaw - box[6])) / (np.pi / 2))
+    sides = box[3:5] if turns % 2 == 0 else box[[4, 3]]
+    return np.array([*box[:3], *sides, box[5], wrap_angle(box[6] + turns * np.pi / 2)])
+
+
+def usual_size(class_name: str) -> Size | None:
+    """Of a class that is detected; None of others."""
+    return DETECTED[class_name].mean_size if class_name in DETECTED else None
+
+
+def completed(box: Array, class_name: str) -> Array:
+    """(7,) the box of what is seen, made as long and wide as the class usually is, away from the
+    sensor; the longer side seen is taken for the width where it fits that better."""
+    usual = usual_size(class_name)
+    if usual is None:
+        return box
+    length, width, height = usual
+    if box[3] < (length + width) / 2 and length - width > HIDDEN:
+        box = headed(box, box[6] + np.pi / 2)
+    tall = box[5] if box[5] > height / 2 else height
+    return to_size(box, np.array([max(box[3], length), max(box[4], width), tall]))
+
+
+def _around(scan: Scan, members: Array) -> Array:
+    """(7,) the L-shape around points (N,) bool, down to the ground."""
+    xyz = scan.xyz[members]
+    box = oriented_boxes(xyz, np.ones(len(xyz), np.int32), "l_shape")[0].astype(np.float64)
+    floor = float(surface_under(scan.xyz[scan.ground], box[None, :2])[0])
+    if np.isfinite(floor):
+        top = max(box[2] + box[5] / 2, floor + 0.1)
+        box[2], box[5] = (floor + top) / 2, top - floor
+    box[3:6] = np.maximum(box[3:6], 0.05)
+    return box
