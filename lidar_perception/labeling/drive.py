@@ -103,10 +103,12 @@ class Clouds:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """name and layout for people; recording: of one sequence; frames in the order of time."""
+    """name and layout for people; recording: of one sequence; frames in the order of time; scan:
+    makes the scan of a frame, by default with our own ground and clusters."""
 
     name: str
     recording: Recording
+    scan: Callable[[Frame], Scan] = scanned
 
     @cached_property
     def frames(self) -> list[Frame]:
@@ -125,7 +127,7 @@ class Drive:
     @cached_property
     def clouds(self) -> Clouds:
         """Its scans."""
-        return Clouds(lambda i: scanned(self.frames[i]))
+        return Clouds(lambda i: self.scan(self.frames[i]))
 
 
 def one_drive(recording: Recording, sequence: str | None = None) -> Drive:

@@ -123,8 +123,10 @@ export async function merge() {
     say("Select a second track with Ctrl and a click, then merge.");
     return;
   }
-  const tracks = [track.id, ...store.also];
-  if (await act({ do: "merge", tracks })) select(track.id);
+  for (const other of [...store.also]) {
+    if (!await act({ do: "merge", tracks: [track.id, other] })) return;
+  }
+  select(track.id);
 }
 
 export async function seedAt(xyz) {

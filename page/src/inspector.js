@@ -96,7 +96,7 @@ let asked = "", waiting = 0;
 
 function askSilhouettes() {
   const track = selectedTrack(), area = document.getElementById("silhouettes");
-  const key = track && selectedBox() && !store.playing ? `${store.frame} ${track.id} ${selectedBox().box}` : "";
+  const key = track && store.seeds.length && selectedBox() && !store.playing ? `${store.frame} ${track.id} ${selectedBox().box}` : "";
   if (key === asked || store.mode === "view") return;
   asked = key;
   clearTimeout(waiting);
