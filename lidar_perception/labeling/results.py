@@ -4,7 +4,7 @@ missed and what is false; tracks. Read from a bag, from result files, or detecte
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -18,59 +18,73 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.results import read_results
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.geometry import bev_iou
+from lidar_perception.groups import renumbered
+from lidar_perception.labeling.drive import Drive, Scan, scan_of, scanned
 from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_to_one
 from lidar_perception.types import Detections, GroundTruth, InputError
-from lidar_perception.wire.messages import to_detections
+from lidar_perception.wire.messages import column, to_detections, to_frame
 from lidar_perception.wire.topics import POINTS, TRUTH
 from msg_utils.markers import MarkedObjects, from_marker_array
 
 Array = np.ndarray[Any, Any]
-Source = Callable[[int, Frame], Detections]  # what was detected in frame i
 SIMILAR = {row.name: row.looks_like or row.name for row in TABLE}
 MARKERS, CLOUD = "visualization_msgs/msg/MarkerArray", "sensor_msgs/msg/PointCloud2"
-TRACKS = "/output/tracks"                    # the end of a topic, of whatever tracker
+FOUND, TRACKS = "/output/detections", "/output/tracks"  # the end of a topic, of whatever node
 CLUSTERED = ("/clustering/output/points", "/perception/output/points", POINTS)
 KEPT = 2000                                  # frames whose detections are kept
 
 
+def with_recorded_scans(drive: Drive) -> Drive:
+    """The drive of a bag, with the ground and clusters that are recorded in it."""
+    return replace(drive, scan=recorded_scan)
+
+
+@dataclass(frozen=True)
+class Source:
+    """find(i, frame): what was detected in frame i; classes: names of those that it can detect."""
+
+    find: Callable[[int, Frame], Detections]
+    classes: frozenset[str] = frozenset(DETECTED)
+
+
 @dataclass(frozen=True)
 class Results:
-    """sources by name; tracks as the page has them; points: the topic of the clouds, of a bag."""
+    """sources by name; tracks as the page has them."""
 
     sources: Mapping[str, Source] = field(default_factory=dict)
     tracks: tuple[dict[str, Any], ...] = ()
-    points: str = POINTS
 
     def layers(self, i: int, frame: Frame, min_score: float) -> dict[str, Any]:
         """Labels and detections of frame i as /api/labels has them, and what of them is missed and
         false from this score on."""
         truth, camera = frame.truth(), frame.camera()
-        found = {name: source(i, frame) for name, source in self.sources.items()}
+        found = {name: source.find(i, frame) for name, source in self.sources.items()}
         labels = [] if truth is None else [
             [*map(float, box), name, extra.get("track_id")]
             for box, name, extra in zip(truth.boxes, truth.labels, truth.extras)]
         rows = {name: [[*map(float, box), CLASSES[c], float(score)] for box, c, score
                        in zip(d.boxes, d.class_ids, d.scores)] for name, d in found.items()}
         matches = {} if truth is None else {
-            name: compared(truth, d, min_score, camera) for name, d in found.items()}
+            name: compared(truth, d, min_score, camera, self.sources[name].classes)
+            for name, d in found.items()}
         return {"labels": labels, "detections": rows, "matches": matches}
 
 
-def compared(truth: GroundTruth, found: Detections, min_score: float,
-             camera: Camera | None) -> dict[str, list[int]]:
+def compared(truth: GroundTruth, found: Detections, min_score: float, camera: Camera | None = None,
+             classes: frozenset[str] = frozenset(DETECTED)) -> dict[str, list[int]]:
     """Row numbers of labels that are missed, and of detections of at least min_score that are
-    false, class by class: a hit overlaps seen from above by the class's relaxed share, or is a
-    pedestrian with its centre within 1 m. What only looks like a class, a van like a car, is
+    false, for each of the classes: a hit overlaps seen from above by the class's relaxed share, or
+    is a pedestrian with its centre within 1 m. What only looks like a class, a van like a car, is
     neither; nor is a detection outside the camera's view, where there is one: labels end there."""
     missed, false = [], []
     true_names = np.array([SIMILAR[CLASSES[c]] for c in truth.class_ids], object)
-    for name, numbers in DETECTED.items():
+    for name in classes & DETECTED.keys():
         alike = np.flatnonzero(true_names == name)
         rows = np.flatnonzero((found.class_ids == CLASSES.index(name))
                               & (found.scores >= min_score))
         boxes, others = found.boxes[rows].astype(np.float64), truth.boxes[alike]
         share = bev_iou(boxes, others)
-        hit = share >= numbers.relaxed
+        hit = share >= DETECTED[name].relaxed
         if name == "Pedestrian":
             far = np.linalg.norm(boxes[:, None, :2] - others[None, :, :2], axis=2)
             hit |= far <= MAX_CENTRE_DISTANCE
@@ -89,7 +103,7 @@ def by_detector(detector: Detector) -> Source:
     @lru_cache(maxsize=KEPT)
     def detect(i: int, frame: Frame) -> Detections:
         return detector(frame.load()).detections
-    return detect
+    return Source(detect, frozenset(detector.classes))
 
 
 def by_files(folder: Path) -> Source:
@@ -102,13 +116,13 @@ def by_files(folder: Path) -> Source:
     def read(i: int, frame: Frame) -> Detections:
         calibration, path = frame.calibration(), folder / f"{frame.name}.txt"
         if calibration is None:
-            raise InputError(f"frame {frame.name} has no camera calibration, in whose frame KITTI's "
-                             "result files are")
+            raise InputError(f"frame {frame.name} has no camera calibration, in whose frame "
+                             "KITTI's result files are")
         if not path.exists():
             return Detections.none()
         rows = read_results(path, calibration.lidar_to_camera)
         return Detections.of(rows.boxes, rows.class_ids, [e["score"] for e in rows.extras])
-    return read
+    return Source(read)
 
 
 def points_topic(path: Path) -> str:
@@ -129,7 +143,7 @@ def recorded(path: Path, stamps: list[int]) -> Results:
     A message belongs to the cloud of its stamp."""
     with Bag(path) as bag:
         wanted = {topic for topic, kind in bag.topics.items() if kind == MARKERS and topic != TRUTH
-                  and topic.endswith((*SUFFIXES, TRACKS))}
+                  and topic.endswith((FOUND, TRACKS))}
         found: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in sorted(wanted)}
         for topic, _, message in bag.messages(wanted):
             objects = from_marker_array(message)
@@ -145,16 +159,25 @@ def recorded(path: Path, stamps: list[int]) -> Results:
     return Results(sources, tuple(tracks))
 
 
-SUFFIXES = ("/output/detections", "/output/candidates")
-
-
 def _short(topic: str) -> str:
     """Of /fused_detector/output/detections the node's name."""
-    return topic.strip("/").removesuffix("/output/detections").replace("/output/", " ")
+    return topic.strip("/").removesuffix(FOUND)
 
 
 def _given(found: Mapping[int, Detections]) -> Source:
-    return lambda i, frame: found.get(i, Detections.none())
+    classes = {CLASSES[c] for each in found.values() for c in each.class_ids}
+    return Source(lambda i, frame: found.get(i, Detections.none()), frozenset(classes))
+
+
+def recorded_scan(frame: Frame) -> Scan:
+    """The cloud of a frame of a bag with the ground and clusters that are recorded in it; those of
+    our own where there are none. InputError where it cannot be read."""
+    message = frame.native()
+    cloud, indices = to_frame(message, intensity_max=0.0)
+    ground, ids = (column(message, name, indices) for name in ("ground", "cluster_id"))
+    if ground is None or ids is None:
+        return scanned(frame)
+    return scan_of(cloud, ground > 0, renumbered(ids)[0])
 
 
 def _tracks(frames: Mapping[int, MarkedObjects], topic: str, before: int) -> list[dict[str, Any]]:

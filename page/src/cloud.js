@@ -2,10 +2,12 @@
 
 import { getBytes } from "./api.js";
 import { sayError } from "./messages.js";
+import { resultsOf } from "./results.js";
 import { changed, store } from "./store.js";
 
 const KEPT = 24; // clouds of 114,000 points take 2 MB each
 const AHEAD = 3;
+const PATIENCE_MS = 120; // for results, so that they come with their cloud
 const EMPTY = { count: 0, xyz: new Float32Array(), intensity: new Uint8Array(),
                 ground: new Uint8Array(), cluster: new Uint32Array(), floor: -1.7 };
 
@@ -74,6 +76,10 @@ export async function show(frame) {
       sayError(`Frame ${store.drive.frames[frame].name} has no cloud: ${error.message}`);
     }
   }
+  if (store.mode === "view") {
+    await Promise.race([resultsOf(frame).catch(() => null),
+                        new Promise((resolve) => setTimeout(resolve, PATIENCE_MS))]);
+  }
   if (store.wanted !== frame) return;
   store.frame = frame;
   store.cloud = cloud;
@@ -92,6 +98,7 @@ function ahead(frame) {
   (async () => { // one after another, so that the nearest is not held up by those behind it
     for (const next of wished) {
       if (next < 0 || next >= frames || store.wanted !== frame) continue;
+      if (store.mode === "view") resultsOf(next).catch(() => null);
       try { await cloudOf(next); } catch { /* said when it is shown */ }
     }
   })();

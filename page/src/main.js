@@ -6,6 +6,7 @@ import { show } from "./cloud.js";
 import { openInspector } from "./inspector.js";
 import { listKeys, openKeys } from "./keys.js";
 import { sayError } from "./messages.js";
+import { loadResults } from "./results.js";
 import { openResults } from "./resultpanel.js";
 import { drawn, focus, fly, openScene } from "./scene.js";
 import { openSideViews } from "./sideviews.js";
@@ -41,7 +42,11 @@ async function open() {
   store.wanted = Math.min(store.drive.frames.length - 1, Math.max(0, Number(asked.get("frame")) || 0));
   await show(store.wanted);
   if (asked.has("track")) select(Number(asked.get("track")));
-  document.documentElement.dataset.ready = "true";
+  await loadResults();
+  changed("tracks"); // one more picture, now that all is here
+  requestAnimationFrame(() => requestAnimationFrame(() => {
+    document.documentElement.dataset.ready = "true";
+  }));
 }
 
 // For measurements and for pictures from a script; nothing on the page uses it.

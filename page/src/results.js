@@ -2,17 +2,20 @@
 
 import { getJson } from "./api.js";
 import { colourOfClass } from "./colours.js";
+import { sayError } from "./messages.js";
 import { changed, on, store } from "./store.js";
 
 export const MISSED = "#ff4d5e", FALSE = "#ffb020";
 const SOURCES = ["#22c1a6", "#a78bfa", "#38bdf8", "#f472b6", "#a3e635", "#fb923c"];
 const LABEL = "#94a3b8";
 
-let loaded = -1;
+const kept = new Map(); // frame -> promise
+const KEPT = 300, NOTHING = { labels: [], detections: {}, matches: {} };
 
 /** Boxes of the frame shown besides those of tracks: {box, colour, strong, text}. */
 export function resultBoxes() {
   const { labels, detections, matches } = store.results, found = [];
+  if (store.results.frame !== store.frame) return found;
   const compared = [...store.sources].find(([, { shown }]) => shown)?.[0];
   const missed = new Set(store.layers.errors ? matches[compared]?.missed : []);
   if (store.layers.labels) {
@@ -48,29 +51,40 @@ export function resultCounts() {
            false: match ? match.false.filter((k) => rows[k][8] >= store.minScore).length : null };
 }
 
-async function load() {
-  const { frame } = store;
-  if (loaded === frame || !store.cloud || !store.drive) return;
-  loaded = frame;
-  try {
-    const found = await getJson(`/api/labels/${frame}?score=${store.minScore}`);
-    if (store.frame !== frame) return;
-    for (const source of Object.keys(found.detections)) {
-      if (!store.sources.has(source)) {
-        store.sources.set(source, { shown: true, colour: SOURCES[store.sources.size % SOURCES.length] });
-        changed("sources");
-      }
-    }
-    store.results = found;
-  } catch {
-    store.results = { labels: [], detections: {}, matches: {} };
+/** The answer of the server for a frame, asked for once. */
+export function resultsOf(frame) {
+  if (!kept.has(frame)) {
+    const asked = getJson(`/api/labels/${frame}?score=${store.minScore}`);
+    asked.catch(() => kept.delete(frame));
+    kept.set(frame, asked);
+    if (kept.size > KEPT) kept.delete(kept.keys().next().value);
   }
+  return kept.get(frame);
+}
+
+/** Show those of the frame shown; boxes of another frame are never seen with it. */
+export async function loadResults() {
+  const { frame } = store;
+  let found = NOTHING;
+  try {
+    found = await resultsOf(frame);
+  } catch (error) {
+    if (store.frame === frame) sayError(error.message);
+  }
+  if (store.frame !== frame) return;
+  for (const source of Object.keys(found.detections)) {
+    if (!store.sources.has(source)) {
+      store.sources.set(source, { shown: true, colour: SOURCES[store.sources.size % SOURCES.length] });
+      changed("sources");
+    }
+  }
+  store.results = { ...found, frame };
   changed("results");
 }
 
 export function reload() {
-  loaded = -1;
-  load();
+  kept.clear();
+  loadResults();
 }
 
-on("frame", load);
+on("frame", loadResults);

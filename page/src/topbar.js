@@ -39,8 +39,8 @@ export function openTopbar() {
     const button = by(id);
     if (button) button.onclick = run;
   }
-  let kept = "auto";
-  try { kept = localStorage.getItem("theme") ?? "auto"; } catch { /* not allowed to keep anything */ }
+  let kept = new URLSearchParams(location.search).get("theme");
+  try { kept ??= localStorage.getItem("theme") ?? "auto"; } catch { /* not allowed to keep anything */ }
   setTheme(THEMES.includes(kept) ? kept : "auto");
   for (const how of COLOURS) by("colour").append(element("option", { value: how }, how));
   by("colour").onchange = () => setColour(by("colour").value);
