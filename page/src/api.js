@@ -97,6 +97,10 @@ export function listen() {
     store.online = false;
     changed("connection");
     setTimeout(listen, RETRY_MS);
+    fetch(address("/api/state")).then((reply) => { // why: a browser does not say it of a socket
+      store.refused = reply.status === 403;
+      changed("connection");
+    }, () => null);
   };
 }
 

@@ -61,10 +61,10 @@ function takeNumbers() {
   values[6] *= Math.PI / 180;
   const good = values.every(Number.isFinite) && values.slice(3, 6).every((size) => size > 0);
   if (good) setNumbers(values);
-  else fill();
+  else fill({ all: true });
 }
 
-function fill() {
+function fill({ all = false } = {}) {
   const track = selectedTrack();
   panel.hidden = !track;
   nothing.hidden = track !== null || store.mode === "view";
@@ -87,7 +87,7 @@ function fill() {
   for (const [k, [name]] of FIELDS.entries()) {
     const input = number(name), value = here?.box[k];
     input.disabled = !here || store.mode === "view";
-    if (document.activeElement === input && !store.draft) continue;
+    if (document.activeElement === input && !store.draft && !all) continue; // being typed
     input.value = value === undefined ? "" : k === 6 ? (value * 180 / Math.PI).toFixed(1) : value.toFixed(2);
   }
 }

@@ -8,13 +8,13 @@ import { listKeys, openKeys } from "./keys.js";
 import { sayError } from "./messages.js";
 import { loadResults } from "./results.js";
 import { openResults } from "./resultpanel.js";
-import { drawn, focus, fly, openScene } from "./scene.js";
+import { drawn, focus, fly, limits, lookAt, openScene } from "./scene.js";
 import { openSideViews } from "./sideviews.js";
 import { changed, on, select, store } from "./store.js";
 import { openTimeline } from "./timeline.js";
 import { openTopbar } from "./topbar.js";
 import { openTrackList } from "./tracklist.js";
-import { pointAt } from "./picking.js";
+import { pointAt, project } from "./picking.js";
 
 async function open() {
   openTopbar();
@@ -50,5 +50,5 @@ async function open() {
 }
 
 // For measurements and for pictures from a script; nothing on the page uses it.
-globalThis.page = { store, drawn, pointAt, fly, focus };
+globalThis.page = { store, drawn, pointAt, project, fly, limits, lookAt };
 open();

@@ -5,7 +5,8 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { paint, theme } from "./colours.js";
 import { on, selectedBox, store } from "./store.js";
 
-export const THINNED = 30_000; // points drawn while the camera moves; their order is random
+// Points drawn while the camera moves; their order is random.
+export const limits = { thinned: 30_000 };
 const REST_MS = 160;
 const BACKGROUND = { dark: 0x11151c, light: 0xf5f7fa };
 const RINGS = [10, 20, 40, 60, 80];
@@ -68,7 +69,7 @@ controls.addEventListener("change", moving);
 function thin(yes) {
   still = !yes;
   const all = store.cloud?.count ?? 0;
-  points.geometry.setDrawRange(0, yes || store.playing ? Math.min(THINNED, all) : all);
+  points.geometry.setDrawRange(0, yes || store.playing ? Math.min(limits.thinned, all) : all);
   draw();
 }
 
@@ -144,6 +145,15 @@ export function resetView() {
   camera.position.set(-16, 0, 12);
   controls.target.set(8, 0, -1);
   controls.update();
+  draw();
+}
+
+/** Look at a place from another, both in the sensor's frame. */
+export function lookAt(place, from) {
+  controls.target.fromArray(place);
+  camera.position.fromArray(from);
+  controls.update();
+  camera.updateMatrixWorld();
   draw();
 }
 

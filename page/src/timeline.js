@@ -124,7 +124,10 @@ export function openTimeline() {
     const frame = store.drive.frames[store.wanted];
     slider.setAttribute("aria-valuetext", `frame ${store.wanted}, ${frame.name}`);
     document.getElementById("frame-number").textContent = `${store.wanted} / ${frames() - 1}`;
-    document.getElementById("frame-name").textContent = frame.name;
+    const name = document.getElementById("frame-name");
+    const seconds = (frame.stamp_ns - store.drive.frames[0].stamp_ns) / 1e9;
+    name.textContent = frame.name.length < 16 ? frame.name : `${seconds.toFixed(2)} s`;
+    name.title = frame.name;
   });
   on("selection", () => { // keep the row of the selected track in sight
     const row = rows().findIndex((track) => track.id === store.selected);

@@ -53,7 +53,15 @@ export function openTopbar() {
   by("import-form").onsubmit = sendImport;
   on("drive", showDrive);
   on("progress drive", showProgress);
-  on("connection", () => { by("lost").hidden = store.online; });
+  on("selection drive", () => {
+    document.documentElement.dataset.chosen = String(store.selected !== null);
+  });
+  on("connection", () => {
+    by("lost").hidden = store.online;
+    by("lost").textContent = store.refused
+      ? "The server was started again. Open the address that it printed: its token is a new one."
+      : "Connection lost. What was saved is safe; trying again…";
+  });
   on("colour", () => { by("colour").value = store.colour; });
   on("tool drive", showTool);
   on("playing", () => {
