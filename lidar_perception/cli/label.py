@@ -67,7 +67,7 @@ def label(data: Path, sequence: str | None, out: Path | None, port: int, browser
 
 def _labels(drive: Drive) -> Any:
     """The labels of frame i, as the page has them."""
-    def layers(i: int) -> dict[str, Any]:
+    def layers(i: int, score: float) -> dict[str, Any]:
         truth = drive.frames[i].truth()
         labels = [] if truth is None else [
             [*box.tolist(), name, extra.get("track_id")]

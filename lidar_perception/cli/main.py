@@ -14,6 +14,7 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
     "convert": ("convert.convert", "Turn a data set into a rosbag2 bag."),
     "evaluate": ("evaluate.group.evaluate", "Score the algorithms without ROS."),
     "compare": ("compare.compare", "Run every detector on the same frames, side by side."),
+    "view": ("view.view", "Look at a recording and its results on a page in the browser."),
     "reproduce": ("reproduce.reproduce", "Reproduce every table of the STM-CPA paper."),
     "label": ("label.label", "Label a drive on a page in the browser."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),

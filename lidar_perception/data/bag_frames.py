@@ -44,9 +44,9 @@ def open_recording(path: Path, *, points: str = POINTS, scans: bool = True) -> R
 
 
 class BagFrames(Sequence):
-    """The frames in order of time. Iterating reads the bag once, and each frame holds its cloud; a
-    frame by its number reads it when it is asked for, found by its time after one look through the
-    bag for the times of all."""
+    """The frames in order of time; native() of each gives its message. Iterating reads the bag
+    once, and each frame holds its cloud; a frame by its number reads it when it is asked for, found
+    by its time after one look through the bag for the times of all."""
 
     def __init__(self, path: Path, points: str, kind: str, count: int):
         self.path, self.points, self.kind, self.count = path, points, kind, count
@@ -123,7 +123,8 @@ class BagFrames(Sequence):
         name = str(stamp) if which == 1 else f"{stamp}-{which}"  # recorders may not set the stamp
         return Frame(name, stamp, partial(self._load, time, data), partial(self._truth, stamp),
                      calibration=partial(self._calibration, time),
-                     pose=partial(self._pose, stamp), index=i)
+                     pose=partial(self._pose, stamp), index=i,
+                     native=lambda: decode(data(), self.kind))
 
     def _load(self, time: int, data: Callable[[], bytes]) -> LidarFrame:
         try:

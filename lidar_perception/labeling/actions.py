@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.labeling.interpolation import Motion, corrected
+from lidar_perception.labeling.interpolation import Motion, corrected, straightened
 from lidar_perception.labeling.state import (
     ACCEPTED,
     KEY,
@@ -195,6 +195,15 @@ def _remove_box(state: State, action: Action, motion: Motion) -> Made:
     return _only(state, replace(track, boxes=boxes, gone=track.gone | {frame}))
 
 
+def _interpolate(state: State, action: Action, motion: Motion) -> Made:
+    track, frame = track_of(state, action.get("track")), frame_of(action, motion)
+    gone = track.gone - {frame}
+    boxes = straightened(track.boxes, gone, frame, motion)
+    if boxes is None:
+        raise InputError(f"track {track.id} has no key box on both sides of frame {frame}")
+    return _only(state, replace(track, boxes=boxes, gone=gone))
+
+
 def _without(seeds: Seeds, track: int) -> Seeds:
     return tuple(seed for seed in seeds if seed[1] != track)
 
@@ -267,9 +276,9 @@ def _check(state: State, action: Action, motion: Motion) -> Made:
 
 DO: dict[str, Callable[[State, Action, Motion], Made]] = {
     "seed": _seed, "add": _add, "box": _box, "size": _size, "remove_box": _remove_box,
-    "copy": _copy, "class": _class, "accept": _accept, "reject": _reject, "reopen": _reopen,
-    "merge": _merge, "split": _split, "check": _check, "snap": _box, "propose": _results,
-    "import": _results,
+    "interpolate": _interpolate, "copy": _copy, "class": _class, "accept": _accept,
+    "reject": _reject, "reopen": _reopen, "merge": _merge, "split": _split, "check": _check,
+    "snap": _box, "propose": _results, "import": _results,
 }
 
 

@@ -20,7 +20,7 @@ from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.labeling.interpolation import Motion
 from lidar_perception.param_fields import with_values
 from lidar_perception.tracking.ego import usable
-from lidar_perception.types import InputError
+from lidar_perception.types import InputError, LidarFrame
 
 Array = np.ndarray[Any, Any]
 CACHE_BYTES = 300 * 10**6  # of clouds that are kept
@@ -64,11 +64,16 @@ def scanned(frame: Frame) -> Scan:
     """The cloud of a frame with ground and clusters. InputError where it cannot be read."""
     cloud = frame.load()
     found = segment(cloud, None, settings(frame))
+    return scan_of(cloud, found.ground, found.cluster_ids)
+
+
+def scan_of(cloud: LidarFrame, ground: Array, cluster_ids: Array) -> Scan:
+    """The scan of a cloud of N points with ground (N,) bool and cluster_ids (N,) int."""
     order = np.random.default_rng(0).permutation(len(cloud))
     intensity = np.zeros(len(cloud)) if cloud.intensity is None else cloud.intensity
     shown = np.nan_to_num(np.clip(intensity, 0.0, 1.0)) * 255
-    return Scan(cloud.xyz[order], shown[order].astype(np.uint8), found.ground[order],
-                found.cluster_ids[order].astype(np.int32))
+    return Scan(cloud.xyz[order], shown[order].astype(np.uint8), ground[order],
+                cluster_ids[order].astype(np.int32))
 
 
 class Clouds:
@@ -103,10 +108,12 @@ class Clouds:
 
 @dataclass(frozen=True, eq=False)
 class Drive:
-    """name and layout for people; recording: of one sequence; frames in the order of time."""
+    """name and layout for people; recording: of one sequence; frames in the order of time; scan:
+    makes the scan of a frame, by default with our own ground and clusters."""
 
     name: str
     recording: Recording
+    scan: Callable[[Frame], Scan] = scanned
 
     @cached_property
     def frames(self) -> list[Frame]:
@@ -125,7 +132,7 @@ class Drive:
     @cached_property
     def clouds(self) -> Clouds:
         """Its scans."""
-        return Clouds(lambda i: scanned(self.frames[i]))
+        return Clouds(lambda i: self.scan(self.frames[i]))
 
 
 def one_drive(recording: Recording, sequence: str | None = None) -> Drive:

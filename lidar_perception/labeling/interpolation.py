@@ -136,6 +136,20 @@ def _fill(found: dict[int, Box], gone: frozenset[int], a: int, b: int, motion: M
                                   INTERPOLATED)
 
 
+def straightened(boxes: Mapping[int, Box], gone: frozenset[int], frame: int,
+                 motion: Motion) -> dict[int, Box] | None:
+    """The boxes of a track with that of a frame given back: all between the key boxes on either
+    side of it are on the straight way, except in frames in gone. None where there are no two."""
+    keys = [f for f, box in boxes.items() if box.kind == KEY and f != frame]
+    before = max((f for f in keys if f < frame), default=None)
+    after = min((f for f in keys if f > frame), default=None)
+    if before is None or after is None:
+        return None
+    found = {f: box for f, box in boxes.items() if not before < f < after}
+    _fill(found, gone, before, after, motion)
+    return dict(sorted(found.items()))
+
+
 def filled(boxes: Mapping[int, Box], motion: Motion) -> dict[int, Box]:
     """Proposed boxes with those of the frames between them that have none."""
     found = dict(boxes)

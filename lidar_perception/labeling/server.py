@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import logging
+import re
 import secrets
 import signal
 from collections.abc import Awaitable, Callable, Mapping
@@ -40,12 +41,14 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 @dataclass(eq=False)
 class Served:
     """What the page shows. session: the labels being made; None: results are only looked at.
-    layers: of frame i, as /api/labels has it, None where there is nothing to show. has: what the
-    page offers, beside what the recording has."""
+    layers: of frame i from a score on, as /api/labels has it, None where there is nothing to show;
+    tracks: as the page has them, where results are looked at. has: what the page offers, beside
+    what the recording has."""
 
     drive: Drive
     session: Session | None = None
-    layers: Callable[[int], dict[str, Any]] | None = None
+    layers: Callable[[int, float], dict[str, Any]] | None = None
+    tracks: tuple[dict[str, Any], ...] = ()
     has: tuple[str, ...] = ()
     live: bool = False
     can_export: tuple[str, ...] = ()
@@ -157,7 +160,9 @@ class Server:
         return self.served.session
 
     async def state(self, request: web.Request) -> web.StreamResponse:
-        """All labels."""
+        """All labels, or all tracks of the results."""
+        if self.served.session is None:
+            return web.json_response({"seq": 0, "tracks": self.served.tracks})
         return web.json_response(self.session.everything())
 
     async def do(self, request: web.Request) -> web.StreamResponse:
@@ -199,7 +204,9 @@ class Server:
         i, layers = self.frame(request.match_info["i"]), self.served.layers
         if layers is None:
             return web.json_response({"labels": [], "detections": {}, "matches": {}})
-        return web.json_response(await self.in_thread(partial(layers, i)))
+        score = request.query.get("score", "0")
+        least = float(score) if re.fullmatch(r"[01](\.\d{1,9})?", score) else 0.0
+        return web.json_response(await self.in_thread(partial(layers, i, least)))
 
     async def silhouettes(self, request: web.Request) -> web.StreamResponse:
         """Of the seed and a candidate."""

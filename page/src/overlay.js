@@ -1,0 +1,146 @@
+// What is laid over the 3D view: handles of the selected box, names of boxes.
+
+import { axisOf, meetLevel, moveBy, moveFace, nearestOnLine, toWorld, turnBy } from "./boxmath.js";
+import { colourOfClass, shownBoxes } from "./colours.js";
+import { element, svg } from "./dom.js";
+import { commit, dropDraft, setDraft } from "./edits.js";
+import { project, rayAt } from "./picking.js";
+import { resultNames } from "./results.js";
+import { afterDrawing, controls } from "./scene.js";
+import { selectedBox, selectedTrack, store } from "./store.js";
+
+const layer = document.getElementById("handles");
+const names = document.getElementById("names");
+const FACES = [["+x", "front"], ["-x", "back"], ["+y", "left side"], ["-y", "right side"],
+               ["+z", "top"], ["-z", "bottom"]];
+const AXES = { x: 0, y: 1, z: 2 };
+
+const ring = svg("path", { class: "ring" });
+const stalk = svg("path", { class: "stalk" });
+const knob = svg("circle", { class: "handle turn", r: 7, "data-handle": "yaw" },
+  svg("title", {}, "Drag to turn"));
+const faces = FACES.map(([name, what]) => svg("circle", { class: "handle face", r: 6,
+  "data-handle": name }, svg("title", {}, `Drag to move the ${what} alone`)));
+layer.append(ring, stalk, ...faces, knob);
+
+const away = (box) => Math.hypot(box[3], box[4]) / 2 + 0.35;
+const path = (places) => places.some((p) => !p) ? "" : `M${places.map((p) => p.map((v) => v.toFixed(1)).join(" ")).join("L")}`;
+
+function place(handle, at) {
+  handle.style.display = at ? "" : "none";
+  if (at) {
+    handle.setAttribute("cx", at[0].toFixed(1));
+    handle.setAttribute("cy", at[1].toFixed(1));
+  }
+}
+
+function placeHandles() {
+  const box = store.mode === "label" && store.tool === "select" ? selectedBox()?.box : null;
+  layer.style.display = box ? "" : "none";
+  if (!box) return;
+  for (const [k, [name]] of FACES.entries()) {
+    const local = [0, 0, 0], axis = AXES[name[1]];
+    local[axis] = (name[0] === "+" ? 0.5 : -0.5) * box[3 + axis];
+    place(faces[k], project(...toWorld(box, ...local)));
+  }
+  const radius = away(box), low = -box[5] / 2, round = [];
+  for (let k = 0; k <= 40; k++) {
+    const angle = k / 40 * 2 * Math.PI;
+    round.push(project(...toWorld(box, radius * Math.cos(angle), radius * Math.sin(angle), low)));
+  }
+  ring.setAttribute("d", path(round));
+  const end = project(...toWorld(box, radius, 0, low));
+  stalk.setAttribute("d", path([project(...toWorld(box, box[3] / 2, 0, low)), end]));
+  place(knob, end);
+}
+
+function placeNames() {
+  const wanted = [];
+  const withTracks = store.mode === "label" || store.layers.tracks;
+  for (const { track, box } of withTracks ? shownBoxes() : []) {
+    const chosen = track.id === store.selected;
+    if (!store.names && !chosen && track.id !== store.hover) continue;
+    wanted.push({ box, chosen, colour: colourOfClass(track.class), state: track.state,
+                  text: `${track.id} ${track.class}` });
+  }
+  if (store.names) wanted.push(...resultNames());
+  while (names.children.length < wanted.length) names.append(element("div", { class: "name" }));
+  for (const [k, tag] of [...names.children].entries()) {
+    const entry = wanted[k];
+    const at = entry && project(entry.box[0], entry.box[1], entry.box[2] + entry.box[5] / 2);
+    tag.style.display = at ? "" : "none";
+    if (!at) continue;
+    if (tag.textContent !== entry.text) tag.textContent = entry.text;
+    tag.className = `name ${entry.state ?? ""}${entry.chosen ? " chosen" : ""}`;
+    tag.style.setProperty("--shade", entry.colour);
+    tag.style.transform = `translate(${at[0].toFixed(0)}px, ${at[1].toFixed(0)}px)`;
+  }
+}
+afterDrawing.push(placeHandles, placeNames);
+
+/** Follow the pointer from here on: move(event) for each step; commits at the end, Escape gives up. */
+export function follow(target, event, move) {
+  target.setPointerCapture(event.pointerId);
+  controls.enabled = false;
+  let given = false;
+  const step = (e) => { if (!given) move(e); };
+  const stop = (e) => {
+    target.removeEventListener("pointermove", step);
+    target.removeEventListener("pointerup", stop);
+    target.removeEventListener("pointercancel", stop);
+    removeEventListener("keydown", escape, true);
+    controls.enabled = true;
+    if (given || e.type === "pointercancel") dropDraft();
+    else commit();
+  };
+  const escape = (e) => {
+    if (e.key !== "Escape") return;
+    e.stopPropagation();
+    given = true;
+    dropDraft();
+  };
+  target.addEventListener("pointermove", step);
+  target.addEventListener("pointerup", stop);
+  target.addEventListener("pointercancel", stop);
+  addEventListener("keydown", escape, true);
+}
+
+/** Drag a face along its own axis, or the ring about the box. */
+layer.addEventListener("pointerdown", (event) => {
+  const name = event.target.dataset?.handle, start = selectedBox()?.box;
+  if (!name || !start || event.button !== 0) return;
+  event.preventDefault();
+  const from = rayAt(event.clientX, event.clientY);
+  if (name === "yaw") {
+    const low = start[2] - start[5] / 2;
+    follow(event.target, event, (e) => {
+      const { origin, direction } = rayAt(e.clientX, e.clientY), at = meetLevel(origin, direction, low);
+      if (at) setDraft(turnBy(start, Math.atan2(at[1] - start[1], at[0] - start[0]) - start[6]));
+    });
+    return;
+  }
+  const axis = AXES[name[1]], sign = name[0] === "+" ? 1 : -1;
+  const along = axisOf(start, axis).map((v) => v * sign);
+  const local = [0, 0, 0];
+  local[axis] = sign * start[3 + axis] / 2;
+  const centre = toWorld(start, ...local);
+  const first = nearestOnLine(centre, along, from.origin, from.direction);
+  follow(event.target, event, (e) => {
+    const { origin, direction } = rayAt(e.clientX, e.clientY);
+    const now = nearestOnLine(centre, along, origin, direction);
+    if (first !== null && now !== null) setDraft(moveFace(start, axis, sign, now - first));
+  });
+});
+
+/** Drag the body of the selected box over the level plane in which it was taken. */
+export function dragBody(target, event) {
+  const start = selectedBox()?.box, from = rayAt(event.clientX, event.clientY);
+  const first = meetLevel(from.origin, from.direction, start[2]);
+  if (!selectedTrack() || !first) return false;
+  follow(target, event, (e) => {
+    const { origin, direction } = rayAt(e.clientX, e.clientY);
+    const now = meetLevel(origin, direction, start[2]);
+    if (now) setDraft(moveBy(start, now[0] - first[0], now[1] - first[1], 0));
+  });
+  return true;
+}
