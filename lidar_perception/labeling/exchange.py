@@ -7,19 +7,35 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lidar_perception.data.frame import Frame
-from lidar_perception.labeling.formats import kitti_object, kitti_tracking, openlabel
+from lidar_perception.labeling.formats import (
+    bag,
+    kitti_object,
+    kitti_tracking,
+    labelcloud,
+    nuscenes,
+    openlabel,
+    sustech,
+)
 from lidar_perception.labeling.labels import DriveLabels
 from lidar_perception.types import InputError
 
 Read = Callable[[Path, Sequence[Frame]], DriveLabels]
-Write = Callable[[DriveLabels, Path, Sequence[Frame], bool], None]
+Write = Callable[..., None]  # labels, out, frames, force
 
 # Each reads the labels of a drive's frames at a path, and writes them to one, with force over what
 # is there. A new format is a file and a line here.
 FORMATS: dict[str, tuple[Read, Write]] = {
     "kitti_object": (kitti_object.read, kitti_object.write),
     "kitti_tracking": (kitti_tracking.read, kitti_tracking.write),
+    "nuscenes_detection": nuscenes.detection,
+    "nuscenes_tracking": nuscenes.tracking,
+    "labelcloud": labelcloud.absolute,
+    "labelcloud_rel": labelcloud.relative,
+    "labelcloud_vertices": labelcloud.vertices,
+    "sustech": (sustech.read, sustech.write),
     "openlabel": (openlabel.read, openlabel.write),
+    "bag": (bag.read, bag.write),
+    "bag_labels": (bag.read, bag.write_labels),
 }
 
 

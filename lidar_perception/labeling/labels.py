@@ -14,6 +14,7 @@ from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import CLASSES, GroundTruth, InputError
 
 NO_TRACK = -1
+OTHER = "Misc"  # of CLASSES, for those that it does not have
 SAME = 1e-4  # metres, radians: a box that moved by less is as it was read
 
 
@@ -101,14 +102,17 @@ def of_rows(frame: Frame, rows: Iterable[Row], notes: Iterable[tuple[str, dict[s
 
 
 def of_truth(name: str, stamp_ns: int, truth: GroundTruth | None) -> FrameLabels:
-    """The labels that a recording gives for a frame; none where it gives none."""
+    """The labels that a recording gives for a frame; none where it gives none. A class that
+    CLASSES does not have has the name that the recording gave it."""
     if truth is None:
         return FrameLabels.of(name, stamp_ns)
     extra = [dict(e) for e in truth.extras]
     ids = [e.pop("track_id", NO_TRACK) for e in extra]
     scores = [e.pop("score", np.nan) for e in extra]
-    return FrameLabels.of(name, stamp_ns, truth.boxes, truth.labels, ids, scores, extra,
-                          truth.notes)
+    classes = [e.pop("class_name", label) if label != OTHER else
+               e.pop("class_name", None) or e.get("detection_name") or label
+               for e, label in zip(extra, truth.labels)]
+    return FrameLabels.of(name, stamp_ns, truth.boxes, classes, ids, scores, extra, truth.notes)
 
 
 def to_truth(labels: FrameLabels) -> GroundTruth:
@@ -117,7 +121,7 @@ def to_truth(labels: FrameLabels) -> GroundTruth:
     for k, (name, extra) in enumerate(zip(labels.class_names, labels.extra)):
         known = {} if name in CLASSES else {"class_name": name}
         extras.append({**extra, **known, **ids_and_score(labels, k)})
-    ids = [CLASSES.index(n if n in CLASSES else "Misc") for n in labels.class_names]
+    ids = [CLASSES.index(n if n in CLASSES else OTHER) for n in labels.class_names]
     return GroundTruth.of(labels.boxes, ids, extras, labels.notes)
 
 

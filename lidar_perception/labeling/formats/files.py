@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,19 @@ def check_all_known(folder: Path, known: Sequence[Path], suffix: str,
     if not there:
         raise InputError(f"{folder} has no label file (*{suffix}); those of this drive would be "
                          f"named like {example}")
+
+
+def track_numbers(names: Iterable[str]) -> dict[str, int]:
+    """A track id for each name: its number where it is one, else one behind all of these."""
+    known = sorted(set(names))
+    found = {name: int(name) for name in known if is_number(name)}
+    following = itertools.count(max([0, *found.values()]) + 1)
+    return found | {name: next(following) for name in known if name not in found}
+
+
+def is_number(name: str) -> bool:
+    """Whether a track id is written as it would be as a number."""
+    return name.isascii() and name.isdigit() and len(name) < 19 and name == str(int(name))
 
 
 def read_json(path: Path) -> Any:

@@ -20,8 +20,10 @@ from lidar_perception.labeling.formats.files import (
     check_all_known,
     drive_files,
     in_file,
+    is_number,
     read_json,
     sequences_of,
+    track_numbers,
     write_json,
 )
 from lidar_perception.labeling.formats.openlabel_parts import (
@@ -29,7 +31,6 @@ from lidar_perception.labeling.formats.openlabel_parts import (
     coordinate_systems,
     from_named,
     intervals,
-    is_number,
     lidar_of,
     named,
     quaternion,
@@ -82,11 +83,8 @@ def _read_drive(content: dict[str, Any], frames: list[Frame], where: str) -> lis
         raise InputError(f"{where} has the frame {strange[0]!r} ({len(strange)} such), and the "
                          f"drive has {frames[0].index} to {frames[-1].index}; give the drive that "
                          "was labelled")
-    # Numbers are ids as they are; other names, such as UUIDs, are numbered behind them.
-    names = list(objects) + [uid for frame in said.values() for uid in frame.get("objects", {})]
-    numbers = {uid: int(uid) for uid in names if is_number(uid)}
-    following = itertools.count(max([0, *numbers.values()]) + 1)
-    numbers |= {uid: next(following) for uid in dict.fromkeys(names) if uid not in numbers}
+    numbers = track_numbers([*objects, *(uid for frame in said.values()
+                                         for uid in frame.get("objects", {}))])
     found = []
     for frame in frames:
         here = said.get(str(frame.index), {})

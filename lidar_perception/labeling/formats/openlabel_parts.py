@@ -173,11 +173,6 @@ KINDS = {"boolean": lambda v: isinstance(v, bool), "num": _number,
          "vec": lambda v: isinstance(v, list) and len(v) > 0 and all(map(_number, v))}
 
 
-def is_number(uid: str) -> bool:
-    """Whether the id of an object is a number, and no UUID."""
-    return uid.isascii() and uid.isdigit() and len(uid) < 19
-
-
 def intervals(numbers: list[int]) -> list[dict[str, int]]:
     """Runs of numbers without a gap."""
     found: list[dict[str, int]] = []
