@@ -38,7 +38,7 @@ NO_SCORE = -1.0    # as nuscenes-devkit writes labels
 OURS = {**CLASS_OF, **{theirs: ours for ours, theirs in DETECTED.items()}}
 THEIRS = {ours: theirs for theirs, ours in OURS.items()}
 # What is ours with a rider, and theirs also without one.
-WITH_RIDER, NOT_RIDDEN = OURS.keys() - CLASS_OF.keys(), "cycle.without_rider"
+RIDDEN, NOT_RIDDEN = OURS.keys() - CLASS_OF.keys(), "cycle.without_rider"
 OWN = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id",
        "attribute_name"}
 
@@ -130,9 +130,9 @@ def _columns(task: str, labels: FrameLabels, k: int, frame: Frame,
     kind, track = labels.class_names[k], int(labels.track_ids[k])
     extra = dict(labels.extra[k])
     attribute = extra.pop("attribute", None) or ""
-    if kind in WITH_RIDER:
+    if kind in RIDDEN:
         attribute = NOT_RIDDEN
-    elif THEIRS.get(kind) in WITH_RIDER and attribute == NOT_RIDDEN:
+    elif THEIRS.get(kind) in RIDDEN and attribute == NOT_RIDDEN:
         attribute = ""  # a person said otherwise
     said = extra.pop("tracking_id", None)
     columns = {"velocity": extra.pop("velocity", velocity), "attribute_name": attribute,
