@@ -149,7 +149,8 @@ def recorded(path: Path, stamps: list[int]) -> Results:
             objects = from_marker_array(message)
             found[topic][objects.stamp_ns] = objects
     numbers = {stamp: i for i, stamp in enumerate(stamps)}
-    sources, tracks = {}, []
+    sources: dict[str, Source] = {}
+    tracks: list[dict[str, Any]] = []
     for topic, by_stamp in found.items():
         frames = {numbers[stamp]: each for stamp, each in by_stamp.items() if stamp in numbers}
         if topic.endswith(TRACKS):
