@@ -36,7 +36,11 @@ MAX_NAME = 100                    # characters of a class
 def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
     """The next state, and what changed. InputError, in one line for a person, for an action that
     cannot be done; the state stays as it was."""
-    name = action.get("do")
+    name, motion = action.get("do"), motion_of(state, motion)
+    if name == "poses":  # knowledge, not an edit: it is not undone
+        poses = tuple(tuple(map(float, row)) for row in action["poses"])
+        return replace(state, poses=poses, seq=state.seq + 1), Change(
+            {}, (state.seeds, state.seeds), (state.checked, state.checked))
     if name == "undo" or name == "redo":
         return _back(state) if name == "undo" else _forth(state)
     if name not in DO:
@@ -48,6 +52,13 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
                     (state.seeds, seeds), (state.checked, checked))
     after = replace(state.after(change), seq=state.seq + 1, done=(change, state.done), undone=None)
     return after, change
+
+
+def motion_of(state: State, motion: Motion) -> Motion:
+    """The drive's own, or with the poses that were found by the scans."""
+    if motion.poses is not None or len(state.poses) != len(motion.times):
+        return motion
+    return Motion(motion.times, np.array(state.poses, np.float64).reshape(-1, 4, 4))
 
 
 def _back(state: State) -> tuple[State, Change]:
@@ -217,7 +228,8 @@ def _accept(state: State, action: Action, motion: Motion) -> Made:
 
 def _reject(state: State, action: Action, motion: Motion) -> Made:
     track = track_of(state, action.get("track"))
-    return {track.id: replace(track, state=REJECTED)}, _without(state.seeds, track.id), state.checked
+    seeds = _without(state.seeds, track.id)
+    return {track.id: replace(track, state=REJECTED)}, seeds, state.checked
 
 
 def _reopen(state: State, action: Action, motion: Motion) -> Made:

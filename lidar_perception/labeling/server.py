@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import logging
 import re
 import secrets
 import signal
@@ -17,12 +18,14 @@ from typing import Any
 
 from aiohttp import WSMsgType, web
 
+from lidar_perception.labeling.actions import track_of
 from lidar_perception.labeling.drive import Drive, classes
 from lidar_perception.labeling.session import Session
 from lidar_perception.labeling.state import next_uncertain
 from lidar_perception.runs.files import short
 from lidar_perception.types import InputError
 
+LOG = logging.getLogger(__name__)
 HOSTS = ("127.0.0.1", "localhost")
 PAGE = Path(__file__).with_name("page")
 MAX_REQUEST = 10**7     # bytes
@@ -88,6 +91,9 @@ class Server:
             response = _error(400, str(error))
         except web.HTTPException as error:
             response = _error(error.status, error.reason)
+        except Exception as error:  # ours; the page is told, and the labels are as the journal has
+            LOG.exception("%s %s", request.method, request.path)  # them
+            response = _error(500, f"this failed: {type(error).__name__}: {short(error)}")
         if not response.prepared:
             response.headers.update(HEADERS)
         return response
@@ -109,7 +115,7 @@ class Server:
     async def drive(self, request: web.Request) -> web.StreamResponse:
         """What is looked at."""
         served, drive = self.served, self.served.drive
-        poses = drive.motion.poses
+        poses = (served.session or drive).motion.poses
         frames = [{"name": f.name, "stamp_ns": f.stamp_ns, "sequence": f.sequence,
                    "pose": None if poses is None else poses[i].ravel().tolist()}
                   for i, f in enumerate(drive.frames)]
@@ -204,12 +210,19 @@ class Server:
 
     async def silhouettes(self, request: web.Request) -> web.StreamResponse:
         """Of the seed and a candidate."""
-        return _error(404, "there is no seed yet")
+        made = self.session
+        track = track_of(made.state, _number(request.query.get("track", "")))
+        frame = self.frame(request.query.get("frame", ""))
+        try:
+            return web.json_response(await self.in_thread(partial(
+                made.proposer.silhouettes, made.state, track, frame)))
+        except InputError as error:
+            return _error(404, str(error))
 
     async def next(self, request: web.Request) -> web.StreamResponse:
         """The next uncertain track."""
-        after = request.query.get("after", "")
-        track = next_uncertain(self.session.state, int(after) if after.isdigit() else None)
+        after = _number(request.query.get("after", ""))
+        track = next_uncertain(self.session.state, after)
         return web.json_response({"track": track and track.id,
                                   "frame": track.nearest_frame() if track else 0})
 
@@ -222,6 +235,10 @@ class Server:
             raise InputError("an export needs a format and out, the name of a folder")
         return web.json_response(await self.in_thread(partial(
             export, asked["format"], asked["out"], asked.get("force") is True)))
+
+
+def _number(text: str) -> int | None:
+    return int(text[:18]) if text.isascii() and text.isdigit() else None
 
 
 def _cookie(request: web.Request) -> str:

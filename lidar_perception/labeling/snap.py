@@ -32,7 +32,7 @@ def to_cluster(scan: Scan, box: Array) -> Array:
     """(7,) the L-shape of the cluster in a box (7,), headed as that is. InputError where no cluster
     is in it."""
     near = points_in_box(scan.xyz, box, MARGIN) & (scan.cluster_ids > 0)
-    counts = np.bincount(scan.cluster_ids[near])
+    counts = np.bincount(scan.cluster_ids[near], minlength=scan.cluster_ids.max(initial=0) + 1)
     if not counts.any():
         raise InputError("there is no cluster in the box; move it onto one")
     return headed(_around(scan, near & (counts[scan.cluster_ids] >= PIECE * counts.max())), box[6])

@@ -81,13 +81,14 @@ Stack = tuple[Change, Any] | None      # a change, and the stack below it: share
 @dataclass(frozen=True)
 class State:
     """seq: number of the last action; next_id: no track ever had it; done and undone: what can be
-    undone and redone."""
+    undone and redone; poses: (F, 16) of the sensor by the scans, where the drive has none."""
 
     tracks: Mapping[int, Track] = field(default_factory=dict)
     seeds: Seeds = ()
     checked: frozenset[int] = frozenset()
     seq: int = 0
     next_id: int = 1
+    poses: tuple[tuple[float, ...], ...] = ()
     done: Stack = None
     undone: Stack = None
 
