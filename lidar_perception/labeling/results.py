@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.camera import Camera
-from lidar_perception.classes import CLASSES, DETECTED, TABLE
+from lidar_perception.classes import CLASSES, DETECTED, PEDESTRIAN, TABLE
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.results import read_results
@@ -85,7 +85,7 @@ def compared(truth: GroundTruth, found: Detections, min_score: float, camera: Ca
         boxes, others = found.boxes[rows].astype(np.float64), truth.boxes[alike]
         share = bev_iou(boxes, others)
         hit = share >= DETECTED[name].relaxed
-        if name == "Pedestrian":
+        if name == CLASSES[PEDESTRIAN]:
             far = np.linalg.norm(boxes[:, None, :2] - others[None, :, :2], axis=2)
             hit |= far <= MAX_CENTRE_DISTANCE
         i, j = one_to_one(1.0 - share, hit) if hit.size else (np.zeros(0, int), np.zeros(0, int))
