@@ -94,6 +94,7 @@ function showProgress() {
   by("bar-left").style.flexGrow = tracks ? left : 1;
   by("progress-text").textContent = `${left} left · ${accepted} accepted · ${rejected} rejected · `
     + `${checked} of ${frames} frames checked`;
+  if (by("busy").hidden !== !busy) changed("busy");
   by("busy").hidden = !busy;
   if (busy) {
     by("busy").textContent = `${busy.what} ${busy.done} of ${busy.of}`;

@@ -60,8 +60,8 @@ def labels(drive_bag, tmp_path_factory):
     """The labelling of a drive, at the address that stays the same when its server is started
     again."""
     out, port = tmp_path_factory.mktemp("labels"), free_port()
-    arguments = ("label", "--data", str(drive_bag), "--out", str(out), "--no-open", "--port",
-                 str(port))
+    arguments = ("label", "--data", str(drive_bag), "--out", str(out), "--no-open", "--no-propose",
+                 "--port", str(port))
     with serving(*arguments) as (process, url):
         yield Label(process, url, out, arguments)
 
@@ -237,8 +237,8 @@ def test_a_killed_server_loses_nothing(page, browser, labels, person):
 
 
 def test_a_wrong_token_and_another_host_are_refused(drive_bag, tmp_path):
-    with serving("label", "--data", str(drive_bag), "--out", str(tmp_path), "--no-open"
-                 ) as (_, url):
+    with serving("label", "--data", str(drive_bag), "--out", str(tmp_path), "--no-open",
+                 "--no-propose") as (_, url):
         plain = url.partition("?")[0]
         for address, headers in ((plain, {}), (f"{plain}?token=x", {}),
                                  (url, {"Host": "example.org"})):
