@@ -35,8 +35,8 @@ STRANGERS = {
     "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils", "lz4", "zstandard"],
     "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,
     "detectors": [*NUMBERS, "torch", "safetensors", "onnx", "onnxruntime", "onnxscript"],
-    "tracking": ["numpy", "scipy", "kiss_icp"], "labeling": ["numpy", "aiohttp", "msg_utils"],
-    "params": [],
+    "tracking": ["numpy", "scipy", "kiss_icp"],
+    "labeling": ["numpy", "aiohttp", "msg_utils"], "params": [],
 }
 
 

@@ -44,6 +44,7 @@ def label(data: Path, sequence: str | None, out: Path | None, port: int, browser
 
     from lidar_perception.detectors.open import FUSED
     from lidar_perception.labeling.drive import one_drive
+    from lidar_perception.labeling.exchange import FORMATS
     from lidar_perception.labeling.server import Served, serve
     from lidar_perception.labeling.session import session
 
@@ -61,7 +62,8 @@ def label(data: Path, sequence: str | None, out: Path | None, port: int, browser
                 made.do({"do": "propose"})
             if browser:
                 webbrowser.open(url)
-        served = Served(drive, made, _labels(drive) if show_labels else None)
+        served = Served(drive, made, _labels(drive) if show_labels else None,
+                        can_export=tuple(FORMATS), export=made.export)
         asyncio.run(serve(served, port, started))
 
 

@@ -40,7 +40,8 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
     if name == "poses":  # knowledge, not an edit: it is not undone
         poses = tuple(tuple(map(float, row)) for row in action["poses"])
         return replace(state, poses=poses, seq=state.seq + 1), Change(
-            {}, (state.seeds, state.seeds), (state.checked, state.checked))
+            {}, (state.seeds, state.seeds), (state.checked, state.checked),
+            (state.kept, state.kept))
     if name == "undo" or name == "redo":
         return _back(state) if name == "undo" else _forth(state)
     if name not in DO:
@@ -49,7 +50,9 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
     tracks, seeds, checked = DO[name](state, action, motion)
     change = Change({n: (state.tracks.get(n), track) for n, track in tracks.items()
                      if state.tracks.get(n) != track},
-                    (state.seeds, seeds), (state.checked, checked))
+                    (state.seeds, seeds), (state.checked, checked),
+                    (state.kept, action.get("kept", state.kept) if name == "import"
+                     else state.kept))
     after = replace(state.after(change), seq=state.seq + 1, done=(change, state.done), undone=None)
     return after, change
 

@@ -25,8 +25,10 @@ from lidar_perception.labeling.actions import (
     track_of,
 )
 from lidar_perception.labeling.drive import Drive
+from lidar_perception.labeling.exchange import export_labels, import_labels, recognised
 from lidar_perception.labeling.interpolation import Motion
 from lidar_perception.labeling.journal import Journal, header, opened
+from lidar_perception.labeling.labelled import from_labels, to_labels
 from lidar_perception.labeling.proposing import Proposer
 from lidar_perception.labeling.snap import around_click, to_cluster, to_ground, to_size
 from lidar_perception.labeling.state import (
@@ -126,11 +128,31 @@ class Session:
             return self._seeded(action)
         if name == "snap":
             return {**action, "box": rounded(self._snapped(action))}
+        if name == "import":
+            return self._imported(action)
         if name == "accept":
             track = track_of(self.state, action.get("track"))
             if track.class_name == CLASSES[PEDESTRIAN] and track.boxes:
                 return {**action, "seed": track.nearest_frame()}
         return action
+
+    def _imported(self, action: Action) -> Action:
+        path, named = action.get("path"), action.get("format") or None
+        if not isinstance(path, str) or not isinstance(named, str | None):
+            raise InputError("an import needs the path of labels, and may name their format")
+        labels = import_labels(Path(path), named or recognised(Path(path)), self.drive.frames)
+        tracks, kept = from_labels(labels, self.state.next_id)
+        return {**action, "tracks": [track_to_json(t) for t in tracks], "kept": kept}
+
+    def export(self, named: str, out: str, force: bool = False) -> dict[str, Any]:
+        """Write the accepted tracks in a format of exchange.FORMATS, to a path or, by its name,
+        into the journal's folder; as /api/export has it. InputError where that cannot be."""
+        path = Path(out).expanduser()
+        if not out or ".." in path.parts:
+            raise InputError(f"{out!r} is no name for an export; give one without '..'")
+        written = export_labels(to_labels(self.state, self.drive.frames), named,
+                                self.journal.path.parent / path, self.drive.frames, force)
+        return {"path": str(written.path), "boxes": written.boxes, "frames": written.frames}
 
     def _seeded(self, action: Action) -> Action:
         frame, named = frame_of(action, self.drive.motion), class_of(action)
@@ -171,7 +193,7 @@ class Session:
     def _tell(self, action: Action, change: Change, by: str) -> None:
         tracks = [track_to_json(track) for _, track in change.tracks.values() if track]
         removed = [n for n, (_, track) in change.tracks.items() if track is None]
-        named = {k: v for k, v in action.items() if k not in ("tracks", "removed", "poses")
+        named = {k: v for k, v in action.items() if k not in ("tracks", "removed", "poses", "kept")
                  or action["do"] == "merge"}
         self.tell({"seq": self.state.seq, "by": by, "action": named, "tracks": tracks,
                    "removed": removed, **self.summary()})
@@ -204,7 +226,8 @@ def _asked(action: Mapping[str, Any]) -> Action:
     if action.get("do") == "poses":
         raise InputError("poses come from the drive")
     computed = {"seed": ("track", "tracks", "removed"), "propose": ("tracks", "removed"),
-                "import": ("tracks", "removed"), "accept": ("seed",), "snap": ("box",)}
+                "import": ("tracks", "removed", "kept"),
+                "accept": ("seed",), "snap": ("box",)}
     unwanted = ("seq", "time", "by", *computed.get(str(action.get("do")), ()))
     return {k: v for k, v in action.items() if k not in unwanted}
 

@@ -62,19 +62,21 @@ class Track:
 
 class Change(NamedTuple):
     """What one action changed, before and after: tracks by id (None: not there), seeds, checked
-    frames."""
+    frames, what imported files said besides."""
 
     tracks: Mapping[int, tuple[Track | None, Track | None]]
     seeds: tuple[Seeds, Seeds]
     checked: tuple[frozenset[int], frozenset[int]]
+    kept: tuple[Kept, Kept]
 
     def turned_round(self) -> Change:
         """The change that takes it back."""
         return Change({k: (after, before) for k, (before, after) in self.tracks.items()},
-                      self.seeds[::-1], self.checked[::-1])
+                      self.seeds[::-1], self.checked[::-1], self.kept[::-1])
 
 
 Seeds = tuple[tuple[int, int], ...]    # (frame, track id)
+Kept = Mapping[str, Any]               # "notes" by frame, "extra": see labelled.py
 Stack = tuple[Change, Any] | None      # a change, and the stack below it: shared between states
 
 
@@ -88,6 +90,7 @@ class State:
     checked: frozenset[int] = frozenset()
     seq: int = 0
     next_id: int = 1
+    kept: Kept = field(default_factory=dict)
     poses: tuple[tuple[float, ...], ...] = ()
     done: Stack = None
     undone: Stack = None
@@ -101,6 +104,7 @@ class State:
             else:
                 tracks[number] = track
         return replace(self, tracks=tracks, seeds=change.seeds[1], checked=change.checked[1],
+                       kept=change.kept[1],
                        next_id=max(self.next_id, *(n + 1 for n in change.tracks), 1))
 
 
