@@ -77,10 +77,11 @@ function showDrive() {
   by("drive").textContent = name;
   by("drive").title = path;
   by("layout").textContent = `${layout} · ${frames.length} frame${frames.length === 1 ? "" : "s"}`;
-  for (const id of ["export-format", "import-format"]) {
-    by(id).replaceChildren(...(formats ?? []).map((format) =>
-      element("option", { value: format }, format.replaceAll("_", " "))));
-  }
+  const choices = () => (formats ?? []).map((format) =>
+    element("option", { value: format }, format.replaceAll("_", " ")));
+  by("export-format").replaceChildren(...choices());
+  by("import-format").replaceChildren(element("option", { value: "" }, "as it is recognised"),
+                                      ...choices());
 }
 
 function showProgress() {

@@ -204,6 +204,24 @@ def test_what_cannot_be_saved_is_said_and_goes_back(page, labels, person):
     page.wait_for_function("() => Number(document.getElementById('field-length').value) > 0")
 
 
+def test_an_export_is_written_and_nothing_is_written_over_it(page, labels, person):
+    number = labels.chosen(page, person)
+    page.keyboard.press("a")
+    labels.wait(page, number, lambda t: t["state"] == "accepted")
+    for replace, wrong in ((False, False), (False, True), (True, False)):
+        page.click("#export")
+        page.select_option("#export-format", "openlabel")
+        page.fill("#export-out", "labels.json")
+        page.set_checked("#export-force", replace)
+        page.click("#export-form button.primary")
+        if wrong:
+            page.wait_for_function("() => document.getElementById('export-error').textContent")
+            page.click("#export-dialog [data-close]")
+        else:
+            page.wait_for_selector("#export-dialog", state="hidden")
+    assert "openlabel" in json.loads((labels.out / "labels.json").read_text())
+
+
 def test_help_lists_the_keys_and_needs_no_mouse(page):
     page.keyboard.press("?")
     page.wait_for_selector("#help[open]")
