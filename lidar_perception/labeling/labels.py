@@ -83,6 +83,10 @@ class DriveLabels:
     def __len__(self) -> int:
         return len(self.frames)
 
+    def first(self, count: int) -> DriveLabels:
+        """Those of the first frames."""
+        return DriveLabels(self.frames[:count], self.extra)
+
     @property
     def boxes(self) -> int:
         """How many there are in all frames."""

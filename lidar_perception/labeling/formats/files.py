@@ -5,15 +5,17 @@ from __future__ import annotations
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from lidar_perception.data.frame import Frame
+from lidar_perception.labeling.labels import NO_TRACK, FrameLabels
 from lidar_perception.runs.files import read_text, write_text
 from lidar_perception.types import InputError
 
 MAX_BYTES = 2**30  # of a file of labels
+KEPT = "kept"
 
 
 def sequences_of(frames: Sequence[Frame]) -> dict[str, list[int]]:
@@ -63,12 +65,41 @@ def check_all_known(folder: Path, known: Sequence[Path], suffix: str,
                          f"named like {example}")
 
 
+def beside(extra: dict[str, Any], own: Collection[str]) -> dict[str, Any]:
+    """What else is known of a box as further fields of a format; under KEPT what would take the
+    place of one of its own."""
+    taken = {key: value for key, value in extra.items() if key in own or key == KEPT}
+    return {**{key: value for key, value in extra.items() if key not in taken},
+            **({KEPT: taken} if taken else {})}
+
+
+def extra_of(item: dict[str, Any], own: Collection[str]) -> dict[str, Any]:
+    """The inverse of beside()."""
+    kept = item.get(KEPT)
+    rest = {key: value for key, value in item.items() if key not in own}
+    return {**rest, **rest.pop(KEPT)} if isinstance(kept, dict) else rest
+
+
 def track_numbers(names: Iterable[str]) -> dict[str, int]:
     """A track id for each name: its number where it is one, else one behind all of these."""
     known = sorted(set(names))
     found = {name: int(name) for name in known if is_number(name)}
     following = itertools.count(max([0, *found.values()]) + 1)
     return found | {name: next(following) for name in known if name not in found}
+
+
+def track_names(frames: Iterable[FrameLabels], key: str) -> dict[int, str]:
+    """The names that tracks had in a file, which are under `key` in extra: each for one track, so
+    that the parts of a track that was split are two."""
+    found: dict[int, str] = {}
+    taken = set()
+    for each in frames:
+        for track, extra in zip(each.track_ids.tolist(), each.extra):
+            name = extra.get(key)
+            if track != NO_TRACK and track not in found and name is not None and name not in taken:
+                found[track] = str(name)
+                taken.add(name)
+    return found
 
 
 def is_number(name: str) -> bool:

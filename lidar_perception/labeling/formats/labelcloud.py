@@ -21,7 +21,9 @@ import numpy as np
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import box_corners
 from lidar_perception.labeling.formats.files import (
+    beside,
     check_all_known,
+    extra_of,
     frame_files,
     in_file,
     read_json,
@@ -43,7 +45,8 @@ ROOT, CLASSES_FILE, SUFFIX = "labelcloud", "_classes.json", ".json"
 DECIMALS = 8
 CORNERS = [2, 1, 0, 3, 6, 5, 4, 7]  # of geometry.box_corners
 ABSOLUTE, RELATIVE, VERTICES = KINDS = "centroid_abs", "centroid_rel", "vertices"
-OWN = {"name", "centroid", "dimensions", "rotations", "vertices", "track_id", "score", "tilted"}
+TILTED = "labelcloud_tilted"
+OWN = {"name", "centroid", "dimensions", "rotations", "vertices", "track_id", "score"}
 
 
 def _read(kind: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
@@ -68,11 +71,11 @@ def _read(kind: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
 def _rows(content: dict[str, Any], kind: str) -> list[Row]:
     rows: list[Row] = []
     for item in content["objects"]:
-        extra = {key: value for key, value in item.items() if key not in OWN}
+        extra = extra_of(item, OWN)
         shape = {key: item[key] for key in ("rotations", "vertices") if key in item}
         box, tilted = _box(item, kind)
         if tilted:
-            extra["tilted"] = {**shape, "unit": kind, "box": box}
+            extra[TILTED] = {**shape, "unit": kind, "box": box}
         rows.append((box, str(item["name"]), int(item.get("track_id", NO_TRACK)),
                      float(item.get("score", math.nan)), extra))
     return rows
@@ -119,7 +122,7 @@ def _write(kind: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
 def _object(labels: FrameLabels, k: int, kind: str) -> dict[str, Any]:
     box, extra = labels.boxes[k], dict(labels.extra[k])
     x, y, z, length, width, height, _ = box.round(DECIMALS).tolist()
-    kept = extra.pop("tilted", None)
+    kept = extra.pop(TILTED, None)
     shape: dict[str, Any]
     if kept and kept["unit"] == kind and unchanged(box, kept["box"]):
         shape = {key: kept[key] for key in ("rotations", "vertices") if key in kept}
@@ -132,7 +135,8 @@ def _object(labels: FrameLabels, k: int, kind: str) -> dict[str, Any]:
     if kind != VERTICES:
         shape = {"centroid": {"x": x, "y": y, "z": z},
                  "dimensions": {"length": length, "width": width, "height": height}, **shape}
-    return {**extra, "name": labels.class_names[k], **shape, **ids_and_score(labels, k)}
+    return {**beside(extra, OWN), "name": labels.class_names[k], **shape,
+            **ids_and_score(labels, k)}
 
 
 def _color(name: str) -> str:

@@ -21,7 +21,14 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.nuscenes.boxes import GlobalBoxes, in_frame, in_global
 from lidar_perception.data.nuscenes.labels import CLASS_OF
 from lidar_perception.data.nuscenes.results import DETECTED, META, places
-from lidar_perception.labeling.formats.files import in_file, read_json, track_numbers
+from lidar_perception.labeling.formats.files import (
+    beside,
+    extra_of,
+    in_file,
+    read_json,
+    track_names,
+    track_numbers,
+)
 from lidar_perception.labeling.labels import (
     NO_TRACK,
     DriveLabels,
@@ -77,8 +84,7 @@ def _rows(task: str, frame: Frame, boxes: list[dict[str, Any]], ids: dict[str, i
     rows: list[Row] = []
     for row in boxes:
         kind, attribute = str(row[f"{task}_name"]), row.get("attribute_name", "")
-        rest = {key: value for key, value in row.items()
-                if key not in OWN and key not in (f"{task}_name", f"{task}_score")}
+        rest = extra_of(row, OWN | {f"{task}_name", f"{task}_score"})
         if attribute:
             rest["attribute"] = attribute
         if (velocity := _finite(row.get("velocity"))) is not None:
@@ -114,18 +120,18 @@ def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
     """out: one JSON file. Velocities that the labels do not have are those of the tracks, from
     frame to frame; NaN, which nuscenes-devkit reads, where there is none."""
     check_free(out, force)
-    speeds = _velocities(labels, frames)
+    speeds, names = _velocities(labels, frames), track_names(labels.frames, "tracking_id")
     results = {}
     for i, (each, frame) in enumerate(zip(labels.frames, frames)):
         placed = places(_token(frame), *in_global(each.boxes, _pose(frame))) if len(each) else []
         results[_token(frame)] = [
-            {**place, **_columns(task, each, k, frame, speeds.get((i, k), [np.nan, np.nan]))}
+            {**place, **_columns(task, each, k, frame, speeds.get((i, k), [np.nan] * 2), names)}
             for k, place in enumerate(placed)]
     write_text(out, json.dumps({"meta": META, **labels.extra.get(ROOT, {}), "results": results}))
 
 
 def _columns(task: str, labels: FrameLabels, k: int, frame: Frame,
-             velocity: list[float]) -> dict[str, Any]:
+             velocity: list[float], names: dict[int, str]) -> dict[str, Any]:
     """What else a box says, see _write."""
     kind, track = labels.class_names[k], int(labels.track_ids[k])
     extra = dict(labels.extra[k])
@@ -134,21 +140,22 @@ def _columns(task: str, labels: FrameLabels, k: int, frame: Frame,
         attribute = NOT_RIDDEN
     elif THEIRS.get(kind) in RIDDEN and attribute == NOT_RIDDEN:
         attribute = ""  # a person said otherwise
-    said = extra.pop("tracking_id", None)
+    extra.pop("tracking_id", None)
     columns = {"velocity": extra.pop("velocity", velocity), "attribute_name": attribute,
                f"{task}_name": THEIRS.get(kind, kind),
                f"{task}_score": (float(labels.scores[k]) if np.isfinite(labels.scores[k])
                                  else NO_SCORE)}
     if task == "tracking" or track != NO_TRACK:
-        columns["tracking_id"] = str(said or ("" if track == NO_TRACK else track))
-    rotation = extra.pop("rotation", None)
+        columns["tracking_id"] = "" if track == NO_TRACK else names.get(track, str(track))
+    rotation = extra.get("rotation")
     if isinstance(rotation, list) and len(rotation) == 4:
+        del extra["rotation"]
         box = labels.boxes[k].tolist()
         centre, size, _ = in_global(np.array([box]), _pose(frame))
         place = {"translation": centre[0], "size": size[0][[1, 0, 2]], "rotation": rotation}
         if unchanged(box, _in_frame(place, _pose(frame))[0]):
             columns["rotation"] = rotation
-    return {**extra, **columns}
+    return {**beside(extra, OWN | columns.keys()), **columns}
 
 
 def _velocities(labels: DriveLabels, frames: Sequence[Frame]) -> dict[tuple[int, int], list[float]]:

@@ -23,6 +23,7 @@ from lidar_perception.labeling.formats.files import (
     is_number,
     read_json,
     sequences_of,
+    track_names,
     track_numbers,
     write_json,
 )
@@ -145,9 +146,10 @@ def _content(labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[i
              kept: dict[str, Any]) -> dict[str, Any]:
     """kept: what was read from such a file, but for its boxes."""
     own = [(frames[i], labels.frames[i]) for i in positions]
+    named_tracks = track_names((each for _, each in own), UID)
     used = {str(i) for _, each in own for i in each.track_ids.tolist()} | {
-        str(extra[UID]) for _, each in own
-        for extra in [*each.extra, *(note for _, note in each.notes)] if UID in extra}
+        *named_tracks.values(), *(str(note[UID]) for _, each in own for _, note in each.notes
+                                  if UID in note)}
     objects = {uid: dict(o) for uid, o in kept.get("objects", {}).items()  # used, or of no frame
                if uid in used or not o.get("frame_intervals")}
     systems = kept if kept.get("coordinate_systems") else coordinate_systems(
@@ -171,7 +173,7 @@ def _content(labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[i
             "timestamp": f"{frame.stamp_ns / 1e9:.9f}", "name": frame.name}}
         for k, (kind, extra) in enumerate(zip(each.class_names, each.extra)):
             track = int(each.track_ids[k])
-            uid = str(extra.get(UID, next(new) if track == NO_TRACK else track))
+            uid = named_tracks.get(track, str(next(new) if track == NO_TRACK else track))
             data = element(uid, kind, frame.index)
             data |= {key: value for key, value in extra.get(OBJECT, {}).items() if key not in data}
             data.setdefault(KEPT, []).append(_cuboid(each, k, objects[uid]["type"], lidar))

@@ -15,10 +15,13 @@ from typing import Any
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.labeling.formats.files import (
+    beside,
     check_all_known,
+    extra_of,
     frame_files,
     in_file,
     read_json,
+    track_names,
     track_numbers,
     write_json,
 )
@@ -34,6 +37,7 @@ from lidar_perception.labeling.labels import (
 from lidar_perception.runs.files import whole_folder
 
 SUFFIX = ".json"
+TILTED = "sustech_tilted"
 OWN = {"psr", "obj_type", "obj_id", "score"}
 
 
@@ -66,9 +70,9 @@ def _rows(content: list[dict[str, Any]], ids: dict[str, int]) -> list[Row]:
             math.cos(x) * math.sin(z) + math.sin(x) * math.sin(y) * math.cos(z),
             math.cos(y) * math.cos(z))
         box = [*position, *scale, math.remainder(yaw, math.tau)]
-        extra = {key: value for key, value in item.items() if key not in OWN}
+        extra = extra_of(item, OWN)
         if not upright:
-            extra["tilted"] = {"rotation": item["psr"]["rotation"], "box": box}
+            extra[TILTED] = {"rotation": item["psr"]["rotation"], "box": box}
         name = str(item.get("obj_id", ""))
         track = ids.get(name, NO_TRACK)
         if name and name != str(track):
@@ -80,19 +84,21 @@ def _rows(content: list[dict[str, Any]], ids: dict[str, int]) -> list[Row]:
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
     """out: a folder, for FRAME.json of each frame."""
+    names = track_names(labels.frames, "obj_id")
     with whole_folder(out, force) as folder:
         for each, file in zip(labels.frames, frame_files(folder, frames, SUFFIX)):
-            write_json(file, [_object(each, k) for k in range(len(each))], 1)
+            write_json(file, [_object(each, k, names) for k in range(len(each))], 1)
 
 
-def _object(labels: FrameLabels, k: int) -> dict[str, Any]:
+def _object(labels: FrameLabels, k: int, names: dict[int, str]) -> dict[str, Any]:
     box, extra = labels.boxes[k], dict(labels.extra[k])
     known = ids_and_score(labels, k)
-    tilted, name = extra.pop("tilted", None), extra.pop("obj_id", None)
+    tilted, _ = extra.pop(TILTED, None), extra.pop("obj_id", None)
+    track = known.pop("track_id", "")
     rotation = {"x": 0, "y": 0, "z": float(box[6])}
-    if tilted and "rotation" in tilted and unchanged(box, tilted["box"]):
+    if tilted and unchanged(box, tilted["box"]):
         rotation = tilted["rotation"]
     psr = {"position": dict(zip("xyz", box[:3].tolist())),
            "scale": dict(zip("xyz", box[3:6].tolist())), "rotation": rotation}
-    return {**extra, "psr": psr, "obj_type": labels.class_names[k],
-            "obj_id": name or str(known.pop("track_id", "")), **known}
+    return {**beside(extra, OWN), "psr": psr, "obj_type": labels.class_names[k],
+            "obj_id": names.get(track, str(track)), **known}
