@@ -12,6 +12,7 @@ const GROUND = { dark: "#333e52", light: "#cdd5e0" };
 const THING = { dark: "#d7dee9", light: "#2d3a4f" };
 const SEEN = { dark: "#ffffff", light: "#000000" };
 const ROAD = { dark: "#5b6f93", light: "#7d8fb0" };
+const BRIGHT = 150; // of 255: brighter colours are darkened on a light page
 const SPAN = 4; // metres above the ground over which height is coloured
 
 export const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
@@ -45,7 +46,10 @@ function hue(number, which) {
 }
 
 export function colourOfClass(name) {
-  return classOf(name)?.color ?? "#9b8afb"; // a class that nobody here knows
+  const colour = classOf(name)?.color ?? "#9b8afb"; // a class that nobody here knows
+  const parts = rgb(colour), bright = 0.3 * parts[0] + 0.59 * parts[1] + 0.11 * parts[2];
+  if (theme() === "dark" || bright < BRIGHT) return colour;
+  return `#${parts.map((c) => Math.round(c * BRIGHT / bright).toString(16).padStart(2, "0")).join("")}`;
 }
 
 /** Fill colours, four bytes a point, for a cloud; the cluster `marked`, if any, stands out. */

@@ -104,6 +104,18 @@ def test_a_click_on_a_person_makes_a_track_and_a_seed(page, labels, person):
     assert page.inner_text("#who") == f"Track {number}"
 
 
+def test_a_seed_needs_no_mouse(page, labels, person):
+    before = set(labels.tracks())
+    labels.look_at(page, person)
+    page.locator("#tracks").focus()
+    for key in ("Escape", "s", "Enter"):  # what is in the middle of the view
+        page.keyboard.press(key)
+    page.wait_for_function("before => page.store.selected !== null "
+                           "&& !before.includes(page.store.selected)", arg=sorted(before))
+    box = labels.box(page.evaluate("page.store.selected"))
+    assert math.dist(box[:2], person[:2]) < 0.6
+
+
 def test_keys_accept_reject_and_open_again_and_the_progress_is_in_sight(page, labels, person):
     number = labels.chosen(page, person)
     for key, state in (("r", "rejected"), ("a", "accepted"), ("u", "proposed")):
