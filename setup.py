@@ -59,8 +59,8 @@ setup(
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "test": ["pytest>=7.4", "hypothesis>=6.90", "mypy>=1.15", "opencv-python-headless>=4.8",
-                 "pytest-cov>=7.0", "pytest-xdist>=3.5", "ruff>=0.9", "setuptools>=70.1",
-                 "shapely>=2.0"],
+                 "playwright>=1.50", "pytest-cov>=7.0", "pytest-xdist>=3.5", "ruff>=0.9",
+                 "setuptools>=70.1", "shapely>=2.0"],
         "distributed": ["distributed>=2024.1"],
         "odometry": ["kiss-icp>=1.2"],
         "onnx": ["onnx>=1.16", "onnxruntime>=1.18", "onnxscript>=0.2", "torch>=2.6"],

@@ -1,4 +1,4 @@
-"""How fast the page is: python page/measure.py URL, with the address that `label` or `view` printed.
+"""How fast the page is: python page/measure.py URL, with the address that label or view printed.
 
 Needs playwright (pip install playwright) and chromium; draws in software, as without a GPU.
 """
@@ -16,9 +16,8 @@ FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic 
          "--disable-background-networking --disable-component-update --disable-sync").split()
 PICTURES = """async ([count, thinned]) => {
   const { drawn, fly, limits } = page, took = [];
+  await new Promise((r) => setTimeout(r, 1000)); // at rest
   limits.thinned = thinned;
-  fly(0, 0, 0.02);
-  await new Promise((r) => setTimeout(r, 50));
   for (let k = 0; k < count; k++) {
     const start = performance.now(), before = drawn.pictures;
     fly(0, 0, 0.02);

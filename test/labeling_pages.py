@@ -51,17 +51,21 @@ class Label:
         """Of the journal."""
         return [json.loads(line) for line in (self.out / "journal.jsonl").read_text().splitlines()]
 
-    def seed(self, page, person: np.ndarray) -> int:
-        """Look at a person, click it as a seed; the track that it becomes."""
-        before = set(self.tracks())
+    def look_at(self, page, person: np.ndarray) -> None:
+        """From the side of the sensor; the person is in the middle of the view."""
         x, y, z = map(float, person[:3])
         away = 5.0 / math.hypot(x, y)
         page.evaluate("([place, from]) => page.lookAt(place, from)",
                       [[x, y, z], [x - x * away, y - y * away, z + 1.5]])
+
+    def seed(self, page, person: np.ndarray) -> int:
+        """Look at a person, click it as a seed; the track that it becomes."""
+        before = set(self.tracks())
+        self.look_at(page, person)
         page.keyboard.press("Escape")
         page.keyboard.press("s")
         area = page.locator("#scene").bounding_box()
-        at = page.evaluate("p => page.project(...p)", [x, y, z])
+        at = page.evaluate("p => page.project(...p)", [*map(float, person[:3])])
         page.mouse.click(area["x"] + at[0], area["y"] + at[1])
         page.wait_for_function("before => page.store.selected !== null "
                                "&& !before.includes(page.store.selected)", arg=sorted(before))

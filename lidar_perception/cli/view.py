@@ -32,8 +32,8 @@ if TYPE_CHECKING:
               help="Port on 127.0.0.1; 0: any that is free.")
 @click.option("--open/--no-open", "browser", default=True, help="Open the page in a browser.  "
               "[default: open]")
-@click.option("--screenshot", type=click.Path(path_type=Path), metavar="PNG", help="Write a picture "
-              "of the page and end; needs chromium.")
+@click.option("--screenshot", type=click.Path(path_type=Path), metavar="PNG", help="Write a "
+              "picture of the page and end; needs chromium.")
 @click.option("--frame", type=click.IntRange(0), default=0, show_default=True, metavar="N",
               help="Frame to begin with.")
 @click.option("--theme", type=click.Choice(["auto", "light", "dark"]), default="auto",

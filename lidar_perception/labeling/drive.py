@@ -138,7 +138,8 @@ class Drive:
 def one_drive(recording: Recording, sequence: str | None = None) -> Drive:
     """The drive of a recording, or that of one of its sequences. InputError where there are
     several, or none of that name."""
-    names = list(dict.fromkeys(frame.sequence for frame in recording))
+    every = recording.frames[:]  # of a bag, without the clouds that iterating would keep
+    names = list(dict.fromkeys(frame.sequence for frame in every))
     if sequence is None and len(names) > 1:
         raise InputError(f"{recording.path} has {len(names)} drives; name one with --sequence: "
                          f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}")
@@ -146,7 +147,7 @@ def one_drive(recording: Recording, sequence: str | None = None) -> Drive:
         raise InputError(f"{recording.path} has no drive {sequence}; it has "
                          f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}")
     chosen = names[0] if sequence is None else sequence
-    frames = [frame for frame in recording if frame.sequence == chosen]
+    frames = [frame for frame in every if frame.sequence == chosen]
     path = Path(recording.path).absolute()
     return Drive("_".join(filter(None, (path.name, chosen))), replace(recording, frames=frames))
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.camera import Camera
-from lidar_perception.classes import CLASSES, DETECTED, TABLE
+from lidar_perception.classes import CLASSES, DETECTED, PEDESTRIAN, TABLE
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.results import read_results
@@ -85,7 +85,7 @@ def compared(truth: GroundTruth, found: Detections, min_score: float, camera: Ca
         boxes, others = found.boxes[rows].astype(np.float64), truth.boxes[alike]
         share = bev_iou(boxes, others)
         hit = share >= DETECTED[name].relaxed
-        if name == "Pedestrian":
+        if name == CLASSES[PEDESTRIAN]:
             far = np.linalg.norm(boxes[:, None, :2] - others[None, :, :2], axis=2)
             hit |= far <= MAX_CENTRE_DISTANCE
         i, j = one_to_one(1.0 - share, hit) if hit.size else (np.zeros(0, int), np.zeros(0, int))
@@ -149,7 +149,8 @@ def recorded(path: Path, stamps: list[int]) -> Results:
             objects = from_marker_array(message)
             found[topic][objects.stamp_ns] = objects
     numbers = {stamp: i for i, stamp in enumerate(stamps)}
-    sources, tracks = {}, []
+    sources: dict[str, Source] = {}
+    tracks: list[dict[str, Any]] = []
     for topic, by_stamp in found.items():
         frames = {numbers[stamp]: each for stamp, each in by_stamp.items() if stamp in numbers}
         if topic.endswith(TRACKS):

@@ -11,6 +11,8 @@ const MUTED = { dark: "#4a5568", light: "#b3bccb" };
 const GROUND = { dark: "#333e52", light: "#cdd5e0" };
 const THING = { dark: "#d7dee9", light: "#2d3a4f" };
 const SEEN = { dark: "#ffffff", light: "#000000" };
+const ROAD = { dark: "#5b6f93", light: "#7d8fb0" };
+const BRIGHT = 150; // of 255: brighter colours are darkened on a light page
 const SPAN = 4; // metres above the ground over which height is coloured
 
 export const rgb = (hex) => [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
@@ -21,13 +23,14 @@ export function theme() {
   return matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark";
 }
 
+/** A colour as four bytes of an array of colours. */
+const packed = ([r, g, b]) => (r | g << 8 | b << 16) >>> 0;
+
 function ramp(stops, steps = 256) {
-  const table = new Uint8Array(3 * steps), ends = stops.map(rgb);
+  const table = new Uint32Array(steps), ends = stops.map(rgb);
   for (let i = 0; i < steps; i++) {
     const at = i / (steps - 1) * (ends.length - 1), k = Math.min(ends.length - 2, Math.floor(at));
-    for (let c = 0; c < 3; c++) {
-      table[3 * i + c] = Math.round(ends[k][c] + (at - k) * (ends[k + 1][c] - ends[k][c]));
-    }
+    table[i] = packed(ends[k].map((c, n) => Math.round(c + (at - k) * (ends[k + 1][n] - c))));
   }
   return table;
 }
@@ -36,59 +39,55 @@ const TABLES = { dark: ramp(RAMPS.dark), light: ramp(RAMPS.light) };
 /** Any hue for a number, the same each time. */
 function hue(number, which) {
   const h = number * 0.61803398875 % 1, light = which === "dark" ? 0.66 : 0.4;
-  return [0, 8, 4].map((n) => {
-    const k = (n + 12 * h) % 12;
-    return 255 * (light - 0.75 * Math.min(light, 1 - light) * Math.max(-1, Math.min(k - 3, 9 - k, 1)));
-  });
+  return packed([0, 8, 4].map((n) => {
+    const k = (n + 12 * h) % 12, swing = 0.75 * Math.min(light, 1 - light);
+    return Math.round(255 * (light - swing * Math.max(-1, Math.min(k - 3, 9 - k, 1))));
+  }));
 }
 
 export function colourOfClass(name) {
-  return classOf(name)?.color ?? "#9b8afb"; // a class that nobody here knows
+  const colour = classOf(name)?.color ?? "#9b8afb"; // a class that nobody here knows
+  const parts = rgb(colour), bright = 0.3 * parts[0] + 0.59 * parts[1] + 0.11 * parts[2];
+  if (theme() === "dark" || bright < BRIGHT) return colour;
+  return `#${parts.map((c) => Math.round(c * BRIGHT / bright).toString(16).padStart(2, "0")).join("")}`;
 }
 
-/** Fill (4 a point) with the colours of a cloud; returns how many points were coloured. */
-export function paint(colours, cloud, how, marked = 0) {
-  const which = theme(), { count } = cloud;
-  const put = (i, [r, g, b]) => { colours[4 * i] = r; colours[4 * i + 1] = g; colours[4 * i + 2] = b; };
-  const muted = rgb(MUTED[which]), ground = rgb(GROUND[which]), thing = rgb(THING[which]);
-  if (how === "height" || how === "intensity") {
-    const table = TABLES[which], { xyz, intensity } = cloud;
+/** Fill colours, four bytes a point, for a cloud; the cluster `marked`, if any, stands out. */
+export function paint(bytes, cloud, how, marked = 0) {
+  const colours = new Uint32Array(bytes.buffer), which = theme();
+  const { count, xyz, intensity, ground, cluster, floor } = cloud, table = TABLES[which];
+  const [muted, flat, thing, seen] = [MUTED, GROUND, THING, SEEN].map((c) => packed(rgb(c[which])));
+  if (how === "height") {
     for (let i = 0; i < count; i++) {
-      const at = how === "intensity" ? 255 * Math.sqrt(intensity[i] / 255)
-        : 255 * Math.min(1, Math.max(0, (xyz[3 * i + 2] - cloud.floor) / SPAN));
-      const k = 3 * Math.round(at), dim = how === "height" && cloud.ground[i];
-      if (dim) put(i, ground);
-      else put(i, [table[k], table[k + 1], table[k + 2]]);
+      const share = Math.min(1, Math.max(0, (xyz[3 * i + 2] - floor) / SPAN));
+      colours[i] = ground[i] ? flat : table[255 * share | 0];
     }
+  } else if (how === "intensity") {
+    for (let i = 0; i < count; i++) colours[i] = table[255 * Math.sqrt(intensity[i] / 255) | 0];
   } else if (how === "ground") {
-    const brown = rgb(which === "dark" ? "#5b6f93" : "#7d8fb0");
-    for (let i = 0; i < count; i++) put(i, cloud.ground[i] ? brown : thing);
+    const road = packed(rgb(ROAD[which]));
+    for (let i = 0; i < count; i++) colours[i] = ground[i] ? road : thing;
   } else if (how === "cluster") {
-    const known = new Map();
+    const known = new Map([[0, muted]]);
     for (let i = 0; i < count; i++) {
-      const id = cloud.cluster[i];
-      if (id && !known.has(id)) known.set(id, hue(id, which));
-      put(i, id ? known.get(id) : cloud.ground[i] ? ground : muted);
+      const id = cluster[i];
+      if (!known.has(id)) known.set(id, hue(id, which));
+      colours[i] = !id && ground[i] ? flat : known.get(id);
     }
   } else {
-    for (let i = 0; i < count; i++) put(i, cloud.ground[i] ? ground : muted);
-    paintClasses(put, cloud);
+    for (let i = 0; i < count; i++) colours[i] = ground[i] ? flat : muted;
+    paintClasses(colours, cloud);
   }
-  if (marked) {
-    const seen = rgb(SEEN[which]);
-    for (let i = 0; i < count; i++) if (cloud.cluster[i] === marked) put(i, seen);
-  }
-  return count;
+  if (marked) for (let i = 0; i < count; i++) if (cluster[i] === marked) colours[i] = seen;
 }
 
-function paintClasses(put, cloud) {
+function paintClasses(colours, { xyz, count }) {
   for (const { box, colour } of shownBoxes()) {
-    const reach = Math.hypot(box[3], box[4]) / 2, shade = rgb(colour), { xyz } = cloud;
-    for (let i = 0; i < cloud.count; i++) {
-      if (Math.abs(xyz[3 * i] - box[0]) > reach || Math.abs(xyz[3 * i + 1] - box[1]) > reach) continue;
-      const at = toLocal(box, xyz[3 * i], xyz[3 * i + 1], xyz[3 * i + 2]);
-      if (Math.abs(at[0]) <= box[3] / 2 && Math.abs(at[1]) <= box[4] / 2
-          && Math.abs(at[2]) <= box[5] / 2) put(i, shade);
+    const reach = Math.hypot(box[3], box[4]) / 2, shade = packed(rgb(colour));
+    for (let i = 0, k = 0; i < count; i++, k += 3) {
+      if (Math.abs(xyz[k] - box[0]) > reach || Math.abs(xyz[k + 1] - box[1]) > reach) continue;
+      const at = toLocal(box, xyz[k], xyz[k + 1], xyz[k + 2]);
+      if (at.every((value, n) => Math.abs(value) <= box[3 + n] / 2)) colours[i] = shade;
     }
   }
 }

@@ -5,7 +5,7 @@ import { checkFrame, commit, copyOn, decide, dropDraft, interpolate, merge, next
          redo, removeBox, setClass, snap, split, toKey, undo } from "./edits.js";
 import { step, togglePlay } from "./playback.js";
 import { goTo } from "./cloud.js";
-import { setTool } from "./pointer.js";
+import { setTool, useCentre } from "./pointer.js";
 import { fly, focus, resetView, topView } from "./scene.js";
 import { changed, select, selectedBox, store } from "./store.js";
 
@@ -22,9 +22,9 @@ export function setColour(how) {
 const nextColour = () => setColour(COLOURS[(COLOURS.indexOf(store.colour) + 1) % COLOURS.length]);
 const toggleNames = () => { store.names = !store.names; changed("tracks"); };
 
-/** The box where one is selected; else the camera. */
+/** The box where one is selected; else, and while a place is looked for, the camera. */
 const arrow = (box, camera) => () => {
-  if (selectedBox() && store.mode === "label") nudge(box);
+  if (selectedBox() && store.mode === "label" && store.tool === "select") nudge(box);
   else camera();
 };
 
@@ -40,6 +40,7 @@ const TABLE = [
   ["Decide", "Ctrl+y Ctrl+Shift+z", "Ctrl Y", "Redo", redo, LABEL],
   ["Tools", "s", "S", "Seed: click a person", () => setTool("seed"), LABEL],
   ["Tools", "b", "B", "Box: click where a new one stands", () => setTool("add"), LABEL],
+  ["Tools", "Enter", "Enter", "What is in the middle of the view: select, seed, or add", useCentre, BOTH],
   ["Tools", "Escape", "Esc", "Back to selecting; nothing selected", escape, BOTH],
   ["Tools", "1 2 3 4 5 6 7 8 9", "1 – 9", "Class", null, LABEL],
   ["Box", "ArrowUp", "↑", "Forward by 5 cm", arrow({ forward: 1 }, () => fly(0, 0.04)), BOTH],
@@ -96,7 +97,7 @@ function taken(event) {
   if (document.querySelector("dialog[open]")) return true;
   if (target.matches?.("input[type=range]")) return HELD.has(event.key) || /^(Home|End|Page)/.test(event.key);
   if (target.matches?.("input:not([type=checkbox]), select, textarea")) return event.key !== "Escape";
-  return target.matches?.("button, summary, input") && event.key === " ";
+  return target.matches?.("button, summary, input") && (event.key === " " || event.key === "Enter");
 }
 
 function press(event) {

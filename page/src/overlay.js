@@ -15,13 +15,15 @@ const FACES = [["+x", "front"], ["-x", "back"], ["+y", "left side"], ["-y", "rig
                ["+z", "top"], ["-z", "bottom"]];
 const AXES = { x: 0, y: 1, z: 2 };
 
+const SMALL = 34; // pixels: handles of a box that looks smaller would hide it
 const ring = svg("path", { class: "ring" });
+const grip = svg("path", { class: "ringgrip", "data-handle": "yaw" }, svg("title", {}, "Drag to turn"));
 const stalk = svg("path", { class: "stalk" });
 const knob = svg("circle", { class: "handle turn", r: 7, "data-handle": "yaw" },
   svg("title", {}, "Drag to turn"));
 const faces = FACES.map(([name, what]) => svg("circle", { class: "handle face", r: 6,
   "data-handle": name }, svg("title", {}, `Drag to move the ${what} alone`)));
-layer.append(ring, stalk, ...faces, knob);
+layer.append(ring, grip, stalk, ...faces, knob);
 
 const away = (box) => Math.hypot(box[3], box[4]) / 2 + 0.35;
 const path = (places) => places.some((p) => !p) ? "" : `M${places.map((p) => p.map((v) => v.toFixed(1)).join(" ")).join("L")}`;
@@ -49,9 +51,13 @@ function placeHandles() {
     round.push(project(...toWorld(box, radius * Math.cos(angle), radius * Math.sin(angle), low)));
   }
   ring.setAttribute("d", path(round));
+  grip.setAttribute("d", path(round));
   const end = project(...toWorld(box, radius, 0, low));
   stalk.setAttribute("d", path([project(...toWorld(box, box[3] / 2, 0, low)), end]));
   place(knob, end);
+  const seen = round.filter(Boolean), span = (k) => Math.max(...seen.map((p) => p[k]))
+    - Math.min(...seen.map((p) => p[k]));
+  layer.classList.toggle("small", seen.length === 0 || Math.max(span(0), span(1)) < 2 * SMALL);
 }
 
 function placeNames() {
@@ -112,10 +118,14 @@ layer.addEventListener("pointerdown", (event) => {
   event.preventDefault();
   const from = rayAt(event.clientX, event.clientY);
   if (name === "yaw") {
-    const low = start[2] - start[5] / 2;
+    const angleOf = ({ origin, direction }) => {
+      const at = meetLevel(origin, direction, start[2] - start[5] / 2);
+      return at && Math.atan2(at[1] - start[1], at[0] - start[0]);
+    };
+    const first = angleOf(from);
     follow(event.target, event, (e) => {
-      const { origin, direction } = rayAt(e.clientX, e.clientY), at = meetLevel(origin, direction, low);
-      if (at) setDraft(turnBy(start, Math.atan2(at[1] - start[1], at[0] - start[0]) - start[6]));
+      const now = angleOf(rayAt(e.clientX, e.clientY));
+      if (first !== null && now !== null) setDraft(turnBy(start, now - first));
     });
     return;
   }

@@ -81,10 +81,17 @@ export function setTool(tool) {
   changed("tool");
 }
 
+/** What a click would do in the middle of the view, for who works without a mouse. */
+export function useCentre() {
+  const area = canvas.getBoundingClientRect();
+  click({ clientX: area.left + area.width / 2, clientY: area.top + area.height / 2 });
+}
+
 on("tool", () => {
   mark(0);
   canvas.style.cursor = store.tool === "select" ? "" : "crosshair";
   canvas.dataset.tool = store.tool;
+  document.getElementById("cross").toggleAttribute("hidden", store.tool === "select");
   controls.update();
 });
 

@@ -87,7 +87,7 @@ function setCloud() {
   }
   repaint();
   setRings(cloud.floor);
-  thin(!still);
+  moving(); // a thinned picture at once, then all
 }
 
 function repaint() {

@@ -16,7 +16,7 @@ const VIEWS = [
 ];
 const NAMES = "xyz";
 const POINTS = { dark: ["#7f8ea8", "#ffffff", "#3b4558"], light: ["#8794a8", "#0b1220", "#c3ccd8"] };
-const MARGIN = 1.1, KNOB = 20; // metres round the box; pixels from the front to the knob
+const MARGIN = 0.6, KNOB = 20; // metres round the box; pixels from the front to the knob
 
 let anchor = null, near = [], zoom = 1;
 

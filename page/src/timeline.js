@@ -2,9 +2,10 @@
 
 import { colourOfClass, theme } from "./colours.js";
 import { goTo } from "./cloud.js";
+import { checkFrame } from "./edits.js";
 import { on, select, store } from "./store.js";
 
-const ROW = 13, HEAD = 16, NAMES = 64; // pixels
+const ROW = 13, HEAD = 16, NAMES = 88; // pixels
 const INK = {
   dark: { text: "#9fb0c8", line: "#232b38", now: "#f8fafc", check: "#34d399", chosen: "#1d2838" },
   light: { text: "#475569", line: "#e3e8ef", now: "#0f172a", check: "#059669", chosen: "#e6edf7" },
@@ -50,7 +51,7 @@ function paintRow(pen, ink, track, y, width, wide) {
   const colour = colourOfClass(track.class);
   pen.globalAlpha = track.state === "rejected" ? 0.3 : 1;
   pen.fillStyle = ink.text;
-  pen.fillText(`${track.id} ${track.class}`, 6, y + ROW / 2 + 0.5, NAMES - 10);
+  pen.fillText(`${track.id} ${track.class}`, 6, y + ROW / 2 + 0.5, NAMES - 12);
   for (const [frame, { kind }] of track.byFrame) {
     const x = NAMES + frame * wide, w = Math.max(1, wide - (wide > 4 ? 1 : 0));
     pen.fillStyle = colour;
@@ -118,6 +119,9 @@ export function openTimeline() {
   box.addEventListener("scroll", redraw);
   new ResizeObserver(redraw).observe(box);
   on("tracks selection wanted drive theme listed progress", redraw);
+  const check = document.getElementById("check");
+  check.onclick = checkFrame;
+  on("frame progress", () => check.setAttribute("aria-pressed", String(store.checked.has(store.frame))));
   on("drive wanted frame", () => {
     slider.max = frames() - 1;
     slider.value = store.wanted;

@@ -77,10 +77,11 @@ function showDrive() {
   by("drive").textContent = name;
   by("drive").title = path;
   by("layout").textContent = `${layout} · ${frames.length} frame${frames.length === 1 ? "" : "s"}`;
-  for (const id of ["export-format", "import-format"]) {
-    by(id).replaceChildren(...(formats ?? []).map((format) =>
-      element("option", { value: format }, format.replaceAll("_", " "))));
-  }
+  const choices = () => (formats ?? []).map((format) =>
+    element("option", { value: format }, format.replaceAll("_", " ")));
+  by("export-format").replaceChildren(...choices());
+  by("import-format").replaceChildren(element("option", { value: "" }, "as it is recognised"),
+                                      ...choices());
 }
 
 function showProgress() {
@@ -94,6 +95,7 @@ function showProgress() {
   by("bar-left").style.flexGrow = tracks ? left : 1;
   by("progress-text").textContent = `${left} left · ${accepted} accepted · ${rejected} rejected · `
     + `${checked} of ${frames} frames checked`;
+  if (by("busy").hidden !== !busy) changed("busy");
   by("busy").hidden = !busy;
   if (busy) {
     by("busy").textContent = `${busy.what} ${busy.done} of ${busy.of}`;

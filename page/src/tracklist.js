@@ -91,6 +91,10 @@ function place() {
 
 function emptyHint() {
   if (store.mode === "view") return "No tracks in this recording.";
+  if (store.tracks.size === 0 && store.progress?.busy) {
+    return "Detectors look through the whole drive; proposals appear here when they are done. "
+      + "Meanwhile S and a click on a person, or B and a click, begin a track by hand.";
+  }
   if (store.tracks.size === 0) {
     return "No tracks yet. Press P to let the detectors propose some, S and click a person, or B "
       + "and click to add a box.";
@@ -131,6 +135,6 @@ export function openTrackList() {
     walk(by);
   });
   new ResizeObserver(place).observe(list);
-  on("tracks selection drive frame", rebuild);
+  on("tracks selection drive frame busy", rebuild);
   on("selection", scrollToChosen);
 }

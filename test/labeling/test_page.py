@@ -60,8 +60,8 @@ def labels(drive_bag, tmp_path_factory):
     """The labelling of a drive, at the address that stays the same when its server is started
     again."""
     out, port = tmp_path_factory.mktemp("labels"), free_port()
-    arguments = ("label", "--data", str(drive_bag), "--out", str(out), "--no-open", "--port",
-                 str(port))
+    arguments = ("label", "--data", str(drive_bag), "--out", str(out), "--no-open", "--no-propose",
+                 "--port", str(port))
     with serving(*arguments) as (process, url):
         yield Label(process, url, out, arguments)
 
@@ -102,6 +102,18 @@ def test_a_click_on_a_person_makes_a_track_and_a_seed(page, labels, person):
     assert math.dist(box[:2], person[:2]) < 0.6
     assert labels.lines()[-1]["do"] == "seed"
     assert page.inner_text("#who") == f"Track {number}"
+
+
+def test_a_seed_needs_no_mouse(page, labels, person):
+    before = set(labels.tracks())
+    labels.look_at(page, person)
+    page.locator("#tracks").focus()
+    for key in ("Escape", "s", "Enter"):  # what is in the middle of the view
+        page.keyboard.press(key)
+    page.wait_for_function("before => page.store.selected !== null "
+                           "&& !before.includes(page.store.selected)", arg=sorted(before))
+    box = labels.box(page.evaluate("page.store.selected"))
+    assert math.dist(box[:2], person[:2]) < 0.6
 
 
 def test_keys_accept_reject_and_open_again_and_the_progress_is_in_sight(page, labels, person):
@@ -204,6 +216,24 @@ def test_what_cannot_be_saved_is_said_and_goes_back(page, labels, person):
     page.wait_for_function("() => Number(document.getElementById('field-length').value) > 0")
 
 
+def test_an_export_is_written_and_nothing_is_written_over_it(page, labels, person):
+    number = labels.chosen(page, person)
+    page.keyboard.press("a")
+    labels.wait(page, number, lambda t: t["state"] == "accepted")
+    for replace, wrong in ((False, False), (False, True), (True, False)):
+        page.click("#export")
+        page.select_option("#export-format", "openlabel")
+        page.fill("#export-out", "labels.json")
+        page.set_checked("#export-force", replace)
+        page.click("#export-form button.primary")
+        if wrong:
+            page.wait_for_function("() => document.getElementById('export-error').textContent")
+            page.click("#export-dialog [data-close]")
+        else:
+            page.wait_for_selector("#export-dialog", state="hidden")
+    assert "openlabel" in json.loads((labels.out / "labels.json").read_text())
+
+
 def test_help_lists_the_keys_and_needs_no_mouse(page):
     page.keyboard.press("?")
     page.wait_for_selector("#help[open]")
@@ -237,8 +267,8 @@ def test_a_killed_server_loses_nothing(page, browser, labels, person):
 
 
 def test_a_wrong_token_and_another_host_are_refused(drive_bag, tmp_path):
-    with serving("label", "--data", str(drive_bag), "--out", str(tmp_path), "--no-open"
-                 ) as (_, url):
+    with serving("label", "--data", str(drive_bag), "--out", str(tmp_path), "--no-open",
+                 "--no-propose") as (_, url):
         plain = url.partition("?")[0]
         for address, headers in ((plain, {}), (f"{plain}?token=x", {}),
                                  (url, {"Host": "example.org"})):
