@@ -102,10 +102,13 @@ class Session:
             self.busy = None
             self.tell({"progress": self.progress()})
 
-    def propose(self, by: str = "", here: bool = False) -> None:
+    def propose(self, by: str = "", here: bool = False,
+                told: Callable[[int], object] = lambda count: None) -> None:
         """Look at the drive, in a process of its own or here, and write down the proposals; nothing
-        is written if it is cancelled. InputError where a frame or the weights cannot be read."""
+        is written if it is cancelled. told: how many frames were looked at. InputError where a
+        frame or the weights cannot be read."""
         def done(count: int) -> bool:
+            told(count)
             if self.busy is not None:
                 self.busy = {**self.busy, "done": count}
                 self.tell({"progress": self.progress()})
