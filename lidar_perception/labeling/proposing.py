@@ -143,9 +143,10 @@ def merged(state: State, made: Sequence[Track], motion: Motion) -> tuple[list[Tr
         old = there.same(new)
         by_person = [t for t in old if t.id not in waiting]
         if by_person:
-            if is_placed(by_person[0]) and by_person[0].id not in taken:
-                taken.add(by_person[0].id)
-                found.append(followed(by_person[0], new, motion))
+            placed = next((t for t in by_person if is_placed(t) and t.id not in taken), None)
+            if placed is not None:
+                taken.add(placed.id)
+                found.append(followed(placed, new, motion))
             continue
         number = next((t.id for t in old if t.id not in taken), free)
         free += number == free

@@ -25,7 +25,7 @@ from lidar_perception.labeling.actions import (
     track_of,
 )
 from lidar_perception.labeling.drive import Drive
-from lidar_perception.labeling.exchange import export_labels, import_labels, recognised
+from lidar_perception.labeling.exchange import export_labels, import_labels
 from lidar_perception.labeling.interpolation import Motion
 from lidar_perception.labeling.journal import Journal, header, opened
 from lidar_perception.labeling.labelled import from_labels, to_labels
@@ -102,10 +102,13 @@ class Session:
             self.busy = None
             self.tell({"progress": self.progress()})
 
-    def propose(self, by: str = "", here: bool = False) -> None:
+    def propose(self, by: str = "", here: bool = False,
+                told: Callable[[int], object] = lambda count: None) -> None:
         """Look at the drive, in a process of its own or here, and write down the proposals; nothing
-        is written if it is cancelled. InputError where a frame or the weights cannot be read."""
+        is written if it is cancelled. told: how many frames were looked at. InputError where a
+        frame or the weights cannot be read."""
         def done(count: int) -> bool:
+            told(count)
             if self.busy is not None:
                 self.busy = {**self.busy, "done": count}
                 self.tell({"progress": self.progress()})
@@ -137,10 +140,10 @@ class Session:
         return action
 
     def _imported(self, action: Action) -> Action:
-        path, named = action.get("path"), action.get("format") or None
-        if not isinstance(path, str) or not isinstance(named, str | None):
-            raise InputError("an import needs the path of labels, and may name their format")
-        labels = import_labels(Path(path), named or recognised(Path(path)), self.drive.frames)
+        path, named = action.get("path"), action.get("format")
+        if not isinstance(path, str) or not isinstance(named, str):
+            raise InputError("an import needs the path of labels and their format")
+        labels = import_labels(Path(path), named, self.drive.frames)
         tracks, kept = from_labels(labels, self.state.next_id)
         return {**action, "tracks": [track_to_json(t) for t in tracks], "kept": kept}
 

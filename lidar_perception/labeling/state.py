@@ -7,7 +7,7 @@ own scan.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -130,10 +130,11 @@ def track_from_json(found: Mapping[str, Any]) -> Track:
                  {int(f): v for f, v in found.get("extra", {}).items()})
 
 
-def next_uncertain(state: State, after: int | None = None) -> Track | None:
-    """The proposed track whose score is nearest to the threshold, or, given one of these, the next;
-    after the last the first again. Ties by id."""
-    waiting = sorted((t for t in state.tracks.values() if t.state == PROPOSED and t.boxes),
+def next_uncertain(state: State, after: int | None = None,
+                   among: Callable[[Track], bool] = lambda track: True) -> Track | None:
+    """The proposed track, of some, whose score is nearest to the threshold, or, given one of these,
+    the next; after the last the first again. Ties by id."""
+    waiting = sorted((t for t in state.tracks.values() if t.state == PROPOSED and among(t)),
                      key=lambda t: (-t.uncertainty, t.id))
     if not waiting:
         return None
