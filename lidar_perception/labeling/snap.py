@@ -18,14 +18,24 @@ from lidar_perception.types import InputError
 Array = np.ndarray[Any, Any]
 MARGIN = 0.3       # metres around a box within which its cluster is looked for
 PIECE = 0.2        # of the points of the largest cluster there: smaller ones are something else
-HIDDEN = 0.25      # metres: what lies so near to the usual size has its far side hidden
+PIECES = 0.55      # of the usual length: so far from a click there are pieces of the same vehicle,
+MOST = 0.8         # if more of their points than this are there
+LONG = 2.5         # metres: what is usually longer hides its far side
+WIDER = 1.3        # times the width: a side that is no longer than this is the front or the rear
 
 
 def around_click(scan: Scan, click: Array, class_name: str) -> Array:
     """(7,) the box of the cluster at a point (3,), on the ground and as large as the class usually
     is. InputError where no cluster is near."""
     label = clicked_cluster(click, scan.xyz, scan.cluster_ids, SeedParams().click_radius)
-    return completed(_around(scan, scan.cluster_ids == label), class_name)
+    members = scan.cluster_ids == label
+    usual = usual_size(class_name)
+    if usual is not None and usual[0] > LONG:  # of which one cluster is often but a piece
+        near = np.hypot(*(scan.xyz[:, :2] - click[:2]).T) < usual[0] * PIECES
+        inside, whole = (np.bincount(scan.cluster_ids[mask], minlength=scan.cluster_ids.max() + 1)
+                         for mask in (near, slice(None)))
+        members |= ((inside > MOST * whole) & (np.arange(len(whole)) > 0))[scan.cluster_ids]
+    return completed(_around(scan, members), class_name)
 
 
 def to_cluster(scan: Scan, box: Array) -> Array:
@@ -70,16 +80,21 @@ def usual_size(class_name: str) -> Size | None:
 
 
 def completed(box: Array, class_name: str) -> Array:
-    """(7,) the box of what is seen, made as long and wide as the class usually is, away from the
-    sensor; the longer side seen is taken for the width where it fits that better."""
+    """(7,) the box of what is seen, made as long and wide as the class usually is. People are seen
+    through and through, so theirs grows evenly; others grow away from the sensor, and a side that
+    is hardly longer than the width is taken for the width."""
     usual = usual_size(class_name)
     if usual is None:
         return box
     length, width, height = usual
-    if box[3] < (length + width) / 2 and length - width > HIDDEN:
+    vehicle = length > LONG
+    if vehicle and box[3] < WIDER * width:
         box = headed(box, box[6] + np.pi / 2)
-    tall = box[5] if box[5] > height / 2 else height
-    return to_size(box, np.array([max(box[3], length), max(box[4], width), tall]))
+    size = np.array([max(box[3], length), max(box[4], width),
+                     box[5] if box[5] > height / 2 else height])
+    if vehicle:
+        return to_size(box, size)
+    return np.array([*box[:2], box[2] + (size[2] - box[5]) / 2, *size, box[6]])
 
 
 def _around(scan: Scan, members: Array) -> Array:
