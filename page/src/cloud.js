@@ -5,7 +5,7 @@ import { sayError } from "./messages.js";
 import { resultsOf } from "./results.js";
 import { changed, store } from "./store.js";
 
-const KEPT = 24; // clouds of 114,000 points take 2 MB each
+const KEPT = 12; // clouds of 114,000 points take 2 MB each
 const AHEAD = 3;
 const PATIENCE_MS = 120; // for results, so that they come with their cloud
 const EMPTY = { count: 0, xyz: new Float32Array(), intensity: new Uint8Array(),

@@ -6,7 +6,7 @@ import { element, svg } from "./dom.js";
 import { commit, dropDraft, setDraft } from "./edits.js";
 import { project, rayAt } from "./picking.js";
 import { resultNames } from "./results.js";
-import { afterDrawing, controls } from "./scene.js";
+import { afterDrawing, camera, controls } from "./scene.js";
 import { selectedBox, selectedTrack, store } from "./store.js";
 
 const layer = document.getElementById("handles");
@@ -70,17 +70,34 @@ function placeNames() {
                   text: `${track.id} ${track.class}` });
   }
   if (store.names) wanted.push(...resultNames());
-  while (names.children.length < wanted.length) names.append(element("div", { class: "name" }));
+  const shown = apart(wanted);
+  while (names.children.length < shown.length) names.append(element("div", { class: "name" }));
   for (const [k, tag] of [...names.children].entries()) {
-    const entry = wanted[k];
-    const at = entry && project(entry.box[0], entry.box[1], entry.box[2] + entry.box[5] / 2);
-    tag.style.display = at ? "" : "none";
-    if (!at) continue;
+    const entry = shown[k];
+    tag.style.display = entry ? "" : "none";
+    if (!entry) continue;
     if (tag.textContent !== entry.text) tag.textContent = entry.text;
     tag.className = `name ${entry.state ?? ""}${entry.chosen ? " chosen" : ""}`;
     tag.style.setProperty("--shade", entry.colour);
-    tag.style.transform = `translate(${at[0].toFixed(0)}px, ${at[1].toFixed(0)}px)`;
+    tag.style.transform = `translate(${entry.at[0].toFixed(0)}px, ${entry.at[1].toFixed(0)}px)`;
   }
+}
+
+/** Those names that do not lie over each other: the chosen one, then errors, then the nearest. */
+function apart(wanted) {
+  const rank = (entry) => (entry.chosen ? 0 : entry.loud ? 1000 : 2000) + entry.far;
+  const shown = [];
+  for (const entry of wanted) {
+    entry.at = project(entry.box[0], entry.box[1], entry.box[2] + entry.box[5] / 2);
+    entry.far = camera.position.distanceTo({ x: entry.box[0], y: entry.box[1], z: entry.box[2] });
+    entry.wide = 6.4 * entry.text.length + 20;
+  }
+  for (const entry of wanted.filter(({ at }) => at).sort((a, b) => rank(a) - rank(b))) {
+    const [x, y] = entry.at;
+    if (shown.every(({ at, wide }) => Math.abs(at[1] - y) > 15 || x > at[0] + wide
+      || at[0] > x + entry.wide)) shown.push(entry);
+  }
+  return shown;
 }
 afterDrawing.push(placeHandles, placeNames);
 

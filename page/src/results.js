@@ -39,7 +39,7 @@ export function resultBoxes() {
 }
 
 export const resultNames = () => resultBoxes().filter(({ text }) => text !== null)
-  .map(({ box, colour, text }) => ({ box, colour, text, state: "found" }));
+  .map(({ box, colour, strong, text }) => ({ box, colour, text, loud: strong, state: "found" }));
 
 /** How many of the frame shown: {labels, missed, found, false} of the first source shown. */
 export function resultCounts() {
