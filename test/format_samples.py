@@ -52,7 +52,7 @@ def drive(name: str, frames: int = 3, camera: bool = True) -> list[Frame]:
 def labels_of(frames: list[Frame], format: str, seed: int = 0) -> DriveLabels:
     """Boxes all around the sensor with all that a format keeps; the second frame has none."""
     rng = np.random.default_rng(seed)
-    names = ["Car", "Pedestrian", "e-scooter"]
+    names = ["Car", "Pedestrian", "Van", "Cyclist", "e-scooter"]
     found = []
     for number, frame in enumerate(frames):
         count = 0 if number == 1 else 4
