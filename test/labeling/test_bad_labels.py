@@ -12,8 +12,9 @@ from cli_samples import error_line, exit_of
 from format_samples import drive, labels_of
 from samples import object_folder, walker_truth
 
+from lidar_perception.cli import convert
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.labeling.datasets import write_dataset
+from lidar_perception.labeling.datasets import LAYOUTS, write_dataset
 from lidar_perception.labeling.exchange import FORMATS, export_labels, import_labels, recognised
 from lidar_perception.labeling.labels import FrameLabels
 from lidar_perception.types import InputError
@@ -96,6 +97,10 @@ def test_labels_of_what_the_drive_has_not_and_no_labels_are_named(format, tmp_pa
         import_labels(tmp_path / "empty", format, drive("one"))
     with pytest.raises(InputError, match=r"there is no folder|cannot read"):
         import_labels(tmp_path / "none", format, drive("one"))
+
+
+def test_the_command_knows_every_format_and_layout():
+    assert (convert.LABELS, convert.DATASETS) == (tuple(FORMATS), tuple(LAYOUTS))
 
 
 def test_numbers_that_are_none_never_become_labels():
@@ -185,6 +190,8 @@ def test_kitti_and_nuscenes_say_what_they_lack(tmp_path):
     (["{bag}", "--points", "/lidar", "--to", "nuscenes", "--out", "{out}"], "has no topic /lidar"),
     (["{bag}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
      "/ground_truth/detections has labels of"),
+    (["{bag}", "--data", "{kitti}", "--detections", "/none", "--to", "openlabel", "--out", "{out}"],
+     "has no topic /none"),
     (["{empty}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
      "holds no labels that are recognised"),
     (["{kitti}/none", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"], "there is no"),
