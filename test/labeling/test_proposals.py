@@ -181,7 +181,7 @@ def test_a_recording_of_several_drives_wants_one_named():
 def test_boxes_snap_to_what_is_there(drive):
     frame = drive.frames[0]
     truth, scan = frame.truth(), drive.clouds(0)
-    near = np.hypot(*truth.boxes[:, :2].T) < 30  # farther away little ground is seen
+    near = np.hypot(*truth.boxes[:, :2].T) < 20  # farther away little ground is seen
     for box in truth.boxes[(truth.class_ids == 3) & near]:
         lifted = box + [0.1, -0.1, 0.3, 0, 0, 0, 0]
         down = to_ground(scan, lifted)
