@@ -23,7 +23,7 @@ from lidar_perception.tracking.ego import usable
 from lidar_perception.types import InputError, LidarFrame
 
 Array = np.ndarray[Any, Any]
-CACHE_BYTES = 300 * 10**6  # of clouds that are kept
+CACHE_BYTES = 200 * 10**6  # of clouds that are kept
 MAGIC = b"LPC1"
 COLORS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#cc79a7", "#0072b2", "#d55e00", "#999999",
           "#666666")  # Okabe and Ito's, which the colour-blind can tell apart, and two greys

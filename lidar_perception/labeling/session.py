@@ -25,7 +25,7 @@ from lidar_perception.labeling.actions import (
     track_of,
 )
 from lidar_perception.labeling.drive import Drive
-from lidar_perception.labeling.exchange import export_labels, import_labels
+from lidar_perception.labeling.exchange import export_labels, import_labels, recognised
 from lidar_perception.labeling.interpolation import Motion
 from lidar_perception.labeling.journal import Journal, header, opened
 from lidar_perception.labeling.labelled import from_labels, to_labels
@@ -140,10 +140,10 @@ class Session:
         return action
 
     def _imported(self, action: Action) -> Action:
-        path, named = action.get("path"), action.get("format")
+        path, named = action.get("path"), action.get("format") or ""
         if not isinstance(path, str) or not isinstance(named, str):
-            raise InputError("an import needs the path of labels and their format")
-        labels = import_labels(Path(path), named, self.drive.frames)
+            raise InputError("an import needs the path of labels, and may name their format")
+        labels = import_labels(Path(path), named or recognised(Path(path)), self.drive.frames)
         tracks, kept = from_labels(labels, self.state.next_id)
         return {**action, "tracks": [track_to_json(t) for t in tracks], "kept": kept}
 
