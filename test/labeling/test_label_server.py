@@ -303,3 +303,26 @@ def test_labels_of_the_drive_are_shown_only_when_asked_for(served, written, tmp_
         (*box, name, _), = asked(url, lambda page: page.json("/api/labels/0"))["labels"]
         assert np.allclose(box, WALKER) and name == "Pedestrian"
         assert asked(url, lambda page: page.json("/api/labels/1"))["labels"] == []
+
+
+def test_the_drive_is_looked_at_beside_the_page_and_only_once(written, tmp_path):
+    async def wait(page):
+        async with page.http.ws_connect(f"{page.base}/api/events") as events:
+            state = await page.json("/api/state")
+            while state["progress"]["busy"] is not None:
+                event = await events.receive_json()
+                assert "error" not in event, event
+                state["progress"] = event["progress"]
+        return await page.json("/api/state")
+    arguments = [a for a in command(written, tmp_path) if a != "--no-propose"]
+    before = None
+    for _ in range(2):  # the second one finds the proposals in the journal
+        with subprocess.Popen(arguments, text=True, stdout=subprocess.PIPE) as process:
+            try:
+                state = asked(process.stdout.readline().strip(), wait)
+            finally:
+                process.kill()
+        assert before is None or state == before
+        before = state
+    lines = [json.loads(line) for line in (tmp_path / "journal.jsonl").read_text().splitlines()]
+    assert [line["do"] for line in lines[1:]].count("propose") == 1
