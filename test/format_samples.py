@@ -52,7 +52,7 @@ def drive(name: str, frames: int = 3, camera: bool = True) -> list[Frame]:
 def labels_of(frames: list[Frame], format: str, seed: int = 0) -> DriveLabels:
     """Boxes all around the sensor with all that a format keeps; the second frame has none."""
     rng = np.random.default_rng(seed)
-    names = ["Car", "Pedestrian", "e-scooter"]
+    names = ["Car", "Pedestrian", "Van", "Cyclist", "e-scooter"]
     found = []
     for number, frame in enumerate(frames):
         count = 0 if number == 1 else 4
@@ -76,7 +76,7 @@ def same(labels: DriveLabels, others: DriveLabels, tolerance: float) -> None:
     assert [f.name for f in labels.frames] == [f.name for f in others.frames]
     assert [f.stamp_ns for f in labels.frames] == [f.stamp_ns for f in others.frames]
     for a, b in zip(labels.frames, others.frames):
-        one, other = np.lexsort(a.boxes.round(3).T), np.lexsort(b.boxes.round(3).T)
+        one, other = (np.lexsort(f.boxes[:, :3].round(3).T) for f in (a, b))
         difference = a.boxes[one] - b.boxes[other]
         difference[:, 6] = (difference[:, 6] + math.pi) % (2 * math.pi) - math.pi
         assert np.abs(difference).max(initial=0) <= tolerance

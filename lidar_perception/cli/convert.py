@@ -63,15 +63,15 @@ def convert(source: Path, format: str, out: Path, data: Path | None, given: str 
             (images and (given_labels or format != BAG), "--images is for --to bag"),
             (given is not None and data is None, "--from says what labels PATH holds; give their "
                                                  "drive with --data"),
-            (detections is not None and data is not None, "--detections is for a bag as PATH"),
+            (given is not None and detections is not None, "--detections is for a bag, --from for "
+                                                           "other labels"),
             (data is not None and format == "nuscenes", "labels are written as nuscenes_detection "
                                                         "or nuscenes_tracking")):
         if wrong:
             raise click.UsageError(what)
     recording = opened(source if data is None else data, split=split, points=points)
     if given_labels:
-        _labels(source, recording, format, out, given if data else None, data is not None,
-                detections, limit, force)
+        _labels(source, recording, format, out, given, data is not None, detections, limit, force)
     elif format == BAG and detections is None:
         _bag(source, recording, out, images, limit, force)
     else:
@@ -90,21 +90,17 @@ def _bag(source: Path, recording: Any, out: Path, images: bool, limit: int | Non
     raise SystemExit(1 if skipped else 0)
 
 
-def _own_labels(source: Path, recording: Any, detections: str | None) -> Any:
-    """DriveLabels of the recording: those of its frames, or the boxes on a topic of a bag."""
+def _on_topic(source: Path, recording: Any, topic: str) -> Any:
+    """DriveLabels of the boxes on a topic of a bag."""
     from lidar_perception.labeling.formats import bag
-    from lidar_perception.labeling.labels import DriveLabels, of_truth
-    if detections is not None:
-        return bag.read(source, recording.frames, detections)
-    return DriveLabels([of_truth(frame.name, frame.stamp_ns, frame.truth())
-                        for frame in recording.frames])
+    return bag.read(source, recording.frames[:], topic)
 
 
 def _dataset(source: Path, recording: Any, format: str, out: Path, detections: str | None,
              limit: int | None, force: bool) -> None:
     from lidar_perception.labeling.datasets import write_dataset
     from lidar_perception.labeling.exchange import export_labels
-    labels = _own_labels(source, recording, detections) if detections else None
+    labels = _on_topic(source, recording, detections) if detections else None
     count = min(len(recording), limit or len(recording))
     if format == BAG:
         export_labels(labels.first(count), format, out, recording.frames[:count], force)
@@ -121,11 +117,15 @@ def _dataset(source: Path, recording: Any, format: str, out: Path, detections: s
 def _labels(source: Path, recording: Any, format: str, out: Path, given: str | None,
             elsewhere: bool, detections: str | None, limit: int | None, force: bool) -> None:
     from lidar_perception.labeling.exchange import export_labels, import_labels, recognised
+    from lidar_perception.labeling.labels import DriveLabels, of_truth
     count = min(len(recording), limit or len(recording))
-    if elsewhere:
+    if detections is not None:
+        labels = _on_topic(source, recording, detections)
+    elif elsewhere:
         labels = import_labels(source, given or recognised(source), recording.frames)
     else:
-        labels = _own_labels(source, recording, detections)
+        labels = DriveLabels([of_truth(frame.name, frame.stamp_ns, frame.truth())
+                              for frame in recording.frames[:]])
     written = export_labels(labels.first(count), format, out, recording.frames[:count], force)
     console.print(f"{escape(str(out))}: {written.boxes} boxes of {written.frames} frames, "
                   f"as {format}")

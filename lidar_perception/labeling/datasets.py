@@ -20,6 +20,7 @@ from lidar_perception.data.kitti.folder import GAP_NS, PERIOD_NS
 from lidar_perception.data.kitti.write import calibration_text, write_velodyne
 from lidar_perception.labeling.datasets_nuscenes import NuscenesTables
 from lidar_perception.labeling.formats import kitti_object, kitti_tracking
+from lidar_perception.labeling.formats.nuscenes import LIKE
 from lidar_perception.labeling.labels import NO_TRACK, DriveLabels, FrameLabels, of_truth
 from lidar_perception.runs.files import whole_folder, write_bytes
 from lidar_perception.types import InputError
@@ -198,6 +199,8 @@ def _nuscenes(folder: Path, frames: Iterator[Placed], summary: Summary) -> Itera
         frame, labels = placed.frame, placed.labels
         if frame.pose() is None:
             summary.remark("assumed: a vehicle that stands, as there are no poses")
+        for name in sorted(set(labels.class_names) & LIKE.keys()):
+            summary.remark(f"written as another class: {name} as {LIKE[name]}")
         tables.add(frame, labels, placed.drive, _cloud(frame, summary))
         _remark_losses(summary, placed, "boxes, poses, track ids")
         yield placed

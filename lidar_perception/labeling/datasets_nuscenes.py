@@ -30,7 +30,7 @@ from lidar_perception.data.nuscenes.boxes import (
 from lidar_perception.data.nuscenes.folder import CHANNEL, FULL_REFLECTION
 from lidar_perception.data.nuscenes.results import places
 from lidar_perception.geometry import points_in_boxes
-from lidar_perception.labeling.formats.nuscenes import OURS, RIDDEN, THEIRS
+from lidar_perception.labeling.formats.nuscenes import LIKE, OURS, RIDDEN, THEIRS
 from lidar_perception.labeling.labels import NO_TRACK, FrameLabels
 from lidar_perception.runs.files import write_bytes, write_text
 
@@ -109,7 +109,7 @@ class NuscenesTables:
         for k, place in enumerate(placed):
             track, name, extra = labels.track_ids[k], labels.class_names[k], labels.extra[k]
             instance = token(scene, "track", track) if track != NO_TRACK else token(sample, k)
-            kind = THEIRS.get(name, name)
+            kind = {**THEIRS, **LIKE}.get(name, name)
             category = extra.get("category")
             if CATEGORIES.get(str(category), category) != kind:
                 category = CATEGORY_OF.get(kind, name)

@@ -61,7 +61,7 @@ class Written:
 def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabels:
     """The labels at a path, of each of the frames of a drive in their order. InputError in one line
     where they cannot be read, or are of frames that the drive has not."""
-    return _of(format)[0](path, frames)
+    return _of(format)[0](path, frames[:])  # of a bag, frames that do not hold their clouds
 
 
 def export_labels(labels: DriveLabels, format: str, out: Path, frames: Sequence[Frame],
@@ -71,7 +71,7 @@ def export_labels(labels: DriveLabels, format: str, out: Path, frames: Sequence[
     if len(labels) != len(frames):
         raise InputError(f"labels of {len(labels)} frames for a drive of {len(frames)}; give those "
                          "of the same frames")
-    _of(format)[1](labels, out, frames, force)
+    _of(format)[1](labels, out, frames[:], force)
     notes = 0 if format in WITH_NOTES else sum(len(each.notes) for each in labels.frames)
     ids = format == "kitti_object" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
     return Written(out, labels.boxes, len(labels), (

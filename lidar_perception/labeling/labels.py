@@ -113,9 +113,9 @@ def of_truth(name: str, stamp_ns: int, truth: GroundTruth | None) -> FrameLabels
     extra = [dict(e) for e in truth.extras]
     ids = [e.pop("track_id", NO_TRACK) for e in extra]
     scores = [e.pop("score", np.nan) for e in extra]
-    classes = [e.pop("class_name", label) if label != OTHER else
-               e.pop("class_name", None) or e.get("detection_name") or label
-               for e, label in zip(extra, truth.labels)]
+    classes = [str(e.pop("class_name", None) or (label == OTHER and (
+        e.get("detection_name") or e.get("category"))) or label)
+        for e, label in zip(extra, truth.labels)]
     return FrameLabels.of(name, stamp_ns, truth.boxes, classes, ids, scores, extra, truth.notes)
 
 

@@ -17,6 +17,7 @@ from lidar_perception.types import InputError
 
 Array = np.ndarray[Any, Any]
 MARGIN = 0.3       # metres around a box within which its cluster is looked for
+NEAREST, FARTHEST = 20, 15.0  # points of the ground, and metres, where few are near
 PIECE = 0.2        # of the points of the largest cluster there: smaller ones are something else
 PIECES = 0.55      # of the usual length: so far from a click there are pieces of the same vehicle,
 MOST = 0.8         # if more of their points than this are there
@@ -50,10 +51,22 @@ def to_cluster(scan: Scan, box: Array) -> Array:
 
 def to_ground(scan: Scan, box: Array) -> Array:
     """(7,) the box with its bottom on the ground under it. InputError where none is seen there."""
-    floor = float(surface_under(scan.xyz[scan.ground], box[None, :2])[0])
+    floor = _floor(scan, box)
     if not np.isfinite(floor):
         raise InputError("no ground is seen around the box; move it by hand")
     return np.array([*box[:2], floor + box[5] / 2, *box[3:]])
+
+
+def _floor(scan: Scan, box: Array) -> float:
+    """z of the ground under a box (7,), or of the nearest ground where few of its points are seen;
+    NaN where there is none."""
+    ground = scan.xyz[scan.ground]
+    floor = float(surface_under(ground, box[None, :2])[0])
+    if np.isfinite(floor) or len(ground) < NEAREST:
+        return floor
+    apart = np.hypot(*(ground[:, :2] - box[:2]).T)
+    nearest = np.argpartition(apart, NEAREST - 1)[:NEAREST]
+    return float(np.median(ground[nearest, 2])) if apart[nearest].max() <= FARTHEST else np.nan
 
 
 def to_size(box: Array, size: Array) -> Array:
@@ -101,7 +114,7 @@ def _around(scan: Scan, members: Array) -> Array:
     """(7,) the L-shape around points (N,) bool, down to the ground."""
     xyz = scan.xyz[members]
     box = oriented_boxes(xyz, np.ones(len(xyz), np.int32), "l_shape")[0].astype(np.float64)
-    floor = float(surface_under(scan.xyz[scan.ground], box[None, :2])[0])
+    floor = _floor(scan, box)
     if np.isfinite(floor):
         top = max(box[2] + box[5] / 2, floor + 0.1)
         box[2], box[5] = (floor + top) / 2, top - floor

@@ -16,6 +16,7 @@ import aiohttp
 import numpy as np
 import pytest
 from samples import WALKER
+from yarl import URL
 
 BOX = [*WALKER[:6].tolist(), 0.3]
 ADD = {"do": "add", "frame": 0, "class": "Pedestrian", "box": BOX}
@@ -47,8 +48,8 @@ class Page:
         self.http, self.base = http, base
 
     async def get(self, path, **how):
-        """Status and body."""
-        async with self.http.get(self.base + path, **how) as answer:
+        """Status and body; the path goes out as it is."""
+        async with self.http.get(URL(self.base + path, encoded=True), **how) as answer:
             return answer.status, await answer.read()
 
     async def json(self, path):
@@ -258,8 +259,7 @@ def test_a_full_disk_is_said_and_the_labels_stay_as_the_journal_has_them(written
                     assert await page.json("/api/state") == before
                     return before
         raise AssertionError("the disk was never full")
-    with serving(written, tmp_path, preexec_fn=limited,
-                 env={**__import__("os").environ, "NUMBA_CACHE_DIR": ""}) as (_, url):
+    with serving(written, tmp_path, preexec_fn=limited) as (_, url):
         before = asked(url, fill)
     assert len(before["tracks"]) > 3
     with serving(written, tmp_path) as (_, url):

@@ -29,27 +29,28 @@ def read_object_labels(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
     return to_ground_truth([label for _, label in parsed_lines(path)], lidar_to_camera)
 
 
-def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray) -> dict[int, GroundTruth]:
+def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray,
+                         known_only: bool = False) -> dict[int, GroundTruth]:
     """Frame number -> objects, of one label_02 file. Frames without objects are left out."""
     frames: dict[int, list[dict]] = {}
-    for _, frame, label in parsed_tracking_lines(path):
+    for _, frame, label in parsed_tracking_lines(path, known_only):
         frames.setdefault(frame, []).append(label)
     return {k: to_ground_truth(v, lidar_to_camera) for k, v in frames.items()}
 
 
-def parsed_lines(path: Path, any_class: bool = False) -> list[tuple[int, dict]]:
+def parsed_lines(path: Path, known_only: bool = False) -> list[tuple[int, dict]]:
     """Line number, from 1, and parse() of every line of a label_2 or result file."""
-    return [(i, parse(line, path, i, any_class)) for i, line in _lines(path)]
+    return [(i, parse(line, path, i, known_only)) for i, line in _lines(path)]
 
 
-def parsed_tracking_lines(path: Path, any_class: bool = False) -> list[tuple[int, int, dict]]:
+def parsed_tracking_lines(path: Path, known_only: bool = False) -> list[tuple[int, int, dict]]:
     """Line number, from 1, the frame's number, and parse() with track_id of every line of a
     label_02 file."""
     found = []
     for i, line in _lines(path):
         try:
             frame, track, rest = line.split(maxsplit=2)
-            found.append((i, int(frame), dict(parse(rest, path, i, any_class),
+            found.append((i, int(frame), dict(parse(rest, path, i, known_only),
                                               track_id=int(track))))
         except ValueError as error:
             if isinstance(error, InputError):
@@ -58,9 +59,9 @@ def parsed_tracking_lines(path: Path, any_class: bool = False) -> list[tuple[int
     return found
 
 
-def parse(line: str, path: Path | str = "label", number: int = 0, any_class: bool = False) -> dict:
+def parse(line: str, path: Path | str = "label", number: int = 0, known_only: bool = False) -> dict:
     """One label line as a dict: class, the COLUMNS, and score where the line has one. InputError
-    for a class that is not in CLASSES, but with any_class."""
+    for a class that is not in CLASSES, if they must be known."""
     words = line.split()
     try:
         numbers = [float(w) for w in words[1:]]
@@ -70,7 +71,7 @@ def parse(line: str, path: Path | str = "label", number: int = 0, any_class: boo
         raise InputError(f"{path}:{number} is no KITTI label (a class and 14 or 15 numbers): "
                          f"{line!r}") from None
     name = OTHER_NAMES.get(words[0], words[0])
-    if name not in CLASSES and not any_class:
+    if name not in CLASSES and known_only:
         raise InputError(f"{path}:{number} has the unknown class {words[0]!r}; known are "
                          f"{', '.join(CLASSES)}")
     label = {"class": name, "truncated": numbers[0], "occluded": int(numbers[1]),
@@ -82,7 +83,8 @@ def parse(line: str, path: Path | str = "label", number: int = 0, any_class: boo
 
 
 def to_ground_truth(labels: list[dict], lidar_to_camera: np.ndarray) -> GroundTruth:
-    """Boxes in the LiDAR frame. Objects without a 3D box (DontCare) become notes."""
+    """Boxes in the LiDAR frame. Objects without a 3D box (DontCare) become notes; those of a class
+    that is not in CLASSES are Misc, with its name as class_name."""
     to_lidar = np.linalg.inv(lidar_to_camera)
     boxes, class_ids, extras, notes = [], [], [], []
     for label in labels:
@@ -92,8 +94,9 @@ def to_ground_truth(labels: list[dict], lidar_to_camera: np.ndarray) -> GroundTr
             notes.append((label["class"], extra))
             continue
         boxes.append(box)
-        class_ids.append(CLASSES.index(label["class"]))
-        extras.append(extra)
+        known = label["class"] in CLASSES
+        class_ids.append(CLASSES.index(label["class"] if known else "Misc"))
+        extras.append(extra if known else {**extra, "class_name": label["class"]})
     return GroundTruth.of(boxes, class_ids, extras, notes)
 
 
@@ -113,7 +116,8 @@ def to_labels(truth: GroundTruth, lidar_to_camera: np.ndarray) -> list[dict]:
     computed from the box; the 2D box is then zero."""
     labels = []
     for box, name, extra in zip(truth.boxes, truth.labels, truth.extras):
-        labels.append({"class": name, **camera_box(box, lidar_to_camera), **extra})
+        labels.append({"class": extra.get("class_name", name), **camera_box(box, lidar_to_camera),
+                       **{key: value for key, value in extra.items() if key != "class_name"}})
     return labels + [{"class": name, **extra} for name, extra in truth.notes]
 
 

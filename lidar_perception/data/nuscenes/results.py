@@ -86,6 +86,10 @@ def _boxes(where: str, rows: list) -> GlobalBoxes:
     if not isinstance(rows, list) or len(rows) > MAX_BOXES:
         raise InputError(f"{where}, needs a list of at most {MAX_BOXES} boxes; leave out those of "
                          "the lowest scores")
+    for number, row in enumerate(rows, 1):
+        if isinstance(row, dict) and row.get("detection_name", NAMES[0]) not in NAMES:
+            raise InputError(f"{where}, box {number}: the class {row['detection_name']!r} is none "
+                             f"of nuScenes' {', '.join(NAMES)}; rename or leave out such boxes")
     try:
         boxes = GlobalBoxes.of(
             [row["translation"] for row in rows],

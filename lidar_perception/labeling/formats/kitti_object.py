@@ -25,7 +25,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     files = frame_files(path, frames, ".txt")
     check_all_known(path, files, ".txt")
     return DriveLabels([frame_labels(
-        frame, [line for _, line in parsed_lines(file, any_class=True)] if file.exists() else [],
+        frame, [line for _, line in parsed_lines(file)] if file.exists() else [],
         file) for frame, file in zip(frames, files)])
 
 

@@ -28,7 +28,7 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     for drive, positions in sequences_of(frames).items():
         lines: dict[int, list[dict[str, Any]]] = {frames[i].index: [] for i in positions}
         if files[drive].exists() or files[drive] == path:
-            for number, frame, line in parsed_tracking_lines(files[drive], any_class=True):
+            for number, frame, line in parsed_tracking_lines(files[drive]):
                 if frame not in lines:
                     raise InputError(f"{files[drive]}:{number} is of frame {frame}, and the drive "
                                      f"has {min(lines)} to {max(lines)} ({len(lines)} of them); "

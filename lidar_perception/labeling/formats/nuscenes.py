@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.nuscenes.boxes import GlobalBoxes, in_frame, in_global
 from lidar_perception.data.nuscenes.labels import CLASS_OF
@@ -44,6 +45,8 @@ ROOT = "nuscenes"
 NO_SCORE = -1.0    # as nuscenes-devkit writes labels
 OURS = {**CLASS_OF, **{theirs: ours for ours, theirs in DETECTED.items()}}
 THEIRS = {ours: theirs for theirs, ours in OURS.items()}
+# What is theirs under another name of ours, which stands beside it: vans are cars.
+LIKE = {row.name: THEIRS[row.looks_like] for row in TABLE if row.looks_like in THEIRS}
 # What is ours with a rider, and theirs also without one.
 RIDDEN, NOT_RIDDEN = OURS.keys() - CLASS_OF.keys(), "cycle.without_rider"
 OWN = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id",
@@ -96,6 +99,8 @@ def _rows(task: str, frame: Frame, boxes: list[dict[str, Any]], ids: dict[str, i
         if track and track != str(ids[track]):
             rest["tracking_id"] = track
         score = float(row.get(f"{task}_score", NO_SCORE))
+        if (finer := rest.get("class_name")) in LIKE and LIKE[finer] == kind:
+            kind = rest.pop("class_name")
         kind = kind if attribute == NOT_RIDDEN else OURS.get(kind, kind)
         rows.append((box, kind, ids.get(track, NO_TRACK), np.nan if score < 0 else score, rest))
     return rows
@@ -141,8 +146,10 @@ def _columns(task: str, labels: FrameLabels, k: int, frame: Frame,
     elif THEIRS.get(kind) in RIDDEN and attribute == NOT_RIDDEN:
         attribute = ""  # a person said otherwise
     extra.pop("tracking_id", None)
+    if kind in LIKE:
+        extra["class_name"] = kind
     columns = {"velocity": extra.pop("velocity", velocity), "attribute_name": attribute,
-               f"{task}_name": THEIRS.get(kind, kind),
+               f"{task}_name": {**THEIRS, **LIKE}.get(kind, kind),
                f"{task}_score": (float(labels.scores[k]) if np.isfinite(labels.scores[k])
                                  else NO_SCORE)}
     if task == "tracking" or track != NO_TRACK:
