@@ -164,7 +164,8 @@ def _content(labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[i
         before = kept.get("frames", {}).get(str(frame.index), {})
         said[str(frame.index)] = {**before, "frame_properties": {
             **({} if systems is kept else parts.transforms(frame)),
-            **before.get("frame_properties", {}), "timestamp": f"{frame.stamp_ns / 1e9:.9f}", "name": frame.name}}
+            **before.get("frame_properties", {}), "name": frame.name,
+            "timestamp": f"{frame.stamp_ns / 1e9:.9f}"}}
         for k, (kind, extra) in enumerate(zip(each.class_names, each.extra)):
             track = int(each.track_ids[k])
             uid = named_tracks.get(track, str(next(new) if track == NO_TRACK else track))
