@@ -148,7 +148,9 @@ def _columns(task: str, labels: FrameLabels, k: int, frame: Frame,
     extra.pop("tracking_id", None)
     if kind in LIKE:
         extra["class_name"] = kind
-    columns = {"velocity": extra.pop("velocity", velocity), "attribute_name": attribute,
+    if isinstance(said := extra.pop("velocity", None), list) and len(said) == 2:
+        velocity = said
+    columns = {"velocity": velocity, "attribute_name": attribute,
                f"{task}_name": {**THEIRS, **LIKE}.get(kind, kind),
                f"{task}_score": (float(labels.scores[k]) if np.isfinite(labels.scores[k])
                                  else NO_SCORE)}
