@@ -38,6 +38,16 @@ def probabilities(class_ids: np.ndarray, evidence: Evidence) -> np.ndarray:
     return result
 
 
+def sources(class_ids: np.ndarray, evidence: Evidence) -> dict[str, np.ndarray]:
+    """By source, the probability (K,) float32 that it alone gives each of K proposals; NaN where it
+    says nothing, or does not count for the class."""
+    counts = {source: [i for i, name in enumerate(CLASSES)
+                       if source in models().get(name, {"curves": {}})["curves"]]
+              for source in evidence}
+    return {source: np.where(np.isin(class_ids, counts[source]), expit(odds), np.nan).astype(
+        np.float32) for source, odds in evidence.items()}
+
+
 @functools.cache
 def models() -> dict[str, Any]:
     """By class, the curves."""
