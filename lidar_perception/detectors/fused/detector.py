@@ -15,8 +15,14 @@ from lidar_perception.clustering.cluster import cluster
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.fused.boxes import on_ground, on_points
-from lidar_perception.detectors.fused.evidence import Evidence, distances, gathered
-from lidar_perception.detectors.fused.model import probabilities, sources
+from lidar_perception.detectors.fused.evidence import (
+    Evidence,
+    clipped_logit,
+    distances,
+    judged,
+    silhouette_at,
+)
+from lidar_perception.detectors.fused.model import at_most, probabilities, sources
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.nms import first_of_each, suppressed
 from lidar_perception.detectors.params import ScoreParams
@@ -70,7 +76,7 @@ class FusedDetector(NetworkDetector):
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:
         """Ground and PointPillars' clusters are computed where they are None."""
-        look = self.look(frame, ground, cluster_ids)
+        look = self.look(frame, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
         detections, best = self._fused(look)
         detections = in_sensor_frame(detections, self.params.ground.sensor_pose)
@@ -79,8 +85,10 @@ class FusedDetector(NetworkDetector):
                      best)
 
     def look(self, frame: LidarFrame, ground: np.ndarray | None = None,
-             cluster_ids: np.ndarray | None = None) -> Look:
-        """What all sources say of a frame, before it is weighed."""
+             cluster_ids: np.ndarray | None = None,
+             scores: ScoreParams = ScoreParams.all_alike(0.0)) -> Look:
+        """What all sources say of a frame, before it is weighed. The classifier, which takes the
+        time, is asked only about proposals that can reach these scores with its help."""
         times = [perf_counter()]
         settings = self.settings
         indices, seen = visible(frame, self.config, self.params.ground.sensor_pose)
@@ -96,9 +104,15 @@ class FusedDetector(NetworkDetector):
         times.append(perf_counter())
         people = cluster(obstacles.xyz, self.params.people)
         times.append(perf_counter())
-        evidence = gathered(proposed.detections, obstacles, floor, people, self.classifier)
+        found = proposed.detections
+        evidence = {"network": clipped_logit(found.scores), "silhouette": clipped_logit(
+            silhouette_at(found.boxes, obstacles.xyz, floor, people))}
+        open_ = scores.passed(replace(found, scores=at_most(found.class_ids, evidence,
+                                                            "classifier")))
+        evidence["classifier"] = clipped_logit(
+            judged(found, obstacles, floor, self.classifier, open_))
         times.append(perf_counter())
-        return Look(proposed.detections, evidence, obstacles.xyz, floor,
+        return Look(found, evidence, obstacles.xyz, floor,
                     self.proposer.out_of_sight(frame, seen) or proposed.problem,
                     dict(zip(STEPS, (np.diff(times) * 1e3).tolist())))
 

@@ -28,39 +28,35 @@ MARGIN = 0.2                # metres around a proposal: its points, for the clas
 FEWEST = 3                  # points that it says something of
 LEAST, MOST = 0.001, 0.999  # probabilities: no source is certain
 
+# By source, the log-odds (K,) float64 that each of K proposals is what it is proposed as; NaN where
+# the source is silent.
 Evidence = dict[str, np.ndarray]
-
-
-def gathered(proposed: Detections, obstacles: LidarFrame, ground: np.ndarray,
-             cluster_ids: np.ndarray, classifier: PointNetDetector) -> Evidence:
-    """By source, the log-odds (K,) float64 that each of K proposals is what it is proposed as; NaN
-    where the source is silent. obstacles: the N points that are not ground, with cluster_ids (N,),
-    1..J for people; ground (G, 3): the others."""
-    return {"network": clipped_logit(proposed.scores),
-            "silhouette": clipped_logit(
-                silhouette_at(proposed.boxes, obstacles.xyz, ground, cluster_ids)),
-            "classifier": clipped_logit(judged(proposed, obstacles, ground, classifier))}
 
 
 def silhouette_at(boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray,
                   cluster_ids: np.ndarray) -> np.ndarray:
     """(K,) float64: the greatest confidence that a cluster at boxes (K, 7) is a pedestrian, 0 where
-    there is none that may be; xyz (N, 3), cluster_ids (N,) and ground (G, 3) as of gathered."""
+    there is none that may be. xyz (N, 3): what is not ground, with cluster_ids (N,), 1..J for
+    people; ground (G, 3): the rest."""
     found = snap_to_ground(oriented_boxes(xyz, cluster_ids, BEST.boxes.shape), fit_plane(ground))
     chosen = np.flatnonzero((found[:, 5] >= HEIGHTS[0]) & (found[:, 5] <= HEIGHTS[1])
                             & (found[:, 3:5].max(axis=1, initial=0.0) <= LENGTH))
+    near = distances(boxes, found[chosen]) <= SAME_PLACE
+    asked = near.any(axis=0)
+    chosen, near = chosen[asked], near[:, asked]
     own, start = group_points(xyz, cluster_ids, chosen + 1)
     confidences = confidence(shape_features(own, start, found[chosen], BEST))
-    near = distances(boxes, found[chosen]) <= SAME_PLACE
     return (near * confidences).max(axis=1, initial=0.0)
 
 
 def judged(proposed: Detections, obstacles: LidarFrame, ground: np.ndarray,
-           classifier: PointNetDetector) -> np.ndarray:
+           classifier: PointNetDetector, open_: np.ndarray) -> np.ndarray:
     """(K,) the probability of the class of each of K proposals, for the points in its box; NaN
-    where the classifier does not know the class, or there are less than FEWEST points."""
+    where it is decided already, not open_ (K,), where the classifier does not know the class, and
+    where there are less than FEWEST points."""
     clusters = points_of(proposed.boxes, obstacles, obstacles, MARGIN)
-    asked = np.flatnonzero((clusters.sizes >= FEWEST) & known(classifier, proposed.class_ids))
+    asked = np.flatnonzero(open_ & (clusters.sizes >= FEWEST)
+                           & known(classifier, proposed.class_ids))
     clusters = clusters.take(asked).on(ground)
     probabilities = np.full(len(proposed), np.nan)
     probabilities[asked] = rescored_by(classifier, proposed[asked], clusters, 1.0)[0].scores

@@ -95,15 +95,16 @@ def _print_intervals(content: dict, console: Console) -> None:
     rows = {name: row["intervals"] for name, row in content["rows"].items() if "intervals" in row}
     if not rows:
         return
+    shown = INTERVALS[0], INTERVALS[-1]
     table = narrow_table(f"{SHARE} % intervals, drawn by drive", "",
-                         *(f"{name[:3]} {SHORT[row]}" for name in SCORED for row in INTERVALS),
-                         "F1", width=6)
+                         *(f"{name[:3]} {SHORT[row]}" for name in SCORED for row in shown),
+                         "F1", width=7)
     table.add_row("overlap above", *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}"
-                                     for name in SCORED for row in INTERVALS), style="dim",
+                                     for name in SCORED for row in shown), style="dim",
                   end_section=True)
     for name, said in rows.items():
         table.add_row(name, *(between(said["ap"][each] and said["ap"][each][row])
-                              for each in SCORED for row in INTERVALS), between(said["f1"]))
+                              for each in SCORED for row in shown), between(said["f1"]))
     table.caption = "AP of moderate labels; F1 of pedestrians at the score in use."
     console.print(table)
 
