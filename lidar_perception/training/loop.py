@@ -99,14 +99,14 @@ def _validate(run: Run, log: Log | None) -> None:
     progress = run.progress
     progress.validated = progress.step
     if rank() == 0:
-        metrics = run.task.validate(run.average.module)
+        metrics, calibration = run.task.validate(run.average.module)
         log.add("validation", progress.step, metrics)
         shown = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
         errors.print(f"step {progress.step}: {shown}", soft_wrap=True)
         better = progress.best is None or metrics["score"] > progress.best
         if better:
             progress.best, progress.best_step = metrics["score"], progress.step
-        record = {**vars(progress), "metrics": metrics}
+        record = {**vars(progress), "metrics": metrics, "calibration": calibration}
         if better:
             run.task.keep("best", run.average.module, record)
         if progress.step == run.steps:

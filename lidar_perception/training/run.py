@@ -26,15 +26,16 @@ class Task:
     module: on its device. loss(module, batch): the scalar to lower, and the parts to log; module is
     called as a function, as it may be wrapped for several processes. batches(step): the batches of
     that step, from 0, and all later ones, the same ones whenever it is asked. validate(module):
-    metrics, of which 'score' counts. keep(name, module, record): write the weights under a name,
-    'best' or 'last'; record can be JSON. epoch: steps of one pass over the data. about: what else a
+    metrics, of which 'score' counts, and what makes its scores probabilities
+    (detectors/calibration.py). keep(name, module, record): write the weights under a name, 'best'
+    or 'last'; record can be JSON. epoch: steps of one pass over the data. about: what else a
     resumed run must have in common with what was begun.
     """
 
     module: nn.Module
     loss: Callable[[nn.Module, Any], tuple[Tensor, dict[str, Tensor]]]
     batches: Callable[[int], Iterable[Any]]
-    validate: Callable[[nn.Module], dict[str, float]]
+    validate: Callable[[nn.Module], tuple[dict[str, float], dict[str, tuple[float, float]]]]
     keep: Callable[[str, nn.Module, dict[str, Any]], None]
     epoch: int
     about: dict[str, Any] = field(default_factory=dict)

@@ -196,11 +196,16 @@ def to_detections(objects: MarkedObjects) -> Detections:
 
 def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
                       lifetime_ns: int = 0, clusters: np.ndarray | None = None) -> Any:
-    """MarkerArray of K detections, with their ids in the text too, and the cluster_id (K,) of each
-    where it is one cluster of the cloud: a marker's own id has 32 bits, which not every cluster_id
-    fits. previous and lifetime_ns as in to_marker_array."""
+    """MarkerArray of K detections, with their ids in the text too, what each of their sources says
+    where it says something, and the cluster_id (K,) of each where it is one cluster of the cloud: a
+    marker's own id has 32 bits, which not every cluster_id fits. previous and lifetime_ns as in
+    to_marker_array."""
     labels = [CLASSES[i] for i in detections.class_ids]
-    texts: list[dict[str, int]] = [{"id": i} for i in range(len(detections))]
+    texts: list[dict[str, Any]] = [{"id": i} for i in range(len(detections))]
+    if detections.sources:
+        for i, text in enumerate(texts):
+            text["sources"] = {name: round(float(said[i]), 3) for name, said
+                               in detections.sources.items() if np.isfinite(said[i])}
     for text, cluster in zip(texts, () if clusters is None else clusters):
         text["cluster_id"] = int(cluster)
     return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,

@@ -32,7 +32,7 @@ from lidar_perception.training.augment import noisy, varied
 from lidar_perception.training.data import Batches, ReadScenes, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes
-from lidar_perception.training.record import begun_with, keeper, metrics_of
+from lidar_perception.training.record import begun_with, judged, keeper
 from lidar_perception.training.run import Task
 from lidar_perception.types import GroundTruth, InputError
 
@@ -180,9 +180,10 @@ def clusters_to_validate(source: CutScenes, i: int) -> ValidationClusters:
                               frame.truth(), frame.calibration())
 
 
-def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> dict[str, float]:
-    """Calibrate the network on the scenes and score it: score, the mean AP from above at the
-    relaxed overlaps (moderate, R40), and each class's; accuracy, the share of clusters of
+def validated(network: PointNet, scenes: Sequence[ValidationClusters]
+              ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """Calibrate the network on the scenes and score it, see Task: score, the mean AP from above at
+    the relaxed overlaps (moderate, R40), and each class's; accuracy, the share of clusters of
     SCORED_POINTS or more, and of the objects among them, whose class is right."""
     config = network.config
     labels = np.concatenate([s.labels for s in scenes])
@@ -196,14 +197,14 @@ def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> dict[s
         predictions.append(predict(network, scene.clusters))
         boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
         report.update(Detected(scene.name, scene.truth, boxes, scene.calibration))
-    metrics = metrics_of(report.compute(), "bev", config.classes)
+    metrics, calibration = judged(report, "bev", config.classes)
     known = (labels >= 0) & (sizes >= SCORED_POINTS)
     probabilities = np.concatenate([p.probabilities for p in predictions])[known]
     right, objects = probabilities.argmax(axis=1) == labels[known], labels[known] < len(
         config.classes)
     return {**metrics, "accuracy": 100 * float(right.mean()) if len(right) else math.nan,
             "object_accuracy": 100 * float(right[objects].mean()) if objects.any() else math.nan,
-            "calibration_error": calibration_error(probabilities, labels[known])}
+            "calibration_error": calibration_error(probabilities, labels[known])}, calibration
 
 
 def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches,
@@ -214,7 +215,7 @@ def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches
     network = begun_with(make_pointnet(config), init, PointNetConfig).to(device)
     scenes: list[ValidationClusters] = []
 
-    def validate(module: PointNet) -> dict[str, float]:
+    def validate(module: PointNet) -> tuple:
         if not scenes:
             for item, in loaded(validation, ([n] for n in range(len(validation))), batches.jobs):
                 if item.sample is not None:

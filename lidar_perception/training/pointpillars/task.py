@@ -42,7 +42,7 @@ from lidar_perception.training.data import Batches, ReadScenes, loaded
 from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
 from lidar_perception.training.putting import inside
-from lidar_perception.training.record import begun_with, keeper, metrics_of
+from lidar_perception.training.record import begun_with, judged, keeper
 from lidar_perception.training.run import Task
 from lidar_perception.types import CLASSES, InputError, LidarFrame
 
@@ -191,11 +191,11 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
     network = begun_with(make_network(config), init, NetworkConfig)
     network = network.to(device, memory_format=torch.channels_last)
 
-    def validate(module: PointPillars) -> dict[str, float]:
+    def validate(module: PointPillars) -> tuple:
         detector = PointPillarsDetector(TorchNetwork(module, device), Header(config), device,
                                         VALIDATED)
-        content = validation_report(detector, validation, batches.jobs).compute()
-        return metrics_of(content, params.score, config.classes)
+        return judged(validation_report(detector, validation, batches.jobs), params.score,
+                      config.classes)
 
     seen = narrowed(config, params.ahead, params.aside)
     return Task(network, make_loss(seen, device), batches, validate,
