@@ -1,0 +1,109 @@
+"""How much fits into a time: scans, steps and validations, from the speed of a machine."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from lidar_perception.types import InputError
+
+RESERVE = 0.1         # of the budget, for what was not measured
+PREPARING = 0.25      # of the time, at most, to make scenes
+VALIDATING = 0.12     # of it, to validate
+SCANS, VAL_SCANS = (24, 3000), (16, 200)
+VALIDATIONS = 6
+PASSES = 80           # over the scenes, at most
+WHOLE_RANGE = 12_000  # steps from which on the whole range is trained on, not a part of it
+LEAST_STEPS = 20      # in fewer nothing is learned
+
+
+@dataclass(frozen=True)
+class Speed:
+    """What was measured, in seconds: scan, cut: of one core, to simulate a scan and to cut objects
+    or clusters out of it (scan 0: nothing is simulated); step, whole: a step on the part of the
+    range that is quicker, and on all of it; frame: to validate a frame. scan_mb: size of what is
+    kept of a scan."""
+
+    scan: float
+    cut: float
+    step: float
+    whole: float
+    frame: float
+    scan_mb: float = 0.0
+
+
+@dataclass(frozen=True)
+class Plan:
+    """scans to train on, val_scans to validate on, cuts: scenes that are cut; steps, and
+    validate_steps from one validation to the next; part: only the quick part of the range."""
+
+    scans: int = 0
+    val_scans: int = 0
+    cuts: int = 0
+    steps: int = 0
+    validate_steps: int = 0
+    part: bool = True
+
+
+@dataclass(frozen=True)
+class Data:
+    """What is there to learn from: whether scans are simulated to train on, and to validate on; how
+    many recorded scenes there are of both; scenes in a step; scenes that are cut at most."""
+
+    simulated: bool
+    val_simulated: bool
+    recorded: int
+    val_recorded: int
+    batch: int
+    most_cuts: int
+
+
+def plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(),
+         epochs: float = 0.0) -> Plan:
+    """The plan that fits into so many hours. given: what is fixed, where it is not 0 (part False:
+    no part of the range), whether it fits or not; epochs: passes over the data, likewise.
+
+    A quarter of the time at most makes scenes; of the rest all that validation leaves is for steps.
+    InputError if the time is too short for LEAST_STEPS.
+    """
+    time = 3600 * hours * (1 - RESERVE)
+    scans, val, steps = given.scans, given.val_scans, given.steps
+    if data.simulated and not scans:
+        scans = _within(PREPARING * time * cores / (speed.scan + speed.cut), SCANS)
+        scans = min(scans, steps * data.batch) if steps else scans
+    scenes = (scans if data.simulated else 0) + data.recorded
+    if data.val_simulated and not val:
+        val = _within(min(max(scenes, SCANS[1]) / 8 if data.recorded else scenes / 8,
+                          VALIDATING * time / VALIDATIONS / speed.frame), VAL_SCANS)
+    epoch = max(1, round(scenes / data.batch))
+    steps = steps or (max(1, round(epochs * epoch)) if epochs else 0)
+    made = Plan(scans, val, given.cuts or min(scenes, data.most_cuts), steps, given.validate_steps)
+    once = speed.frame * (val + data.val_recorded)
+    validations = max(1, min(VALIDATIONS, int(VALIDATING * time / once)))
+    left = time - preparing(made, cores, speed) - validations * once
+    part = given.part and left / speed.whole < WHOLE_RANGE
+    each = speed.step if part else speed.whole
+    if not steps:
+        steps = min(int(left / each), PASSES * epoch)
+        if steps < LEAST_STEPS:
+            least = (time - left + LEAST_STEPS * each) / 3600 / (1 - RESERVE)
+            raise InputError(f"a budget of {hours:g} h is too short for {LEAST_STEPS} steps on "
+                             f"this machine: give --budget {least:.2g} or more, or fewer "
+                             "--data-scans and --data-val-scans")
+    return replace(made, part=part, steps=steps,
+                   validate_steps=given.validate_steps or -(-steps // validations))
+
+
+def preparing(plan: Plan, cores: int, speed: Speed) -> float:
+    """Seconds to make all scenes."""
+    return (speed.scan * (plan.scans + plan.val_scans) + speed.cut * plan.cuts) / cores
+
+
+def training(plan: Plan, speed: Speed, data: Data) -> tuple[float, float]:
+    """Seconds of all steps, and of all validations."""
+    validations = -(-plan.steps // plan.validate_steps)
+    return (plan.steps * (speed.step if plan.part else speed.whole),
+            validations * (plan.val_scans + data.val_recorded) * speed.frame)
+
+
+def _within(value: float, bounds: tuple[int, int]) -> int:
+    return int(min(max(value, bounds[0]), bounds[1]))
