@@ -41,12 +41,14 @@ setup(
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "msg_utils*"]),
     package_data={NAME: ["nodes/*.xml", "candidates/*.json", "reproduction/*.html",
+                         "simulation/sensors/*.yaml",
                          "detectors/*/weights/*", "detectors/fused/*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
-        (f"share/{NAME}/config", glob("config/*")),
+        (f"share/{NAME}/config", glob("config/*.*")),
+        (f"share/{NAME}/config/sensors", glob("config/sensors/*")),
         (f"lib/{NAME}", node_executables()),
     ],
     install_requires=[
