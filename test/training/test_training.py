@@ -26,7 +26,7 @@ from lidar_perception.types import InputError
 
 few = settings(max_examples=25, database=None)
 CPU = torch.device("cpu")
-PARAMS = LoopParams(steps=13, validate_steps=4, save_steps=3, log_steps=1, seed=3, lr=0.05)
+PARAMS = LoopParams(steps=13, validate_steps=4, save_steps=3, log_steps=1, seed=3, lr=0.05, amp="off")
 
 
 @pytest.fixture(scope="module", autouse=True)

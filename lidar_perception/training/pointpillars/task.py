@@ -182,8 +182,9 @@ def validation_report(detector: Detector, scenes: ReadScenes, jobs: int = 0) -> 
         report.skipped += item.skipped
         if item.sample is not None:
             frame = item.sample
-            report.update(detected(detector.mounted_at(frame.sensor_height), frame, frame.truth(),
-                                   frame.calibration()))
+            height = frame.sensor_height
+            at = detector if height == SENSOR_HEIGHT else detector.mounted_at(height)
+            report.update(detected(at, frame, frame.truth(), frame.calibration()))
     return report
 
 
