@@ -7,11 +7,12 @@ from dataclasses import dataclass, replace
 from lidar_perception.types import InputError
 
 RESERVE = 0.1         # of the budget, for what was not measured
+STARTING = 20.0       # seconds until processes run
 PREPARING = 0.25      # of the time, at most, to make scenes
 VALIDATING = 0.12     # of it, to validate
 SCANS, VAL_SCANS = (24, 3000), (16, 200)
 VALIDATIONS = 6
-PASSES = 80           # over the scenes, at most
+PASSES = 4, 80        # over the scenes: fewer show too little of each, more learn nothing new
 WHOLE_RANGE = 12_000  # steps from which on the whole range is trained on, not a part of it
 LEAST_STEPS = 20      # in fewer nothing is learned
 
@@ -62,13 +63,16 @@ def plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(
     """The plan that fits into so many hours. given: what is fixed, where it is not 0 (part False:
     no part of the range), whether it fits or not; epochs: passes over the data, likewise.
 
-    A quarter of the time at most makes scenes; of the rest all that validation leaves is for steps.
+    As many scenes as are seen four times, and take a quarter of the time at most; what these and
+    validation leave is for steps.
     InputError if the time is too short for LEAST_STEPS.
     """
-    time = 3600 * hours * (1 - RESERVE)
+    time = 3600 * hours * (1 - RESERVE) - STARTING
     scans, val, steps = given.scans, given.val_scans, given.steps
     if data.simulated and not scans:
-        scans = _within(PREPARING * time * cores / (speed.scan + speed.cut), SCANS)
+        each = (speed.scan + speed.cut) / cores
+        scans = _within(min(PREPARING * time / each, (1 - VALIDATING) * time / (
+            each + PASSES[0] * speed.step / data.batch)), SCANS)
         scans = min(scans, steps * data.batch) if steps else scans
     scenes = (scans if data.simulated else 0) + data.recorded
     if data.val_simulated and not val:
@@ -83,9 +87,9 @@ def plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(
     part = given.part and left / speed.whole < WHOLE_RANGE
     each = speed.step if part else speed.whole
     if not steps:
-        steps = min(int(left / each), PASSES * epoch)
+        steps = min(int(left / each), PASSES[1] * epoch)
         if steps < LEAST_STEPS:
-            least = (time - left + LEAST_STEPS * each) / 3600 / (1 - RESERVE)
+            least = (time - left + LEAST_STEPS * each + STARTING) / 3600 / (1 - RESERVE)
             raise InputError(f"a budget of {hours:g} h is too short for {LEAST_STEPS} steps on "
                              f"this machine: give --budget {least:.2g} or more, or fewer "
                              "--data-scans and --data-val-scans")
