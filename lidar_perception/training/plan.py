@@ -64,9 +64,22 @@ def plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(
     no part of the range), whether it fits or not; epochs: passes over the data, likewise.
 
     As many scenes as are seen four times, and take a quarter of the time at most; what these and
-    validation leave is for steps.
-    InputError if the time is too short for LEAST_STEPS.
+    validation leave is for steps. InputError if the time is too short for LEAST_STEPS.
     """
+    made = _fitted(hours, cores, speed, data, given, epochs)
+    if given.steps or epochs or made.steps >= LEAST_STEPS:
+        return made
+    enough = hours
+    while _fitted(enough, cores, speed, data, given, epochs).steps < LEAST_STEPS:
+        enough = 1.2 * enough
+    raise InputError(f"a budget of {hours:g} h is too short for {LEAST_STEPS} steps on this "
+                     f"machine: give --budget {1.05 * enough:.2g} or more, or fewer --data-scans "
+                     "and --data-val-scans")
+
+
+def _fitted(hours: float, cores: int, speed: Speed, data: Data, given: Plan,
+            epochs: float) -> Plan:
+    """As plan, with as few steps as there is time for."""
     time = 3600 * hours * (1 - RESERVE) - STARTING
     scans, val, steps = given.scans, given.val_scans, given.steps
     if data.simulated and not scans:
@@ -76,8 +89,7 @@ def plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(
         scans = min(scans, steps * data.batch) if steps else scans
     scenes = (scans if data.simulated else 0) + data.recorded
     if data.val_simulated and not val:
-        val = _within(min(max(scenes, SCANS[1]) / 8 if data.recorded else scenes / 8,
-                          VALIDATING * time / VALIDATIONS / speed.frame), VAL_SCANS)
+        val = _within(min(scenes / 8, VALIDATING * time / VALIDATIONS / speed.frame), VAL_SCANS)
     epoch = max(1, round(scenes / data.batch))
     steps = steps or (max(1, round(epochs * epoch)) if epochs else 0)
     made = Plan(scans, val, given.cuts or min(scenes, data.most_cuts), steps, given.validate_steps)
@@ -85,16 +97,10 @@ def plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(
     validations = max(1, min(VALIDATIONS, int(VALIDATING * time / once)))
     left = time - preparing(made, cores, speed) - validations * once
     part = given.part and left / speed.whole < WHOLE_RANGE
-    each = speed.step if part else speed.whole
-    if not steps:
-        steps = min(int(left / each), PASSES[1] * epoch)
-        if steps < LEAST_STEPS:
-            least = (time - left + LEAST_STEPS * each + STARTING) / 3600 / (1 - RESERVE)
-            raise InputError(f"a budget of {hours:g} h is too short for {LEAST_STEPS} steps on "
-                             f"this machine: give --budget {least:.2g} or more, or fewer "
-                             "--data-scans and --data-val-scans")
+    steps = steps or max(0, min(int(left / (speed.step if part else speed.whole)),
+                                PASSES[1] * epoch))
     return replace(made, part=part, steps=steps,
-                   validate_steps=given.validate_steps or -(-steps // validations))
+                   validate_steps=given.validate_steps or max(1, -(-steps // validations)))
 
 
 def preparing(plan: Plan, cores: int, speed: Speed) -> float:

@@ -148,8 +148,7 @@ def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
         errors.print(f"resuming {asked.out}", soft_wrap=True)
         return
     errors.print("measuring this machine with a few scenes ...")
-    few = with_values(params, {"data.scans": params.data.scans or 8,
-                               "data.val_scans": params.data.val_scans or 1})
+    few = with_values(params, {"data.scans": 8, "data.val_scans": 1, "data.cache": ""})
     sources, held_out = scenes_of(asked, few, sensor)
     scenes, scan = _some_scenes((*sources, *held_out))
     cut, step, whole, frame = network.measured(few, scenes, held_out[0], device)
