@@ -36,7 +36,8 @@ OPTIONS = (
     a_path("--out", "Folder for best.safetensors, last.safetensors, logs and the state.", "DIR",
            required=True),
     click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one."),
-    a_path("--init", "Start from the weights of this checkpoint, as far as they fit."),
+    a_path("--init", "Start from the weights of this checkpoint, as far as they fit; `package`: "
+           "those that come with the package.", "FILE|package"),
     device_option,
     click.option("--jobs", type=click.IntRange(0), default=lambda: min(cores(), 8),
                  show_default="one for each core, 8 at most",
@@ -79,7 +80,7 @@ def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
     Examples:
       lidar-perception train pointpillars --version v4 --data sim --out v4
       lidar-perception train pointpillars --data sim --sensor vlp16 --mount-height 0.6 \\
-          --range around --out robot
+          --range around --init package --out robot
       lidar-perception train pointpillars --data /data/kitti/object --split train.txt \\
           --val-split val.txt --epochs 80 --out v4 --resume
       torchrun --nproc-per-node 4 -m lidar_perception.cli.main train pointpillars --size full \\

@@ -35,6 +35,7 @@ from lidar_perception.types import InputError
 
 RUN = "run.json"  # what was asked for, measured and planned at the first start
 BUDGET = 2.0      # hours
+PACKAGE = Path("package")  # in --init: the weights that come with the package
 ROOM = 0.5        # GB that stay free on the disk
 
 
@@ -43,6 +44,9 @@ class Network(Protocol):
 
     name: str
     cutting: str  # what is cut from the scenes before the training
+
+    def own_weights(self, params: Any) -> Path:
+        """Those that come with the package. InputError if there are none."""
 
     def most_cuts(self, params: Any) -> int:
         """Scenes that are cut at most."""
@@ -80,12 +84,12 @@ class Ended(NamedTuple):
     batches: Batches
 
 
-def check(asked: Asked) -> None:
+def check(asked: Asked, init: Path | None) -> None:
     """InputError, before anything is made, for what cannot be."""
     if asked.budget is not None and not 0 < asked.budget < math.inf:
         raise InputError(f"--budget {asked.budget:g} must be a number of hours above 0")
-    if asked.init is not None:
-        network_of(asked.init)
+    if init is not None:
+        network_of(init)
     if (asked.out / RUN).exists() and not asked.resume:
         raise InputError(f"{asked.out} holds a training run already; give --resume to resume it, "
                          "or another --out")
@@ -107,7 +111,8 @@ def start(network: Network, asked: Asked, params: Any,
     InputError for what cannot be used, before much is computed.
     """
     begun = time.monotonic()
-    check(asked)
+    init = network.own_weights(params) if asked.init == PACKAGE else asked.init
+    check(asked, init)
     if not params.data.cache:
         params = with_values(params, {"data.cache": str(asked.out / "scans")})
     decided = bool(params.steps or params.epochs)
@@ -134,7 +139,7 @@ def start(network: Network, asked: Asked, params: Any,
         about = {**about_data(asked.data, asked.val, stream, held_out, asked.init),
                  "sensor": {"name": params.sensor, "height": sensor.height, "beams": sensor.rings}}
         task = network.task(params, batches, to_validate, asked.out, device, about, commit,
-                            asked.init)
+                            init)
         until = math.inf if hours is None else begun + 3600 * hours
         progress = train(task, params, asked.out, device, asked.resume, until)
         return Ended(progress, params.steps, batches) if rank() == 0 else None

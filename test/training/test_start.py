@@ -127,11 +127,14 @@ def test_the_plan_is_kept_and_other_settings_are_no_resumed_run(tmp_path, one_th
     sensor = write(tmp_path / "robot.yaml",
                    "elevations: [2, -3, -8, -13, -18]\nazimuth_step: 1.5\nrate: 10\nheight: 0.9\n")
     asked = ["train", "pointnet", "--data", "sim", "--sensor", str(sensor), "--data-scans", "2",
-             "--data-val-scans", "1", "--steps", "2", "--batch", "1", "--jobs", "0", "--out",
-             str(out)]
+             "--data-val-scans", "1", "--steps", "2", "--batch", "1", "--jobs", "0", "--init",
+             "package", "--out", str(out)]
     assert CliRunner().invoke(cli, [*asked, "--mount-height", "0.6"]).exit_code == 0
     said = read_header(out / "last.safetensors").training
     assert said["sensor"] == {"name": str(sensor), "height": 0.6, "beams": 5}
+    header = read_header(out / "last.safetensors")
+    assert header.unlike(0.7) is None and "at 0.6 m, and used with one at 1.73 m" in header.unlike(
+        1.73)
     plan = json.loads((out / RUN).read_text())["plan"]
     assert (plan["scans"], plan["steps"]) == (2, 2)
     other = CliRunner().invoke(cli, [*asked, "--resume"])

@@ -12,6 +12,8 @@ import torch
 
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import make_pointnet
+from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.data import Batches, ReadScenes, Stream
 from lidar_perception.training.measuring import seconds_of_step, timed
@@ -38,6 +40,10 @@ class PointNetStart:
     def name(self) -> str:
         """What is trained, for people."""
         return f"PointNet {self.config.title}".strip()
+
+    def own_weights(self, params: PointNetTraining) -> Path:
+        """Of the improved network; of others as far as they fit."""
+        return weights_file(PointNetParams())
 
     def most_cuts(self, params: PointNetTraining) -> int:
         """All scenes are cut."""

@@ -16,6 +16,8 @@ from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
 from lidar_perception.detectors.pointpillars.network import make_network
+from lidar_perception.detectors.pointpillars.params import PointPillarsParams
+from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cut_objects import CutObjects, cut, joined
 from lidar_perception.training.data import Batches, ReadScenes, Stream
@@ -48,6 +50,10 @@ class PointPillarsStart:
     def name(self) -> str:
         """What is trained, for people."""
         return f"PointPillars {self.config.title}"
+
+    def own_weights(self, params: PointPillarsTraining) -> Path:
+        """Of the same version and size."""
+        return weights_file(PointPillarsParams(version=params.version, size=params.size))
 
     def most_cuts(self, params: PointPillarsTraining) -> int:
         """0 where no objects are pasted."""
