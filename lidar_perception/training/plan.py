@@ -103,6 +103,17 @@ def _fitted(hours: float, cores: int, speed: Speed, data: Data, given: Plan,
                    validate_steps=given.validate_steps or max(1, -(-steps // validations)))
 
 
+def refitted(made: Plan, seconds: float, slower: float, speed: Speed, data: Data) -> Plan:
+    """The plan with as many of its steps as fit into what time is left, on a machine that many
+    times slower than measured; LEAST_STEPS at least."""
+    steps, validating = training(made, speed, data)
+    fit = ((1 - RESERVE) * seconds / slower - validating) / (steps / made.steps)
+    few = min(made.steps, max(LEAST_STEPS, int(fit)))
+    validations = -(-made.steps // made.validate_steps)
+    return made if few > (1 - RESERVE) * made.steps else replace(
+        made, steps=few, validate_steps=-(-few // validations))
+
+
 def preparing(plan: Plan, cores: int, speed: Speed) -> float:
     """Seconds to make all scenes."""
     return (speed.scan * (plan.scans + plan.val_scans) + speed.cut * plan.cuts) / cores

@@ -24,8 +24,17 @@ from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.data import Batches, ReadScenes, Stream
-from lidar_perception.training.loop import may_begin, train
-from lidar_perception.training.plan import Data, Plan, Speed, plan, preparing, training
+from lidar_perception.training.loop import STATE, may_begin, train
+from lidar_perception.training.plan import (
+    STARTING,
+    Data,
+    Plan,
+    Speed,
+    plan,
+    preparing,
+    refitted,
+    training,
+)
 from lidar_perception.training.preparing import keep_all
 from lidar_perception.training.ranks import joined, rank, wait, world
 from lidar_perception.training.run import Progress, Task
@@ -123,17 +132,20 @@ def start(network: Network, asked: Asked, params: Any,
             make_folder(Path(params.data.cache))
             _settle(network, asked, params, sensor, device)
         wait()
-        params = _settled(network, asked, params, sensor)
+        given, params = params, _settled(network, asked, params, sensor)
         sources, held_out = scenes_of(asked, params, sensor)
         cut = network.cut(params, sources, held_out, Path(params.data.cache))
         if rank() == 0:
             try:
                 _prepare(network, asked, sources, held_out, cut)
                 network.gather(params, cut, asked.out)
+                if not decided:
+                    _refit(asked.out, begun, hours or BUDGET)
             except KeyboardInterrupt:
                 errors.print("stopped; what is prepared is kept, --resume goes on")
                 raise
         wait()
+        params = _settled(network, asked, given, sensor)
         stream, to_validate = network.scenes(params, sources, held_out, cut, asked.out)
         batches = Batches(stream, params.batch, asked.jobs, rank(), world())
         about = {**about_data(asked.data, asked.val, stream, held_out, asked.init),
@@ -168,8 +180,23 @@ def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
         chosen = replace(chosen, validate_steps=params.validation_steps(epoch))
     _require_room(Path(params.data.cache), params.data.cache_gb, chosen, speed)
     _say(network, params, sensor, chosen, speed, data)
-    write_text(path, json.dumps({"asked": _decisive(asked, params, sensor),
-                                 "plan": asdict(chosen), "speed": asdict(speed)}, indent=1))
+    write_text(path, json.dumps({"asked": _decisive(asked, params, sensor), "plan": asdict(chosen),
+                                 "speed": asdict(speed), "data": asdict(data)}, indent=1))
+
+
+def _refit(out: Path, begun: float, hours: float) -> None:
+    """Plan fewer steps, before the first, where the preparation took longer than planned."""
+    if (out / STATE).exists():
+        return
+    known = json.loads(read_text(out / RUN, 10**6))
+    made, speed, data = Plan(**known["plan"]), Speed(**known["speed"]), Data(**known["data"])
+    passed = time.monotonic() - begun
+    slower = max(1.0, (passed - STARTING) / preparing(made, cores(), speed))
+    refit = refitted(made, 3600 * hours - passed, slower, speed, data)
+    if refit != made:
+        errors.print(f"the preparation took {duration(passed)}, {slower:.1f} times as long as "
+                     f"planned: {refit.steps} steps instead of {made.steps}", soft_wrap=True)
+        write_text(out / RUN, json.dumps({**known, "plan": asdict(refit)}, indent=1))
 
 
 def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor) -> Any:

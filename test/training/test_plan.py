@@ -19,6 +19,7 @@ from lidar_perception.training.plan import (
     Speed,
     plan,
     preparing,
+    refitted,
     training,
 )
 from lidar_perception.types import InputError
@@ -74,6 +75,17 @@ def test_what_is_given_wins():
     assert made == Plan(30, 7, 30, 5000, 11, False)  # it takes longer, as asked for
     assert plan(1.0, 2, SPEED, SIM, Plan(scans=100), epochs=3).steps == 75
     assert plan(1.0, 2, SPEED, SIM, Plan(steps=10)).scans <= 40  # no more than are looked at
+
+
+@few
+@given(st.floats(0, 7200), st.floats(1, 20))
+def test_after_a_slow_preparation_as_many_steps_are_left_as_fit(seconds, slower):
+    made = plan(2.0, 2, SPEED, SIM)
+    left = refitted(made, seconds, slower, SPEED, SIM)
+    assert LEAST_STEPS <= left.steps <= made.steps and left.validate_steps <= left.steps
+    assert (left.steps in (LEAST_STEPS, made.steps)
+            or slower * sum(training(left, SPEED, SIM)) <= seconds)
+    assert refitted(made, 7000.0, 1.0, SPEED, SIM) == made
 
 
 def test_a_machine_that_becomes_slower_is_said_once(monkeypatch, capsys):
