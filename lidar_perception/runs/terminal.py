@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from rich.console import Console
@@ -61,6 +62,19 @@ class _Lines(Progress):
         left = task.time_remaining
         errors.print(f"{task.description}: {task.completed:.0f}{of}"
                      + ("" if left is None else f", {duration(left)} left"), soft_wrap=True)
+
+
+@contextmanager
+def paused(bar: Progress) -> Iterator[None]:
+    """Without this bar, so that another one can be shown."""
+    if bar.disable:
+        yield
+        return
+    bar.stop()
+    try:
+        yield
+    finally:
+        bar.start()
 
 
 def track(items: Iterable, description: str, total: int) -> Iterator:

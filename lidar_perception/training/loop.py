@@ -20,7 +20,7 @@ from typing import Any
 import torch
 
 from lidar_perception.runs.files import make_folder, remove_temporaries, write_bytes
-from lidar_perception.runs.terminal import errors, progress
+from lidar_perception.runs.terminal import errors, paused, progress
 from lidar_perception.training.log import Log
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.ranks import any_of, rank, wait
@@ -66,7 +66,7 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
                 if run.due() or (run.progress.late
                                  and run.progress.step > run.progress.validated):
                     _save(path, run)  # as validation takes its time
-                    with pace.validating():
+                    with pace.validating(), paused(bar):
                         _validate(run, log)
                     _save(path, run)
                 if run.progress.step >= run.steps or run.progress.late:

@@ -28,6 +28,7 @@ from lidar_perception.detectors.pointnet.predict import found, outputs_of, predi
 from lidar_perception.detectors.view import in_sensor_frame
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.detections import Detected
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import noisy, varied
@@ -196,7 +197,7 @@ def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> dict[s
         for s in scenes if len(s.clusters)])
     calibrate(network, logits, torch.from_numpy(labels))
     report, predictions = DetectionReport(), []
-    for scene in scenes:
+    for scene in track(scenes, "validating", len(scenes)):
         predictions.append(predict(network, scene.clusters))
         boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
         boxes = in_sensor_frame(boxes, SensorPoseParams(height=scene.height))

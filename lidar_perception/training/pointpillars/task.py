@@ -35,6 +35,7 @@ from lidar_perception.detectors.pointpillars.targets import (
 )
 from lidar_perception.detectors.view import visible
 from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.detections import detected
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.scoring.kitti.report import DetectionReport
@@ -178,7 +179,8 @@ def frame_to_validate(source: Any, i: int) -> Frame:
 def validation_report(detector: Detector, scenes: ReadScenes, jobs: int = 0) -> DetectionReport:
     """The detector on every scene, by KITTI's protocol."""
     report = DetectionReport()
-    for item, in loaded(scenes, ([n] for n in range(len(scenes))), jobs):
+    items = loaded(scenes, ([n] for n in range(len(scenes))), jobs)
+    for item, in track(items, "validating", len(scenes)):
         report.skipped += item.skipped
         if item.sample is not None:
             frame = item.sample
