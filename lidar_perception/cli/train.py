@@ -111,8 +111,10 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
           --val-split val.txt --epochs 20 --out pointnet --resume
       lidar-perception train pointnet --ablation --data sim --steps 1000 --out ablation
     """
+    from lidar_perception.detectors.devices import chosen_device
     from lidar_perception.detectors.pointnet.config import ABLATIONS, pointnet_config
     from lidar_perception.training.pointnet.start import PointNetStart
+    from lidar_perception.training.ranks import joined, rank
     if not ablation:
         run(PointNetStart(pointnet_config(params.network)), asked, params)
         return
@@ -120,11 +122,14 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
         params = with_values(params, {"data.cache": str(asked.out / "scans")})
     if asked.budget:
         asked = replace(asked, budget=asked.budget / len(ABLATIONS))
-    for name in ABLATIONS:
-        console.print(f"{name}:", style="bold")
-        run(PointNetStart(pointnet_config(name)), replace(asked, out=asked.out / name),
-            replace(params, network=name))
-    print_ablation(asked.out)
+    with joined(chosen_device(asked.device)):
+        for name in ABLATIONS:
+            if rank() == 0:
+                console.print(f"{name}:", style="bold")
+            run(PointNetStart(pointnet_config(name)), replace(asked, out=asked.out / name),
+                replace(params, network=name))
+        if rank() == 0:
+            print_ablation(asked.out)
 
 
 def run(network: Any, asked: Asked, params: Any) -> None:
