@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from typing import Any, TypeVar
 
 import torch
@@ -11,7 +12,7 @@ from torch import nn
 
 from lidar_perception.runs.machine import cores
 from lidar_perception.training.params import LoopParams
-from lidar_perception.training.run import Run, Task
+from lidar_perception.training.run import number_format
 
 Result = TypeVar("Result")
 
@@ -29,10 +30,16 @@ def seconds_of_step(module: nn.Module, loss: Callable, prepare: Callable[[], Seq
     gives in processes of their own."""
     prepare()  # so that what is compiled is there
     preparing, samples = timed(prepare)
-    run = Run(Task(module, loss, lambda _: (), lambda _: {}, lambda *_: None, 1), params, device)
     batch = [samples[i % len(samples)] for i in range(params.batch)]
-    run.step(batch)
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
-    return (timed(lambda: run.step(batch))[0]
-            + preparing / len(samples) * params.batch / cores())
+    amp = number_format(params.amp, device)
+
+    def step() -> None:  # in this process alone, whatever others there are
+        with torch.autocast(device.type, amp) if amp else nullcontext():
+            total, _ = loss(module, batch)
+        total.backward()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+
+    module.train()
+    step()
+    return timed(step)[0] + preparing / len(samples) * params.batch / cores()

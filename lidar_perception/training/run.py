@@ -76,7 +76,7 @@ class Run:
                 self.module, device_ids=[device] if device.type == "cuda" else None)
         self.optimizer = torch.optim.AdamW(self.module.parameters(), lr=params.lr,
                                            weight_decay=params.weight_decay)
-        self.format = _format(params.amp, device)
+        self.format = number_format(params.amp, device)
         self.scaler = torch.amp.GradScaler(device.type, enabled=self.format is torch.float16)
         self.progress = Progress()
 
@@ -155,7 +155,8 @@ class Run:
         return length
 
 
-def _format(amp: str, device: torch.device) -> torch.dtype | None:
+def number_format(amp: str, device: torch.device) -> torch.dtype | None:
+    """The format of the forward pass, None for float32; amp as in LoopParams."""
     if device.type == "cpu":
         return FORMATS["bf16"] if amp == "bf16" or (amp == "auto" and has_bf16()) else None
     if amp == "off":
