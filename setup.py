@@ -41,7 +41,7 @@ setup(
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "msg_utils*"]),
     package_data={NAME: ["nodes/*.xml", "candidates/*.json", "reproduction/*.html",
-                         "simulation/sensors/*.yaml",
+                         "simulation/sensors/*.yaml", "sensor_setup/*.html",
                          "detectors/*/weights/*", "detectors/fused/*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

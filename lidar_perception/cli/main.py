@@ -15,6 +15,7 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
     "evaluate": ("evaluate.group.evaluate", "Score the algorithms without ROS."),
     "compare": ("compare.compare", "Run every detector on the same frames, side by side."),
     "reproduce": ("reproduce.reproduce", "Reproduce every table of the STM-CPA paper."),
+    "setup": ("setup.setup", "Measure a sensor and its mounting from unlabelled clouds."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),
     "simulate": ("simulate.simulate", "Write simulated, labelled scans as a bag or a data set."),
     "train": ("train.train", "Train a detector on recordings or simulated streets."),

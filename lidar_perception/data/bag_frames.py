@@ -62,6 +62,15 @@ class BagFrames(Sequence):
                 names[stamp] += 1
                 yield self._frame(i, time, stamp, names[stamp], lambda data=data: data)
 
+    def stamps(self) -> np.ndarray:
+        """(count,) int64 ns: the stamps of all clouds, after one look through the bag."""
+        return np.array([row[2] for row in self._index], np.int64)
+
+    def message(self, i: int) -> Any:
+        """Cloud i as it was recorded, with all its columns."""
+        time, before, *_ = self._index[i]
+        return decode(self._read(time, before), self.kind)
+
     def __getitem__(self, i):
         if isinstance(i, slice):
             return [self[k] for k in range(*i.indices(self.count))]

@@ -70,7 +70,7 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
                 bag.write(TRUTH, frame.stamp_ns, markers)
             if images and frame.image is not None and frame.image.exists():
                 _write_image(bag, frame.image, frame.stamp_ns)
-            bag.write(POINTS, frame.stamp_ns, from_array(_points(scan), header, bag_message))
+            bag.write(POINTS, frame.stamp_ns, from_array(points_of(scan), header, bag_message))
             count += 1
     return count
 
@@ -80,7 +80,7 @@ def _same(calibration: Calibration, written: Calibration | None) -> bool:
         np.array_equal(a, b) for a, b in zip(vars(calibration).values(), vars(written).values()))
 
 
-def _points(scan: LidarFrame) -> np.ndarray:
+def points_of(scan: LidarFrame) -> np.ndarray:
     """(N,) of POINT; without an intensity, only x y z."""
     if scan.intensity is None:
         return np.ascontiguousarray(scan.xyz).view(np.dtype(POINT.descr[:3])).reshape(-1)
