@@ -22,6 +22,7 @@ from lidar_perception.types import CLASSES, InputError
 KEY = "lidar_perception"  # of the metadata, whose values are strings
 FORMAT = 1
 MOST = 100.0  # of a calibration's slopes and offsets
+HEIGHT_APART = 0.3  # m between mounts from which on a cloud looks another
 
 
 class Config(Protocol):
@@ -63,6 +64,16 @@ class Header:
     def network(self) -> str:
         """Its name in NETWORKS."""
         return self.config.network
+
+    def unlike(self, height: float) -> str | None:
+        """What to say where weights that were trained on simulated scans are used with a sensor
+        so many metres above the ground, and theirs was elsewhere; None where that is not so."""
+        sensor = self.training.get("sensor")
+        if not isinstance(sensor, dict) or not isinstance(sensor.get("height"), float) or (
+                abs(sensor["height"] - height) < HEIGHT_APART):
+            return None
+        return (f"trained for the sensor {sensor.get('name')} at {sensor['height']:g} m, and used "
+                f"with one at {height:g} m")
 
     def text(self) -> str:
         """As JSON."""

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lidar_perception.runs.machine import has_bf16
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.ranks import any_of, world
 from lidar_perception.training.schedule import Average, one_cycle
@@ -44,7 +45,8 @@ class Task:
 @dataclass
 class Progress:
     """How far a run is: steps done, steps skipped (of them the last ones in a row), the best score
-    and its step, the step of the last validation, seconds spent; stopped: by a signal."""
+    and its step, the step of the last validation, seconds spent; stopped: by a signal; late: the
+    time was over."""
 
     step: int = 0
     skipped: int = 0
@@ -54,6 +56,7 @@ class Progress:
     validated: int = 0
     seconds: float = 0.0
     stopped: bool = False
+    late: bool = False
 
 
 class Run:
@@ -74,7 +77,7 @@ class Run:
                 self.module, device_ids=[device] if device.type == "cuda" else None)
         self.optimizer = torch.optim.AdamW(self.module.parameters(), lr=params.lr,
                                            weight_decay=params.weight_decay)
-        self.format = _format(params.amp, device)
+        self.format = number_format(params.amp, device)
         self.scaler = torch.amp.GradScaler(device.type, enabled=self.format is torch.float16)
         self.progress = Progress()
 
@@ -102,7 +105,7 @@ class Run:
         self.average.updates = state["updates"]
         self.optimizer.load_state_dict(state["optimizer"])
         self.scaler.load_state_dict(state["scaler"])
-        self.progress = Progress(**{**state["progress"], "stopped": False})
+        self.progress = Progress(**{**state["progress"], "stopped": False, "late": False})
         torch.set_rng_state(state["random"])
         if state["cuda"] is not None and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"], self.device)
@@ -153,9 +156,10 @@ class Run:
         return length
 
 
-def _format(amp: str, device: torch.device) -> torch.dtype | None:
+def number_format(amp: str, device: torch.device) -> torch.dtype | None:
+    """The format of the forward pass, None for float32; amp as in LoopParams."""
     if device.type == "cpu":
-        return FORMATS["bf16"] if amp == "bf16" else None
+        return FORMATS["bf16"] if amp == "bf16" or (amp == "auto" and has_bf16()) else None
     if amp == "off":
         return None
     if amp == "auto":

@@ -182,7 +182,7 @@ def test_a_scene_is_cut_by_our_own_clustering_and_around_its_objects(rng, tmp_pa
         def __len__(self):
             return 1
 
-        def __repr__(self):
+        def key(self, i):
             return "one"
 
         def scene(self, i):

@@ -18,6 +18,7 @@ from lidar_perception.cli.data import (
 )
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.runs.terminal import console
+from lidar_perception.runs.terminal import errors as terminal_errors
 from lidar_perception.types import InputError
 
 
@@ -58,6 +59,7 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
       lidar-perception evaluate detection --data drive --weights v4.safetensors --keep 0.1
     """
     from lidar_perception.data.frame import BOXES
+    from lidar_perception.detectors.checkpoint import read_header
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.scoring.detections import by_detector, by_files
     from lidar_perception.scoring.kitti.box_errors import box_errors, print_box_errors
@@ -83,6 +85,8 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
         start = partial(by_files, results)
     else:
         height = recording.frames[0].sensor_height
+        if weights.suffix == ".safetensors" and (other := read_header(weights).unlike(height)):
+            terminal_errors.print(f"{weights}: {other}", soft_wrap=True)
         open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height)
         start = partial(by_detector, open_, keep, write_results)
     report = DetectionReport()

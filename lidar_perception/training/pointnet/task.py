@@ -25,7 +25,10 @@ from lidar_perception.detectors.pointnet.clusters import (
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
 from lidar_perception.detectors.pointnet.predict import found, outputs_of, predict
+from lidar_perception.detectors.view import in_sensor_frame
 from lidar_perception.geometry import points_in_box
+from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.detections import Detected
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import noisy, varied
@@ -34,7 +37,7 @@ from lidar_perception.training.params import ClusterAugmentParams, PointNetTrain
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes
 from lidar_perception.training.record import begun_with, judged, keeper
 from lidar_perception.training.run import Task
-from lidar_perception.types import GroundTruth, InputError
+from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
 FEWEST = 3          # points that are left of a cluster, at least
 SCORED_POINTS = 10  # clusters with fewer do not count in the accuracy
@@ -162,13 +165,15 @@ def make_loss(config: PointNetConfig, device: torch.device) -> Callable:
 
 @dataclass(frozen=True)
 class ValidationClusters:
-    """A scene to validate on: the clusters that clustering made, with the truth of its frame."""
+    """A scene to validate on: the clusters that clustering made, with the truth of its frame.
+    height: of its sensor, metres."""
 
     name: str
     clusters: Clusters
     labels: np.ndarray
     truth: GroundTruth
     calibration: Calibration | None
+    height: float = SENSOR_HEIGHT
 
 
 def clusters_to_validate(source: CutScenes, i: int) -> ValidationClusters:
@@ -177,7 +182,7 @@ def clusters_to_validate(source: CutScenes, i: int) -> ValidationClusters:
     made = np.flatnonzero(~scene.loose)
     frame = source.frame(i)
     return ValidationClusters(frame.name, scene.clusters.take(made), scene.labels[made],
-                              frame.truth(), frame.calibration())
+                              frame.truth(), frame.calibration(), frame.sensor_height)
 
 
 def validated(network: PointNet, scenes: Sequence[ValidationClusters]
@@ -193,9 +198,10 @@ def validated(network: PointNet, scenes: Sequence[ValidationClusters]
         for s in scenes if len(s.clusters)])
     calibrate(network, logits, torch.from_numpy(labels))
     report, predictions = DetectionReport(), []
-    for scene in scenes:
+    for scene in track(scenes, "validating", len(scenes)):
         predictions.append(predict(network, scene.clusters))
         boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
+        boxes = in_sensor_frame(boxes, SensorPoseParams(height=scene.height))
         report.update(Detected(scene.name, scene.truth, boxes, scene.calibration))
     metrics, calibration = judged(report, "bev", config.classes)
     known = (labels >= 0) & (sizes >= SCORED_POINTS)
