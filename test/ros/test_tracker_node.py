@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -33,7 +31,8 @@ from lidar_perception.wire.messages import (
     to_truth,
 )
 from lidar_perception.wire.topics import CAMERA_INFO, ODOMETRY, POINTS, TRUTH
-from msg_utils.markers import ADD, box_pose, from_marker_array
+from msg_utils.detections import to_detection_array
+from msg_utils.markers import ADD, from_marker_array
 from msg_utils.stamps import header_message, to_ns
 
 NODE, ODOMETRY_TYPE = "tracker", "nav_msgs/msg/Odometry"
@@ -222,14 +221,10 @@ def test_detection_arrays_are_tracked_as_markers_are(start):
     node.transforms.on_odometry(odometry(pose(50, 0, 1), header(START, "lidar"), "base",
                                           bag_message))  # detections are in its fixed frame
     for i, found in enumerate(crowd()):
-        boxes = [SimpleNamespace(
-            bbox=SimpleNamespace(center=box_pose(box, bag_message), size=SimpleNamespace(
-                x=float(box[3]), y=float(box[4]), z=float(box[5]))),
-            results=[SimpleNamespace(hypothesis=SimpleNamespace(
-                class_id=CLASSES[kind], score=float(score)))])
-            for box, kind, score in zip(found.boxes, found.class_ids, found.scores)]
         stamp = START + i * TENTH
-        node.on_detections(SimpleNamespace(header=header(stamp), detections=boxes))
+        node.on_detections(to_detection_array(
+            found.boxes, [CLASSES[kind] for kind in found.class_ids], found.scores.tolist(),
+            header=header(stamp), make=bag_message))
         tracks = tracker(found, stamp, np.eye(4))
         shown = read(decode(node.sent["tracks"][-1], MARKERS))
         assert shown[1] == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]
