@@ -24,7 +24,7 @@ BEST_VALUES = {
     "stm.shifts": 2,
     "cpa.steps": 0,                # points drawn in their true size need no copies
     "confidence.enabled": True,
-    "confidence.threshold": 0.15,
+    "confidence.threshold": 0.25,
     "seed.min_confidence": 0.9,    # of seeds that nobody vouches for the template's is the best
 }
 PAPER = with_values(PipelineParams(), PAPER_VALUES)

@@ -19,7 +19,7 @@ from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
 from lidar_perception.testing.peer import Peer
-from lidar_perception.tracking.params import tracking_of
+from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
 from lidar_perception.wire.codec import bag_message, decode, encode
@@ -122,7 +122,7 @@ def test_tracks_of_the_graph_are_those_of_the_library_and_end_with_the_loop(loop
     poses = poses_of(drive_bag)
     stamps = [from_marker_array(m).stamp_ns for m in heard["found"]]
     assert len(poses) == clouds and stamps[:2 * clouds] == 2 * sorted(poses)
-    shown = assert_tracked(heard["found"], heard["behind"], poses, tracking_of("candidates"))
+    shown = assert_tracked(heard["found"], heard["behind"], poses, TrackingParams())
     rounds = [{i for t in shown[start:start + clouds] if t is not None for i in t.ids.tolist()}
               for start in (0, clouds)]
     assert rounds[0] and rounds[1] and not rounds[0] & rounds[1]
@@ -146,7 +146,7 @@ def test_in_one_process_with_the_detector_the_library_tracks_too(looped, drive_b
     """Each cloud waits for its pose, as the frames of a tracker do."""
     _, heard, _ = looped
     shown = assert_tracked(heard["found"], heard["inside"], poses_of(drive_bag),
-                           tracking_of("candidates"))
+                           TrackingParams())
     assert any(t is not None and len(t) for t in shown)
 
 
