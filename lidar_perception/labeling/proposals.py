@@ -4,7 +4,7 @@ through the drive, the surest first."""
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from lidar_perception.labeling.interpolation import Motion, filled
 from lidar_perception.labeling.snap import completed
 from lidar_perception.labeling.state import PROPOSED, Box, Track
 from lidar_perception.labeling.survey import Look
-from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams, tracking_of
+from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
 
@@ -31,7 +31,7 @@ LEAST_SCORE = 0.3      # of one
 SURE = 0.95            # score of a box that a person placed
 CANDIDATES = "candidates"  # source of a track that no detector sees
 # All that is followed comes out; what is proposed is chosen among whole tracks.
-TRACKING = replace(tracking_of(FUSED), report=0.0, report_unseen=0.0)
+TRACKING = TrackingParams(report=0.0, report_unseen=0.0)
 
 
 @dataclass(frozen=True, eq=False)
