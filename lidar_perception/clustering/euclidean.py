@@ -72,7 +72,7 @@ def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
         cells = cells_of(xyz, reach.max())
     component, enough = np.empty(n, np.int32), params.beta * np.log(n)
     reach2 = reach[cells.order] ** 2
-    leads, left = crowded(cells, reach2, enough, patience * n)
+    leads, left = crowded(cells, reach2, enough, float(patience * n))
     component[cells.order], left = _components(cells, np.stack([*cells.xyz, reach2], axis=1), leads,
                                                left)
     if left < 0:
@@ -201,7 +201,7 @@ def _components_by_tree(tree: Tree, reach2: np.ndarray, enough: float) -> np.nda
         thin = tree_of(tree.points[leads][kept])
         found = np.empty(len(kept), np.int64)
         found[thin.order] = connected(thin, widest[thin.order] * (1 + SLACK) ** 2,
-                                      np.ones(len(kept), bool), 0.0)[0]
+                                      np.ones(len(kept), bool), 0.0, np.inf)[0]
         component[leads] = found[group]
     leader = nearest_leaders(tree, reach2, leads)[0]
     return np.where(leader >= 0, component[leader], component)
@@ -270,7 +270,7 @@ def _merged(xyz: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
     if len(centre) > 2:
         tree = tree_of(centre[1:])
         every = np.ones(len(tree.order), bool)
-        joined = connected(tree, diameter[1:][tree.order], every, gamma)[0]
+        joined = connected(tree, diameter[1:][tree.order], every, gamma, np.inf)[0]
         component = np.empty(len(joined), np.int64)
         component[tree.order] = joined
         parent[1:] = np.unique(component, return_index=True)[1][component] + 1
