@@ -34,7 +34,8 @@ def convert(data: Path, out: Path, images: bool, split: Path | None, limit: int 
     """
     from lidar_perception.data.to_bag import write_bag
     recording = opened(data, split=split)
-    count, skipped = min(len(recording), limit or len(recording)), []
+    count = min(len(recording), limit or len(recording))
+    skipped: list[str] = []
     frames = track(islice(recording, count), f"converting {data}", count)
     written = write_bag(out, frames, images=images, force=force, skipped=skipped)
     console.print(f"{out}: {written} scans of {count}")

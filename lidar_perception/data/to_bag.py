@@ -48,7 +48,8 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
         bag.add_topic(TF_STATIC, "tf2_msgs/msg/TFMessage", LATCHED_QOS)
         bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")
         bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
-        count, shown, written = 0, frozenset(), None
+        shown: frozenset[tuple[str, int]] = frozenset()
+        count, written = 0, None
         for frame in frames:
             try:
                 scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()

@@ -66,7 +66,7 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
         if record:
             processes.start("bag_recorder", {}, {"bag": str((out / "result").resolve()),
                                                  "topics": recorded})
-        others = {"bag_recorder": set()} if record else {}
+        others: dict[str, set[str]] = {"bag_recorder": set()} if record else {}
         outputs = outputs_in_use({**graph, "evaluator": evaluator_remap})
         with errors.status("starting the nodes"):
             ready = watch.until(lambda: watch.connected(outputs | others),
