@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import click
+import numpy as np
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.warm_up import warm_up
-from lidar_perception.classes import CLASSES, PEDESTRIAN
+from lidar_perception.classes import DETECTED
 from lidar_perception.cli.data import WHAT, a_path, opened
 from lidar_perception.cli.evaluate.candidates import view_as_recorded
 from lidar_perception.cli.options import parameter_options
@@ -22,70 +24,80 @@ from lidar_perception.data.frame import BOXES, Recording
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.groups import renumbered
-from lidar_perception.nodes.graph import cloud_topic, result_topics
+from lidar_perception.nodes.graph import ALONE, FINAL, cloud_topic, result_topics
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console, errors, track
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.tables import print_candidate_report
-from lidar_perception.wire.messages import column, to_detections, to_frame
-from lidar_perception.wire.topics import TRUTH
+from lidar_perception.scoring.recorded import Answered, answered
+from lidar_perception.types import CLASSES, PEDESTRIAN
+from lidar_perception.wire.messages import column, to_detections, to_frame, to_truth
 from lidar_perception.wire.track_markers import drawn_trails
 from msg_utils.markers import from_marker_array
+
+CANDIDATES = "candidates"
 
 
 @click.command()
 @a_path("--data", f"Replay this instead of the simulated drive: {WHAT}", "PATH")
+@click.option("--detector", type=click.Choice(list(ALONE)), help="What detects. Default: fused; "
+              f"{CANDIDATES} if one of their parameters, below, is given.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("out/demo"),
               show_default=True, help="Folder for the results.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
               help="Length of the simulated drive, 10 frames a second.")
-@click.option("--drive-seed", type=click.IntRange(0), default=33, show_default=True,
+@click.option("--drive-seed", type=click.IntRange(0), default=38, show_default=True,
               help="Seed of the simulated drive.")
 @click.option("--rate", type=click.FloatRange(0.01, 100), default=1.0, show_default=True,
               help="Speed of the replay.")
-@click.option("--single", is_flag=True, help="Run all stages in one process instead of three.")
+@click.option("--single", is_flag=True, help="Run ground, clusters and detector in one process "
+                                             "instead of three.")
 @click.option("--real-time", is_flag=True, help="Play at the speed of the sensor, even if the "
                                                 "machine cannot keep up. Without it each cloud is "
                                                 "sent once those before it have their results.")
 @parameter_options(PAPER)
-def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float, single: bool,
-         real_time: bool, params: PipelineParams) -> None:
-    """Replay a drive through the real nodes over DDS and score the pedestrian candidates, and the
-    tracks of them.
+def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_seed: int,
+         rate: float, single: bool, real_time: bool, params: PipelineParams) -> None:
+    """Replay a drive through the real nodes over DDS, and score the detections and their tracks.
 
-    Without options: makes a simulated drive with walking pedestrians, writes it as a rosbag2 bag,
-    replays it into the nodes, each in its own process on a private ROS domain, and prints the
-    scores. Leaves in --out: the bag, the result bag, scores.json, birdseye.png and the logs.
+    Without options: makes a simulated drive with traffic and walking pedestrians, writes it as a
+    rosbag2 bag, replays it into the nodes, each in its own process on a private ROS domain, and
+    prints the scores. Leaves in --out: the bag, the result bag, scores.json, birdseye.png and the
+    logs. With --detector candidates, pedestrians alone, by the protocol of the STM-CPA paper.
 
     \b
     Examples:
       lidar-perception demo
       lidar-perception demo --data /data/kitti/tracking
       lidar-perception demo --data drive.bag --rate 0.5 --single
+      lidar-perception demo --detector candidates --config best
     """
+    detector = detector or ("fused" if params == PAPER else CANDIDATES)
+    if detector != CANDIDATES and params != PAPER:
+        raise click.UsageError(f"--config and the parameters are those of --detector {CANDIDATES}")
     recording = None if data is None else opened(data)
     for old in ("drive", "result", "logs"):
         shutil.rmtree(out / old, ignore_errors=True)
     drive = _bag(out / "drive", recording, frames, drive_seed)
     played = open_recording(drive)
     played.require(BOXES, "demo")
-    clouds, params = len(played), view_as_recorded(played, params)
-    from lidar_perception.nodes.replay import replay
+    clouds = len(played)
+    from lidar_perception.nodes.replay import TRACKS, replay
     with errors.status("loading compiled code (the first time: compiling, about a minute)"):
-        warm_up()
-    content = replay(drive, clouds, out, params, rate=rate, single=single,
+        own = _params_of(detector, played, params)
+    content = replay(drive, clouds, out, own, detector=detector, rate=rate, single=single,
                      real_time=real_time)
-    print_candidate_report(content, console)
-    latency = content["latency_ms"]
-    slower = content["slower"]
-    pace = f"{rate:g}x" if slower < 1.05 else f"{rate / slower:.2g}x, {slower:.2g} times slower " \
-        "than asked for, as the machine cannot keep up"
-    console.print(f"{clouds} clouds replayed at {pace}; {content['results']} results; latency "
-                  f"cloud to candidates median {latency['median']:.0f} ms, 95 % under "
-                  f"{latency['p95']:.0f} ms; memory of the graph {content['memory_mb']:.0f} MB")
-    content["tracks"] = _print_tracks(out / "result", played, content["poses"])
+    final = result_topics(single, detector)[FINAL]
+    found, calibration = answered(out / "result", final), next(iter(played)).calibration()
+    if detector == CANDIDATES:
+        print_candidate_report(content, console)
+    else:
+        content["detections"] = _print_detections(found, calibration)
+    _print_pace(content, rate, clouds)
+    tracks = answered(out / "result", TRACKS)
+    content["tracks"] = _print_tracks(tracks, calibration, content["poses"])
     write_text(out / "scores.json", json.dumps(content, indent=1))
-    picture = _draw_best(out / "result", out / "birdseye.png", single)
+    picture = _draw_best(out, cloud_topic(single, detector), _drawn(found, detector))
     console.print(f"results in {out}: result (bag), scores.json, logs"
                   + (", birdseye.png" if picture else ""))
     if missing := clouds - content["results"]:
@@ -93,6 +105,15 @@ def demo(data: Path | None, out: Path, frames: int, drive_seed: int, rate: float
             "; without --real-time none is dropped" if real_time else f"; see {out}/logs"))
         if not real_time:
             raise SystemExit(1)
+
+
+def _params_of(detector: str, played: Recording, params: PipelineParams) -> Any:
+    """The parameters of the nodes; compiles what they share, once instead of in each of them."""
+    if detector == CANDIDATES:
+        warm_up()
+        return view_as_recorded(played, params)
+    from lidar_perception.detectors.open import open_detector
+    return open_detector(detector, sensor_height=played.frames[0].sensor_height).params
 
 
 def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
@@ -116,51 +137,81 @@ POSES = {"odometry": "poses of the recording",
                "installed: pip install 'lidar_perception[odometry]'"}
 
 
-def _print_tracks(result: Path, played: Recording, poses: str | None) -> dict:
-    """Say how many pedestrians were tracked, how well, and with which poses; the scores."""
-    from lidar_perception.nodes.replay import TRACKS
+def _print_detections(frames: Sequence[Answered], calibration: Any) -> dict:
+    """Say what was found, by class, against the labels that the camera sees; the scores."""
+    from lidar_perception.scoring.detections import Detected
+    from lidar_perception.scoring.kitti.in_use import in_use, print_in_use
+    from lidar_perception.scoring.kitti.report import DetectionReport
+    report = DetectionReport()
+    for frame in frames:
+        report.update(Detected(str(frame.stamp_ns), to_truth(frame.truth),
+                               to_detections(frame.found), calibration))
+    scores = in_use(report.frames)
+    print_in_use(scores, len(frames), console)
+    return scores
+
+
+def _print_pace(content: dict, rate: float, clouds: int) -> None:
+    latency, slower = content["latency_ms"], content["slower"]
+    pace = f"{rate:g}x" if slower < 1.05 else f"{rate / slower:.2g}x, {slower:.2g} times slower " \
+        "than asked for, as the machine cannot keep up"
+    console.print(f"{clouds} clouds replayed at {pace}; {content['results']} results; latency "
+                  f"cloud to detections median {latency['median']:.0f} ms, 95 % under "
+                  f"{latency['p95']:.0f} ms; memory of the graph {content['memory_mb']:.0f} MB")
+
+
+def _print_tracks(frames: Sequence[Answered], calibration: Any, poses: str | None) -> dict:
+    """Say by class how many were tracked, how well, and with which poses; the scores."""
     from lidar_perception.scoring.tracking.from_bag import recorded_tracks
-    person = CLASSES[PEDESTRIAN]
-    count, scores, problem = recorded_tracks(result, TRACKS, person,
-                                             next(iter(played)).calibration())
-    text = f"HOTA is not known: {problem}" if scores is None else (
-        f"{scores['true_tracks']} labelled; {scores['switches']} identity switches, HOTA "
-        f"{100 * scores['HOTA']:.1f} (detection {100 * scores['DetA']:.1f}, association "
-        f"{100 * scores['AssA']:.1f})")
-    console.print(f"tracks: {count} of pedestrians, {text}; {POSES[poses]}")
-    return {"found": count, "scores": scores}
+    result = recorded_tracks(frames, calibration)
+    for name in DETECTED:
+        scores, count = result.scores.get(name), result.count.get(name, 0)
+        if scores:
+            console.print(
+                f"tracks of {name}: {count}, {scores['true_tracks']} labelled; "
+                f"{scores['switches']} identity switches, HOTA {100 * scores['HOTA']:.1f} "
+                f"(detection {100 * scores['DetA']:.1f}, association {100 * scores['AssA']:.1f})")
+    if result.problem:
+        console.print(f"tracks: {result.count}; HOTA is not known: {result.problem}")
+    console.print(f"tracks are with {POSES[poses]}" if poses else f"tracks are {POSES[poses]}")
+    return {"found": result.count, "scores": result.scores}
 
 
-def _draw_best(result: Path, picture: Path, single: bool) -> bool:
-    """Draw the recorded frame with most hits, and the ways of tracks; False if none has a labelled
-    pedestrian."""
+def _drawn(frames: Sequence[Answered], detector: str) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+    """Stamp -> true and found boxes, of the classes that the detector can find."""
+    wanted = {CLASSES[PEDESTRIAN]} if detector == CANDIDATES else {*DETECTED}
+
+    def of(objects: Any) -> np.ndarray:
+        return objects.boxes[[label in wanted for label in objects.labels]]
+
+    return {f.stamp_ns: (of(f.truth), of(f.found)) for f in frames}
+
+
+def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, np.ndarray]]) -> bool:
+    """Draw the recorded frame with most hits, and the ways of tracks; False if none has a label."""
     from lidar_perception.nodes.replay import TRACKS
     from lidar_perception.scoring.pictures import draw_frame
-    final = result_topics(single)["final"]
-    frames: dict[int, dict] = {}
-    trails: dict[int, dict] = {}
-    with Bag(result) as bag:
-        for topic, _, msg in bag.messages({TRUTH, final, TRACKS} & set(bag.topics)):
+    hits = {stamp: (len(match_centres(found, truth)[0]), len(truth))
+            for stamp, (truth, found) in frames.items() if len(truth)}
+    if not hits:
+        return False
+    best = max(hits, key=lambda s: (hits[s], s))  # the last of them: its trails are longest
+    trails: dict[int, np.ndarray] = {}
+    drawing = None
+    with Bag(out / "result") as bag:
+        for topic, _, msg in bag.messages({cloud, TRACKS} & set(bag.topics)):
             if topic == TRACKS:
-                trails[from_marker_array(msg).stamp_ns] = drawn_trails(msg)
-                continue
-            objects = from_marker_array(msg)
-            boxes = (to_detections(objects).boxes if topic == final
-                     else objects.boxes[[x == CLASSES[PEDESTRIAN] for x in objects.labels]])
-            frames.setdefault(objects.stamp_ns, {})[topic] = boxes
-        hits = {stamp: (len(match_centres(f[final], f[TRUTH])[0]), len(f[TRUTH]))
-                for stamp, f in frames.items() if len(f) == 2 and len(f[TRUTH])}
-        if not hits:
-            return False
-        best = max(hits, key=lambda s: (hits[s], s))  # the last of them: its trails are longest
-        for _, _, msg in bag.messages({cloud_topic(single)}):
-            frame, indices = to_frame(msg)
-            if frame.stamp_ns == best:
-                ids, _ = renumbered(column(msg, "cluster_id", indices))
-                draw_frame(picture, frame.xyz, column(msg, "ground", indices) > 0, ids,
-                           frames[best][TRUTH],
-                           frames[best][final], trails=trails.get(best, {}),
-                           title=f"{hits[best][0]} of {hits[best][1]} pedestrians found, stamp "
-                           f"{best / 1e9:.1f} s")
-                return True
-    return False
+                if from_marker_array(msg).stamp_ns == best:
+                    trails = drawn_trails(msg)
+            elif to_frame(msg)[0].stamp_ns == best:
+                drawing = msg
+    if drawing is None:
+        return False
+    frame, indices = to_frame(drawing)
+    ground, ids = column(drawing, "ground", indices), column(drawing, "cluster_id", indices)
+    none = np.zeros(len(frame), int)
+    draw_frame(out / "birdseye.png", frame.xyz, none > 0 if ground is None else ground > 0,
+               none if ids is None else renumbered(ids)[0], *frames[best], trails=trails,
+               title=f"{hits[best][0]} of {hits[best][1]} labelled objects found, stamp "
+               f"{best / 1e9:.1f} s")
+    return True

@@ -34,6 +34,7 @@ TRUTH_IN = {"~/input/ground_truth": relative(TRUTH)}
 CLOUDS = {"~/input/points": relative(POINTS)}
 ODOMETRY_IN = {"~/input/odometry": relative(ODOMETRY)}
 TRACKER = "tracker"
+FINAL = "final"  # the last stage of a detector, whose boxes are its detections
 CLUSTERED = {"~/input/points": "clustering/output/points"}
 
 # Ground and clusters, once for all detectors ...
@@ -101,16 +102,25 @@ STAGES, SINGLE = graph_of(["candidates"]), graph_of(["candidates"], single=True)
 POINTPILLARS, POINTNET = graph_of(["pointpillars"]), graph_of(["pointnet"])
 
 
-def result_topics(single: bool = False) -> dict[str, str]:
-    """Stage -> topic of its detections, without a namespace."""
-    node = "perception" if single else "candidate_refinement"
-    return {"stage1": f"/{node}/debug/stage1", "stage2": f"/{node}/debug/stage2",
-            "final": f"/{node}/output/detections"}
+def last_node(detector: str, single: bool = False) -> str:
+    """The node that publishes what a detector finds."""
+    node, = (ALONE if single else BEHIND)[detector]
+    return node
 
 
-def cloud_topic(single: bool = False) -> str:
-    """The cloud with all columns."""
-    return "/perception/output/points" if single else "/clustering/output/points"
+def result_topics(single: bool = False, detector: str = "candidates") -> dict[str, str]:
+    """Stage -> topic of its detections, without a namespace; the networks have one stage."""
+    node = last_node(detector, single)
+    before = ("stage1", "stage2") if detector == "candidates" else ()
+    return {**{stage: f"/{node}/debug/{stage}" for stage in before},
+            FINAL: f"/{node}/output/detections"}
+
+
+def cloud_topic(single: bool = False, detector: str = "candidates") -> str:
+    """The cloud with all columns that there are."""
+    if not single:
+        return "/clustering/output/points"
+    return f"/{last_node(detector, True)}/output/points" if detector == "candidates" else POINTS
 
 
 def timing_topics(single: bool = False) -> list[str]:
@@ -135,12 +145,13 @@ def outputs_in_use(graph: Graph) -> dict[str, set[str]]:
     return {node: {t for t in heard if t.startswith(f"/{node}/")} for node in graph}
 
 
-def wait_for(single: bool = False, points: int = 1, truth: int = 2) -> list[str]:
+def wait_for(single: bool = False, points: int = 1, truth: int = 2,
+             detector: str = "candidates") -> list[str]:
     """bag_player's wait_for: subscribers of the clouds, of the labels (the seed input and an
     evaluator), and one of each topic between the nodes."""
-    graph = SINGLE if single else STAGES
-    between = sorted(set().union(*outputs_in_use(graph).values()))
-    topics = [f"{POINTS}:={points}", f"{TRUTH}:={truth}", *between, result_topics(single)["final"]]
+    between = sorted(set().union(*outputs_in_use(graph_of([detector], single)).values()))
+    topics = [f"{POINTS}:={points}", f"{TRUTH}:={truth}", *between,
+              result_topics(single, detector)[FINAL]]
     return [*map(relative, topics)]
 
 

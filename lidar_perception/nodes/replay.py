@@ -1,14 +1,16 @@
-"""Replays a bag through the graph of nodes, each a process of its own, and scores the result."""
+"""Replays a bag through the graph of nodes, each a process of its own; records what they find."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
+from typing import Any
 
-from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.graph import (
+    FINAL,
     TRACKER,
     Processes,
     cloud_topic,
@@ -24,8 +26,9 @@ from lidar_perception.nodes.main import use_large_shared_memory
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors, progress
 from lidar_perception.tracking.ego import has_odometry
+from lidar_perception.tracking.params import tracking_of
 from lidar_perception.types import InputError
-from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, TRUTH
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
 TRACKS = f"/{TRACKER}/output/tracks"
 START_TIMEOUT = 180.0   # seconds for all nodes to compile, come up and find each other
@@ -33,54 +36,57 @@ AHEAD = 2               # clouds at a time, so that one stage works while anothe
 SILENCE_TIMEOUT = 10.0  # seconds without a result after the last cloud
 
 
-def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate: float = 1.0,
-           single: bool = False, record: bool = True, real_time: bool = False) -> dict:
-    """Scores of a bag with `clouds` clouds, and how the run went: results, latency_ms (from the
-    cloud's arrival in this process to its candidates'), memory_mb (proportional set size), slower
-    (how many times slower than asked for it was), and poses: whence the tracker had them, the
-    bag's odometry, KISS-ICP where there is none, or None where that is not installed either.
+def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = "candidates",
+           rate: float = 1.0, single: bool = False, real_time: bool = False) -> dict:
+    """How the run of a detector of the graph, with its params, over a bag of `clouds` clouds went:
+    results, latency_ms (from the cloud's arrival in this process to its detections'), memory_mb
+    (proportional set size), slower (how many times slower than asked for it was), and poses:
+    whence the tracker had them, the bag's odometry, KISS-ICP where there is none, or None where
+    that is not installed either. With the candidates also the evaluator's scores.
 
-    A cloud is sent when those before have their candidates, so that none is lost on a slow
+    A cloud is sent when those before have their detections, so that none is lost on a slow
     machine; with real_time they come as from a sensor, whatever becomes of them.
 
-    Leaves logs and, with record, the result bag in out. The nodes run on a private domain.
+    Leaves logs and the result bag in out. The nodes run on a private domain.
     """
     use_large_shared_memory()
     from lidar_perception.nodes.watch import Watch
 
-    graph = graph_of(["candidates"], single, tracking=True)
-    topics = {**result_topics(single), "tracks": TRACKS}
+    graph = graph_of([detector], single, tracking=True)
+    stages = result_topics(single, detector)
+    topics = {**stages, "tracks": TRACKS}
     domain = private_domain()
-    scores = out / "logs" / "scores.json"
-    evaluator_remap, evaluator_params = evaluation(scores.resolve(), single)
-    recorded = [cloud_topic(single), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
     with Bag(drive) as bag:
         poses = "odometry" if ODOMETRY in bag.topics else "kiss_icp" if has_odometry() else None
-    tracker = {"ego.source": poses or "none",
-               **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT})}
-    with Processes(out / "logs", domain) as processes, Watch(domain, topics["final"]) as watch:
-        for node, remap in graph.items():
-            processes.start(node, remap, tracker if node == TRACKER else
-                            {**flatten(params), "input.queue": AHEAD})
-        processes.start("evaluator", evaluator_remap, evaluator_params)
-        if record:
-            processes.start("bag_recorder", {}, {"bag": str((out / "result").resolve()),
-                                                 "topics": recorded})
-        others: dict[str, set[str]] = {"bag_recorder": set()} if record else {}
-        outputs = outputs_in_use({**graph, "evaluator": evaluator_remap})
+    scores = out / "logs" / "scores.json"
+    nodes: dict[str, tuple[Mapping[str, str], dict[str, Any]]] = {
+        node: (remap, {**flatten(params), "input.queue": AHEAD}) for node, remap in graph.items()}
+    nodes[TRACKER] = graph[TRACKER], {
+        **{f"tracking.{name}": value for name, value in flatten(tracking_of(detector)).items()},
+        "ego.source": poses or "none",
+        **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT})}
+    if scored := detector == "candidates":
+        nodes["evaluator"] = evaluation(scores.resolve(), single)
+    recorded = [cloud_topic(single, detector), *topics.values(), TRUTH, CAMERA_INFO, EXTRINSICS]
+    nodes["bag_recorder"] = {}, {"bag": str((out / "result").resolve()), "topics": recorded}
+    with Processes(out / "logs", domain) as processes, Watch(domain, stages[FINAL]) as watch:
+        for node, (remap, values) in nodes.items():
+            processes.start(node, remap, values)
+        outputs = outputs_in_use({node: remap for node, (remap, _) in nodes.items()})
         with errors.status("starting the nodes"):
-            ready = watch.until(lambda: watch.connected(outputs | others),
-                                START_TIMEOUT, processes.check)
+            ready = watch.until(lambda: watch.connected(outputs), START_TIMEOUT, processes.check)
         if not ready:
             raise InputError(f"the nodes did not find each other in {START_TIMEOUT:.0f} s: "
                              f"{list(watch.diagnostics) or 'none'} reported; see {out}/logs")
-        # The watch hears the clouds too, as the tracker may, and the recorder the labels.
-        rules = wait_for(single, points=2 + (poses == "kiss_icp"), truth=2 + record)
-        rules += [f"{relative(topics['final'])}:={3 + record}"]  # watch, evaluator, tracker
+        # The watch hears the clouds too, as the tracker and the recorder may, and the recorder
+        # the labels.
+        clouds_heard = 2 + (poses == "kiss_icp") + (POINTS in recorded)
+        rules = wait_for(single, clouds_heard, 1 + 2 * scored, detector)
+        rules += [f"{relative(stages[FINAL])}:={3 + scored}"]  # watch, recorder, tracker, evaluator
         rules += [relative(ODOMETRY)] if poses == "odometry" else []
         processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
                                            "wait_for": rules,
-                                           "follow": [] if real_time else [topics["final"]],
+                                           "follow": [] if real_time else [stages[FINAL]],
                                            "ahead": AHEAD})
         with progress() as bar:
             task = bar.add_task("replaying", total=clouds)
@@ -95,7 +101,7 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
                 before = watch.frames
                 watch.until(finished, SILENCE_TIMEOUT, lambda: processes.check("bag_player"))
         # These are behind the results by as much as their own work takes.
-        for node in ("evaluator", TRACKER):
+        for node in ("evaluator", TRACKER)[not scored:]:
             watch.until(lambda n=node: int(watch.value_of(n, "frames") or 0) >= watch.frames,
                         SILENCE_TIMEOUT)
         memory = processes.memory_mb()
@@ -105,7 +111,8 @@ def replay(drive: Path, clouds: int, out: Path, params: PipelineParams, *, rate:
     if watch.frames == 0:
         raise InputError(f"no cloud of {drive} gave a result; see {out}/logs")
     latencies = sorted(watch.latencies_ms) or [0.0]
-    return {**json.loads(scores.read_text()), "clouds": clouds, "results": watch.frames,
+    return {**(json.loads(scores.read_text()) if scored else {}),
+            "clouds": clouds, "results": watch.frames,
             "latency_ms": {"median": median(latencies),
                            "p95": latencies[int(0.95 * (len(latencies) - 1))]},
             "slower": float(watch.value_of("bag_player", "slower") or 1.0),

@@ -37,8 +37,8 @@ def draw_frame(path: str | Path, xyz: np.ndarray, ground: np.ndarray, cluster_id
     # Neighbouring ids get different colours.
     axes.scatter(-xyz[clustered, 1], xyz[clustered, 0], s=1.2, linewidths=0, cmap="tab20",
                  c=cluster_ids[clustered] * 7 % 20, vmin=0, vmax=19)
-    for boxes, color, label in ((truth, TRUTH_COLOR, "labelled pedestrian"),
-                                (found, FOUND_COLOR, "candidate")):
+    for boxes, color, label in ((truth, TRUTH_COLOR, "labelled"),
+                                (found, FOUND_COLOR, "found")):
         for i, corners in enumerate(box_corners(np.asarray(boxes, float).reshape(-1, 7))[:, :4]):
             closed = corners[[0, 1, 2, 3, 0]]
             axes.plot(-closed[:, 1], closed[:, 0], color=color, linewidth=1.6,

@@ -8,6 +8,7 @@ from tracking_samples import START, TENTH, crowd
 
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.scoring.pictures import draw_frame
+from lidar_perception.scoring.recorded import answered
 from lidar_perception.scoring.tracking.from_bag import recorded_tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
@@ -45,14 +46,15 @@ def recorded(request, tmp_path):
 
 def test_recorded_tracks_are_counted_and_scored_where_labels_have_ids(recorded):
     path, with_ids, _ = recorded
-    count, scores, problem = recorded_tracks(path, TRACKS, "Pedestrian", None)
-    assert count == 3
+    result = recorded_tracks(answered(path, TRACKS), None)
+    assert result.count == {"Car": 2, "Cyclist": 1, "Pedestrian": 3}
     if with_ids:
-        assert (scores["true_tracks"], scores["switches"], problem) == (3, 0, None)
+        scores = result.scores["Pedestrian"]
+        assert (scores["true_tracks"], scores["switches"], result.problem) == (3, 0, None)
         assert scores["HOTA"] > 0.8
     else:
-        assert scores is None and "track id" in problem
-    assert recorded_tracks(path, "/nothing", "Pedestrian", None)[0] == 0
+        assert result.scores == {} and "track id" in result.problem
+    assert answered(path, "/nothing") == []
 
 
 def test_the_ways_of_tracks_are_in_the_picture(recorded, tmp_path):

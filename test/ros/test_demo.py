@@ -1,0 +1,45 @@
+"""demo, README's first command: a bag through the graph of the default detector, to a score."""
+
+from __future__ import annotations
+
+import json
+import os
+
+import pytest
+import torch
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from click.testing import CliRunner
+from detector_node import assert_equal
+
+from lidar_perception.cli.demo import demo
+from lidar_perception.data.open import open_recording
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.nodes.graph import FINAL, result_topics
+from lidar_perception.scoring.recorded import answered
+
+
+def test_the_demo_scores_what_fused_finds_offline(drive_bag, tmp_path):
+    outcome = CliRunner().invoke(demo, ["--data", str(drive_bag), "--single",
+                                        "--out", str(tmp_path)])
+    assert outcome.exit_code == 0, outcome.output
+    scores = json.loads((tmp_path / "scores.json").read_text())
+    frames = {frame.stamp_ns: frame for frame in open_recording(drive_bag)}
+    found = answered(tmp_path / "result", result_topics(True, "fused")[FINAL])
+    assert {f.stamp_ns for f in found} == frames.keys() and scores["results"] == len(frames)
+    torch.set_num_threads(len(os.sched_getaffinity(0)))  # sums depend on it; nodes take all cores
+    fused = open_detector(sensor_height=next(iter(frames.values())).sensor_height)
+    for answer in found:
+        assert_equal(answer.found, fused(frames[answer.stamp_ns].load()).detections)
+    people = scores["detections"]["Pedestrian"]
+    assert people["hits"] > 0 and people["hits"] + people["missed"] == people["labels"]
+    assert scores["tracks"]["scores"]["Pedestrian"]["hits"] > 0
+    assert (tmp_path / "birdseye.png").stat().st_size > 10_000
+
+
+def test_parameters_of_the_candidates_are_refused_for_another_detector(tmp_path):
+    outcome = CliRunner().invoke(demo, ["--detector", "pointnet", "--config", "best",
+                                        "--out", str(tmp_path / "out")])
+    assert outcome.exit_code == 2 and "--detector candidates" in outcome.output
+    assert not (tmp_path / "out").exists()
