@@ -17,9 +17,10 @@ The equations are missing from the text of the paper; this is our reading of wha
 So the clusters do not depend on the order of the points. No pairs are stored: memory grows with
 the number of points only. Where the grid takes more than PATIENCE distances a point, because it
 is crowded with points out of reach of each other, a tree finds the same. Only the local threshold
-has to look at every pair: it is exact up to DENSE distances a point, where real scans take less
-than 1,000, and WORK a cloud, twice what the densest scan known takes; of denser clouds it takes a
-sample of each cell, the same of the same points.
+has to look at every pair: it is exact up to DENSE distances a point, where scans of KITTI take
+less than 1,700 and one of a Pandar64 among near surfaces 21,000, and WORK a cloud, twice what the
+densest scan known takes; of denser clouds it takes a sample of each cell, the same of the same
+points.
 """
 
 from __future__ import annotations

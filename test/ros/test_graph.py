@@ -47,14 +47,12 @@ def setting(request):
 
 @pytest.fixture(scope="module")
 def run(setting, drive_bag, tmp_path_factory):
-    """One replay: whether in one process, its scores, and the folder with the result bag. The one
-    process is started as in use."""
+    """One replay: whether in one process, its scores, and the folder with the result bag."""
     single, params = setting
     out = tmp_path_factory.mktemp("run")
     with Bag(drive_bag) as bag, pytest.MonkeyPatch.context() as patch:
         clouds = bag.counts[POINTS]
-        if not single:
-            patch.setattr("lidar_perception.nodes.replay.Processes", NodesUnderTest)
+        patch.setattr("lidar_perception.nodes.replay.Processes", NodesUnderTest)
         return single, replay(drive_bag, clouds, out, params, single=single), out
 
 
