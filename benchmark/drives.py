@@ -24,9 +24,11 @@ from benchmark.tracking import Seen, Step, peer, tracker
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.seed_sources import automatic_seed
 from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.classes import DETECTED
 from lidar_perception.detectors.candidates import CandidateDetector
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console, track
@@ -37,14 +39,14 @@ from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.scene import Streets
 from lidar_perception.simulation.sensor import HDL64E
-from lidar_perception.tracking.params import TrackingParams, tracking_of
+from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import Detections, InputError
 
 # Detector -> its classes, and the score from which on the peer gets its detections.
-DETECTORS = {"pointpillars": (("Car", "Pedestrian", "Cyclist"), 0.3),
-             "pointnet": (("Car", "Pedestrian", "Cyclist"), 0.3),
+NETWORKS = ("fused", "pointpillars", "pointnet")
+DETECTORS = {**dict.fromkeys(NETWORKS, (tuple(DETECTED), ScoreParams().car)),
              "candidates": (("Pedestrian",), BEST.confidence.threshold)}
-RESAMPLED, LEAST, INTERVAL = 2000, 0.05, (2.5, 97.5)
+RESAMPLED, LEAST, INTERVAL = 2000, 0.001, (2.5, 97.5)
 RECALLS = (0.3, 0.5, 0.6)
 Drive = list[tuple[Seen, dict[str, Detections]]]
 Counts = dict[str, tuple[HotaCounts, ClearCounts]]
@@ -56,7 +58,7 @@ def detected(street: int, frames: int, people: float) -> Drive:
     detectors: dict[str, Detector] = {
         "candidates": CandidateDetector(automatic_seed(load_seed(), params),
                                         FORWARD_CAMERA.camera(), params),
-        **{name: open_detector(name, "cpu") for name in ("pointpillars", "pointnet")}}
+        **{name: open_detector(name, "cpu") for name in NETWORKS}}
     detectors = {name: each.with_min_score(LEAST) for name, each in detectors.items()}
     drive = []
     for i in range(frames):
@@ -193,7 +195,7 @@ def main(first: int, count: int, seconds: float, people: float, cache: Path,
     drives = [cached(cache, street, frames, people) for street in
               track(range(first, first + count), "detecting", count)]
     content = {"drives": count, "seconds": seconds, "people": people, "first": first, "detectors": {
-        name: measured(drives, name, tracking_of(name)) for name in DETECTORS}}
+        name: measured(drives, name, TrackingParams()) for name in DETECTORS}}
     print_drives(content)
     if json_file:
         write_text(json_file, json.dumps(content, indent=1))

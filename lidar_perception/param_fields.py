@@ -21,6 +21,7 @@ RENAMED = {
     "seed.least_confidence": "seed.min_confidence",
     "pointnet.least_points": "pointnet.min_points",
     "data.least_points": "data.min_points",
+    "data.sensor": "sensor",
     "most_skipped": "max_skipped",
 }
 

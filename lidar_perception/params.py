@@ -9,8 +9,6 @@ dataclass is made, with the name, the value and the range in the message.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from typing import Self
 
 from lidar_perception.candidates.params import (
     ConfidenceParams,
@@ -24,7 +22,7 @@ from lidar_perception.clustering.params import BoxParams, ClusteringParams
 from lidar_perception.ground.params import GroundParams, ObstacleParams
 from lidar_perception.param_fields import Params, param
 from lidar_perception.robot.params import CropParams
-from lidar_perception.tracking.params import EgoParams, TrackingParams, tracking_of
+from lidar_perception.tracking.params import EgoParams, TrackingParams
 from lidar_perception.wire.params import InputParams, ViewParams
 
 
@@ -123,23 +121,12 @@ class DetectionNodeParams(BoxNodeParams):
     tracking: OptionalTracking = OptionalTracking()
     ego: EgoParams = EgoParams()
 
-    @classmethod
-    def of(cls, detector: str) -> Self:
-        """With the tracker's numbers for a detector."""
-        return cls(tracking=OptionalTracking(**vars(tracking_of(detector))))
-
 
 @dataclass(frozen=True)
 class PerceptionRobotParams(DetectionNodeParams):
     """What perception has besides."""
 
     obstacles: ObstacleParams = ObstacleParams()
-
-
-CANDIDATES, POINTPILLARS, POINTNET, FUSED = (
-    partial(DetectionNodeParams.of, name)
-    for name in ("candidates", "pointpillars", "pointnet", "fused"))
-PERCEPTION = partial(PerceptionRobotParams.of, "candidates")
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ Frames follow REP-103 (x forward, y left, z up; metres, radians); boxes are
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -66,11 +66,14 @@ def usable_returns(xyz: np.ndarray) -> np.ndarray:
 @dataclass(frozen=True)
 class Detections:
     """K boxes: boxes (K, 7) float32 [x y z l w h yaw], class_ids (K,) int32 into CLASSES,
-    scores (K,) float32. No detections is K = 0, never None."""
+    scores (K,) float32. No detections is K = 0, never None. sources: by the name of what judged
+    them its own probability (K,) float32, NaN where it says nothing; empty where one thing alone
+    did."""
 
     boxes: np.ndarray
     class_ids: np.ndarray
     scores: np.ndarray
+    sources: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     @staticmethod
     def of(boxes: ArrayLike, class_ids: ArrayLike = PEDESTRIAN,
@@ -90,7 +93,8 @@ class Detections:
 
     def __getitem__(self, index: np.ndarray | slice) -> Detections:
         """The detections under a mask, slice or index array."""
-        return Detections(self.boxes[index], self.class_ids[index], self.scores[index])
+        return Detections(self.boxes[index], self.class_ids[index], self.scores[index],
+                          {name: said[index] for name, said in self.sources.items()})
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,9 @@ def to_detection_array(boxes: np.ndarray, labels: Sequence[str],
 
 
 def from_detection_array(msg: Any) -> MarkedObjects:
-    """The objects of a Detection3DArray, each with its most likely class."""
+    """The objects of a Detection3DArray, each with its most likely class. Ids are those of the
+    message where all of them are numbers, each once; else 0..K-1, and the message's own, which may
+    be any text, are "id" in extras."""
     boxes, labels, scores = [], [], []
     for d in msg.detections:
         p, s = d.bbox.center.position, d.bbox.size
@@ -44,6 +46,10 @@ def from_detection_array(msg: Any) -> MarkedObjects:
         best = max(d.results, key=lambda r: r.hypothesis.score, default=None)
         labels.append(best.hypothesis.class_id if best else "")
         scores.append(best.hypothesis.score if best else 1.0)
+    names = [d.id for d in msg.detections]
+    numbered = (all(n.isascii() and n.isdigit() and len(n) < 19 for n in names)
+                and len(set(map(int, names))) == len(names))
+    extras = [{"id": n} if n and not numbered else {} for n in names]
     return MarkedObjects(np.array(boxes, float).reshape(-1, 7), labels, np.array(scores, float),
-                         np.arange(len(boxes)), [{} for _ in boxes], [],
-                         to_ns(msg.header.stamp), msg.header.frame_id)
+                         np.array(names if numbered else range(len(names)), np.int64),
+                         extras, [], to_ns(msg.header.stamp), msg.header.frame_id)

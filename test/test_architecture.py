@@ -23,7 +23,8 @@ MAX_LINES = 400
 # From the ground up: a room imports only those before it, and itself.
 ROOMS = ("classes", "types", "param_fields", "geometry", "camera", "groups", "robot", "runs",
          "wire", "data", "ground", "clustering", "candidates", "detectors", "tracking", "scoring",
-         "simulation", "training", "reproduction", "params", "nodes", "campaign", "cli", "testing")
+         "simulation", "sensor_setup", "training", "reproduction", "labeling", "params", "nodes",
+         "campaign", "cli", "testing")
 # What the files of a room may import besides the rooms below and the standard library.
 NUMBERS = ["numpy", "scipy", "numba"]
 STRANGERS = {
@@ -34,7 +35,9 @@ STRANGERS = {
     "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils", "lz4", "zstandard"],
     "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,
     "detectors": [*NUMBERS, "torch", "safetensors", "onnx", "onnxruntime", "onnxscript"],
-    "tracking": ["numpy", "scipy", "kiss_icp"], "params": [],
+    "tracking": ["numpy", "scipy", "kiss_icp"],
+    "sensor_setup": ["numpy", "scipy", "matplotlib", "jinja2", "msg_utils"],
+    "labeling": ["numpy", "aiohttp", "msg_utils"], "params": [],
 }
 
 
@@ -211,7 +214,8 @@ def test_every_public_function_has_a_docstring(name):
 
 
 STRICT = tuple(f"lidar_perception/{room}" for room in ROOMS[:ROOMS.index("data")] + (
-    "ground", "clustering", "candidates", "tracking") if room != "runs") + ("msg_utils",)
+    "ground", "clustering", "candidates", "tracking", "sensor_setup", "labeling")
+    if room != "runs") + ("msg_utils",)
 
 
 @for_all([n for n in TREES if n.startswith(STRICT)])

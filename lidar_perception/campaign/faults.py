@@ -21,7 +21,7 @@ from lidar_perception.types import InputError
 SECONDS, MEGABYTES = 240.0, 4000.0
 STOPPED = 4.0  # seconds, longer than the diagnostics take to notice
 SENSOR = "generic:16,-24,4,0.8,10"
-TRAIN = ("train", "pointnet", "--data", "sim", "--data-sensor", SENSOR, "--data-scans", "2",
+TRAIN = ("train", "pointnet", "--data", "sim", "--sensor", SENSOR, "--data-scans", "2",
          "--data-val-scans", "1", "--data-people", "1", "--steps", "6", "--validate-steps", "2",
          "--log-steps", "1", "--batch", "1", "--jobs", "0", "--device", "cpu")
 # What is stopped in the middle -> the command, what is added to resume it, and the files that must

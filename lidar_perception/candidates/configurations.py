@@ -25,6 +25,7 @@ BEST_VALUES = {
     "cpa.steps": 0,                # points drawn in their true size need no copies
     "confidence.enabled": True,
     "confidence.threshold": 0.25,
+    "seed.min_confidence": 0.9,    # of seeds that nobody vouches for the template's is the best
 }
 PAPER = with_values(PipelineParams(), PAPER_VALUES)
 BEST = with_values(PAPER, BEST_VALUES)

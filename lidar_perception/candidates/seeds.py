@@ -68,6 +68,14 @@ def seed_from_truth(xyz: np.ndarray, ground: np.ndarray, pedestrians: np.ndarray
 def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxes: np.ndarray,
                     radius: float) -> Seed:
     """Seed of the cluster whose points (labels 1..K, ground-snapped boxes (K, 7)) come nearest to
+    click (3,). InputError as of clicked_cluster."""
+    label = clicked_cluster(click, xyz, labels, radius)
+    return seed_from_points(xyz[labels == label], boxes[label - 1], certain=True)
+
+
+def clicked_cluster(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray,
+                    radius: float) -> int:
+    """The label of the cluster whose points (N, 3), labels (N,) with 0 for none, come nearest to
     click (3,). InputError where none is within radius, or the click is not finite."""
     click = np.asarray(click, np.float64)
     if not np.isfinite(click).all():
@@ -79,9 +87,8 @@ def seed_from_click(click: np.ndarray, xyz: np.ndarray, labels: np.ndarray, boxe
         distance = np.linalg.norm(xyz[clustered] - click.astype(np.float32), axis=1)
     if not distance.min() <= radius:
         raise InputError(f"nearest cluster is {distance.min():.1f} m from the clicked point; "
-                         f"click within {radius:g} m of a pedestrian")
-    label = labels[clustered[distance.argmin()]]
-    return seed_from_points(xyz[labels == label], boxes[label - 1], certain=True)
+                         f"click within {radius:g} m of one")
+    return int(labels[clustered[distance.argmin()]])
 
 
 def save_seed(seed: Seed, path: str | Path) -> None:

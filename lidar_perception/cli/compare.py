@@ -8,7 +8,14 @@ from pathlib import Path
 
 import click
 
-from lidar_perception.cli.data import Walk, a_path, device_option, no_labels, walk_options
+from lidar_perception.cli.data import (
+    Walk,
+    a_path,
+    device_option,
+    intervals_option,
+    no_labels,
+    walk_options,
+)
 from lidar_perception.runs.terminal import console, errors
 
 
@@ -17,8 +24,10 @@ from lidar_perception.runs.terminal import console, errors
 @a_path("--weights", "One more network, PointPillars or PointNet; may be given several times.",
         multiple=True)
 @a_path("--png", "Draw F1 and mean AP against time.")
+@intervals_option
 @device_option
-def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, device: str) -> None:
+def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, device: str,
+            intervals: int) -> None:
     """Run all detectors on the same frames, in turns, and print scores and times side by side.
 
     STM-CPA (`paper` and `best`), PointPillars V0 to V4 in both sizes, PointNet, and their hybrids:
@@ -29,6 +38,7 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, device: str
     \b
     Examples:
       lidar-perception compare --data /data/kitti/object --json compare.json --png compare.png
+      lidar-perception compare --data /data/kitti/tracking --intervals 200
       lidar-perception compare --data training_data --weights v4.safetensors --limit 100
     """
     from lidar_perception.data.frame import BOXES
@@ -43,7 +53,7 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, device: str
         height = recording.frames[0].sensor_height
         found, missing = contenders(weights, device, height)
     open_ = (lambda: found) if walk.here else partial(opened_in_a_process, weights, device, height)
-    report = ComparisonReport(found)
+    report = ComparisonReport(found, intervals)
     walk.fill(report, recording, partial(by_contenders, open_), title="comparing")
     if not report.first.frames:
         raise no_labels(recording, report.skipped)

@@ -1,44 +1,133 @@
-"""convert: labelled frames to a bag."""
+"""convert: recordings to bags and data sets, labels from one format to another."""
 
 from __future__ import annotations
 
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import click
 from rich.markup import escape
 
-from lidar_perception.cli.data import limit_option, opened, split_option
+from lidar_perception.cli.data import a_path, limit_option, opened, split_option
 from lidar_perception.runs.terminal import console, track
+from lidar_perception.wire.topics import POINTS
+
+BAG = "bag"
+DATASETS = ("kitti_object", "kitti_tracking", "nuscenes", "semantickitti")
+LABELS = ("kitti_object", "kitti_tracking", "nuscenes_detection", "nuscenes_tracking", "labelcloud",
+          "labelcloud_rel", "labelcloud_vertices", "sustech", "openlabel", "bag", "bag_labels")
 
 
 @click.command()
-@click.argument("data", type=click.Path(path_type=Path), metavar="PATH")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Bag folder to make.")
-@click.option("--images", is_flag=True, help="Include the left colour images, as PNG.")
+@click.argument("source", type=click.Path(path_type=Path), metavar="PATH")
+@click.option("--to", "format", type=click.Choice(list(dict.fromkeys((BAG, *DATASETS, *LABELS)))),
+              default=BAG, show_default=True, help="What to make.")
+@click.option("--out", type=click.Path(path_type=Path), required=True,
+              help="Bag, folder or file to make.")
+@a_path("--data", "PATH holds labels of this drive, a recording; convert the labels.", "DRIVE")
+@click.option("--from", "given", type=click.Choice(LABELS), help="Format of the labels at PATH. "
+              "Default: recognised.")
+@click.option("--detections", metavar="TOPIC", help="Take the boxes on this topic of the bag at "
+              "PATH (MarkerArray or Detection3DArray), instead of its labels.")
+@click.option("--points", default=POINTS, show_default=True, metavar="TOPIC",
+              help="Clouds of a bag.")
+@click.option("--images", is_flag=True, help="To a bag: include the left colour images, as PNG.")
 @split_option
 @limit_option
-@click.option("--force", is_flag=True, help="Replace the bag if it exists.")
-def convert(data: Path, out: Path, images: bool, split: Path | None, limit: int | None,
-            force: bool) -> None:
-    """KITTI, nuScenes or SemanticKITTI at PATH, or another bag, to one MCAP bag.
+@click.option("--force", is_flag=True, help="Replace what is there: a bag, or files of the same "
+              "names.")
+def convert(source: Path, format: str, out: Path, data: Path | None, given: str | None,
+            detections: str | None, points: str, images: bool, split: Path | None,
+            limit: int | None, force: bool) -> None:
+    """The recording at PATH (KITTI, nuScenes, SemanticKITTI, a bag) to one MCAP bag, or to a folder
+    of a data set with clouds, labels, poses and calibration, or only its labels to a format of
+    other tools. With --data, PATH holds labels.
 
-    Topics: /points, /ground_truth/detections, /camera/camera_info, /camera/extrinsics, /tf_static,
-    and with --images /camera/image/compressed. Scans that cannot be read are left out, named and
-    counted; the exit code is then 1.
+    A bag has the topics /points, /ground_truth/detections, /camera/camera_info, /camera/extrinsics,
+    /tf_static, /odom and with --images /camera/image/compressed; scans that cannot be read are left
+    out of it, named and counted; the exit code is then 1. A folder or a file is written whole or
+    not at all, and nothing that is there is replaced without --force.
 
     \b
     Examples:
       lidar-perception convert /data/kitti/tracking --out tracking.bag
-      lidar-perception convert /data/nuscenes/v1.0-mini --out nuscenes.bag
+      lidar-perception convert drive --to kitti_tracking --out drive_kitti
+      lidar-perception convert result --detections /fused_detector/output/detections \\
+        --to kitti_object --out detected
+      lidar-perception convert /data/kitti/tracking --to openlabel --out labels.json
+      lidar-perception convert labels --data drive --to sustech --out drive_sustech/label
     """
+    given_labels = data is not None or (format in LABELS and format not in (BAG, *DATASETS))
+    for wrong, what in (
+            (images and (given_labels or format != BAG), "--images is for --to bag"),
+            (given is not None and data is None, "--from says what labels PATH holds; give their "
+                                                 "drive with --data"),
+            (given is not None and detections is not None, "--detections is for a bag, --from for "
+                                                           "other labels"),
+            (data is not None and format == "nuscenes", "labels are written as nuscenes_detection "
+                                                        "or nuscenes_tracking")):
+        if wrong:
+            raise click.UsageError(what)
+    recording = opened(source if data is None else data, split=split, points=points)
+    if given_labels:
+        _labels(source, recording, format, out, given, data is not None, detections, limit, force)
+    elif format == BAG and detections is None:
+        _bag(source, recording, out, images, limit, force)
+    else:
+        _dataset(source, recording, format, out, detections, limit, force)
+
+
+def _bag(source: Path, recording: Any, out: Path, images: bool, limit: int | None,
+         force: bool) -> None:
     from lidar_perception.data.to_bag import write_bag
-    recording = opened(data, split=split)
-    count = min(len(recording), limit or len(recording))
-    skipped: list[str] = []
-    frames = track(islice(recording, count), f"converting {data}", count)
+    count, skipped = min(len(recording), limit or len(recording)), []
+    frames = track(islice(recording, count), f"converting {source}", count)
     written = write_bag(out, frames, images=images, force=force, skipped=skipped)
     console.print(f"{out}: {written} scans of {count}")
     for line in skipped:
         console.print(f"[yellow]left out[/]: {escape(line)}")
     raise SystemExit(1 if skipped else 0)
+
+
+def _on_topic(source: Path, recording: Any, topic: str) -> Any:
+    """DriveLabels of the boxes on a topic of a bag."""
+    from lidar_perception.labeling.formats import bag
+    return bag.read(source, recording.frames[:], topic)
+
+
+def _dataset(source: Path, recording: Any, format: str, out: Path, detections: str | None,
+             limit: int | None, force: bool) -> None:
+    from lidar_perception.labeling.datasets import write_dataset
+    from lidar_perception.labeling.exchange import export_labels
+    labels = _on_topic(source, recording, detections) if detections else None
+    count = min(len(recording), limit or len(recording))
+    if format == BAG:
+        export_labels(labels.first(count), format, out, recording.frames[:count], force)
+        console.print(f"{out}: {count} scans")
+        return
+    frames = track(islice(recording, count), f"converting {source}", count)
+    summary = write_dataset(format, frames, out, labels, force)
+    drives = f"{summary.drives} drive{'' if summary.drives == 1 else 's'}"
+    console.print(f"{escape(str(out))}: {summary.frames} scans of {drives}, {summary.boxes} boxes")
+    for remark, frames_of in summary.remarks.items():
+        console.print(f"[yellow]{escape(remark)}[/] ({frames_of} scans)")
+
+
+def _labels(source: Path, recording: Any, format: str, out: Path, given: str | None,
+            elsewhere: bool, detections: str | None, limit: int | None, force: bool) -> None:
+    from lidar_perception.labeling.exchange import export_labels, import_labels, recognised
+    from lidar_perception.labeling.labels import DriveLabels, of_truth
+    count = min(len(recording), limit or len(recording))
+    if detections is not None:
+        labels = _on_topic(source, recording, detections)
+    elif elsewhere:
+        labels = import_labels(source, given or recognised(source), recording.frames)
+    else:
+        labels = DriveLabels([of_truth(frame.name, frame.stamp_ns, frame.truth())
+                              for frame in recording.frames[:]])
+    written = export_labels(labels.first(count), format, out, recording.frames[:count], force)
+    console.print(f"{escape(str(out))}: {written.boxes} boxes of {written.frames} frames, "
+                  f"as {format}")
+    for what in written.left_out:
+        console.print(f"[yellow]left out: {what}, for which the format has no place[/]")

@@ -11,10 +11,13 @@ from lidar_perception import __version__
 
 COMMANDS = {  # verb -> module.function, and its line in the overview
     "demo": ("demo.demo", "Replay a drive through the ROS 2 nodes and score the result."),
-    "convert": ("convert.convert", "Turn a data set into a rosbag2 bag."),
+    "convert": ("convert.convert", "Turn recordings and labels into bags and other formats."),
     "evaluate": ("evaluate.group.evaluate", "Score the algorithms without ROS."),
     "compare": ("compare.compare", "Run every detector on the same frames, side by side."),
+    "view": ("view.view", "Look at a recording and its results on a page in the browser."),
     "reproduce": ("reproduce.reproduce", "Reproduce every table of the STM-CPA paper."),
+    "setup": ("setup.setup", "Measure a sensor and its mounting from unlabelled clouds."),
+    "label": ("label.label", "Label a drive on a page in the browser."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),
     "simulate": ("simulate.simulate", "Write simulated, labelled scans as a bag or a data set."),
     "train": ("train.train", "Train a detector on recordings or simulated streets."),

@@ -17,7 +17,7 @@ from lidar_perception.runs.terminal import console, track
 from lidar_perception.simulation.dataset import LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import longest_drive
 from lidar_perception.simulation.scene import KINDS, Streets
-from lidar_perception.simulation.sensor import GENERIC, SENSORS, sensor_named
+from lidar_perception.simulation.sensor import GENERIC, NAMES, sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.types import InputError
 
@@ -27,7 +27,7 @@ from lidar_perception.types import InputError
 @click.option("--format", "layout", type=click.Choice(["mcap", *LAYOUTS]), default="mcap",
               show_default=True, help="A rosbag2 bag, or the folders of one of these data sets.")
 @click.option("--sensor", "sensor_name", default="hdl64e", show_default=True,
-              help=f"One of {', '.join(SENSORS)}, or {GENERIC}.")
+              help=f"One of {', '.join(NAMES)}, a .yaml file (`setup` writes one), or {GENERIC}.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
               help="Number of scans; with --compare, one scan of each of that many streets.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
@@ -14,11 +15,27 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import Bag
-from lidar_perception.data.frame import BOXES, CAMERA, POSES, Frame, Recording
+from lidar_perception.data.frame import (
+    BOXES,
+    CAMERA,
+    POINT_LABELS,
+    POSES,
+    Frame,
+    PointTruth,
+    Recording,
+)
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import decode
-from lidar_perception.wire.messages import calibration_of, pose_of, to_frame, to_truth
-from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
+from lidar_perception.wire.messages import calibration_of, column, pose_of, to_frame, to_truth
+from lidar_perception.wire.topics import (
+    CAMERA_INFO,
+    EXTRINSICS,
+    INSTANCE,
+    ODOMETRY,
+    POINTS,
+    SEMANTIC,
+    TRUTH,
+)
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import SECOND, to_ns
 
@@ -39,14 +56,19 @@ def open_recording(path: Path, *, points: str = POINTS, scans: bool = True) -> R
         bag.require(points)
         topics = {topic for topic, count in bag.counts.items() if count}
         frames = BagFrames(path, points, bag.topics[points], bag.counts[points])
-    has = frozenset(what for what, needed in BESIDE.items() if needed <= topics)
+        labelled = False
+        with suppress(InputError):  # a damaged cloud is named when it is read
+            labelled = any(frames.labels_points(data)
+                           for _, _, data in islice(bag.raw({points}), 1))
+    has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | (
+        {POINT_LABELS} if labelled else set())
     return Recording(path, f"rosbag2 bag, clouds on {points}", frames, has)
 
 
 class BagFrames(Sequence):
-    """The frames in order of time. Iterating reads the bag once, and each frame holds its cloud; a
-    frame by its number reads it when it is asked for, found by its time after one look through the
-    bag for the times of all."""
+    """The frames in order of time; native() of each gives its message. Iterating reads the bag
+    once, and each frame holds its cloud; a frame by its number reads it when it is asked for, found
+    by its time after one look through the bag for the times of all."""
 
     def __init__(self, path: Path, points: str, kind: str, count: int):
         self.path, self.points, self.kind, self.count = path, points, kind, count
@@ -61,6 +83,15 @@ class BagFrames(Sequence):
                 stamp = _stamp(data, time)
                 names[stamp] += 1
                 yield self._frame(i, time, stamp, names[stamp], lambda data=data: data)
+
+    def stamps(self) -> np.ndarray:
+        """(count,) int64 ns: the stamps of all clouds, after one look through the bag."""
+        return np.array([row[2] for row in self._index], np.int64)
+
+    def message(self, i: int) -> Any:
+        """Cloud i as it was recorded, with all its columns."""
+        time, before, *_ = self._index[i]
+        return decode(self._read(time, before), self.kind)
 
     def __getitem__(self, i):
         if isinstance(i, slice):
@@ -122,14 +153,34 @@ class BagFrames(Sequence):
                data: Callable[[], bytes]) -> Frame:
         name = str(stamp) if which == 1 else f"{stamp}-{which}"  # recorders may not set the stamp
         return Frame(name, stamp, partial(self._load, time, data), partial(self._truth, stamp),
+                     point_truth=partial(self._point_truth, time, data),
                      calibration=partial(self._calibration, time),
-                     pose=partial(self._pose, stamp), index=i)
+                     pose=partial(self._pose, stamp), index=i,
+                     native=lambda: decode(data(), self.kind))
 
     def _load(self, time: int, data: Callable[[], bytes]) -> LidarFrame:
         try:
             return to_frame(decode(data(), self.kind), intensity_max=0.0)[0]
         except InputError as error:
             raise InputError(f"{self.path}, topic {self.points} at {time} ns: {error}") from None
+
+    def labels_points(self, data: bytes) -> bool:
+        """Whether a serialised cloud has labels of its points; not if it is broken."""
+        with suppress(InputError):
+            return {SEMANTIC, INSTANCE} <= {f.name for f in decode(data, self.kind).fields}
+        return False
+
+    def _point_truth(self, time: int, data: Callable[[], bytes]) -> PointTruth | None:
+        raw = data()
+        if not self.labels_points(raw):
+            return None
+        try:
+            msg = decode(raw, self.kind)
+            indices = to_frame(msg)[1]
+            classes, instances = (column(msg, name, indices) for name in (SEMANTIC, INSTANCE))
+        except InputError as error:
+            raise InputError(f"{self.path}, topic {self.points} at {time} ns: {error}") from None
+        return PointTruth(classes.astype(np.uint16), instances.astype(np.uint16))
 
     def _truth(self, stamp: int) -> GroundTruth | None:
         return self._beside[0].get(stamp)

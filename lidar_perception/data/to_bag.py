@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import LATCHED_QOS, BagWriter
-from lidar_perception.data.frame import Frame
+from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import camera_info, extrinsics, odometry, truth_markers
@@ -18,26 +19,33 @@ from lidar_perception.wire.topics import (
     CAMERA_INFO,
     EXTRINSICS,
     IMAGE,
+    INSTANCE,
     LIDAR_FRAME,
     ODOMETRY,
     ODOMETRY_FRAME,
     POINTS,
+    SEMANTIC,
     TF_STATIC,
     TRUTH,
+    TRUTH_3D,
 )
-from msg_utils.markers import marker_keys
+from msg_utils.detections import to_detection_array
+from msg_utils.markers import from_marker_array, marker_keys
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import header_message
 
+POINT_LABELS = np.dtype([(SEMANTIC, "<u2"), (INSTANCE, "<u2")])  # as data.frame.PointTruth
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 
 
 def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False,
-              force: bool = False, skipped: list[str] | None = None) -> int:
+              force: bool = False, skipped: list[str] | None = None, clouds: bool = True,
+              detections_3d: bool = False) -> int:
     """Write frames in order; returns how many. The calibration is written, latched, whenever it
     changes, before the scan it belongs to: as CameraInfo, as TransformStamped and as TF; poses,
-    where there are any, as the sensor's odometry. images: the camera's PNG files too, where they
-    are.
+    where there are any, as the sensor's odometry; labels of points as columns of their cloud.
+    images: the camera's PNG files too, where they are. Without clouds, all else. detections_3d: the
+    labelled boxes as Detection3DArray too.
 
     A frame that cannot be read is left out, and the reason put into skipped; InputError without
     such a list, and where the bag cannot be written.
@@ -47,13 +55,15 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
         bag.add_topic(EXTRINSICS, "geometry_msgs/msg/TransformStamped", LATCHED_QOS)
         bag.add_topic(TF_STATIC, "tf2_msgs/msg/TFMessage", LATCHED_QOS)
         bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")
-        bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
-        shown: frozenset[tuple[str, int]] = frozenset()
-        count, written = 0, None
+        if detections_3d:
+            bag.add_topic(TRUTH_3D, "vision_msgs/msg/Detection3DArray")
+        if clouds:
+            bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+        count, shown, written = 0, frozenset(), None
         for frame in frames:
             try:
                 scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
-                pose = frame.pose()
+                pose, columns = frame.pose(), frame.point_truth() if clouds else None
             except InputError as error:
                 if skipped is None:
                     raise
@@ -69,9 +79,13 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
                 markers = truth_markers(truth, header, bag_message, shown)
                 shown = marker_keys(markers)
                 bag.write(TRUTH, frame.stamp_ns, markers)
+                if detections_3d:
+                    bag.write(TRUTH_3D, frame.stamp_ns, _detections(markers, header))
             if images and frame.image is not None and frame.image.exists():
                 _write_image(bag, frame.image, frame.stamp_ns)
-            bag.write(POINTS, frame.stamp_ns, from_array(_points(scan), header, bag_message))
+            if clouds:
+                bag.write(POINTS, frame.stamp_ns,
+                          from_array(points_of(scan, columns), header, bag_message))
             count += 1
     return count
 
@@ -81,11 +95,26 @@ def _same(calibration: Calibration, written: Calibration | None) -> bool:
         np.array_equal(a, b) for a, b in zip(vars(calibration).values(), vars(written).values()))
 
 
-def _points(scan: LidarFrame) -> np.ndarray:
-    """(N,) of POINT; without an intensity, only x y z."""
-    if scan.intensity is None:
-        return np.ascontiguousarray(scan.xyz).view(np.dtype(POINT.descr[:3])).reshape(-1)
-    return np.column_stack([scan.xyz, scan.intensity]).astype(np.float32).view(POINT).reshape(-1)
+def points_of(scan: LidarFrame, labels: PointTruth | None = None) -> np.ndarray:
+    """(N,) of POINT, without an intensity only x y z; and of POINT_LABELS, where there are any."""
+    fields = POINT.descr[:4 if scan.intensity is not None else 3]
+    points = np.empty(len(scan), fields + (POINT_LABELS.descr if labels else []))
+    for i, axis in enumerate("xyz"):
+        points[axis] = scan.xyz[:, i]
+    if scan.intensity is not None:
+        points["intensity"] = scan.intensity
+    if labels is not None:
+        points[SEMANTIC], points[INSTANCE] = labels.classes, labels.instances
+    return points
+
+
+def _detections(markers: Any, header: Any) -> Any:
+    """Detection3DArray of the labels as markers have them; the id is that of the track, if any."""
+    objects = from_marker_array(markers)
+    tracks = [extra.get("track_id") for extra in objects.extras]
+    numbered = None not in tracks and len(set(tracks)) == len(tracks)
+    return to_detection_array(objects.boxes, objects.labels, objects.scores.tolist(),
+                              header=header, make=bag_message, ids=tracks if numbered else None)
 
 
 def _write_image(bag: BagWriter, image: Path, stamp_ns: int) -> None:

@@ -12,6 +12,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 import torch
 
+from lidar_perception.detectors.calibration import raw_score
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found, require_columns
 from lidar_perception.detectors.devices import CPU
@@ -66,6 +67,17 @@ class NetworkDetector:
     def min_scores(self) -> dict[str, float]:
         """By class, the least score of a detection."""
         return {name: self.settings.scores.of_class(name) for name in self.classes}
+
+    def raw_min_scores(self) -> list[float]:
+        """The same in the order of classes, before calibration."""
+        return [raw_score(name, score, self.header.calibration)
+                for name, score in self.min_scores.items()]
+
+    def raw(self) -> Self:
+        """The same detector, of the same network, with the network's own scores."""
+        other = copy.copy(self)
+        other.header = replace(self.header, calibration={})
+        return other
 
     def with_min_score(self, min_score: float) -> Self:
         """The same detector, of the same network, with this least score for every class."""

@@ -17,10 +17,12 @@ from lidar_perception.detectors.config_json import config_of
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.runs.files import write_bytes
-from lidar_perception.types import InputError
+from lidar_perception.types import CLASSES, InputError
 
 KEY = "lidar_perception"  # of the metadata, whose values are strings
 FORMAT = 1
+MOST = 100.0  # of a calibration's slopes and offsets
+HEIGHT_APART = 0.3  # m between mounts from which on a cloud looks another
 
 
 class Config(Protocol):
@@ -48,24 +50,37 @@ NETWORKS: dict[str, tuple[str, str, type[Config]]] = {  # what it is, where it i
 @dataclass(frozen=True)
 class Header:
     """What is known about weights. config: of the network; training: data, steps, time, seed;
-    metrics: AP and the like, or empty; commit: of the code that trained them. All of it can be
-    JSON."""
+    metrics: AP and the like, or empty; commit: of the code that trained them; calibration: what
+    makes scores probabilities, see calibration.py, empty where they are the network's own. All of
+    it can be JSON."""
 
     config: Any
     training: dict[str, Any] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)
     commit: str = ""
+    calibration: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def network(self) -> str:
         """Its name in NETWORKS."""
         return self.config.network
 
+    def unlike(self, height: float) -> str | None:
+        """What to say where weights that were trained on simulated scans are used with a sensor
+        so many metres above the ground, and theirs was elsewhere; None where that is not so."""
+        sensor = self.training.get("sensor")
+        if not isinstance(sensor, dict) or not isinstance(sensor.get("height"), float) or (
+                abs(sensor["height"] - height) < HEIGHT_APART):
+            return None
+        return (f"trained for the sensor {sensor.get('name')} at {sensor['height']:g} m, and used "
+                f"with one at {height:g} m")
+
     def text(self) -> str:
         """As JSON."""
         return json.dumps(dict(format=FORMAT, network=self.network,
                                config=dataclasses.asdict(self.config), training=self.training,
-                               metrics=self.metrics, commit=self.commit))
+                               metrics=self.metrics, commit=self.commit,
+                               calibration=self.calibration))
 
     @staticmethod
     def of_text(text: str | None, source: str, kind: type[Config] | None = None) -> Header:
@@ -78,7 +93,7 @@ class Header:
             raise InputError(f"{source} holds a {title}, which is for {use}; {own_use} take a "
                              f"{wanted}")
         return Header(config_of(config, content["config"], source), content["training"],
-                      content["metrics"], content["commit"])
+                      content["metrics"], content["commit"], _lines(content["calibration"], source))
 
 
 PARTS = {"config": dict, "training": dict, "metrics": dict, "commit": str}
@@ -90,6 +105,7 @@ def _content(text: str | None, source: str) -> dict[str, Any]:
         content = json.loads(text or "")
         parts = {name: content[name] for name in ("format", *PARTS)}
         network = content.get("network", POINTPILLARS)  # the first files had no such key
+        calibration = content.get("calibration", {})
         if not all(isinstance(parts[name], kind) for name, kind in PARTS.items()):
             raise TypeError
     except (TypeError, ValueError, KeyError, AttributeError, RecursionError):
@@ -101,7 +117,20 @@ def _content(text: str | None, source: str) -> dict[str, Any]:
     if not isinstance(network, str) or network not in NETWORKS:
         raise InputError(f"{source} holds a network {str(network)[:40]!r}, this version knows "
                          f"{' and '.join(NETWORKS)}")
-    return {"network": network, **parts}
+    return {"network": network, "calibration": calibration, **parts}
+
+
+def _lines(content: Any, source: str) -> dict[str, tuple[float, float]]:
+    """The calibration of a header. InputError where it is none."""
+    try:
+        lines = {name: (float(slope), float(offset)) for name, (slope, offset) in content.items()}
+        if all(name in CLASSES and 0 < slope < MOST and abs(offset) < MOST
+               for name, (slope, offset) in lines.items()):
+            return lines
+    except (TypeError, ValueError, AttributeError, OverflowError):
+        pass
+    raise InputError(f"{source} has a calibration that cannot be used; it needs a slope above 0 "
+                     "and an offset for each class")
 
 
 def network_of(path: str | Path) -> str:

@@ -9,17 +9,17 @@ import numpy as np
 from lidar_perception.param_fields import Params, param
 from lidar_perception.types import CLASSES, Detections
 
-MIN_SCORE = 0.05  # of the boxes that average precision is made of: more than a robot would act on
+MIN_SCORE = 0.001  # of boxes that average precision is made of: more than a robot would act on
 
 
 @dataclass(frozen=True)
 class ScoreParams(Params):
-    """The least score of a detection, by class."""
+    """The least score of a detection, by class: a probability, see calibration.py."""
 
-    car: float = param(0.3, "Minimum score of a Car.", low=0.0, high=1.0)
-    pedestrian: float = param(0.3, "Minimum score of a Pedestrian.", low=0.0, high=1.0)
-    cyclist: float = param(0.3, "Minimum score of a Cyclist.", low=0.0, high=1.0)
-    other: float = param(0.3, "Minimum score of any other class of the weights.", low=0.0, high=1.0)
+    car: float = param(0.4, "Minimum score of a Car.", low=0.0, high=1.0)
+    pedestrian: float = param(0.4, "Minimum score of a Pedestrian.", low=0.0, high=1.0)
+    cyclist: float = param(0.4, "Minimum score of a Cyclist.", low=0.0, high=1.0)
+    other: float = param(0.4, "Minimum score of any other class of the weights.", low=0.0, high=1.0)
 
     @staticmethod
     def all_alike(score: float) -> ScoreParams:

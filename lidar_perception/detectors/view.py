@@ -44,7 +44,7 @@ def in_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detection
         heading = np.stack([np.cos(boxes[:, 6]), np.sin(boxes[:, 6])], axis=1) @ back[:2]
         boxes[:, :3] = boxes[:, :3] @ back
         boxes[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
-    return Detections(boxes, detections.class_ids, detections.scores)
+    return replace(detections, boxes=boxes)
 
 
 def with_intensity_scaled(frame: LidarFrame, factor: float) -> LidarFrame:

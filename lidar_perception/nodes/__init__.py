@@ -1,6 +1,6 @@
 """rclpy nodes: convert, call the core, publish. The only part of the package that needs ROS."""
 
-_BOXES = "params.BoxNodeParams"
+_BOXES, _DETECTIONS = "params.BoxNodeParams", "params.DetectionNodeParams"
 # Executable -> its class, in the module of the executable's name, and its parameters. setup.py
 # reads this table too.
 NODES = {
@@ -10,14 +10,14 @@ NODES = {
                             "params.GroundRobotParams"),
     "clustering": ("Clustering", "params.ClusteringNodeParams", _BOXES),
     "candidate_refinement": ("CandidateRefinement", "params.RefinementNodeParams",
-                             "params.CANDIDATES"),
+                             _DETECTIONS),
     "evaluator": ("Evaluator", "params.EvaluatorParams"),
     "perception": ("Perception", "candidates.params.PipelineParams",
-                   "params.PERCEPTION"),
+                   "params.PerceptionRobotParams"),
     "pointpillars_detector": ("PointPillarsNode", "detectors.pointpillars.params.DetectorParams",
-                              "params.POINTPILLARS"),
+                              _DETECTIONS),
     "pointnet_detector": ("PointNetNode", "detectors.pointnet.params.PointNetDetectorParams",
-                          "params.POINTNET"),
-    "fused_detector": ("FusedNode", "detectors.fused.params.FusedDetectorParams", "params.FUSED"),
+                          _DETECTIONS),
+    "fused_detector": ("FusedNode", "detectors.fused.params.FusedDetectorParams", _DETECTIONS),
     "tracker": ("TrackerNode", "params.TrackerNodeParams", "params.TrackInputParams"),
 }

@@ -14,7 +14,7 @@ from lidar_perception.nodes.inputs import SeedInput
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import CandidateOutputs
 from lidar_perception.nodes.runtime import CLOUD
-from lidar_perception.params import CANDIDATES, RefinementNodeParams
+from lidar_perception.params import DetectionNodeParams, RefinementNodeParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import cluster_column, column, to_frame
 from msg_utils.stamps import to_ns
@@ -26,7 +26,8 @@ class CandidateRefinement(ManagedNode):
     """Ground snapping, height filter, STM and CPA."""
 
     def __init__(self, **options: Any):
-        super().__init__("candidate_refinement", RefinementNodeParams(), CANDIDATES(), **options)
+        super().__init__("candidate_refinement", RefinementNodeParams(),
+                         DetectionNodeParams(), **options)
 
     def configure(self) -> None:
         self.outputs = CandidateOutputs(self)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
 from lidar_perception.detectors.fused.weights_file import weights_file
 from lidar_perception.nodes.detector_node import DetectorNode
-from lidar_perception.params import FUSED
+from lidar_perception.params import DetectionNodeParams
 
 if TYPE_CHECKING:
     from lidar_perception.detectors.fused.detector import FusedDetector
@@ -22,7 +22,7 @@ class FusedNode(DetectorNode):
     steps = STEPS
 
     def __init__(self, **options: Any):
-        super().__init__("fused_detector", FusedDetectorParams(), FUSED(), **options)
+        super().__init__("fused_detector", FusedDetectorParams(), DetectionNodeParams(), **options)
 
     def weights(self) -> Path:
         return weights_file(self.params.fused)

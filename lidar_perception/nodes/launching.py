@@ -28,7 +28,6 @@ from lidar_perception.nodes.graph import (
 )
 from lidar_perception.param_fields import flatten
 from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
-from lidar_perception.tracking.params import tracking_of
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import ODOMETRY, POINTS
 
@@ -102,8 +101,7 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     files = {node: value["config"] or _own_file(name, config_folder) for name in detectors
              for node in (ALONE if single else BEHIND)[name]}
     files |= dict.fromkeys(EXPERTS, _expert_file(value, config_folder))
-    trackers = trackers_of(detectors)
-    files |= dict.fromkeys(trackers, value["config"] or str(
+    files |= dict.fromkeys(trackers_of(detectors), value["config"] or str(
         config_folder / f"{TRACKER}.param.yaml"))
     topics = {relative(POINTS): value["points"], relative(ODOMETRY): value["odometry"]}
     inside = ODOMETRY_IN if (tracking and single) or value["deskew"] == "odometry" else {}
@@ -111,21 +109,11 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     return viewer + [Node(
         package="lidar_perception", executable=executable_of(node.removeprefix(prefix)), name=node,
         namespace=value["namespace"] or None, output="screen",
-        parameters=[*_tracked(trackers.get(node.removeprefix(prefix))),
-                    files[node.removeprefix(prefix)],
+        parameters=[files[node.removeprefix(prefix)],
                     _given(value, node.removeprefix(prefix), detectors)],
         remappings=[(a, topics.get(b, b)) for a, b in {**remap, **inside}.items()],
         ros_arguments=["--log-level", value["log_level"]],
     ) for node, remap in graph.items()]
-
-
-def _tracked(detector: str | None) -> list[dict[str, Any]]:
-    """What the tracker behind a detector has instead of the defaults; files stand above it."""
-    if detector is None:
-        return []
-    default = flatten(tracking_of(""))
-    return [{f"tracking.{name}": number for name, number in flatten(tracking_of(detector)).items()
-             if number != default[name]}]
 
 
 def conflicts(value: dict[str, str], config_folder: Path) -> list[str]:

@@ -14,7 +14,7 @@ from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import CandidateOutputs, ClusterBoxes, Obstacles
 from lidar_perception.nodes.runtime import CLOUD
 from lidar_perception.nodes.sensor_check import SensorCheck
-from lidar_perception.params import PERCEPTION
+from lidar_perception.params import PerceptionRobotParams
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import spread
 from msg_utils.point_cloud2 import add_columns
@@ -28,7 +28,7 @@ class Perception(ManagedNode):
     between them. ~/output/points, boxes and obstacles are made only while somebody subscribes."""
 
     def __init__(self, **options: Any):
-        super().__init__("perception", PipelineParams(), PERCEPTION(), **options)
+        super().__init__("perception", PipelineParams(), PerceptionRobotParams(), **options)
 
     def configure(self) -> None:
         self.camera = CameraInput(self)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.nodes.detector_node import DetectorNode
-from lidar_perception.params import POINTNET
+from lidar_perception.params import DetectionNodeParams
 
 if TYPE_CHECKING:
     from lidar_perception.detectors.pointnet.config import PointNetConfig
@@ -22,7 +22,8 @@ class PointNetNode(DetectorNode):
     steps = STEPS
 
     def __init__(self, **options: Any):
-        super().__init__("pointnet_detector", PointNetDetectorParams(), POINTNET(), **options)
+        super().__init__("pointnet_detector", PointNetDetectorParams(),
+                         DetectionNodeParams(), **options)
 
     def weights(self) -> Path:
         return weights_file(self.params.pointnet)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.nodes.detector_node import DetectorNode
-from lidar_perception.params import POINTPILLARS
+from lidar_perception.params import DetectionNodeParams
 
 if TYPE_CHECKING:
     from lidar_perception.detectors.pointpillars.config import NetworkConfig
@@ -22,7 +22,8 @@ class PointPillarsNode(DetectorNode):
     steps = STEPS
 
     def __init__(self, **options: Any):
-        super().__init__("pointpillars_detector", DetectorParams(), POINTPILLARS(), **options)
+        super().__init__("pointpillars_detector", DetectorParams(),
+                         DetectionNodeParams(), **options)
 
     def weights(self) -> Path:
         return weights_file(self.params.pointpillars)

@@ -26,7 +26,6 @@ from lidar_perception.nodes.main import use_large_shared_memory
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors, progress
 from lidar_perception.tracking.ego import has_odometry
-from lidar_perception.tracking.params import tracking_of
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
@@ -62,7 +61,6 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
     nodes: dict[str, tuple[Mapping[str, str], dict[str, Any]]] = {
         node: (remap, {**flatten(params), "input.queue": AHEAD}) for node, remap in graph.items()}
     nodes[TRACKER] = graph[TRACKER], {
-        **{f"tracking.{name}": value for name, value in flatten(tracking_of(detector)).items()},
         "ego.source": poses or "none",
         **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT})}
     if scored := detector == "candidates":

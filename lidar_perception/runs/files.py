@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import errno
 import os
-from contextlib import suppress
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lidar_perception.types import InputError
@@ -64,6 +66,41 @@ def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
         with suppress(OSError):
             temporary.unlink()
         raise InputError(f"cannot write {path}: {error.strerror}") from None
+
+
+def check_free(path: Path, force: bool) -> None:
+    """InputError for what is there already, but with force."""
+    if path.exists() and not force:
+        raise InputError(f"{path} exists already; give another name or --force")
+
+
+@contextmanager
+def whole_folder(path: Path, force: bool = False) -> Iterator[Path]:
+    """A folder to write into, whose files appear under `path` when all of them are complete; after
+    an error there is nothing new. InputError where they cannot be written or `path` exists; with
+    force they replace files of the same names there, and InputError names a file that would be left
+    among them."""
+    check_free(path, force)
+    hidden = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        make_folder(hidden)
+        yield hidden
+        new = {file.relative_to(hidden) for file in hidden.rglob("*") if not file.is_dir()}
+        old = {file.relative_to(path) for file in path.rglob("*") if not file.is_dir()}
+        if left := sorted(old - new):
+            raise InputError(f"{path} has files that would not be replaced ({len(left)}, such as "
+                             f"{left[0]}); remove the folder yourself, or give another name")
+        if not path.exists():
+            hidden.rename(path)
+        for file in sorted(new if hidden.exists() else ()):
+            (path / file).parent.mkdir(parents=True, exist_ok=True)
+            (hidden / file).replace(path / file)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from None
+    except InputError as error:
+        raise InputError(str(error).replace(str(hidden), str(path))) from None
+    finally:
+        shutil.rmtree(hidden, ignore_errors=True)
 
 
 def make_folder(path: Path) -> None:

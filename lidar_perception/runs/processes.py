@@ -15,16 +15,16 @@ from lidar_perception.types import InputError
 
 
 def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, jobs: int,
-                 what: str) -> Iterator:
+                 what: str, *, apart: bool = False) -> Iterator:
     """start()(item) of all items, in the order in which they are done.
 
     start is called once in each of `jobs` new processes, and can be pickled; with one job or one
-    item there is no new process. InputError, and the end of all processes, where one fails: its
-    own, or, naming what it did ("wrote frames"), where a process ended. They end with the iterator
-    too.
+    item there is no new process, unless they are to be done apart. InputError, and the end of all
+    processes, where one fails: its own, or, naming what it did ("wrote frames"), where a process
+    ended. They end with the iterator too.
     """
     jobs = min(jobs, len(items))
-    if jobs <= 1:
+    if jobs <= 1 and not apart:
         if items:
             yield from map(start(), items)
         return

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
     Progress,
+    TaskID,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
@@ -17,14 +21,69 @@ from rich.progress import (
 console = Console(highlight=False)
 errors = Console(stderr=True, highlight=False)
 
+EVERY = 15.0  # seconds between lines where there is no terminal
+
 
 def progress() -> Progress:
-    """A progress bar on standard error: text, bar, count, elapsed and remaining time."""
-    return Progress(TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-                    TimeElapsedColumn(), TimeRemainingColumn(), console=errors, transient=True)
+    """Progress on standard error: in a terminal a bar with text, count, elapsed and remaining time;
+    elsewhere, as in a log, a line of the same every EVERY seconds."""
+    return (Progress if errors.is_terminal else _Lines)(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
+        TimeRemainingColumn(), console=errors, transient=True, auto_refresh=errors.is_terminal,
+        disable=not errors.is_terminal)
+
+
+class _Lines(Progress):
+    """Progress that is written line by line; rich itself shows nothing, but knows the speed."""
+
+    said = 0.0
+
+    def add_task(self, *args: Any, **fields: Any) -> TaskID:
+        self.said = time.monotonic()
+        return super().add_task(*args, **fields)
+
+    def update(self, task_id: TaskID, **fields: Any) -> None:
+        super().update(task_id, **fields)
+        self._say(task_id)
+
+    def advance(self, task_id: TaskID, advance: float = 1) -> None:
+        super().advance(task_id, advance)
+        self._say(task_id)
+
+    def _say(self, task_id: TaskID) -> None:
+        now = time.monotonic()
+        if now - self.said < EVERY:
+            return
+        self.said = now
+        task = next(task for task in self.tasks if task.id == task_id)
+        if not task.visible:
+            return
+        of = "" if task.total is None else f" of {task.total:.0f}"
+        left = task.time_remaining
+        errors.print(f"{task.description}: {task.completed:.0f}{of}"
+                     + ("" if left is None else f", {duration(left)} left"), soft_wrap=True)
+
+
+@contextmanager
+def paused(bar: Progress) -> Iterator[None]:
+    """Without this bar, so that another one can be shown."""
+    if bar.disable:
+        yield
+        return
+    bar.stop()
+    try:
+        yield
+    finally:
+        bar.start()
 
 
 def track(items: Iterable, description: str, total: int) -> Iterator:
-    """The items, under a progress bar of `total` steps."""
+    """The items, under the progress of `total` steps."""
     with progress() as bar:
         yield from bar.track(items, total=total, description=description)
+
+
+def duration(seconds: float) -> str:
+    """For people: 40 s, 12 min, 1.5 h."""
+    return (f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min" if seconds < 5400
+            else f"{seconds / 3600:.1f} h")

@@ -28,6 +28,11 @@ def number(value: float | None, digits: int = 2, width: int = 5) -> str:
     return "-" if value is None or math.isinf(value) else f"{value:.{digits}f}"[:width].rstrip(".")
 
 
+def between(interval: list[float] | None) -> str:
+    """44-89; a dash for none."""
+    return "-" if interval is None else "-".join(f"{value:.0f}" for value in interval)
+
+
 def percent(row: dict, *keys: str) -> list[str]:
     """Shares of a row of scores, 0 .. 1, in percent."""
     return [f"{100 * row[key]:.1f}" for key in keys]

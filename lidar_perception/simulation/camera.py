@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from lidar_perception.camera import Calibration
@@ -14,6 +16,15 @@ FORWARD_CAMERA = Calibration(
     intrinsics=np.array([[720.0, 0, 621, 0], [0, 720, 187.5, 0], [0, 0, 1, 0]]),
     lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]),
     width=1242, height=375)
+
+
+
+def turned_camera(yaw: float) -> Calibration:
+    """That camera, turned with its mount about the sensor, counter-clockwise, rad."""
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    back = np.array([[cos, sin, 0, 0], [-sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    return replace(FORWARD_CAMERA, lidar_to_camera=FORWARD_CAMERA.lidar_to_camera @ back)
+
 
 # People who label leave out what they can hardly see. The least of the 20 pedestrians of the real
 # frames at hand has 16 points; of KITTI's they are few that have less than 5.
@@ -33,10 +44,10 @@ def labels_in_view(truth: GroundTruth) -> GroundTruth:
     return _part(truth, seen)
 
 
-def kitti_labels(truth: GroundTruth) -> GroundTruth:
+def kitti_labels(truth: GroundTruth, camera: Calibration = FORWARD_CAMERA) -> GroundTruth:
     """What a KITTI label file has: the labelled objects of which a part is in the image, and as
     notes the regions of the others, DontCare."""
-    in_image = seen_by_camera(truth, FORWARD_CAMERA)
+    in_image = seen_by_camera(truth, camera)
     labelled = worth_a_label(in_image)
     notes = [("DontCare", {**DONT_CARE, "bbox": extra["bbox"]})
              for extra, known in zip(in_image.extras, labelled) if not known]

@@ -66,7 +66,7 @@ def scans(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
 
 def scan_at(seed: int, i: int, sensor: Sensor, streets: Streets = ANY) -> SimulatedScan:
     """Scan i of the drive along street seed, whatever was asked for before."""
-    scene = _street(seed, streets)
+    scene, sensor = _street(seed, streets), sensor.at_turn(i)
     moment = scene.at(i / sensor.rate, sensor.height)
     hits = cast(moment.solids, scene.ground, moment.position, sensor, moment.motion,
                 (seed << 20) + i)

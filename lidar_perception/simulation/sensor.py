@@ -1,14 +1,21 @@
-"""What a spinning LiDAR is, as numbers: where its rays go and when, and presets of known models."""
+"""What a spinning LiDAR is, as numbers: where its rays go and when, and how it is described in a
+file."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import NamedTuple
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import yaml
 
+from lidar_perception.runs.files import read_text
 from lidar_perception.types import SENSOR_HEIGHT, InputError
 
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where it was built
+MAX_BYTES = 1 << 20  # of a file that describes a sensor
+GOLDEN = 0.6180339887498949
 MAX_RAYS = 5_000_000  # in a turn; the densest sensors have 0.5 million. Each takes some 100 bytes
 
 
@@ -39,6 +46,7 @@ class Sensor:
     fade: tuple[float, float] = (0.0, 0.0)  # from this range on intensity falls so much a metre
     blocked: tuple[tuple[float, float, float], ...] = ()  # by the vehicle: (first ring, from, to),
     #                                that ring and all lower ones, counter-clockwise, in degrees
+    wander: float = 0.0            # beams look elsewhere in every turn, up to so much lower
 
     def __post_init__(self) -> None:
         up = np.asarray(self.elevations, np.float64)
@@ -63,7 +71,9 @@ class Sensor:
                 (not all(0 <= x <= 1 for x in (self.dropout, self.silent, self.floor)),
                  "dropout, silent and floor must be in 0 .. 1"),
                 (not all(0 <= x < np.inf for x in (self.range_noise, self.divergence, self.pulse)),
-                 "range_noise, divergence and pulse must not be negative")):
+                 "range_noise, divergence and pulse must not be negative"),
+                (len(up) and not (0 <= self.wander < np.pi / 2 + up.min()),
+                 "wander must not be negative, nor take beams beyond straight down")):
             if wrong:
                 raise InputError(f"impossible sensor: {what}")
 
@@ -76,6 +86,14 @@ class Sensor:
     def rings(self) -> int:
         """Beams."""
         return len(self.elevations)
+
+    def at_turn(self, number: int) -> Sensor:
+        """The sensor as it looks in one turn: the same, unless its beams wander. All move by the
+        same part of wander, and over the turns the parts fill it evenly (golden ratio)."""
+        if not self.wander:
+            return self
+        lower = self.wander * (number * GOLDEN % 1.0)
+        return replace(self, elevations=tuple(up - lower for up in self.elevations))
 
     def directions(self) -> np.ndarray:
         """(columns, rings, 3) float64 unit vectors, counter-clockwise from straight ahead."""
@@ -152,79 +170,82 @@ def generic(beams: int, lowest: float, highest: float, azimuth_step: float, rate
                   float(np.radians(azimuth_step)), rate=rate, **fields)
 
 
-# KITTI's HDL-64E S2. Found from 57 of KITTI's full scans, all of one car: in a file the beams stand
-# one after the other, each from azimuth 0 to 360 degrees; to the points of each a line z = lift +
-# distance * tan(elevation) was fitted (least squares, outliers dropped). The elevations of single
-# scans differ by less than 0.005 degrees (interquartile range); the lifts fall evenly within the
-# upper and the lower block of 32 lasers. The fullest beams have 2136 points in a turn (median).
-_HDL64E_DEGREES = (
-    1.94, 1.57, 1.30, 0.87, 0.58, 0.18, -0.09, -0.45, -0.80, -1.20, -1.49, -1.83, -2.21, -2.55,
-    -2.87, -3.24, -3.54, -3.94, -4.22, -4.59, -4.91, -5.25, -5.61, -5.96, -6.33, -6.68, -7.00,
-    -7.29, -7.68, -8.06, -8.31, -8.71, -9.03, -9.57, -10.06, -10.47, -10.96, -11.60, -12.11,
-    -12.56, -13.04, -13.48, -14.05, -14.60, -15.19, -15.66, -16.18, -16.55, -17.19, -17.73,
-    -18.32, -18.80, -19.32, -19.74, -20.22, -20.79, -21.32, -21.94, -22.44, -22.86, -23.32,
-    -23.97, -24.51, -25.00)
-_HDL64E_LIFTS = (*np.linspace(0.209, 0.198, 32).tolist(), *np.linspace(0.126, 0.116, 32).tolist())
+def sensor_from_file(path: str | Path) -> Sensor:
+    """The sensor that a YAML file describes: the fields of Sensor by name, all angles in degrees
+    (divergence and wander, too), and a name for people. What is not given has its default;
+    elevations, azimuth_step and rate must be. sensors/*.yaml are examples, and `setup` writes one.
+    InputError, which names the file, where it is no such description, or an impossible one."""
+    remedy = "see config/sensors/ for examples, or measure one with 'lidar-perception setup'"
+    try:
+        content = yaml.load(read_text(path, MAX_BYTES), _Loader)
+    except yaml.YAMLError as error:
+        raise InputError(f"{path} is no YAML: {' '.join(str(error).split())[:150]}") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path} describes no sensor; {remedy}")
+    values = {key: value for key, value in content.items() if key != "name"}
+    known = {field.name for field in fields(Sensor)}
+    if unknown := [key for key in values if key not in known]:
+        raise InputError(f"{path}: a sensor has no {unknown[0]!r}; known are name, "
+                         f"{', '.join(sorted(known))}")
+    if missing := [key for key in ("elevations", "azimuth_step", "rate") if key not in values]:
+        raise InputError(f"{path}: {missing[0]} is missing; {remedy}")
+    try:
+        return Sensor(**{key: _read(key, value) for key, value in values.items()})
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
-# From facades on 14 of KITTI's full scans: how far each beam's median is behind the plane through
-# them all. The two halves of the scans agree (correlation 0.92); below beam 38 there are too few.
-_HDL64E_OFFSETS = (
-    0.0, -0.01, 0.02, -0.01, 0.0, -0.05, 0.04, -0.02, -0.02, 0.0, 0.03, 0.0, 0.02, 0.01, -0.02,
-    -0.02, 0.02, -0.01, 0.04, 0.01, 0.0, -0.01, -0.02, -0.01, 0.02, 0.0, 0.02, -0.03, 0.03, 0.02,
-    0.01, 0.01, -0.01, -0.02, -0.01, -0.03, -0.01, -0.03, 0.03, *[0.0] * 25)
-# From 27 of KITTI's full scans: how the median intensity of each beam within 18 m differs from the
-# median of them all.
-_HDL64E_BIASES = (
-    0.07, 0.03, 0.03, -0.09, 0.05, -0.02, 0.07, 0.0, 0.06, -0.04, 0.02, 0.05, 0.06, 0.02, -0.01,
-    -0.01, 0.0, 0.01, 0.04, -0.03, 0.03, -0.09, 0.03, 0.05, -0.01, 0.01, 0.03, 0.02, 0.02, -0.05,
-    0.02, 0.03, -0.01, -0.01, 0.0, -0.10, -0.19, 0.0, 0.05, 0.04, -0.03, 0.0, -0.12, 0.01, 0.0,
-    0.0, 0.01, -0.03, -0.07, 0.02, 0.04, -0.24, -0.01, -0.10, -0.10, -0.01, 0.01, 0.05, -0.09,
-    -0.10, -0.10, 0.02, 0.05, 0.03)
-# Sectors without points in the lower rings of these scans: the roof of KITTI's car and its racks.
-_HDL64E_BLOCKED = (
-    (44, 160, 165), (44, 199, 204), (48, 285, 302), (52, 170, 192), (54, 160, 204), (56, 130, 136),
-    (56, 231, 236), (58, 346, 15), (58, 155, 207), (62, 343, 20), (62, 150, 212), (62, 324, 330))
-_HDL64E_COLUMNS = 2140  # in a turn of 0.1 s
+
+SHAPES = {"elevations": (0,), "lifts": (0,), "offsets": (0,), "biases": (0,), "fade": (2,),
+          "blocked": (0, 3)}  # of the fields that are no single number; 0: any length
+IN_DEGREES = ("elevations", "azimuth_step", "divergence", "wander")
+
+
+def _read(key: str, value: Any) -> Any:
+    """A value of the file in the unit of the field; InputError where it is of the wrong kind."""
+    shape = SHAPES.get(key, ())
+    if value == [] and shape:
+        return ()
+    try:
+        numbers = np.array(None if isinstance(value, (bool, str)) else value, np.float64)
+    except (TypeError, ValueError):
+        numbers = np.full((0,) * 9, np.nan)
+    if numbers.ndim != len(shape) or any(n not in (0, m) for n, m in zip(shape, numbers.shape)) or (
+            np.isnan(numbers).any()):
+        what = "a number" if not shape else "a list of " + (
+            "numbers" if len(shape) == 1 else "[ring, from, to]")
+        raise InputError(f"{key} = {str(value)[:60]} must be {what}")
+    rows = (np.radians(numbers) if key in IN_DEGREES else numbers).tolist()
+    if not shape:
+        return rows
+    return tuple((int(row[0]), *row[1:]) for row in rows) if len(shape) == 2 else tuple(rows)
+
+
+def _key(name: str) -> str:
+    """A sensor's name without what people write in different ways."""
+    return "".join(c for c in name.lower() if c.isalnum())
+
+
+READY = {_key(path.stem): path for path in sorted(
+    (Path(__file__).parent / "sensors").glob("*.yaml"))}  # described by files of the package
+HDL64E = sensor_from_file(READY["hdl64e"])
+SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E}  # and those of READY
+NAMES = tuple(path.stem for path in READY.values())
+GENERIC = "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE (degrees, turns a second)"
 
 
 def hdl64e(rate: float = 10.0) -> Sensor:
     """KITTI's HDL-64E S2 at so many turns per second, 5 to 20: the lasers fire at a fixed rate, so
-    that a slower turn is a finer one. InputError for another rate.
-
-    Divergence and reach are those of the data sheet: 50 m for pavement, which shines back a tenth.
-    Within a beam the range jitters by 0.008 to 0.009 m on the road, sidewalks and facades of a
-    SemanticKITTI scan (second differences). KITTI's points end at 80 m. Intensity falls by 0.008 a
-    metre from 18 m on: so the quantiles over all 27 scans do up to 80 m, within 0.02. On 57 frames
-    1 % of the points have 0.01 to 0.05, and half of those on cars have 0."""
+    that a slower turn is a finer one. InputError for another rate."""
     if not 5 <= rate <= 20:
         raise InputError(f"impossible sensor: rate {rate} must be 5 .. 20 turns per second")
-    return Sensor(tuple(np.radians(_HDL64E_DEGREES).tolist()),
-                  2 * np.pi / round(_HDL64E_COLUMNS * 10 / rate), rate=rate, max_range=80.0,
-                  range_noise=0.01, lifts=_HDL64E_LIFTS, offsets=_HDL64E_OFFSETS,
-                  biases=_HDL64E_BIASES, fade=(18.0, 0.008), silent=0.07, floor=0.08,
-                  blocked=_HDL64E_BLOCKED)
-
-
-HDL64E = hdl64e()
-
-GENERIC = "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE (degrees, turns a second)"
-
-# Angles, ranges and divergences of the others are meant to be those of their data sheets; the
-# HDL-32E is nuScenes', whose sweeps have 1084 firings.
-SENSORS: dict[str, Sensor] = {
-    "hdl64e": HDL64E,
-    "hdl32e": generic(32, 10.67 - 31 * 4 / 3, 10.67, 360 / 1084, 20.0, height=1.84,
-                      max_range=100.0, divergence=2.8e-3),
-    "vlp16": generic(16, -15.0, 15.0, 0.2, 10.0, max_range=100.0, range_noise=0.03,
-                     divergence=3e-3),
-    "os1_64": generic(64, -16.6, 16.6, 360 / 1024, 10.0, range_noise=0.03, divergence=3.1e-3,
-                      reach=45.0),
-}
+    columns = round(HDL64E.columns * HDL64E.rate / rate)
+    return replace(HDL64E, azimuth_step=2 * np.pi / columns, rate=rate)
 
 
 def sensor_named(name: str) -> Sensor:
-    """The preset of that name, or a generic one as GENERIC says; InputError, which names them all,
-    for anything else."""
+    """The sensor of a YAML file (see sensor_from_file), the one of that name, however it is
+    written (vlp-16, VLP16), or a generic one as GENERIC says. InputError, which names them all, for
+    anything else."""
     if name.startswith("generic:"):
         try:
             beams, *numbers = map(float, name.removeprefix("generic:").split(","))
@@ -234,7 +255,11 @@ def sensor_named(name: str) -> Sensor:
                 raise
             raise InputError(f"sensor {name!r} must be {GENERIC}, such as "
                              "generic:32,-25,15,0.2,10") from None
-    if name not in SENSORS:
-        raise InputError(f"unknown sensor {name!r}: must be one of {', '.join(SENSORS)}, or "
-                         f"{GENERIC}")
-    return SENSORS[name]
+    if name.endswith((".yaml", ".yml")):
+        return sensor_from_file(name)
+    if name in SENSORS:
+        return SENSORS[name]
+    if _key(name) not in READY:
+        raise InputError(f"unknown sensor {name!r}: must be one of {', '.join(NAMES)}, a file "
+                         f".yaml, or {GENERIC}")
+    return sensor_from_file(READY[_key(name)])

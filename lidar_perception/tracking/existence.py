@@ -28,11 +28,9 @@ def probability(odds: np.ndarray) -> np.ndarray:
     return 1.0 / (1.0 + np.exp(-np.clip(odds, -50.0, 50.0)))
 
 
-def evidence(scores: np.ndarray, kinds: np.ndarray, params: ExistenceParams) -> np.ndarray:
-    """(N,) what detections with scores (N,) of kinds (N,) say for (or, below 0, against) an
-    object."""
-    neutral = np.array([params.neutral.vehicle, params.neutral.pedestrian, params.neutral.cyclist])
-    return params.gain * (log_odds(scores) - log_odds(neutral)[kinds])
+def evidence(scores: np.ndarray, params: ExistenceParams) -> np.ndarray:
+    """(N,) what detections with scores (N,) say for (or, below 0, against) an object."""
+    return params.gain * (log_odds(scores) - log_odds(params.neutral))
 
 
 def effective_looks(looks: np.ndarray, correlation: float) -> np.ndarray:

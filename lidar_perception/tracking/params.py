@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from lidar_perception.classes import TABLE
 from lidar_perception.param_fields import Params, param
@@ -51,24 +51,11 @@ class AssociationParams(Params):
 
 
 @dataclass(frozen=True)
-class NeutralParams(Params):
-    """The score that says nothing for or against an object, by kind: what the detector gives to
-    boxes that are right as often as wrong."""
-
-    vehicle: float = param(0.35, "Of vehicles.", low=0.001, high=0.999)
-    pedestrian: float = param(0.3, "Of pedestrians.", low=0.001, high=0.999)
-    cyclist: float = param(0.3, "Of cyclists.", low=0.001, high=0.999)
-
-
-# Of detectors whose scores mean something else than those of PointPillars, see docs/tracking.md.
-NEUTRAL = {"pointnet": NeutralParams(pedestrian=0.5), "fused": NeutralParams(0.5, 0.5, 0.5)}
-
-
-@dataclass(frozen=True)
 class ExistenceParams(Params):
     """Evidence, in log odds, that a track is what it claims to be, and that it is still there."""
 
-    neutral: NeutralParams = NeutralParams()
+    neutral: float = param(0.25, "The score that says nothing for or against an object, for scores "
+                           "that are probabilities.", low=0.001, high=0.999)
     gain: float = param(1.0, "Weight of a score's log odds.", low=0.0, high=10.0)
     correlation: float = param(0.8, "Of the evidence of looks at one object: n of them count as "
                                "n / (1 + (n - 1) correlation).", low=0.0, high=1.0)
@@ -142,11 +129,3 @@ class EgoParams(Params):
                            unit="s", low=0.0, high=100.0)
     max_wait: float = param(0.2, "A frame waits for its pose this long, where poses come but are a "
                             "little behind.", unit="s", low=0.0, high=100.0)
-
-
-def tracking_of(detector: str, params: TrackingParams = TrackingParams()) -> TrackingParams:
-    """params for a detector, as LOAD of detectors/open.py or the graph names it: with its own
-    neutral scores, if it has any and params has the defaults there."""
-    if params.existence.neutral != NeutralParams() or detector not in NEUTRAL:
-        return params
-    return replace(params, existence=replace(params.existence, neutral=NEUTRAL[detector]))

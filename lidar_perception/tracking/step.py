@@ -90,7 +90,7 @@ def _look(new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
     missed[i] = False
     new.total[missed] += own.missed
     new.looks[:] += 1.0
-    new.total[i] += existence.evidence(scores, KINDS[class_ids], own)
+    new.total[i] += existence.evidence(scores, own)
     new.class_evidence[i, class_ids] += scores
     best = new.class_evidence.argmax(axis=1)
     rows = np.arange(len(new))
@@ -125,7 +125,7 @@ def born(first_id: int, boxes: np.ndarray, class_ids: np.ndarray, scores: np.nda
     return States(
         first_id + np.arange(count), means, covariances, boxes[:, 2].copy(),
         np.full(count, HEIGHT_NOISE ** 2), boxes[:, 3:6].copy(), scores.copy(), votes,
-        class_ids.astype(np.int32), existence.evidence(scores, kinds, own), ones,
+        class_ids.astype(np.int32), existence.evidence(scores, own), ones,
         np.full(count, own.seen / 2), ones.copy(), ones.copy(),
         moving(means, covariances, params.moving_speed), zeros.copy(), zeros.copy())
 

@@ -14,6 +14,7 @@ import numpy as np
 from lidar_perception.geometry import bev_iou, to_box_frame, wrap_angle
 from lidar_perception.training.params import AugmentParams, NoiseParams, ThingParams
 from lidar_perception.training.putting import TOUCH, inside
+from lidar_perception.types import SENSOR_HEIGHT
 
 STEP = np.radians(0.4)  # of elevation between two beams
 SHINING = 0.99  # intensity of a reflector
@@ -24,13 +25,14 @@ BORDER = 0.01  # m: points so near to a box are taken for its own, as labels are
 class TrainingScene:
     """points (N, 4) float32 [x y z intensity]; boxes (M, 7) float64 [x y z l w h yaw], class_ids
     (M,) int into CLASSES. wanted (M,) bool: not so hidden that nobody would label it. around: the
-    labels are all around, not ahead only."""
+    labels are all around, not ahead only. height: of the sensor above the ground, metres."""
 
     points: np.ndarray
     boxes: np.ndarray
     class_ids: np.ndarray
     wanted: np.ndarray
     around: bool = False
+    height: float = SENSOR_HEIGHT
 
 
 def augmented(scene: TrainingScene, params: AugmentParams,

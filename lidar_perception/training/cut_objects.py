@@ -3,7 +3,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,8 +15,10 @@ from lidar_perception.clustering.shapes import extents
 from lidar_perception.detectors.pointnet.clusters import ground_under
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.geometry import bev_iou
+from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.training.augment import TrainingScene, grown
+from lidar_perception.training.cache import kept, path_in
 from lidar_perception.training.database import THING, Database
 from lidar_perception.training.putting import inside
 from lidar_perception.types import CLASSES, PEDESTRIAN, LidarFrame
@@ -25,29 +30,66 @@ APART = 0.3           # m from every labelled box
 MOST = 20             # of a scene
 
 
-def cut_objects(scenes: Iterable[TrainingScene], classes: tuple[str, ...],
-                min_points: int) -> Database:
+@dataclass(frozen=True)
+class CutObjects:
+    """scene(i): what scene i of `scenes` gives to others, see cut. cache: folder for that, or
+    None."""
+
+    scenes: Any
+    classes: tuple[str, ...]
+    min_points: int = 5
+    cache: Path | None = None
+
+    def __len__(self) -> int:
+        return len(self.scenes)
+
+    def path(self, i: int) -> Path | None:
+        """The file that keeps it."""
+        return path_in(self.cache, self.scenes.key(i), self.classes, self.min_points)
+
+    def keep(self, i: int) -> None:
+        """Put it into the cache."""
+        self.scene(i)
+
+    def scene(self, i: int) -> Database:
+        """InputError naming the file that cannot be used."""
+        return kept(self.path(i),
+                    lambda: cut(self.scenes.scene(i), self.classes, self.min_points, i),
+                    lambda arrays: Database(**arrays), vars)
+
+
+def cut(scene: TrainingScene, classes: tuple[str, ...], min_points: int, seed: int = 0) -> Database:
     """The wanted objects of some classes that have enough points; where boxes overlap, none. If
-    people are among them, things that look like people, too."""
+    people are among them, things that look like people, too; which of many, the seed draws."""
     chosen = [CLASSES.index(name) for name in classes]
+    overlap = bev_iou(scene.boxes, scene.boxes) > 0
+    alone = overlap.sum(axis=1) <= 1
     boxes, class_ids, points = [np.zeros((0, 7))], [], [np.zeros((0, 4), np.float32)]
-    for n, scene in enumerate(scenes):
-        overlap = bev_iou(scene.boxes, scene.boxes) > 0
-        alone = overlap.sum(axis=1) <= 1
-        for i in np.flatnonzero(scene.wanted & alone & np.isin(scene.class_ids, chosen)):
-            own = scene.points[inside(scene.points, scene.boxes[i], 0.0)]
-            if len(own) >= min_points:
-                boxes.append(scene.boxes[i:i + 1])
-                class_ids.append(scene.class_ids[i])
-                points.append(own)
-        if PEDESTRIAN in chosen:
-            things, of_things = things_in(scene, min_points, np.random.default_rng(n))
-            boxes.append(things)
-            class_ids.extend([THING] * len(things))
-            points.extend(of_things)
+    for i in np.flatnonzero(scene.wanted & alone & np.isin(scene.class_ids, chosen)):
+        own = scene.points[inside(scene.points, scene.boxes[i], 0.0)]
+        if len(own) >= min_points:
+            boxes.append(scene.boxes[i:i + 1])
+            class_ids.append(scene.class_ids[i])
+            points.append(own)
+    if PEDESTRIAN in chosen:
+        things, of_things = things_in(scene, min_points, np.random.default_rng(seed))
+        boxes.append(things)
+        class_ids.extend([THING] * len(things))
+        points.extend(of_things)
     sizes = [len(own) for own in points[1:]]
     return Database(np.concatenate(boxes), np.array(class_ids, np.int32), np.concatenate(points),
                     np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64))
+
+
+def joined(parts: Sequence[Database]) -> Database:
+    """All objects of some databases; with none of them, none."""
+    parts = [Database(np.zeros((0, 7)), np.zeros(0, np.int32), np.zeros((0, 4), np.float32),
+                      np.zeros(1, np.int64)), *parts]
+    ends = np.cumsum([part.first[-1] for part in parts])
+    first = [parts[0].first, *(part.first[1:] + end for part, end in zip(parts[1:], ends))]
+    return Database(np.concatenate([part.boxes for part in parts]),
+                    np.concatenate([part.class_ids for part in parts]),
+                    np.concatenate([part.points for part in parts]), np.concatenate(first))
 
 
 def things_in(scene: TrainingScene, min_points: int,
@@ -56,7 +98,8 @@ def things_in(scene: TrainingScene, min_points: int,
     clusters of obstacles of a person's width with so many points that touch no box of the scene; at
     most MOST, drawn by rng."""
     xyz = np.ascontiguousarray(scene.points[:, :3])
-    ground = segment_ground(LidarFrame(xyz), EXPERT_GROUND)
+    ground = segment_ground(LidarFrame(xyz), replace(
+        EXPERT_GROUND, sensor_pose=SensorPoseParams(height=scene.height)))
     ids = cluster_obstacles(xyz, ground, EXPERT_CLUSTERING)
     low, high, sizes = extents(xyz, ids, int(ids.max(initial=0)))
     boxes = np.zeros((len(sizes), 7))

@@ -11,7 +11,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import count, islice
+from itertools import count
 from typing import Any, NamedTuple
 
 import numba
@@ -20,7 +20,6 @@ import torch
 from torch.utils.data import DataLoader
 
 from lidar_perception.runs.terminal import errors
-from lidar_perception.training.augment import TrainingScene
 from lidar_perception.types import InputError
 
 AHEAD = 4  # batches that each worker prepares in advance
@@ -43,7 +42,7 @@ class Stream:
     """
 
     sources: tuple[Any, ...]
-    prepare: Callable[[TrainingScene, np.random.Generator], Any]
+    prepare: Callable[[Any, np.random.Generator], Any]
     seed: int = 0
 
     def __len__(self) -> int:
@@ -148,18 +147,3 @@ def _end_with_parent() -> None:
     outlive a main process that was killed."""
     multiprocessing.parent_process().join()
     os._exit(1)
-
-
-def some_scenes(sources: tuple[Any, ...], most: int, seed: int,
-                jobs: int) -> Iterator[TrainingScene]:
-    """At most so many scenes of the sources as they are, drawn by the seed; what cannot be used is
-    left out."""
-    scenes = ReadScenes(sources, _scene)
-    chosen = np.random.default_rng(seed).permutation(len(scenes))[:most]
-    for item, in islice(loaded(scenes, ([int(n)] for n in chosen), jobs), len(chosen)):
-        if item.sample is not None:
-            yield item.sample
-
-
-def _scene(source: Any, i: int) -> TrainingScene:
-    return source.scene(i)

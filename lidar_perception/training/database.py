@@ -20,7 +20,7 @@ from lidar_perception.types import InputError
 NEIGHBOURHOOD = 3.0  # m: the ground under an object is looked for so far around it
 GROUND_SHARE = 0.1   # of the points there lie lower
 MAX_STEP = 1.0      # m: from further up or down nothing is put there
-THINGS = (-1.1, 0.5)  # m from the sensor's height up: what is there is no ground, and hides people
+THINGS = (0.63, 2.23)  # m above the ground: what is there is no ground, and hides people
 SECTORS = 720        # directions that are told apart
 TRIES = 64           # of them drawn for an object
 DRAWN = 3
@@ -74,7 +74,7 @@ def with_objects(scene: TrainingScene, database: Database, params: AugmentParams
     """
     points, taken = scene.points, scene.boxes
     class_ids = []
-    free = _free_depths(points)
+    free = _free_depths(points, scene.height)
     for class_id, number in ((CAR, params.cars), (PEDESTRIAN, params.pedestrians),
                          (CYCLIST, params.cyclists), (THING, params.things)):
         known = np.flatnonzero(database.class_ids == class_id)
@@ -127,10 +127,11 @@ def _put(box, own, points, boxes, free, low, high,
     return (points, np.concatenate([boxes, box[None]])) if len(points) else None
 
 
-def _free_depths(points: np.ndarray) -> np.ndarray:
+def _free_depths(points: np.ndarray, height: float) -> np.ndarray:
     """(SECTORS,) m: how far one sees, about, in each direction from -pi on, before something
     stands there."""
-    things = points[(points[:, 2] > THINGS[0]) & (points[:, 2] < THINGS[1])]
+    above = points[:, 2] + height
+    things = points[(above > THINGS[0]) & (above < THINGS[1])]
     free = np.full(SECTORS, np.inf)
     np.minimum.at(free, _sectors(np.arctan2(things[:, 1], things[:, 0])),
                   np.hypot(things[:, 0], things[:, 1]))

@@ -7,6 +7,7 @@ average of the weights, validation, logs, and a state on disk from which a kille
 from __future__ import annotations
 
 import io
+import math
 import pickle
 import signal
 import threading
@@ -19,7 +20,7 @@ from typing import Any
 import torch
 
 from lidar_perception.runs.files import make_folder, remove_temporaries, write_bytes
-from lidar_perception.runs.terminal import errors, progress
+from lidar_perception.runs.terminal import errors, paused, progress
 from lidar_perception.training.log import Log
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.ranks import any_of, rank, wait
@@ -30,8 +31,9 @@ STATE = "last.pt"
 
 
 def train(task: Task, params: LoopParams, out: Path, device: torch.device = torch.device("cpu"),
-          resume: bool = False) -> Progress:
-    """Train until the steps are done or a signal (SIGINT, SIGTERM) comes; the state is saved then.
+          resume: bool = False, until: float = math.inf) -> Progress:
+    """Train until the steps are done, a signal (SIGINT, SIGTERM) comes, or time.monotonic() comes
+    to `until`, with so much left as the last validation takes; the state is saved then.
 
     In out: STATE, for resuming; log.csv, validation.csv, and whatever task.keep writes. The same
     task and seed give the same weights on the CPU, whether the run was interrupted or not.
@@ -49,6 +51,7 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
         remove_temporaries(out)
     log = Log(out, run.progress.step) if rank() == 0 else None
     begun = time.monotonic() - run.progress.seconds
+    pace = Pace(run.steps - run.progress.step, until)
     try:
         with _signals() as stop, progress() as bar:
             line = bar.add_task("training", total=run.steps, completed=run.progress.step,
@@ -59,14 +62,18 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
                     run.progress.stopped = True
                     _save(path, run)
                     break
-                if run.due():
+                run.progress.late = any_of(pace.over(), device) and run.progress.step < run.steps
+                if run.due() or (run.progress.late
+                                 and run.progress.step > run.progress.validated):
                     _save(path, run)  # as validation takes its time
-                    _validate(run, log)
+                    with pace.validating(), paused(bar):
+                        _validate(run, log)
                     _save(path, run)
-                if run.progress.step >= run.steps:
+                if run.progress.step >= run.steps or run.progress.late:
                     break
                 row = run.step(next(batches))
                 step = run.progress.step
+                pace.step()
                 run.progress.seconds = time.monotonic() - begun
                 bar.update(line, completed=step)
                 if row is not None:
@@ -80,6 +87,37 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
         if log is not None:
             log.close()
     return run.progress
+
+
+class Pace:
+    """Whether so many steps fit into the time that is left."""
+
+    def __init__(self, missing: int, until: float):
+        self.missing, self.until, self.last_validation, self.steps = missing, until, 0.0, 0
+        self.begun, self.warned = time.monotonic(), False
+
+    def over(self) -> bool:
+        """Whether it is time to validate for the last time."""
+        return time.monotonic() + self.last_validation >= self.until
+
+    def step(self) -> None:
+        """After each step; says once if the steps will not fit."""
+        self.steps += 1
+        passed = time.monotonic() - self.begun
+        if self.warned or passed < 60 or self.until == math.inf:
+            return
+        fit = self.steps + int((self.until - time.monotonic()) * self.steps / passed)
+        if fit < 0.9 * self.missing:
+            self.warned = True
+            errors.print(f"slower than planned, {passed / self.steps:.2g} s a step: about {fit} of "
+                         f"{self.missing} steps fit into the budget", soft_wrap=True)
+
+    @contextmanager
+    def validating(self) -> Iterator[None]:
+        """Around a validation, to know how long one takes."""
+        begun = time.monotonic()
+        yield
+        self.last_validation = time.monotonic() - begun
 
 
 def may_begin(out: Path, resume: bool) -> Path:
@@ -99,17 +137,17 @@ def _validate(run: Run, log: Log | None) -> None:
     progress = run.progress
     progress.validated = progress.step
     if rank() == 0:
-        metrics = run.task.validate(run.average.module)
+        metrics, calibration = run.task.validate(run.average.module)
         log.add("validation", progress.step, metrics)
         shown = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
         errors.print(f"step {progress.step}: {shown}", soft_wrap=True)
         better = progress.best is None or metrics["score"] > progress.best
         if better:
             progress.best, progress.best_step = metrics["score"], progress.step
-        record = {**vars(progress), "metrics": metrics}
+        record = {**vars(progress), "metrics": metrics, "calibration": calibration}
         if better:
             run.task.keep("best", run.average.module, record)
-        if progress.step == run.steps:
+        if progress.step == run.steps or progress.late:
             run.task.keep("last", run.average.module, record)
     wait()
 

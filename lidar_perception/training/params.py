@@ -15,9 +15,10 @@ PAPER_SHARE = 751 / 7518  # of the frames that paper B holds out
 class LoopParams(Params):
     """How long, how fast, and how often something is written."""
 
-    steps: int = param(0, "Steps of the optimizer. 0: as many as the epochs have.", low=0,
-                       high=10**9)
-    epochs: float = param(80.0, "Passes over the data, if steps is 0.", low=0.001, high=1e5)
+    steps: int = param(0, "Steps of the optimizer. 0: as many as the epochs have, or the budget.",
+                       low=0, high=10**9)
+    epochs: float = param(0.0, "Passes over the data, if steps is 0. 0: the budget decides.",
+                          low=0.0, high=1e5)
     batch: int = param(4, "Scenes in a step, on each device.", low=1, high=4096)
     lr: float = param(0.003, "Highest learning rate.", low=1e-9, high=10.0)
     warm_share: float = param(0.4, "Share of the steps during which the learning rate rises; then "
@@ -28,12 +29,12 @@ class LoopParams(Params):
     ema: float = param(0.999, "Decay of the moving average of the weights, which is validated "
                        "and saved. 0: the weights themselves.", low=0.0,
                        high=0.999999)
-    amp: str = param("auto", "Number format of the forward pass. auto: on CUDA bf16 where the "
-                     "device has it, else fp16; on the CPU float32. bf16 on the CPU is about twice "
-                     "as fast where it has instructions for it.",
+    amp: str = param("auto", "Number format of the forward pass. auto: bf16 where the device has "
+                     "instructions for it, which takes half the time on the CPU; else fp16 on "
+                     "CUDA, float32 on the CPU.",
                      choices=("auto", "bf16", "fp16", "off"))
-    validate_epochs: float = param(5.0, "Epochs between validations, if validate_steps is 0.",
-                                   low=0.001, high=1e5)
+    validate_epochs: float = param(0.0, "Epochs between validations, if validate_steps is 0. 0: "
+                                   "the budget decides.", low=0.0, high=1e5)
     validate_steps: int = param(0, "Steps between validations; 0: validate_epochs decides.",
                                 low=0, high=10**9)
     save_steps: int = param(200, "Steps between saves of the state that a resumed run needs.",
@@ -49,12 +50,13 @@ class LoopParams(Params):
         return {name: value for name, value in flatten(self).items() if name not in INDIFFERENT}
 
     def total_steps(self, epoch: int) -> int:
-        """Steps in all, if an epoch has so many."""
-        return self.steps or max(1, round(self.epochs * epoch))
+        """Steps in all, if an epoch has so many; 0 where the budget decides."""
+        return self.steps or (max(1, round(self.epochs * epoch)) if self.epochs else 0)
 
     def validation_steps(self, epoch: int) -> int:
-        """Steps from one validation to the next."""
-        return self.validate_steps or max(1, round(self.validate_epochs * epoch))
+        """Steps from one validation to the next; 0 where the budget decides."""
+        return self.validate_steps or (max(1, round(self.validate_epochs * epoch))
+                                       if self.validate_epochs else 0)
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ class AugmentParams(ThingParams):
     cyclists: int = param(8, "Likewise cyclists.", low=0, high=100)
     things: int = param(12, "This many objects that resemble a standing person, such as posts, are "
                         "pasted in as background.", low=0, high=100)
-    database_scans: int = param(2000, "Pasted objects come from at most this many scenes.", low=0,
+    database_scans: int = param(500, "Pasted objects come from at most this many scenes.", low=0,
                                 high=10**6)
     object_turn: float = param(0.157, "Each object is rotated by up to this.", unit="rad", low=0.0,
                                high=3.1416)
@@ -115,20 +117,18 @@ class AugmentParams(ThingParams):
 class DataParams(Params):
     """Which scenes."""
 
-    scans: int = param(4000, "Simulated scans in an epoch.", low=1, high=10**7)
+    scans: int = param(0, "Simulated scans in an epoch. 0: the budget decides.", low=0, high=10**7)
     street_scans: int = param(4, "Scans of each street, spread over a drive of 20 s.",
                               low=1, high=100)
-    val_scans: int = param(200, "Simulated scans in a validation, of other streets.", low=1,
-                           high=10**6)
-    sensor: str = param("hdl64e", "Sensor of the simulated scans: the name of a preset, or "
-                        "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE. It is mounted at 1.73 m.")
+    val_scans: int = param(0, "Simulated scans in a validation, of other streets. 0: the budget "
+                           "decides.", low=0, high=10**6)
     people: float = param(3.0, "Pedestrians and cyclists on the streets trained on, as a multiple "
                           "of KITTI's.", low=0.0, high=100.0)
     val_people: float = param(1.0, "Likewise on the streets validated on.", low=0.0, high=100.0)
-    cache: str = param("", "Folder that keeps simulated scans, which take about a second to make. "
-                       "Empty: none.")
-    cache_gb: float = param(20.0, "Scans are added to the cache until it has this size.", unit="GB",
-                            low=0.0, high=1e6)
+    cache: str = param("", "Folder that keeps simulated scans, and what is cut from scans, for "
+                       "several runs. Empty: scans in --out.")
+    cache_gb: float = param(20.0, "Scans are added to the cache until it has this size; the others "
+                            "are simulated in every epoch.", unit="GB", low=0.0, high=1e6)
     val_share: float = param(PAPER_SHARE, "Share of the frames held out for validation, drawn by "
                              "the seed, where neither --val nor --split is given.", low=0.0,
                              high=0.9)
@@ -138,16 +138,29 @@ class DataParams(Params):
 
 
 @dataclass(frozen=True)
-class PointPillarsTraining(LoopParams):
+class SceneTraining(LoopParams):
+    """How long, and by which sensor."""
+
+    sensor: str = param("hdl64e", "Sensor of the simulated scans: a sensor.yaml, the name of a "
+                        "preset, or generic:BEAMS,LOWEST,HIGHEST,STEP,RATE.")
+    mount_height: float = param(0.0, "Its height above the ground. 0: what its file or preset "
+                                "says.", unit="m", low=0.0, high=10.0)
+
+
+@dataclass(frozen=True)
+class PointPillarsTraining(SceneTraining):
     """All settings of train pointpillars."""
 
     version: str = param("v4", "EG-PointPillars version; v0 is PointPillars.",
                          choices=("v0", "v1", "v2", "v3", "v4"))
     size: str = param("compact", "full: the paper's network, for a GPU. compact: for two CPU "
                       "cores.", choices=("full", "compact"))
-    ahead: float = param(0.0, "Train only on what lies up to this far ahead, which is quicker; the "
-                         "weights still cover the whole range. 0: all of it.",
-                         unit="m", low=0.0, high=1000.0)
+    range: str = param("ahead", "What the network sees: ahead, 69.12 m ahead and 39.68 m to each "
+                       "side, as in KITTI; around, 51.2 m to every side.",
+                       choices=("ahead", "around"))
+    ahead: float = param(0.0, "Train only on what lies up to this far ahead, and behind, which is "
+                         "quicker; the weights still cover the whole range. 0: the budget decides; "
+                         "a large number: all of it.", unit="m", low=0.0, high=1000.0)
     aside: float = param(0.0, "Likewise to each side.", unit="m", low=0.0, high=1000.0)
     score: str = param("bev", "Score that chooses the best weights: bev, the mean AP from above at "
                        "the overlaps 0.5 / 0.25 / 0.25, or map, the mean AP in space at 0.7 / 0.5 "
@@ -181,7 +194,7 @@ class ClusterAugmentParams(ThingParams):
 
 
 @dataclass(frozen=True)
-class PointNetTraining(LoopParams):
+class PointNetTraining(SceneTraining):
     """All settings of train pointnet."""
 
     network: str = param("improved", "improved: paper C's. pointnet, pointnet2: plain PointNet and "

@@ -15,13 +15,17 @@ PATIENCE = timedelta(hours=2)  # of the others, while rank 0 validates
 
 @contextmanager
 def joined(device: torch.device) -> Iterator[torch.device]:
-    """Join the processes that torchrun started, if it did; gives the device of this one."""
+    """Join the processes that torchrun started, if it did, and if that was not done by the caller;
+    gives the device of this one."""
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         yield device
         return
     if device.type == "cuda":
         device = torch.device("cuda", int(os.environ.get("LOCAL_RANK", "0")))
         torch.cuda.set_device(device)
+    if distributed.is_initialized():
+        yield device
+        return
     distributed.init_process_group("nccl" if device.type == "cuda" else "gloo", timeout=PATIENCE)
     try:
         yield device

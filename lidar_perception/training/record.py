@@ -14,6 +14,9 @@ from lidar_perception import __version__
 from lidar_perception.detectors.checkpoint import Config, Header, adopt, save_checkpoint
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors
+from lidar_perception.scoring.kitti.protocol import Comparison
+from lidar_perception.scoring.kitti.reliability import lines
+from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.data import Batches
 from lidar_perception.training.params import LoopParams
 
@@ -33,7 +36,7 @@ def keeper(out: Path, config: Any, params: LoopParams, batches: Batches,
     """keep(name, module, record) of a Task: writes out/name.safetensors."""
     def keep(name: str, module: nn.Module, record: dict[str, Any]) -> None:
         header = Header(config, record_of(params, batches, record, about),
-                      rounded(record.get("metrics", {})), commit)
+                      rounded(record.get("metrics", {})), commit, record.get("calibration", {}))
         save_checkpoint(out / f"{name}.safetensors", module, header)
 
     return keep
@@ -52,6 +55,13 @@ def begun_with(network: nn.Module, init: Path | None, kind: type[Config]) -> nn.
 def rounded(metrics: dict[str, float]) -> dict[str, float | None]:
     """For JSON: NaN as None."""
     return {key: None if math.isnan(value) else round(value, 3) for key, value in metrics.items()}
+
+
+def judged(report: DetectionReport, score: str, classes: Sequence[str]
+           ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """What Task.validate gives of a report of the network's own scores."""
+    return (metrics_of(report.compute(), score, classes),
+            lines(Comparison.of(report.frames)) if report.frames else {})
 
 
 def metrics_of(content: dict[str, Any], score: str, classes: Sequence[str]) -> dict[str, float]:

@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from lidar_perception.runs.machine import has_bf16
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.ranks import any_of, world
 from lidar_perception.training.schedule import Average, one_cycle
@@ -26,15 +27,16 @@ class Task:
     module: on its device. loss(module, batch): the scalar to lower, and the parts to log; module is
     called as a function, as it may be wrapped for several processes. batches(step): the batches of
     that step, from 0, and all later ones, the same ones whenever it is asked. validate(module):
-    metrics, of which 'score' counts. keep(name, module, record): write the weights under a name,
-    'best' or 'last'; record can be JSON. epoch: steps of one pass over the data. about: what else a
+    metrics, of which 'score' counts, and what makes its scores probabilities
+    (detectors/calibration.py). keep(name, module, record): write the weights under a name, 'best'
+    or 'last'; record can be JSON. epoch: steps of one pass over the data. about: what else a
     resumed run must have in common with what was begun.
     """
 
     module: nn.Module
     loss: Callable[[nn.Module, Any], tuple[Tensor, dict[str, Tensor]]]
     batches: Callable[[int], Iterable[Any]]
-    validate: Callable[[nn.Module], dict[str, float]]
+    validate: Callable[[nn.Module], tuple[dict[str, float], dict[str, tuple[float, float]]]]
     keep: Callable[[str, nn.Module, dict[str, Any]], None]
     epoch: int
     about: dict[str, Any] = field(default_factory=dict)
@@ -43,7 +45,8 @@ class Task:
 @dataclass
 class Progress:
     """How far a run is: steps done, steps skipped (of them the last ones in a row), the best score
-    and its step, the step of the last validation, seconds spent; stopped: by a signal."""
+    and its step, the step of the last validation, seconds spent; stopped: by a signal; late: the
+    time was over."""
 
     step: int = 0
     skipped: int = 0
@@ -53,6 +56,7 @@ class Progress:
     validated: int = 0
     seconds: float = 0.0
     stopped: bool = False
+    late: bool = False
 
 
 class Run:
@@ -73,7 +77,7 @@ class Run:
                 self.module, device_ids=[device] if device.type == "cuda" else None)
         self.optimizer = torch.optim.AdamW(self.module.parameters(), lr=params.lr,
                                            weight_decay=params.weight_decay)
-        self.format = _format(params.amp, device)
+        self.format = number_format(params.amp, device)
         self.scaler = torch.amp.GradScaler(device.type, enabled=self.format is torch.float16)
         self.progress = Progress()
 
@@ -101,7 +105,7 @@ class Run:
         self.average.updates = state["updates"]
         self.optimizer.load_state_dict(state["optimizer"])
         self.scaler.load_state_dict(state["scaler"])
-        self.progress = Progress(**{**state["progress"], "stopped": False})
+        self.progress = Progress(**{**state["progress"], "stopped": False, "late": False})
         torch.set_rng_state(state["random"])
         if state["cuda"] is not None and self.device.type == "cuda":
             torch.cuda.set_rng_state(state["cuda"], self.device)
@@ -152,9 +156,10 @@ class Run:
         return length
 
 
-def _format(amp: str, device: torch.device) -> torch.dtype | None:
+def number_format(amp: str, device: torch.device) -> torch.dtype | None:
+    """The format of the forward pass, None for float32; amp as in LoopParams."""
     if device.type == "cpu":
-        return FORMATS["bf16"] if amp == "bf16" else None
+        return FORMATS["bf16"] if amp == "bf16" or (amp == "auto" and has_bf16()) else None
     if amp == "off":
         return None
     if amp == "auto":

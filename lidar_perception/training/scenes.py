@@ -6,26 +6,27 @@ processes: files are opened where they are read.
 
 from __future__ import annotations
 
-import hashlib
-import io
-import os
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from zipfile import BadZipFile
+from typing import Any
 
 import numpy as np
 
-from lidar_perception import __version__
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
-from lidar_perception.runs.files import write_bytes
-from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels, worth_a_label
+from lidar_perception.simulation.camera import (
+    FORWARD_CAMERA,
+    kitti_labels,
+    turned_camera,
+    worth_a_label,
+)
 from lidar_perception.simulation.drive import longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Streets
-from lidar_perception.simulation.sensor import Sensor, sensor_named
+from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
-from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
+from lidar_perception.training.cache import kept, path_in, size_of
+from lidar_perception.types import GroundTruth, InputError, LidarFrame
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,10 @@ class RecordedScenes:
 
     def __getstate__(self) -> dict:
         return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # open where it is read
+
+    def key(self, i: int) -> str:
+        """All that scene i depends on, as long as its files stay as they are."""
+        return repr((str(self.path), self.names[i], self.view))
 
     def scene(self, i: int) -> TrainingScene:
         """InputError naming the file that cannot be used."""
@@ -85,86 +90,81 @@ def random_split(names: tuple[str, ...], share: float,
 class SimulatedScenes:
     """count scans of the streets first, first + 1, ..., of each so many, spread over its drive. To
     make a street takes as long as to scan it. cache: folder for scans, or None; from cache_gb on
-    nothing is added to it."""
+    nothing is added to it. around: frames to validate on have their labels in the image of a camera
+    that looks ahead, left, behind, right in turn, not ahead only."""
 
     first: int
     count: int
-    sensor: str = "hdl64e"
+    sensor: Sensor = HDL64E
     streets: Streets = ANY
     cache: Path | None = None
     cache_gb: float = 20.0
     per_street: int = 1
+    around: bool = False
 
     def __len__(self) -> int:
         return self.count
 
-    def _at(self, i: int) -> tuple[int, int]:
+    def at(self, i: int) -> tuple[int, int]:
         """Street and frame of scan i."""
         street, part = divmod(i, self.per_street)
-        return self.first + street, part * longest_drive(self._sensor) // self.per_street
+        return self.first + street, part * longest_drive(self.sensor) // self.per_street
 
-    @cached_property
-    def _sensor(self) -> Sensor:
-        return replace(sensor_named(self.sensor), height=SENSOR_HEIGHT)
+    def key(self, i: int) -> str:
+        """All that scan i depends on."""
+        return repr((self.sensor, tuple(self.streets), self.at(i)))
+
+    def path(self, i: int) -> Path | None:
+        """The file that keeps scan i."""
+        return path_in(self.cache, self.key(i))
 
     def scene(self, i: int) -> TrainingScene:
         """With the labels all around."""
-        frame, truth = self.scan(i)
-        return TrainingScene(np.column_stack([frame.xyz, frame.intensity]), truth.boxes,
-                             truth.class_ids, worth_a_label(truth), around=True)
+        return self._as_scene(*self.scan(i))
+
+    def made(self, i: int) -> TrainingScene:
+        """scene(i), made anew whatever is kept."""
+        return self._as_scene(*self._simulated(i))
 
     def frame(self, i: int) -> Frame:
-        """To validate on: with the labels that KITTI would have, in the image of a camera that
-        looks ahead."""
+        """To validate on: with the labels that KITTI would have in the image of a camera."""
         scan, truth = self.scan(i)
-        street, part = self._at(i)
-        return Frame.of(f"street {street} frame {part}", scan, kitti_labels(truth), FORWARD_CAMERA)
+        street, part = self.at(i)
+        camera = turned_camera(np.pi / 2 * (i % 4)) if self.around else FORWARD_CAMERA
+        return Frame.of(f"street {street} frame {part}", scan, kitti_labels(truth, camera), camera,
+                        sensor_height=self.sensor.height)
 
     def scan(self, i: int) -> tuple[LidarFrame, GroundTruth]:
         """The frame and all its objects, from the cache if they are there."""
-        path = self._path(i)
-        if path is not None and path.is_file():
-            try:
-                return _read_scan(path)
-            except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-                path.unlink(missing_ok=True)  # it is made again
-        scan = scan_at(*self._at(i), self._sensor, self.streets)
-        if path is not None and _size(path.parent) < self.cache_gb * 1e9:
-            _write_scan(path, scan.frame, scan.truth)
+        return kept(self.path(i), lambda: self._simulated(i), _read_scan, _scan_arrays,
+                    self.cache_gb)
+
+    def keep(self, i: int) -> None:
+        """Put scan i into the cache, if there is room."""
+        if self.cache is not None and size_of(self.cache) < self.cache_gb * 1e9:
+            self.scan(i)
+
+    def _simulated(self, i: int) -> tuple[LidarFrame, GroundTruth]:
+        scan = scan_at(*self.at(i), self.sensor, self.streets)
         return scan.frame, scan.truth
 
-    def _path(self, i: int) -> Path | None:
-        if self.cache is None:
-            return None
-        # One folder, so that its size is soon known; the name says all that the scan depends on.
-        made = hashlib.sha1(repr((self._sensor, tuple(self.streets), __version__)).encode())
-        street, part = self._at(i)
-        return self.cache / f"{made.hexdigest()[:12]}_{street:08}_{part:03}.npz"
+    def _as_scene(self, frame: LidarFrame, truth: GroundTruth) -> TrainingScene:
+        return TrainingScene(np.column_stack([frame.xyz, frame.intensity]), truth.boxes,
+                             truth.class_ids, worth_a_label(truth), True, self.sensor.height)
 
 
 EXTRAS = ("track_id", "truncated", "occluded", "num_points", "visible")
 
 
-def _write_scan(path: Path, frame: LidarFrame, truth: GroundTruth) -> None:
-    content = io.BytesIO()
+def _scan_arrays(scan: tuple[LidarFrame, GroundTruth]) -> dict[str, np.ndarray]:
+    frame, truth = scan
     extras = {name: np.array([e[name] for e in truth.extras]) for name in EXTRAS}
-    np.savez(content, xyz=frame.xyz, intensity=frame.intensity, boxes=truth.boxes,
-             class_ids=truth.class_ids, **extras)
-    write_bytes(path, content.getbuffer())
+    return dict(xyz=frame.xyz, intensity=frame.intensity, boxes=truth.boxes,
+                class_ids=truth.class_ids, **extras)
 
 
-def _read_scan(path: Path) -> tuple[LidarFrame, GroundTruth]:
-    with np.load(path) as arrays:
-        columns = [arrays[name].tolist() for name in EXTRAS]
-        extras = [dict(zip(EXTRAS, row)) for row in zip(*columns)]
-        return (LidarFrame(arrays["xyz"], arrays["intensity"]),
-                GroundTruth.of(arrays["boxes"], arrays["class_ids"], extras))
-
-
-def _size(folder: Path) -> int:
-    """Bytes of the files in a folder; 0 where there is none."""
-    try:
-        with os.scandir(folder) as entries:
-            return sum(entry.stat().st_size for entry in entries if entry.is_file())
-    except OSError:
-        return 0
+def _read_scan(arrays: Any) -> tuple[LidarFrame, GroundTruth]:
+    columns = [arrays[name].tolist() for name in EXTRAS]
+    extras = [dict(zip(EXTRAS, row)) for row in zip(*columns)]
+    return (LidarFrame(arrays["xyz"], arrays["intensity"]),
+            GroundTruth.of(arrays["boxes"], arrays["class_ids"], extras))

@@ -7,16 +7,30 @@ from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from lidar_perception.types import InputError
 
+# Jazzy's vision_msgs, which rosbags does not come with.
+VISION_MSGS = {
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "ObjectHypothesis": "string class_id\nfloat64 score",
+    "ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\n"
+                                "geometry_msgs/PoseWithCovariance pose",
+    "Detection3D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
+                   "vision_msgs/BoundingBox3D bbox\nstring id",
+    "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+}
+
 
 @functools.cache
 def typestore() -> Typestore:
-    """ROS 2 Jazzy's message types, as rosbags knows them."""
-    return get_typestore(Stores.ROS2_JAZZY)
+    """ROS 2 Jazzy's message types, as rosbags knows them, and vision_msgs' boxes in space."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in VISION_MSGS.items():
+        store.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
+    return store
 
 
 def bag_message(type_name: str, /, **fields: Any) -> Any:

@@ -23,6 +23,7 @@ from msg_utils.markers import MarkedObjects, to_marker_array
 from msg_utils.point_cloud2 import CloudError, columns, from_array, to_array, xyz
 from msg_utils.stamps import to_ns
 
+MAX_ID = 2**31  # a marker's id is an int32
 INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # the first that the cloud has
 
 
@@ -167,17 +168,24 @@ def extrinsics(calibration: Calibration, header: Any, make: Any) -> Any:
 
 
 def truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()) -> Any:
-    """MarkerArray of the labels. Objects keep the marker id of their track."""
+    """MarkerArray of the labels. Objects keep the marker id of their track, and the name of a class
+    that is not known, see to_truth."""
+    labels = [str(extra.get("class_name", label))
+              for label, extra in zip(truth.labels, truth.extras)]
     tracks: list[Any] = [extra.get("track_id") for extra in truth.extras]
-    unique = None not in tracks and len(set(zip(truth.labels, tracks))) == len(tracks)
-    return to_marker_array(truth.boxes, truth.labels, header=header, make=make,
+    unique = (all(t is not None and 0 <= t < MAX_ID for t in tracks)
+              and len(set(zip(labels, tracks))) == len(tracks))
+    return to_marker_array(truth.boxes, labels, header=header, make=make,
                            ids=tracks if unique else None,
                            extras=truth.extras, notes=truth.notes, previous=previous)
 
 
 def to_truth(objects: MarkedObjects) -> GroundTruth:
-    """Labels from markers; objects of unknown class are Misc."""
-    return GroundTruth.of(objects.boxes, _class_ids(objects.labels), objects.extras, objects.notes)
+    """Labels from markers; objects of unknown class are Misc, with their own in extras'
+    class_name."""
+    extras = [{"class_name": label, **extra} if label not in CLASSES else extra
+              for label, extra in zip(objects.labels, objects.extras)]
+    return GroundTruth.of(objects.boxes, _class_ids(objects.labels), extras, objects.notes)
 
 
 def to_detections(objects: MarkedObjects) -> Detections:
@@ -188,11 +196,16 @@ def to_detections(objects: MarkedObjects) -> Detections:
 
 def detection_markers(detections: Detections, header: Any, make: Any, previous: Any = (),
                       lifetime_ns: int = 0, clusters: np.ndarray | None = None) -> Any:
-    """MarkerArray of K detections, with their ids in the text too, and the cluster_id (K,) of each
-    where it is one cluster of the cloud: a marker's own id has 32 bits, which not every cluster_id
-    fits. previous and lifetime_ns as in to_marker_array."""
+    """MarkerArray of K detections, with their ids in the text too, what each of their sources says
+    where it says something, and the cluster_id (K,) of each where it is one cluster of the cloud: a
+    marker's own id has 32 bits, which not every cluster_id fits. previous and lifetime_ns as in
+    to_marker_array."""
     labels = [CLASSES[i] for i in detections.class_ids]
-    texts: list[dict[str, int]] = [{"id": i} for i in range(len(detections))]
+    texts: list[dict[str, Any]] = [{"id": i} for i in range(len(detections))]
+    if detections.sources:
+        for i, text in enumerate(texts):
+            text["sources"] = {name: round(float(said[i]), 3) for name, said
+                               in detections.sources.items() if np.isfinite(said[i])}
     for text, cluster in zip(texts, () if clusters is None else clusters):
         text["cluster_id"] = int(cluster)
     return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,

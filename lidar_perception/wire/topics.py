@@ -2,6 +2,7 @@
 
 POINTS = "/points"
 TRUTH = "/ground_truth/detections"
+TRUTH_3D = "/ground_truth/detections_3d"  # the same as Detection3DArray, where it is asked for
 CAMERA_INFO = "/camera/camera_info"
 EXTRINSICS = "/camera/extrinsics"  # geometry_msgs/TransformStamped, camera in the LiDAR frame
 IMAGE = "/camera/image/compressed"
@@ -12,3 +13,5 @@ CLICK = "/clicked_point"           # what RViz and Foxglove publish
 ODOMETRY_FRAME = "odom"            # fixed; REP-105
 LIDAR_FRAME = "velodyne"
 CAMERA_FRAME = "camera_optical"    # z forward; REP-103
+
+SEMANTIC, INSTANCE = "semantic", "instance"  # columns of a labelled cloud, as in SemanticKITTI

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.types import CLASSES, Detections
+from lidar_perception.wire.messages import MAX_ID
 from msg_utils.markers import ADD, COLORS, OTHER_COLOR, box_pose, to_marker_array
 from msg_utils.stamps import duration_message
 
 ARROW, LINE_STRIP, TEXT = 0, 4, 9
 VELOCITY, TRAIL, NUMBER = DRAWN = "velocity", "trail", "number"  # namespaces beside the classes
 SHOWN_MOVING = 0.5  # from this probability of motion on there is an arrow
-MAX_ID = 2**31      # a marker's id is an int32
 
 
 def track_markers(ids: np.ndarray, detections: Detections, velocities: np.ndarray,

@@ -148,6 +148,10 @@ def test_every_part_of_the_contract(detector):
     assert len(found.detections) > 3 and tuple(found.ms) == STEPS
     assert (np.diff(found.detections.scores) <= 0).all()
     assert same(detector(scan), found)  # nothing is left on it
+    said = found.detections.sources
+    assert set(said) == set(KNOTS) and all(len(x) == len(found.detections) for x in said.values())
+    cars = found.detections.class_ids == CAR
+    assert np.isnan(said["silhouette"][cars]).all() and np.isfinite(said["network"]).all()
     middle = float(np.median(found.detections.scores))
     strict = detector.with_min_score(middle)
     assert set(strict.min_scores.values()) == {middle}
@@ -169,10 +173,16 @@ def test_a_higher_sensor_and_given_columns_change_nothing(detector):
     np.testing.assert_allclose(above.boxes + [0, 0, 0.5, 0, 0, 0, 0], found.boxes, atol=2e-3)
     np.testing.assert_allclose(above.scores, found.scores, atol=2e-3)
     look = detector.look(scan)
-    ground = np.ones(len(scan), bool)  # of what the network does not see nothing is asked
-    inside = np.isin(scan.xyz.view("V12").ravel(), look.xyz.view("V12").ravel())
-    ground[inside] = look.ground
+    # Of what the network does not see nothing is asked.
+    ground = ~np.isin(scan.xyz.view("V12").ravel(), look.xyz.view("V12").ravel())
     assert same(detector(scan, ground=ground), found)
+
+
+def test_it_says_so_when_a_part_had_to_leave_its_device(detector):
+    other = copy.copy(detector)
+    other.classifier = copy.copy(detector.classifier)
+    other.classifier.fallback = "cuda is out of memory"
+    assert other(frame()).problem == "cuda is out of memory" and detector(frame()).problem is None
 
 
 def test_parameters_may_change_between_two_clouds(detector):

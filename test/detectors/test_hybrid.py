@@ -1,4 +1,4 @@
-"""The hybrid detectors: either score alone at the ends of the weight, each box by itself."""
+"""The hybrid detectors: each box is scored by itself, from what both parts say of it."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import automatic_seed
 from lidar_perception.candidates.seeds import load_seed
 from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.fused.evidence import LEAST, MOST
 from lidar_perception.detectors.hybrid.candidates import RescoredCandidates
 from lidar_perception.detectors.hybrid.params import ConfirmingParams, RescoringParams
 from lidar_perception.detectors.hybrid.proposals import ConfirmedProposals
@@ -64,10 +65,6 @@ def rescored(classifier, **changes) -> Detections:
     return RescoredCandidates(classifier, SEED, None, params, PIPELINE)(cloud()).detections
 
 
-def by_score(found: Detections) -> Detections:
-    return found[np.argsort(-found.scores, kind="stable")]
-
-
 def test_the_combined_score_is_a_mean_and_each_alone_at_its_ends():
     rng = np.random.default_rng(0)
     a, b = rng.uniform(0, 1, (2, 100)).astype(np.float32)
@@ -88,15 +85,23 @@ def test_candidates_know_their_clusters(found):
     assert (np.diff(candidates.clusters) > 0).all()
 
 
-def test_with_weight_0_the_candidates_stand_as_they_are(classifier, found):
-    assert same(rescored(classifier, weight=0.0, box="cluster"), by_score(found[1].final))
-
-
-def test_with_weight_1_the_network_alone_scores(classifier, found, clusters):
+def test_the_candidates_stand_where_they_did_and_say_what_both_parts_think(classifier, found,
+                                                                           clusters):
     place = classifier.config.classes.index("Pedestrian")
-    probability = predict(classifier.network, clusters).probabilities[:, place]
-    alone = replace(found[1].final, scores=probability)
-    assert same(rescored(classifier, weight=1.0, box="cluster"), by_score(alone), atol=1e-6)
+    judged = predict(classifier.network, clusters).probabilities[:, place].astype(float)
+    shaped = found[1].final.scores.astype(float)
+    result = rescored(classifier, box="cluster")
+    assert set(result.sources) == {"silhouette", "classifier"} and len(result) == len(judged)
+    for k, box in enumerate(result.boxes):
+        i = np.flatnonzero((found[1].final.boxes == box).all(axis=1))[0]
+        assert result.sources["silhouette"][k] == pytest.approx(
+            np.clip(shaped[i], LEAST, MOST), abs=1e-6)
+        assert result.sources["classifier"][k] == pytest.approx(
+            np.clip(judged[i], LEAST, MOST), abs=1e-5)
+    # What both think more likely of one candidate than of another is.
+    said = np.stack([*result.sources.values()])
+    surer = (said[:, :, None] >= said[:, None, :]).all(axis=0)
+    assert (result.scores[:, None] - result.scores[None] >= -1e-6)[surer].all()
 
 
 def test_a_candidate_is_scored_by_itself_whatever_the_order(classifier, found, clusters):

@@ -39,7 +39,8 @@ needs_onnx = pytest.mark.skipif(
 @pytest.fixture
 def saved(tmp_path):
     config = tiny("v4")
-    header = Header(config, {"data": "simulated", "steps": 10}, {"map": 0.5}, "abc123")
+    header = Header(config, {"data": "simulated", "steps": 10}, {"map": 0.5}, "abc123",
+                    {"Pedestrian": (1.5, -0.25)})
     network = lively(config)
     save_checkpoint(tmp_path / "w.safetensors", network, header)
     return tmp_path / "w.safetensors", header, network

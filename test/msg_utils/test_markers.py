@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from samples import STAMP, each_make, header
 
 from lidar_perception.types import CLASSES, GroundTruth
@@ -25,17 +24,6 @@ from msg_utils.markers import (
     pose_yaw,
     to_marker_array,
 )
-
-# Jazzy's vision_msgs, which rosbags does not come with
-VISION_MSGS = {
-    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
-    "ObjectHypothesis": "string class_id\nfloat64 score",
-    "ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\n"
-                                "geometry_msgs/PoseWithCovariance pose",
-    "Detection3D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\n"
-                   "vision_msgs/BoundingBox3D bbox\nstring id",
-    "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
-}
 
 metres = st.floats(-200, 200)
 yaws = st.floats(-math.pi, math.pi, exclude_min=True) | st.sampled_from([math.pi, 0.0])
@@ -186,24 +174,15 @@ def test_labels_keep_their_track_where_it_tells_them_apart(make, tracks, ids):
     assert to_truth(got).extras == truth.extras and to_truth(got).notes == truth.notes
 
 
-@pytest.fixture(scope="module")
-def vision_make():
-    """bag_message, with vision_msgs."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in VISION_MSGS.items():
-        store.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(codec, "typestore", lambda: store)
-        yield codec.bag_message
-
-
 @given(rows=objects)
-def test_from_detection_array_inverts_to_detection_array(vision_make, rows):
+def test_from_detection_array_inverts_to_detection_array(rows):
     msg = to_detection_array(np.array([r[0] for r in rows]), [r[1] for r in rows],
-                             [r[2] for r in rows], header=header(vision_make), make=vision_make)
+                             [r[2] for r in rows], header=header(codec.bag_message),
+                             make=codec.bag_message)
     for read in (msg, codec.decode(codec.encode(msg), "vision_msgs/msg/Detection3DArray")):
         got = from_detection_array(read)
         assert [d.id for d in read.detections] == [str(i) for i in range(len(rows))]
+        assert got.ids.tolist() == list(range(len(rows))) and got.extras == [{}] * len(rows)
         assert not any(np.any(r.pose.covariance) for d in read.detections for r in d.results)
         assert same_boxes(got.boxes, [r[0] for r in rows])
         assert got.labels == [r[1] for r in rows]
@@ -211,9 +190,9 @@ def test_from_detection_array_inverts_to_detection_array(vision_make, rows):
         assert (got.stamp_ns, got.frame_id) == (STAMP, "velodyne")
 
 
-def test_a_detection_is_of_its_most_likely_class(vision_make):
+def test_a_detection_is_of_its_most_likely_class():
     msg = to_detection_array(np.ones((2, 7)), ["Car", "Van"], [0.3, 0.5],
-                             header=header(vision_make), make=vision_make)
+                             header=header(codec.bag_message), make=codec.bag_message)
     msg.detections[0].results.extend(msg.detections[1].results)
     msg.detections[1].results.clear()
     got = from_detection_array(msg)

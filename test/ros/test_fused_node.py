@@ -38,7 +38,12 @@ def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, sh
              for step in STEPS}
     shared_peer.wait_for_diagnostics(NODE, "waiting for input")
     shared_peer.send(talker, message(1), lambda: received(found, 1), "detections")
-    assert_equal(received(found, 1), DETECTOR.offline(weights, message(1)))
+    objects, offline = received(found, 1), DETECTOR.offline(weights, message(1))
+    assert_equal(objects, offline)
+    for i, extra in enumerate(objects.extras):  # which of the sources says what
+        assert extra["sources"] == {name: pytest.approx(said[i], abs=1e-3) for name, said
+                                    in offline.sources.items() if np.isfinite(said[i])}
+        assert extra["sources"]["network"] > 0
     # Columns are believed, here those of a cloud that has no ground.
     none = np.zeros(len(frame()), np.uint8)
     shared_peer.send(talker, message(2, ground=none), lambda: received(found, 2), "detections")

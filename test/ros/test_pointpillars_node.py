@@ -216,4 +216,4 @@ def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, sha
 
 def test_help_and_run_know_the_node(capsys):
     assert run(NODE, [NODE, "--help"]) == 0
-    assert "pointpillars.scores.pedestrian (default 0.3)" in capsys.readouterr().out
+    assert "pointpillars.scores.pedestrian (default 0.4)" in capsys.readouterr().out

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -22,7 +20,7 @@ from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
 from lidar_perception.testing.peer import Peer
 from lidar_perception.testing.processes import NodesUnderTest
-from lidar_perception.tracking.params import tracking_of
+from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
 from lidar_perception.wire.codec import bag_message, decode, encode
@@ -34,7 +32,8 @@ from lidar_perception.wire.messages import (
     to_truth,
 )
 from lidar_perception.wire.topics import CAMERA_INFO, ODOMETRY, POINTS, TRUTH
-from msg_utils.markers import ADD, box_pose, from_marker_array
+from msg_utils.detections import to_detection_array
+from msg_utils.markers import ADD, from_marker_array
 from msg_utils.stamps import header_message, to_ns
 
 NODE, ODOMETRY_TYPE = "tracker", "nav_msgs/msg/Odometry"
@@ -125,7 +124,7 @@ def test_tracks_of_the_graph_are_those_of_the_library_and_end_with_the_loop(loop
     poses = poses_of(drive_bag)
     stamps = [from_marker_array(m).stamp_ns for m in heard["found"]]
     assert len(poses) == clouds and stamps[:2 * clouds] == 2 * sorted(poses)
-    shown = assert_tracked(heard["found"], heard["behind"], poses, tracking_of("candidates"))
+    shown = assert_tracked(heard["found"], heard["behind"], poses, TrackingParams())
     rounds = [{i for t in shown[start:start + clouds] if t is not None for i in t.ids.tolist()}
               for start in (0, clouds)]
     assert rounds[0] and rounds[1] and not rounds[0] & rounds[1]
@@ -149,7 +148,7 @@ def test_in_one_process_with_the_detector_the_library_tracks_too(looped, drive_b
     """Each cloud waits for its pose, as the frames of a tracker do."""
     _, heard, _ = looped
     shown = assert_tracked(heard["found"], heard["inside"], poses_of(drive_bag),
-                           tracking_of("candidates"))
+                           TrackingParams())
     assert any(t is not None and len(t) for t in shown)
 
 
@@ -224,14 +223,10 @@ def test_detection_arrays_are_tracked_as_markers_are(start):
     node.transforms.on_odometry(odometry(pose(50, 0, 1), header(START, "lidar"), "base",
                                           bag_message))  # detections are in its fixed frame
     for i, found in enumerate(crowd()):
-        boxes = [SimpleNamespace(
-            bbox=SimpleNamespace(center=box_pose(box, bag_message), size=SimpleNamespace(
-                x=float(box[3]), y=float(box[4]), z=float(box[5]))),
-            results=[SimpleNamespace(hypothesis=SimpleNamespace(
-                class_id=CLASSES[kind], score=float(score)))])
-            for box, kind, score in zip(found.boxes, found.class_ids, found.scores)]
         stamp = START + i * TENTH
-        node.on_detections(SimpleNamespace(header=header(stamp), detections=boxes))
+        node.on_detections(to_detection_array(
+            found.boxes, [CLASSES[kind] for kind in found.class_ids], found.scores.tolist(),
+            header=header(stamp), make=bag_message))
         tracks = tracker(found, stamp, np.eye(4))
         shown = read(decode(node.sent["tracks"][-1], MARKERS))
         assert shown[1] == tracks.ids.tolist() == [1, 2, 3, 4, 5, 6]

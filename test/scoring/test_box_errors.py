@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import expit, logit
 
 from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.scoring.kitti.box_errors import ERRORS, RANGES, box_errors
 from lidar_perception.scoring.kitti.camera_objects import camera_objects, scored_labels
 from lidar_perception.scoring.kitti.protocol import Comparison, compared
-from lidar_perception.scoring.kitti.reliability import reliability
+from lidar_perception.scoring.kitti.reliability import lines, reliability
 from lidar_perception.types import Detections, GroundTruth
 
 
@@ -55,6 +56,21 @@ def test_scores_that_are_the_share_of_right_boxes_are_reliable_and_others_are_no
     assert sum(row["boxes"] for row in honest["bins"]) == 400
     assert honest["error"] < 12 and modest["error"] > 30
     assert reliability(Comparison.of([frame(true, found[:0])]), "Car")["error"] is None
+
+
+@settings(max_examples=5)
+@given(st.integers(0, 2**32 - 1))
+def test_lines_give_back_what_scores_were_before_they_were_bent(seed):
+    rng = np.random.default_rng(seed)
+    true = cars(3000, rng)
+    true[:, :2] *= 200
+    share = rng.uniform(0.02, 0.98, 3000)
+    found = true.copy()
+    found[rng.random(3000) >= share] += [1e6, 0, 0, 0, 0, 0, 0]
+    bent = expit((logit(share) + 0.7) / 1.6)
+    slope, offset = lines(Comparison.of([frame(true, found, bent)]))["Car"]
+    assert slope == pytest.approx(1.6, abs=0.25) and offset == pytest.approx(-0.7, abs=0.25)
+    assert lines(Comparison.of([frame(true[:5], found[:5], bent[:5])])) == {}
 
 
 def test_errors_are_those_that_were_made():

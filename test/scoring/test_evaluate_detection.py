@@ -16,6 +16,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
+from lidar_perception.scoring.kitti.report import INTERVALS
 from lidar_perception.scoring.thinning import thinned
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, InputError
 
@@ -79,7 +80,9 @@ def truth_of(kitti):
 
 def test_the_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
-    content, text = evaluate(tmp_path, "--data", kitti, "--results", found)
+    content, text = evaluate(tmp_path, "--data", kitti, "--results", found, "--intervals", 10)
+    assert content["intervals"]["Car"] == {row: [100, 100] for row in INTERVALS}
+    assert content["intervals"]["Cyclist"]["3d"] is None and "100-100" in text
     assert content["frames"] == 2 and content["source"] == str(found)
     assert len(cells(content)) == 2 * len(ROWS) * len(DIFFICULTIES)
     assert {(c["objects"], c["r11"], c["r40"]) for c in cells(content).values()} == {(2, 100, 100)}

@@ -9,13 +9,14 @@ from lidar_perception.simulation.raycast import Hits
 from lidar_perception.simulation.returns import returns_of
 from lidar_perception.simulation.sensor import (
     HDL64E,
-    SENSORS,
+    NAMES,
     STILL,
     Motion,
     Sensor,
     generic,
     hdl64e,
     rays,
+    sensor_from_file,
     sensor_named,
 )
 from lidar_perception.simulation.solids import RETROREFLECTOR
@@ -39,7 +40,7 @@ def measured(sensor, distance, brightness=0.3, motion=STILL, seed=0, cosine=1.0,
                    np.random.default_rng(seed), **flags)
 
 
-@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize("name", NAMES)
 def test_presets_are_sensible(name):
     sensor = sensor_named(name)
     direction = sensor.directions()
@@ -47,7 +48,8 @@ def test_presets_are_sensible(name):
     assert np.allclose(np.linalg.norm(direction, axis=2), 1)
     assert np.allclose(direction[0, :, 1], 0) and (direction[0, :, 0] > 0).all()
     assert (np.diff(direction[..., 2], axis=1) < 0).all()
-    assert sensor.rings == {"hdl64e": 64, "hdl32e": 32, "vlp16": 16, "os1_64": 64}[name]
+    assert name.endswith(str(sensor.rings)) or name in ("hdl-64e", "hdl-32e", "vlp-32c", "pandar64",
+                                                        "livox-mid360")
     times = sensor.times()
     assert times.min() == 0 and times.max() < 1 / sensor.rate
     assert len(np.unique(times)) == sensor.columns
@@ -71,6 +73,7 @@ def test_kittis_sensor_is_kittis():
     ({"min_range": -1}, "max_range"),
     ({"rate": 0.0}, "rate"), ({"reach": 0.0}, "reach"), ({"dropout": 1.5}, "dropout"),
     ({"range_noise": -0.1}, "range_noise"), ({"divergence": np.inf}, "divergence"),
+    ({"wander": -0.1}, "wander"), ({"wander": 1.5}, "wander"),
     ({"pulse": -1.0}, "pulse"), ({"fade": (np.nan, 0)}, "fade")])
 def test_impossible_sensors_are_refused(change, named):
     with pytest.raises(InputError, match=named) as error:
@@ -82,8 +85,51 @@ def test_impossible_generic_sensors_and_unknown_names_are_refused():
     for wrong in ((0, -10, 10), (16, 10, -10), (16, -95, 10)):
         with pytest.raises(InputError):
             generic(*wrong, 0.2, 10.0)
-    with pytest.raises(InputError, match="hdl64e"):
+    with pytest.raises(InputError, match="hdl-64e"):
         sensor_named("hdl128")
+
+
+def test_names_are_known_however_they_are_written():
+    assert sensor_named("os1_64") == sensor_named("OS1-64") != sensor_named("os1-128")
+    assert sensor_named("hdl64e") == sensor_named("HDL-64E") == HDL64E
+
+
+def test_a_file_in_degrees_is_the_sensor_in_radians(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("name: mine\nelevations: [4, 0, -10.5]\nazimuth_step: 0.5\nrate: 10\n"
+                    "divergence: 0.2\nfade: [10, 0.1]\nblocked:\n- [1, 350, 10]\nwander: 2\n")
+    assert sensor_from_file(path) == sensor_named(str(path)) == Sensor(
+        tuple(np.radians([4.0, 0.0, -10.5])), np.radians(0.5), rate=10.0,
+        divergence=np.radians(0.2), fade=(10.0, 0.1), blocked=((1, 350.0, 10.0),),
+        wander=np.radians(2.0))
+
+
+@pytest.mark.parametrize("text, named", [
+    ("[1, 2", "no YAML"), ("- 1", "describes no sensor"), ("azimuth_step: 1", "elevations"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nbeams: 3", "no 'beams'; known are"),
+    ("elevations: 3\nazimuth_step: 1\nrate: 10", "elevations = 3 must be a list of numbers"),
+    ("elevations: [1]\nazimuth_step: yes\nrate: 10", "azimuth_step = True must be a number"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nfade: [1]", "fade"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [1, 2, 3]", "blocked"),
+    ("elevations: [a]\nazimuth_step: 1\nrate: 10", "elevations"),
+    ("elevations: [1, 2]\nazimuth_step: 1\nrate: 10", "descend"),
+    ("elevations: [1]\nazimuth_step: 0\nrate: 10", "azimuth_step"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: .inf", "rate")])
+def test_a_file_of_no_possible_sensor_is_named_with_what_is_wrong(tmp_path, text, named):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=named) as error:
+        sensor_from_file(path)
+    assert str(path) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_beams_that_wander_fill_the_gaps_between_them_evenly():
+    sensor = replace(SMALL, wander=np.radians(2.0))
+    turns = [sensor.at_turn(i) for i in range(50)]
+    lower = np.sort([sensor.elevations[3] - turn.elevations[3] for turn in turns])
+    assert SMALL.at_turn(7) is SMALL and turns[0] == sensor
+    assert 0 <= lower[0] and lower[-1] < np.radians(2.0)
+    assert np.diff(lower).max() < np.radians(2.0) / 50 * 2.7
 
 
 def test_rays_turn_and_move_with_the_sensor():

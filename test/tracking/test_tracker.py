@@ -11,7 +11,7 @@ from lidar_perception.param_fields import with_values
 from lidar_perception.tracking.association import FORBIDDEN, assigned, costs
 from lidar_perception.tracking.ego import Ego, moved_boxes, next_ego, usable
 from lidar_perception.tracking.existence import effective_looks
-from lidar_perception.tracking.params import AssociationParams, TrackingParams, tracking_of
+from lidar_perception.tracking.params import AssociationParams, TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import PEDESTRIAN, Detections
 
@@ -114,7 +114,7 @@ def test_looks_at_one_object_count_little_more_than_one():
 
 def test_a_post_that_is_doubtful_in_every_frame_never_becomes_sure():
     """A score that says nothing for it, a hundred times from the same place, says nothing."""
-    neutral = TrackingParams().existence.neutral.pedestrian
+    neutral = TrackingParams().existence.neutral
     tracker = Tracker(with_values(TrackingParams(), {"report": 0.0}))
     tracks = followed([cars(person(15), scores=neutral, kind=PEDESTRIAN)] * 100, tracker=tracker)
     assert max(t.detections.scores.max(initial=0) for t in tracks) < 0.6
@@ -254,13 +254,6 @@ def test_parked_cars_seen_from_a_turning_car_without_poses_keep_their_ids():
     for t, found in zip(tracks[5:], frames[5:]):
         np.testing.assert_allclose(t.detections.boxes[:, :2], found.boxes[:, :2], atol=0.3)
 
-
-def test_a_detector_has_its_own_neutral_scores_unless_others_are_given():
-    own = tracking_of("pointnet").existence.neutral
-    assert own != TrackingParams().existence.neutral and own.pedestrian == 0.5
-    assert tracking_of("pointpillars") == tracking_of("of another program") == TrackingParams()
-    given = with_values(TrackingParams(), {"existence.neutral.pedestrian": 0.7, "report": 0.1})
-    assert tracking_of("pointnet", given) == given
 
 
 def test_who_is_faster_than_anyone_walks_is_no_pedestrian():

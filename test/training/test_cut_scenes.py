@@ -182,7 +182,7 @@ def test_a_scene_is_cut_by_our_own_clustering_and_around_its_objects(rng, tmp_pa
         def __len__(self):
             return 1
 
-        def __repr__(self):
+        def key(self, i):
             return "one"
 
         def scene(self, i):
@@ -271,6 +271,7 @@ def test_validation_reads_every_scene_and_calibrates(rng):
     assert items[1].sample is None and items[1].skipped == ("broken.bin",)
     torch.manual_seed(0)
     network = make_pointnet(CONFIG).eval()
-    metrics = validated(network, [items[0].sample])
+    metrics, calibration = validated(network, [items[0].sample])
+    assert calibration == {}  # of one scene there is nothing to fit to
     assert {"score", "accuracy", "object_accuracy", "calibration_error"} <= set(metrics)
     assert 0 <= metrics["accuracy"] <= 100 and network.temperature.item() != 1.0

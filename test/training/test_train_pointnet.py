@@ -29,7 +29,7 @@ def cache(tmp_path_factory):
 
 
 def train(cache, out, *more, **changes):
-    given = {"--data": "sim", "--data-sensor": SENSOR, "--data-scans": 2, "--data-val-scans": 1,
+    given = {"--data": "sim", "--sensor": SENSOR, "--data-scans": 2, "--data-val-scans": 1,
              "--data-people": 1, "--steps": 3, "--validate-steps": 3, "--log-steps": 1,
              "--batch": 1, "--jobs": 0, "--data-cache": cache, "--out": out, **changes}
     words = [str(word) for pair in given.items() for word in pair]

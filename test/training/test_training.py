@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from torch import nn
 
 from lidar_perception.runs import files
+from lidar_perception.training import loop
 from lidar_perception.training.loop import STATE, train
 from lidar_perception.training.params import LoopParams, PointPillarsTraining
 from lidar_perception.training.ranks import joined, rank, world
@@ -26,7 +27,8 @@ from lidar_perception.types import InputError
 
 few = settings(max_examples=25, database=None)
 CPU = torch.device("cpu")
-PARAMS = LoopParams(steps=13, validate_steps=4, save_steps=3, log_steps=1, seed=3, lr=0.05)
+PARAMS = LoopParams(steps=13, validate_steps=4, save_steps=3, log_steps=1, seed=3, lr=0.05,
+                    amp="off")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -69,7 +71,7 @@ class Toy:
         inputs = torch.linspace(-1, 1, 40).view(10, 4)
         with torch.no_grad():
             error = (module(inputs) - inputs[:, :1] * 2 + inputs[:, 1:2]).square().mean()
-        return {"score": -error.item()}
+        return {"score": -error.item()}, {}
 
     def keep(self, name, module, record):
         state = {k: v.clone() for k, v in module.state_dict().items()}
@@ -372,3 +374,19 @@ def test_two_processes_with_half_the_batch_learn_what_one_learns(tmp_path):
 def test_without_torchrun_there_is_one_process():
     with joined(CPU) as device:
         assert (device, rank(), world()) == (CPU, 0, 1)
+
+
+# time that is over
+
+def test_a_run_out_of_time_validates_keeps_and_goes_on_when_it_is_resumed(unbroken, tmp_path,
+                                                                          monkeypatch):
+    now = [0.0]
+    monkeypatch.setattr(loop.time, "monotonic", lambda: now[0])
+    toy = Toy(lambda step: now.__setitem__(0, float(step)))
+    progress = train(toy.task(), PARAMS, tmp_path, until=5.0)
+    assert (progress.step, progress.late, progress.stopped) == (6, True, False)
+    assert [int(row["step"]) for row in rows(tmp_path, "validation.csv")] == [4, 6]
+    assert set(toy.kept) == {"best", "last"}
+    progress = train(Toy().task(), PARAMS, tmp_path, resume=True)
+    assert (progress.step, progress.late) == (13, False)
+    assert same(weights(tmp_path), weights(unbroken[0])) and rows(tmp_path) == rows(unbroken[0])

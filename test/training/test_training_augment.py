@@ -25,7 +25,7 @@ from lidar_perception.training.augment import (
     turned,
     with_moved_objects,
 )
-from lidar_perception.training.cut_objects import cut_objects
+from lidar_perception.training.cut_objects import cut, joined
 from lidar_perception.training.database import THING, Database, varied_thing, with_objects
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.putting import inside
@@ -176,8 +176,8 @@ def test_the_same_rng_gives_the_same_scene_and_zeros_change_nothing(seed, around
 @few
 @given(seeds)
 def test_objects_that_are_put_in_touch_nothing_and_keep_their_points(seed):
-    database = cut_objects([random_scene(seed + k) for k in range(1, 6)],
-                           ("Car", "Pedestrian", "Cyclist"), 5)
+    database = joined([cut(random_scene(seed + k), ("Car", "Pedestrian", "Cyclist"), 5)
+                       for k in range(1, 6)])
     scene, rng = random_scene(seed), np.random.default_rng(seed)
     params = AugmentParams(cars=4, pedestrians=4, cyclists=0)
     fuller = with_objects(scene, database, params, *AREA, rng)
@@ -251,9 +251,9 @@ def test_posts_are_learned_from_but_are_no_objects():
     walker = one_walker(9.0)
     scene = street_with(post, walker.points, wall(11.0, (-8, -5), (-1.73, 0.5)))
     scene = replace(scene, boxes=walker.boxes, class_ids=walker.class_ids, wanted=np.ones(1, bool))
-    database = cut_objects([scene], ("Pedestrian",), 5)
+    database = cut(scene, ("Pedestrian",), 5)
     assert database.class_ids.tolist() == [PEDESTRIAN, THING]
-    assert len(cut_objects([scene], ("Car",), 5)) == 0
+    assert len(cut(scene, ("Car",), 5)) == 0
     box, own = database.boxes[1], database.points_of(1)
     assert (own[:, 0] == 8).all() and len(own) > 0.8 * len(post)
     assert box[:2] == pytest.approx([8, 3], abs=0.05) and box[5] == pytest.approx(2.33, abs=0.1)
@@ -352,7 +352,7 @@ def test_scenes_that_are_labelled_all_around_are_turned_all_around():
 
 
 def test_objects_survive_their_file_and_a_broken_file_is_named(tmp_path):
-    database = cut_objects([random_scene(k) for k in range(4)], ("Car", "Pedestrian"), 5)
+    database = joined([cut(random_scene(k), ("Car", "Pedestrian"), 5) for k in range(4)])
     assert len(database) > 0 and set(database.class_ids) <= {CAR, PEDESTRIAN}
     database.save(tmp_path / "objects.npz")
     back = Database.load(tmp_path / "objects.npz")
@@ -360,11 +360,11 @@ def test_objects_survive_their_file_and_a_broken_file_is_named(tmp_path):
     (tmp_path / "objects.npz").write_bytes(b"PK")
     with pytest.raises(InputError, match=r"objects\.npz"):
         Database.load(tmp_path / "objects.npz")
-    assert len(cut_objects([], ("Car",), 5)) == 0
+    assert len(joined([])) == 0
 
 
 def test_where_there_is_no_ground_nothing_is_put():
-    database = cut_objects([random_scene(k) for k in range(4)], ("Car",), 5)
+    database = joined([cut(random_scene(k), ("Car",), 5) for k in range(4)])
     empty = TrainingScene(np.zeros((0, 4), np.float32), np.zeros((0, 7)), np.zeros(0, int),
                   np.zeros(0, bool))
     assert len(with_objects(empty, database, AugmentParams(), *AREA,

@@ -23,19 +23,23 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
+from lidar_perception.detectors.pointpillars.config import RANGES, network_config
 from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED
-from lidar_perception.geometry import points_in_box
+from lidar_perception.geometry import points_in_box, wrap_angle
 from lidar_perception.simulation import drive
+from lidar_perception.simulation.camera import kitti_labels, turned_camera
+from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training import scenes as scenes_module
-from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.cut_objects import cut_objects
-from lidar_perception.training.data import Batches, Item, ReadScenes, Stream, some_scenes
+from lidar_perception.training.augment import TrainingScene, raised
+from lidar_perception.training.cut_objects import cut
+from lidar_perception.training.data import Batches, Item, ReadScenes, Stream
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pointpillars.task import (
     Preparation,
     Sample,
     frame_to_validate,
     make_loss,
+    narrowed,
     targets_of,
     validation_report,
 )
@@ -45,6 +49,7 @@ from lidar_perception.training.sources import names_of
 from lidar_perception.types import (
     CLASSES,
     PEDESTRIAN,
+    SENSOR_HEIGHT,
     Detections,
     GroundTruth,
     InputError,
@@ -57,7 +62,7 @@ CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
 STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
                       flip=0, turn=0, scale=0, beam_noise=0, range_noise=0, dropout=0, intensity=0,
                       height=0, tilt=0)
-SENSOR = "generic:8,-20,4,2,10"
+SENSOR = sensor_named("generic:8,-20,4,2,10")
 
 
 # sources
@@ -87,7 +92,6 @@ def test_what_is_broken_is_named_skipped_and_counted(tmp_path, capsys):
     reasons = sorted(batches.skipped)
     assert "000001.txt:1" in reasons[0] and "000003.bin" in reasons[1]
     assert capsys.readouterr().err.replace("\n", "").count("skipped:") == 2  # each said once
-    assert len(list(some_scenes(stream.sources, 10, 0, 0))) == 3
     broken = Stream((RecordedScenes(root, ("000001", "000003")),), keep_all)
     with pytest.raises(InputError, match="none of the 2 scenes"):
         broken[0]
@@ -186,8 +190,8 @@ def test_simulated_scenes_are_labelled_as_people_would():
     scene = source.scene(0)
     seen = [e["visible"] >= 0.15 and e["num_points"] >= 5 for e in truth.extras]
     assert scene.around and scene.wanted.tolist() == seen and 0 < sum(seen) < len(seen)
-    assert drive.scan_at(7, 0, source._sensor).frame.xyz.shape == scene.points[:, :3].shape
-    assert source._sensor.height == 1.73
+    assert drive.scan_at(7, 0, SENSOR).frame.xyz.shape == scene.points[:, :3].shape
+    assert scene.height == source.frame(0).sensor_height == 1.73
 
 
 # the stream
@@ -250,7 +254,7 @@ def test_samples_hold_what_the_version_sees(version):
 
 
 def test_a_share_of_the_scenes_gets_objects_of_others(tmp_path):
-    cut_objects([scene_of_two()], tiny().classes, 1).save(tmp_path / "objects.npz")
+    cut(scene_of_two(), tiny().classes, 1).save(tmp_path / "objects.npz")
     rng, alone = np.random.default_rng(0), scene_of_two()
     alone = replace(alone, boxes=alone.boxes[:1], class_ids=alone.class_ids[:1],
                     wanted=alone.wanted[:1])
@@ -339,3 +343,43 @@ def test_workers_end_with_a_process_that_is_killed():
     while worker.exists() and worker.read_text().split()[2] != "Z":
         assert time.monotonic() < end, "the worker lives on"
         time.sleep(0.05)
+
+
+# the sensor's height, and what is around
+
+def test_a_sensor_mounted_elsewhere_gives_the_network_the_same():
+    """A scene, and the same as a higher or lower sensor would have it."""
+    scene = scene_of_two()
+    for config in tiny(), tiny("v4"):
+        usual = Preparation(config, STILL)(scene, np.random.default_rng(0))
+        for height in 0.6, 2.4:
+            other = replace(raised(scene, SENSOR_HEIGHT - height), height=height)
+            made = Preparation(config, STILL)(other, np.random.default_rng(0))
+            assert np.allclose(made.points, usual.points, atol=1e-5)
+            assert np.allclose(made.boxes, usual.boxes, atol=1e-5)
+            assert np.array_equal(made.labels, usual.labels)
+            assert np.array_equal(made.counted, usual.counted)
+
+
+@pytest.mark.parametrize("quarter", range(4))
+def test_labels_in_a_turned_camera_are_those_of_the_turned_scene(quarter):
+    _, truth = SimulatedScenes(7, 1, SENSOR).scan(0)
+    yaw = quarter * np.pi / 2
+    cos, sin = np.cos(-yaw), np.sin(-yaw)
+    boxes = truth.boxes.copy()
+    boxes[:, :2] = boxes[:, :2] @ np.array([[cos, sin], [-sin, cos]])
+    boxes[:, 6] = wrap_angle(boxes[:, 6] - yaw)
+    turned = kitti_labels(GroundTruth.of(boxes, truth.class_ids, truth.extras))
+    seen = kitti_labels(truth, turned_camera(yaw))
+    assert [e["track_id"] for e in seen.extras] == [e["track_id"] for e in turned.extras]
+    assert len(seen.notes) == len(turned.notes)
+    frame = SimulatedScenes(4, 8, SENSOR, around=True).frame(quarter + 4)
+    assert np.allclose(frame.calibration().lidar_to_camera, turned_camera(yaw).lidar_to_camera)
+
+
+def test_a_part_of_a_range_around_keeps_all_directions():
+    around = network_config("v0", "compact", **RANGES["around"])
+    part = narrowed(around, 30.0, 20.0)
+    assert part.low[:2] == pytest.approx((-30.72, -20.48)) and part.high[:2] == pytest.approx(
+        (30.72, 20.48))
+    assert narrowed(around, 1000.0, 1000.0) == around

@@ -11,12 +11,14 @@ from lidar_perception.cli.data import (
     Walk,
     a_path,
     device_option,
+    intervals_option,
     no_labels,
     walk_options,
     weights_option,
 )
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.runs.terminal import console
+from lidar_perception.runs.terminal import errors as terminal_errors
 from lidar_perception.types import InputError
 
 
@@ -38,9 +40,10 @@ from lidar_perception.types import InputError
               "share of boxes that are right.")
 @click.option("--errors-from", type=click.FloatRange(0, 1), default=0.2, show_default=True,
               metavar="SCORE", help="With --errors: of boxes from this score on.")
+@intervals_option
 def detection(walk: Walk, results: Path | None, weights: Path | None, device: str,
               min_score: float, keep: float, write_results: Path | None, errors: bool,
-              errors_from: float) -> None:
+              errors_from: float, intervals: int) -> None:
     """Boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
 
     Average precision in the image, from above and in space, and of orientation, at 40 and 11
@@ -56,13 +59,14 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
       lidar-perception evaluate detection --data drive --weights v4.safetensors --keep 0.1
     """
     from lidar_perception.data.frame import BOXES
+    from lidar_perception.detectors.checkpoint import read_header
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.scoring.detections import by_detector, by_files
     from lidar_perception.scoring.kitti.box_errors import box_errors, print_box_errors
     from lidar_perception.scoring.kitti.protocol import SCORED, Comparison
     from lidar_perception.scoring.kitti.reliability import print_reliability, reliability
     from lidar_perception.scoring.kitti.report import DetectionReport
-    from lidar_perception.scoring.kitti.tables import print_detection_report
+    from lidar_perception.scoring.kitti.tables import print_detection_report, print_intervals
 
     if results is None:
         weights = weights or Path("fused")
@@ -81,6 +85,8 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
         start = partial(by_files, results)
     else:
         height = recording.frames[0].sensor_height
+        if weights.suffix == ".safetensors" and (other := read_header(weights).unlike(height)):
+            terminal_errors.print(f"{weights}: {other}", soft_wrap=True)
         open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height)
         start = partial(by_detector, open_, keep, write_results)
     report = DetectionReport()
@@ -90,6 +96,8 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
         together = Comparison.of(report.frames)
         content["errors"] = {name: box_errors(report.frames, name, errors_from) for name in SCORED}
         content["reliability"] = {name: reliability(together, name) for name in SCORED}
+    if intervals and report.frames:
+        content["intervals"] = report.intervals(intervals)
     walk.write(content)
     if write_results is not None:
         console.print(f"result files: {write_results}")
@@ -98,5 +106,7 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
         if errors:
             print_box_errors(content["errors"], console)
             print_reliability(content["reliability"], console)
+        if intervals:
+            print_intervals(content["intervals"], console)
     elif write_results is None or report.skipped:
         raise no_labels(recording, report.skipped)

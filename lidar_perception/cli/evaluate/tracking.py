@@ -20,7 +20,7 @@ from lidar_perception.cli.data import (
 )
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.runs.terminal import console
-from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams, tracking_of
+from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
 
 
 @click.command()
@@ -28,8 +28,8 @@ from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams, track
 @split_option
 @limit_option
 @a_path("--weights", "Track what the detector of this checkpoint finds, or one by its name: "
-        "pointpillars or pointnet, with the weights that come with the package.", "FILE|NAME",
-        default="pointpillars", show_default=True)
+        "fused, pointpillars or pointnet, with the weights that come with the package.",
+        "FILE|NAME", default="fused", show_default=True)
 @device_option
 @click.option("--ego", type=click.Choice(RECORDED_EGO), default="auto", show_default=True,
               help="The sensor's motion: from the recording's poses; from the scans, by KISS-ICP "
@@ -50,14 +50,11 @@ def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, d
       lidar-perception evaluate tracking --data drive --ego kiss_icp --weights v4.safetensors
     """
     from lidar_perception.data.frame import BOXES
-    from lidar_perception.detectors.checkpoint import network_of
-    from lidar_perception.detectors.open import LOAD, open_detector
+    from lidar_perception.detectors.open import open_detector
     from lidar_perception.scoring.run import fill
     from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, ego_of
     from lidar_perception.scoring.tracking.tables import print_tracking_report
 
-    named = str(weights) in LOAD or weights.suffix == ".onnx"
-    params = tracking_of(str(weights) if named else network_of(weights), params)
     recording = opened(data, split=split)
     recording.require(BOXES, "evaluate tracking")
     open_ = partial(open_detector, weights, device, min_score=params.min_score,

@@ -29,28 +29,39 @@ def read_object_labels(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
     return to_ground_truth([label for _, label in parsed_lines(path)], lidar_to_camera)
 
 
-def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray) -> dict[int, GroundTruth]:
+def read_tracking_labels(path: Path, lidar_to_camera: np.ndarray,
+                         known_only: bool = False) -> dict[int, GroundTruth]:
     """Frame number -> objects, of one label_02 file. Frames without objects are left out."""
     frames: dict[int, list[dict]] = {}
+    for _, frame, label in parsed_tracking_lines(path, known_only):
+        frames.setdefault(frame, []).append(label)
+    return {k: to_ground_truth(v, lidar_to_camera) for k, v in frames.items()}
+
+
+def parsed_lines(path: Path, known_only: bool = False) -> list[tuple[int, dict]]:
+    """Line number, from 1, and parse() of every line of a label_2 or result file."""
+    return [(i, parse(line, path, i, known_only)) for i, line in _lines(path)]
+
+
+def parsed_tracking_lines(path: Path, known_only: bool = False) -> list[tuple[int, int, dict]]:
+    """Line number, from 1, the frame's number, and parse() with track_id of every line of a
+    label_02 file."""
+    found = []
     for i, line in _lines(path):
         try:
             frame, track, rest = line.split(maxsplit=2)
-            frames.setdefault(int(frame), []).append(
-                dict(parse(rest, path, i), track_id=int(track)))
+            found.append((i, int(frame), dict(parse(rest, path, i, known_only),
+                                              track_id=int(track))))
         except ValueError as error:
             if isinstance(error, InputError):
                 raise
             raise InputError(f"{path}:{i} is no tracking label: {line!r}") from None
-    return {k: to_ground_truth(v, lidar_to_camera) for k, v in frames.items()}
+    return found
 
 
-def parsed_lines(path: Path) -> list[tuple[int, dict]]:
-    """Line number, from 1, and parse() of every line of a label_2 or result file."""
-    return [(i, parse(line, path, i)) for i, line in _lines(path)]
-
-
-def parse(line: str, path: Path | str = "label", number: int = 0) -> dict:
-    """One label line as a dict: class, the COLUMNS, and score where the line has one."""
+def parse(line: str, path: Path | str = "label", number: int = 0, known_only: bool = False) -> dict:
+    """One label line as a dict: class, the COLUMNS, and score where the line has one. InputError
+    for a class that is not in CLASSES, if they must be known."""
     words = line.split()
     try:
         numbers = [float(w) for w in words[1:]]
@@ -60,7 +71,7 @@ def parse(line: str, path: Path | str = "label", number: int = 0) -> dict:
         raise InputError(f"{path}:{number} is no KITTI label (a class and 14 or 15 numbers): "
                          f"{line!r}") from None
     name = OTHER_NAMES.get(words[0], words[0])
-    if name not in CLASSES:
+    if name not in CLASSES and known_only:
         raise InputError(f"{path}:{number} has the unknown class {words[0]!r}; known are "
                          f"{', '.join(CLASSES)}")
     label = {"class": name, "truncated": numbers[0], "occluded": int(numbers[1]),
@@ -72,22 +83,32 @@ def parse(line: str, path: Path | str = "label", number: int = 0) -> dict:
 
 
 def to_ground_truth(labels: list[dict], lidar_to_camera: np.ndarray) -> GroundTruth:
-    """Boxes in the LiDAR frame. Objects without a 3D box (DontCare) become notes."""
+    """Boxes in the LiDAR frame. Objects without a 3D box (DontCare) become notes; those of a class
+    that is not in CLASSES are Misc, with its name as class_name."""
     to_lidar = np.linalg.inv(lidar_to_camera)
     boxes, class_ids, extras, notes = [], [], [], []
     for label in labels:
         extra = {k: v for k, v in label.items() if k != "class"}
-        h, w, length = label["dimensions"]
-        if min(h, w, length) <= 0:
+        box = lidar_box(label, to_lidar)
+        if box is None:
             notes.append((label["class"], extra))
             continue
-        x, y, z = label["location"]  # centre of the bottom face; y points down
-        centre = to_lidar @ [x, y - h / 2, z, 1.0]
-        heading = to_lidar[:3, :3] @ [np.cos(label["rotation_y"]), 0, -np.sin(label["rotation_y"])]
-        boxes.append([*centre[:3], length, w, h, np.arctan2(heading[1], heading[0])])
-        class_ids.append(CLASSES.index(label["class"]))
-        extras.append(extra)
+        boxes.append(box)
+        known = label["class"] in CLASSES
+        class_ids.append(CLASSES.index(label["class"] if known else "Misc"))
+        extras.append(extra if known else {**extra, "class_name": label["class"]})
     return GroundTruth.of(boxes, class_ids, extras, notes)
+
+
+def lidar_box(label: dict, to_lidar: np.ndarray) -> list[float] | None:
+    """[x y z l w h yaw] of a label, to_lidar (4, 4) from the camera; None without a 3D box."""
+    h, w, length = label["dimensions"]
+    if min(h, w, length) <= 0:
+        return None
+    x, y, z = label["location"]  # centre of the bottom face; y points down
+    centre = to_lidar @ [x, y - h / 2, z, 1.0]
+    heading = to_lidar[:3, :3] @ [np.cos(label["rotation_y"]), 0, -np.sin(label["rotation_y"])]
+    return [*centre[:3].tolist(), length, w, h, float(np.arctan2(heading[1], heading[0]))]
 
 
 def to_labels(truth: GroundTruth, lidar_to_camera: np.ndarray) -> list[dict]:
@@ -95,28 +116,36 @@ def to_labels(truth: GroundTruth, lidar_to_camera: np.ndarray) -> list[dict]:
     computed from the box; the 2D box is then zero."""
     labels = []
     for box, name, extra in zip(truth.boxes, truth.labels, truth.extras):
-        labels.append({"class": name, **camera_box(box, lidar_to_camera), **extra})
+        labels.append({"class": extra.get("class_name", name), **camera_box(box, lidar_to_camera),
+                       **{key: value for key, value in extra.items() if key != "class_name"}})
     return labels + [{"class": name, **extra} for name, extra in truth.notes]
 
 
 def camera_box(box: np.ndarray, lidar_to_camera: np.ndarray) -> dict:
-    """dimensions, location, rotation_y and alpha of a LiDAR box (7,); nothing truncated."""
+    """dimensions, location, rotation_y and alpha of a LiDAR box (7,), the inverse of lidar_box;
+    nothing truncated."""
     x, y, z, length, w, h, yaw = (float(v) for v in box)
     centre = lidar_to_camera @ [x, y, z, 1.0]
-    heading = lidar_to_camera[:3, :3] @ [np.cos(yaw), np.sin(yaw), 0.0]
-    rotation = float(np.arctan2(-heading[2], heading[0]))
+    # The turn about the camera's y axis, of which yaw is what the LiDAR sees: the two axes lean
+    # against one another.
+    right, ahead = lidar_to_camera[0, :2], lidar_to_camera[2, :2]
+    rotation = float(np.arctan2(right[1] * np.cos(yaw) - right[0] * np.sin(yaw),
+                                ahead[1] * np.cos(yaw) - ahead[0] * np.sin(yaw)))
+    if (np.cos(rotation) * right - np.sin(rotation) * ahead) @ [np.cos(yaw), np.sin(yaw)] < 0:
+        rotation = float(wrap_angle(rotation + np.pi))
     location = [float(centre[0]), float(centre[1] + h / 2), float(centre[2])]
     alpha = float(wrap_angle(rotation - np.arctan2(location[0], location[2])))
     return {"truncated": 0.0, "occluded": 0, "alpha": alpha, "bbox": [0.0] * 4,
             "dimensions": [h, w, length], "location": location, "rotation_y": rotation}
 
 
-def format_label(label: dict, decimals: int = 2) -> str:
-    """The label_2 line of a label."""
+def format_label(label: dict, decimals: int = 2, whole: bool = True) -> str:
+    """The label_2 line of a label. whole: the -1, -10 and -1000 of DontCare are whole numbers, as
+    in the object layout."""
     numbers = [label["alpha"], *label["bbox"], *label["dimensions"], *label["location"],
                label["rotation_y"]] + ([label["score"]] if "score" in label else [])
     words = [label["class"], label["truncated"], str(label["occluded"]), *numbers]
-    if label["class"] == "DontCare":  # KITTI writes its -1, -10 and -1000 as whole numbers
+    if label["class"] == "DontCare" and whole:
         return " ".join(f"{w:g}" if w in (-1, -10, -1000) else f"{w:.{decimals}f}"
                         if isinstance(w, float) else w for w in words)
     return " ".join(f"{w:.{decimals}f}" if isinstance(w, float) else w for w in words)

@@ -30,7 +30,7 @@ def read_results(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
         raise InputError(f"there is no result file {path}; a frame without detections needs an "
                          "empty one, and --split says which frames to score")
     labels = []
-    for number, label in parsed_lines(path):
+    for number, label in parsed_lines(path, known_only=True):
         if "score" not in label:
             raise InputError(f"{path}:{number} is no result: a class and 14 numbers, and no score "
                              "as the 15th")
@@ -70,7 +70,7 @@ def read_tracking_results(path: Path, lidar_to_camera: np.ndarray) -> dict[int, 
     """Frame number -> tracks, track_id and score in extras, of a result file of the tracking
     benchmark; frames without tracks are left out. InputError as of read_tracking_labels, and for a
     line without a score."""
-    frames = read_tracking_labels(path, lidar_to_camera)
+    frames = read_tracking_labels(path, lidar_to_camera, known_only=True)
     for number, tracks in frames.items():
         if not all("score" in extra for extra in tracks.extras):
             raise InputError(f"{path}: frame {number} has a track without a score as the 18th "

@@ -82,7 +82,7 @@ def tracking_label_text(number: int, truth: GroundTruth, calibration: Calibratio
 def tracking_line(number: int, track: int, label: dict) -> str:
     """A label of frame number as a line of the tracking benchmark's files, six decimals."""
     name = TRACKING_NAMES.get(label["class"], label["class"])
-    return f"{number} {track} {format_label({**label, 'class': name}, decimals=6)}\n"
+    return f"{number} {track} {format_label({**label, 'class': name}, 6, whole=False)}\n"
 
 
 def calibration_text(calibration: Calibration) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -39,15 +40,24 @@ def write_results(path: Path, results: dict[str, GlobalBoxes]) -> None:
     """Write the boxes by sample token. A velocity that is not known is NaN, which nuscenes-devkit
     reads, and judges with an error of 1; strict readers of JSON do not."""
     rows = {token: [{
-        "sample_token": token, "translation": centre, "size": [width, length, height],
-        "rotation": rotation, "velocity": velocity, "detection_name": NAMES[class_id],
+        **place, "velocity": velocity, "detection_name": NAMES[class_id],
         "detection_score": score, "attribute_name": ATTRIBUTES[attribute] if attribute >= 0 else ""}
-        for centre, (length, width, height), rotation, class_id, attribute, velocity, score in zip(
-            *(column.tolist() for column in (boxes.centres, boxes.sizes, boxes.rotations,
-                                             boxes.class_ids, boxes.attributes, boxes.velocities,
+        for place, class_id, attribute, velocity, score in zip(
+            places(token, boxes.centres, boxes.sizes, boxes.rotations),
+            *(column.tolist() for column in (boxes.class_ids, boxes.attributes, boxes.velocities,
                                              boxes.scores)))]
         for token, boxes in results.items()}
     write_text(path, json.dumps({"meta": META, "results": rows}))
+
+
+def places(token: str, centres: np.ndarray, sizes: np.ndarray,
+           rotations: np.ndarray) -> list[dict[str, Any]]:
+    """Where K boxes of a sample are, as its files have it: centres (K, 3), sizes (K, 3) [l w h] and
+    rotations (K, 4) [w x y z] as of in_global; their sizes are [w l h]."""
+    return [{"sample_token": token, "translation": centre, "size": [width, length, height],
+             "rotation": rotation}
+            for centre, (length, width, height), rotation in zip(
+                centres.tolist(), sizes.tolist(), rotations.tolist())]
 
 
 def read_results(path: Path, frames: Sequence[Frame]) -> dict[str, GlobalBoxes]:
@@ -76,6 +86,10 @@ def _boxes(where: str, rows: list) -> GlobalBoxes:
     if not isinstance(rows, list) or len(rows) > MAX_BOXES:
         raise InputError(f"{where}, needs a list of at most {MAX_BOXES} boxes; leave out those of "
                          "the lowest scores")
+    for number, row in enumerate(rows, 1):
+        if isinstance(row, dict) and row.get("detection_name", NAMES[0]) not in NAMES:
+            raise InputError(f"{where}, box {number}: the class {row['detection_name']!r} is none "
+                             f"of nuScenes' {', '.join(NAMES)}; rename or leave out such boxes")
     try:
         boxes = GlobalBoxes.of(
             [row["translation"] for row in rows],

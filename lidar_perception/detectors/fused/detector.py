@@ -11,12 +11,18 @@ import numpy as np
 import torch
 
 from lidar_perception.classes import CAR
-from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.clustering.cluster import cluster
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.fused.boxes import on_ground, on_points
-from lidar_perception.detectors.fused.evidence import Evidence, distances, gathered
-from lidar_perception.detectors.fused.model import probabilities
+from lidar_perception.detectors.fused.evidence import (
+    Evidence,
+    clipped_logit,
+    distances,
+    judged,
+    silhouette_at,
+)
+from lidar_perception.detectors.fused.model import at_most, probabilities, sources
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.nms import first_of_each, suppressed
 from lidar_perception.detectors.params import ScoreParams
@@ -37,8 +43,8 @@ from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, LidarFram
 
 
 class Look(NamedTuple):
-    """A frame of N points in the network's range: what is proposed, and what speaks for it; xyz
-    (N, 3), ground (N,) bool; why little can be detected, or None; ms of each step."""
+    """What is proposed in the network's range, and what speaks for it; xyz (N, 3) of obstacles and
+    ground (G, 3) there; why little can be detected, or None; ms of each step."""
 
     proposed: Detections
     evidence: Evidence
@@ -60,7 +66,7 @@ class FusedDetector(NetworkDetector):
     def __init__(self, proposer: PointPillarsDetector, classifier: PointNetDetector,
                  params: FusedDetectorParams = FusedDetectorParams()):
         super().__init__(proposer.header, proposer.device, params)
-        self.proposer, self.classifier = proposer, classifier
+        self.proposer, self.classifier = proposer.raw(), classifier  # the curves know raw scores
 
     @property
     def settings(self) -> FusedParams:
@@ -70,16 +76,19 @@ class FusedDetector(NetworkDetector):
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:
         """Ground and PointPillars' clusters are computed where they are None."""
-        look = self.look(frame, ground, cluster_ids)
+        look = self.look(frame, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
         detections, best = self._fused(look)
         detections = in_sensor_frame(detections, self.params.ground.sensor_pose)
         ms = {**look.ms, STEPS[-1]: (perf_counter() - begin) * 1e3}
-        return Found(detections, ms, look.problem or self.fallback, best)
+        return Found(detections, ms, look.problem or self.fallback or self.classifier.fallback,
+                     best)
 
     def look(self, frame: LidarFrame, ground: np.ndarray | None = None,
-             cluster_ids: np.ndarray | None = None) -> Look:
-        """What all sources say of a frame, before it is weighed."""
+             cluster_ids: np.ndarray | None = None,
+             scores: ScoreParams = ScoreParams.all_alike(0.0)) -> Look:
+        """What all sources say of a frame, before it is weighed. The classifier, which takes the
+        time, is asked only about proposals that can reach these scores with its help."""
         times = [perf_counter()]
         settings = self.settings
         indices, seen = visible(frame, self.config, self.params.ground.sensor_pose)
@@ -88,14 +97,22 @@ class FusedDetector(NetworkDetector):
         ground = (levelled_ground(seen, self.params.ground) if ground is None
                   else ground.take(indices).astype(bool))
         cluster_ids = None if cluster_ids is None else cluster_ids.take(indices)
+        obstacles = seen.take(np.flatnonzero(~ground))
+        floor = seen.xyz.compress(ground, axis=0)
         times.append(perf_counter())
         proposed = self._proposer()(seen, ground=ground, cluster_ids=cluster_ids)
         times.append(perf_counter())
-        people = cluster_obstacles(seen.xyz, ground, self.params.people)
+        people = cluster(obstacles.xyz, self.params.people)
         times.append(perf_counter())
-        evidence = gathered(proposed.detections, seen, ground, people, self.classifier)
+        found = proposed.detections
+        evidence = {"network": clipped_logit(found.scores), "silhouette": clipped_logit(
+            silhouette_at(found.boxes, obstacles.xyz, floor, people))}
+        open_ = scores.passed(replace(found, scores=at_most(found.class_ids, evidence,
+                                                            "classifier")))
+        evidence["classifier"] = clipped_logit(
+            judged(found, obstacles, floor, self.classifier, open_))
         times.append(perf_counter())
-        return Look(proposed.detections, evidence, seen.xyz, ground,
+        return Look(found, evidence, obstacles.xyz, floor,
                     self.proposer.out_of_sight(frame, seen) or proposed.problem,
                     dict(zip(STEPS, (np.diff(times) * 1e3).tolist())))
 
@@ -111,19 +128,19 @@ class FusedDetector(NetworkDetector):
 
     def _fused(self, look: Look) -> tuple[Detections, dict[str, float]]:
         """The detections, best first, and where there are none the highest score of each class."""
-        settings, xyz, ground = self.settings, look.xyz, look.ground
-        every = Detections.of(look.proposed.boxes, look.proposed.class_ids,
-                              probabilities(look.proposed.class_ids, look.evidence))
+        settings, class_ids = self.settings, look.proposed.class_ids
+        every = replace(look.proposed, scores=probabilities(class_ids, look.evidence),
+                        sources=sources(class_ids, look.evidence))
         found = every[settings.scores.passed(every)]
         if len(found) == 0:
             return found, {
                 name: float(every.scores[every.class_ids == CLASSES.index(name)].max(initial=0.0))
                 for name in self.classes}
         boxes, cars = found.boxes.astype(np.float64), found.class_ids == CAR
-        boxes[cars] = on_points(boxes[cars], xyz.compress(~ground, axis=0), settings.on_points)
-        floors = surface_under(xyz.compress(ground, axis=0), boxes[:, :2])
-        moved = Detections.of(on_ground(boxes, floors, settings.on_ground), found.class_ids,
-                              found.scores)
+        boxes[cars] = on_points(boxes[cars], look.xyz, settings.on_points)
+        floors = surface_under(look.ground, boxes[:, :2])
+        moved = replace(found, boxes=on_ground(boxes, floors, settings.on_ground).astype(
+            np.float32))
         return moved[one_of_each(moved, settings)], {}
 
     def bring_to(self, device: torch.device) -> None:

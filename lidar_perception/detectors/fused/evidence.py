@@ -11,12 +11,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import logit
 
+from lidar_perception.candidates.boxes import snap_to_ground
 from lidar_perception.candidates.confidence import confidence, shape_features
 from lidar_perception.candidates.configurations import BEST
-from lidar_perception.candidates.segmented import grounded_boxes
+from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.detectors.hybrid.rescoring import known, rescored_by
 from lidar_perception.detectors.pointnet.clusters import points_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.groups import group_points
 from lidar_perception.types import Detections, LidarFrame
 
@@ -26,41 +28,36 @@ MARGIN = 0.2                # metres around a proposal: its points, for the clas
 FEWEST = 3                  # points that it says something of
 LEAST, MOST = 0.001, 0.999  # probabilities: no source is certain
 
+# By source, the log-odds (K,) float64 that each of K proposals is what it is proposed as; NaN where
+# the source is silent.
 Evidence = dict[str, np.ndarray]
-
-
-def gathered(proposed: Detections, seen: LidarFrame, ground: np.ndarray, cluster_ids: np.ndarray,
-             classifier: PointNetDetector) -> Evidence:
-    """By source, the log-odds (K,) float64 that each of K proposals is what it is proposed as; NaN
-    where the source is silent. ground (N,) bool and cluster_ids (N,), 1..J for people, of the
-    frame's N points."""
-    return {"network": clipped_logit(proposed.scores),
-            "silhouette": clipped_logit(
-                silhouette_at(proposed.boxes, seen.xyz, ground, cluster_ids)),
-            "classifier": clipped_logit(judged(proposed, seen, ground, classifier))}
 
 
 def silhouette_at(boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray,
                   cluster_ids: np.ndarray) -> np.ndarray:
     """(K,) float64: the greatest confidence that a cluster at boxes (K, 7) is a pedestrian, 0 where
-    there is none that may be."""
-    found = grounded_boxes(xyz, ground, cluster_ids, BEST.boxes.shape)
+    there is none that may be. xyz (N, 3): what is not ground, with cluster_ids (N,), 1..J for
+    people; ground (G, 3): the rest."""
+    found = snap_to_ground(oriented_boxes(xyz, cluster_ids, BEST.boxes.shape), fit_plane(ground))
     chosen = np.flatnonzero((found[:, 5] >= HEIGHTS[0]) & (found[:, 5] <= HEIGHTS[1])
                             & (found[:, 3:5].max(axis=1, initial=0.0) <= LENGTH))
+    near = distances(boxes, found[chosen]) <= SAME_PLACE
+    asked = near.any(axis=0)
+    chosen, near = chosen[asked], near[:, asked]
     own, start = group_points(xyz, cluster_ids, chosen + 1)
     confidences = confidence(shape_features(own, start, found[chosen], BEST))
-    near = distances(boxes, found[chosen]) <= SAME_PLACE
     return (near * confidences).max(axis=1, initial=0.0)
 
 
-def judged(proposed: Detections, seen: LidarFrame, ground: np.ndarray,
-           classifier: PointNetDetector) -> np.ndarray:
+def judged(proposed: Detections, obstacles: LidarFrame, ground: np.ndarray,
+           classifier: PointNetDetector, open_: np.ndarray) -> np.ndarray:
     """(K,) the probability of the class of each of K proposals, for the points in its box; NaN
-    where the classifier does not know the class, or there are less than FEWEST points."""
-    obstacles = seen.take(np.flatnonzero(~ground))
+    where it is decided already, not open_ (K,), where the classifier does not know the class, and
+    where there are less than FEWEST points."""
     clusters = points_of(proposed.boxes, obstacles, obstacles, MARGIN)
-    asked = np.flatnonzero((clusters.sizes >= FEWEST) & known(classifier, proposed.class_ids))
-    clusters = clusters.take(asked).on(seen.xyz.compress(ground, axis=0))
+    asked = np.flatnonzero(open_ & (clusters.sizes >= FEWEST)
+                           & known(classifier, proposed.class_ids))
+    clusters = clusters.take(asked).on(ground)
     probabilities = np.full(len(proposed), np.nan)
     probabilities[asked] = rescored_by(classifier, proposed[asked], clusters, 1.0)[0].scores
     return probabilities

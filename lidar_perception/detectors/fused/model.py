@@ -38,6 +38,24 @@ def probabilities(class_ids: np.ndarray, evidence: Evidence) -> np.ndarray:
     return result
 
 
+def at_most(class_ids: np.ndarray, evidence: Evidence, source: str) -> np.ndarray:
+    """(K,) float32: the greatest probability that each of K proposals can have, whatever one more
+    source will say."""
+    count = len(class_ids)
+    return np.maximum(*(probabilities(class_ids, {**evidence, source: np.full(count, said)})
+                        for said in (np.inf, np.nan)))
+
+
+def sources(class_ids: np.ndarray, evidence: Evidence) -> dict[str, np.ndarray]:
+    """By source, the probability (K,) float32 that it alone gives each of K proposals; NaN where it
+    says nothing, or does not count for the class."""
+    counts = {source: [i for i, name in enumerate(CLASSES)
+                       if source in models().get(name, {"curves": {}})["curves"]]
+              for source in evidence}
+    return {source: np.where(np.isin(class_ids, counts[source]), expit(odds), np.nan).astype(
+        np.float32) for source, odds in evidence.items()}
+
+
 @functools.cache
 def models() -> dict[str, Any]:
     """By class, the curves."""

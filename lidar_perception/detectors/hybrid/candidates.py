@@ -14,6 +14,8 @@ from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import explain_nothing
 from lidar_perception.detectors.contract import Found, require_columns
+from lidar_perception.detectors.fused.evidence import clipped_logit
+from lidar_perception.detectors.fused.model import probabilities, sources
 from lidar_perception.detectors.hybrid.params import RescoringParams
 from lidar_perception.detectors.hybrid.rescoring import rescored_by, seen_by
 from lidar_perception.detectors.nms import suppressed
@@ -64,7 +66,7 @@ class RescoredCandidates:
 
     def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
-        """See contract.Detector: the candidates by their combined score, best first. InputError
+        """See contract.Detector: the candidates by their probability, best first. InputError
         where there is no seed, and without a camera where the pipeline crops to its view."""
         require_columns(frame, ground=ground, cluster_ids=cluster_ids)
         params, pose = self.params, self.pipeline.ground.sensor_pose
@@ -75,8 +77,14 @@ class RescoredCandidates:
         seen = seen_by(self.classifier, frame.take(segmented.indices), pose)
         clusters = clusters_of(seen.take(chosen), segmented.cluster_ids[chosen]).on(
             seen.xyz.compress(segmented.ground, axis=0))
-        result, whole = rescored_by(self.classifier, candidates.final, clusters, params.weight,
-                                    pose)
+        judged, whole = rescored_by(self.classifier, candidates.final, clusters, 1.0, pose)
+        # The curves of the fused detector, with a proposer that has no opinion.
+        evidence = {"network": np.zeros(len(judged)),
+                    "silhouette": clipped_logit(candidates.final.scores),
+                    "classifier": clipped_logit(judged.scores)}
+        result = replace(judged, scores=probabilities(judged.class_ids, evidence), sources={
+            name: said for name, said in sources(judged.class_ids, evidence).items()
+            if name != "network"})
         result = result[result.scores >= params.threshold] if params.box == "cluster" else (
             self._whole(result, whole))
         result = result[np.argsort(-result.scores, kind="stable")]
@@ -85,7 +93,6 @@ class RescoredCandidates:
 
     def _whole(self, detections: Detections, boxes: np.ndarray) -> Detections:
         """The detections with these boxes; of those that overlap the best."""
-        detections = Detections(boxes, detections.class_ids, detections.scores)[
-            detections.scores >= self.params.threshold]
+        detections = replace(detections, boxes=boxes)[detections.scores >= self.params.threshold]
         return detections[suppressed(detections.boxes, detections.scores, detections.class_ids,
                                      self.params.overlap)]

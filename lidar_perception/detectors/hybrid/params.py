@@ -10,21 +10,12 @@ BOXES = ("cluster", "network")
 
 
 @dataclass(frozen=True)
-class WeightParams(Params):
-    """How much the network's probability weighs beside the score that a box comes with."""
-
-    weight: float = param(0.5, "Weight of the network's probability in the score, a geometric "
-                          "mean: 0 keeps the first score, 1 takes the network's.",
-                          low=0.0, high=1.0)
-    threshold: float = param(0.3, "Minimum score of a detection.", low=0.0, high=1.0)
-
-
-@dataclass(frozen=True)
-class RescoringParams(WeightParams):
+class RescoringParams(Params):
     """STM-CPA candidates, scored again by the class of their points."""
 
-    min_confidence: float = param(0.05, "Candidates with a lower confidence are left out before "
-                                        "the network runs.", low=0.0, high=1.0)
+    threshold: float = param(0.4, "Minimum score of a detection, a probability.", low=0.0, high=1.0)
+    min_confidence: float = param(0.0, "Candidates with a lower confidence are left out before "
+                                       "the network runs.", low=0.0, high=1.0)
     box: str = param("network", "cluster: around the visible points, down to the ground. "
                      "network: around the whole pedestrian, as the network estimates it.",
                      choices=BOXES)
@@ -34,9 +25,14 @@ class RescoringParams(WeightParams):
 
 
 @dataclass(frozen=True)
-class ConfirmingParams(WeightParams):
+class ConfirmingParams(Params):
     """Proposals of PointPillars, confirmed by the shape of what is in them."""
 
+    weight: float = param(0.5, "Weight of the network's probability in the score, a geometric "
+                          "mean: 0 keeps the proposal's score, 1 takes the network's.",
+                          low=0.0, high=1.0)
+    threshold: float = param(0.3, "Minimum score of a detection, which is no probability.",
+                             low=0.0, high=1.0)
     margin: float = param(0.2, "Points up to this far outside a proposal's box belong to its "
                                "cluster.",
                           unit="m", low=0.0, high=5.0)

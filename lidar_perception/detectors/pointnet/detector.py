@@ -10,6 +10,7 @@ import torch
 
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.calibration import calibrated
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.devices import CPU, chosen_device
@@ -78,7 +79,9 @@ class PointNetDetector(NetworkDetector):
                       f"{len(sound) - sound.sum()} of {len(sound)} clusters; the weights or the "
                       "intensity are broken")
         predicted = predicted.take(np.flatnonzero(sound))
-        detections = found(predicted, self.config, list(self.min_scores.values()), settings.nms)
+        detections = calibrated(
+            found(predicted, self.config, self.raw_min_scores(), settings.nms),
+            self.header.calibration)
         if len(detections) == 0 and sound.any():
             highest = predicted.probabilities[:, :len(self.classes)].max(axis=0)
             best, nan = self.nothing_passed(highest.tolist())

@@ -30,6 +30,9 @@ SIZES = {
                     block_layers=(1, 3, 3), deconv_channels=32, fpn_channels=32),
 }
 
+RANGES = {"ahead": {},  # as in KITTI, where labels are only there
+          "around": dict(low=(-51.2, -51.2, -3.0), high=(51.2, 51.2, 1.0))}
+
 XY_SCALE = 0.02  # of networks that are trained here
 CHOICES = {"neck": ("deconv", "fpn"), "fusion": ("add", "concat"), "anchors_at": ("cells", "ends")}
 MAX_CELLS = 1 << 22  # of a grid: 100 m x 100 m of 5 cm; what is computed grows with it

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.calibration import calibrated
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.devices import CPU, chosen_device
@@ -103,8 +104,7 @@ class PointPillarsDetector(NetworkDetector):
 
     def _detections(self, logits: Tensor, boxes_at: Callable) -> tuple:
         settings, best_scores, broken = self.settings, {}, None
-        limits = logits.new_tensor([_logit(settings.scores.of_class(name))
-                                    for name in self.config.classes])
+        limits = logits.new_tensor([*map(_logit, self.raw_min_scores())])
         chosen = torch.nonzero((logits >= limits).any(dim=1))[:, 0]
         if len(logits) > 1 and (logits == logits[0]).all():
             chosen, broken = chosen[:0], ("the network gives every place the same scores; the "
@@ -121,7 +121,7 @@ class PointPillarsDetector(NetworkDetector):
                        self.config.direction_offset).cpu().numpy()
         scores, labels = torch.sigmoid(best).cpu().numpy(), labels.cpu().numpy()
         detections = best_of_each(boxes, scores, labels, self.config.classes, settings.nms)
-        return detections, best_scores, broken
+        return calibrated(detections, self.header.calibration), best_scores, broken
 
     def out_of_sight(self, frame: LidarFrame, seen: LidarFrame) -> str | None:
         """Why nothing of the frame is seen, with the remedy; None where something is."""

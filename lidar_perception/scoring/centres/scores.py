@@ -12,20 +12,24 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from lidar_perception.scoring.centres.matching import Score, match_centres
+from lidar_perception.scoring.intervals import blocks, interval
 
 
 @dataclass
 class CentreScores:
     """Frames with at least one true pedestrian: true boxes (M, 7), found boxes (K, 7) and their
-    scores (K,) by falling score."""
+    scores (K,) by falling score; and their names."""
 
     frames: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
 
-    def update(self, truth: np.ndarray, boxes: np.ndarray, scores: np.ndarray) -> None:
+    def update(self, truth: np.ndarray, boxes: np.ndarray, scores: np.ndarray,
+               name: str = "") -> None:
         """One frame; left out, as in the paper, where truth is empty."""
         if len(truth):
             order = np.lexsort([*boxes.T, -scores])
             self.frames.append((truth, boxes[order], scores[order]))
+            self.names.append(name)
 
     def best_score(self) -> float | None:
         """The score from which detections are kept for the greatest F1; the highest of several.
@@ -51,6 +55,19 @@ class CentreScores:
         for truth, boxes, scores in self.frames:
             total.update(boxes[scores >= min_score], truth)
         return total.table()
+
+    def f1_interval(self, min_score: float, count: int) -> list[float] | None:
+        """[low, high] of F1 in percent for detections that score min_score or more; see
+        intervals.py."""
+        found = [boxes[scores >= min_score] for _, boxes, scores in self.frames]
+        counts = np.array([[len(match_centres(boxes, truth)[0]), len(boxes), len(truth)]
+                           for boxes, (truth, _, _) in zip(found, self.frames)]).reshape(-1, 3)
+
+        def f1(frames: np.ndarray) -> float:
+            hits, boxes, true = counts[frames].sum(axis=0)
+            return 200 * hits / (boxes + true)
+
+        return interval(f1, blocks(self.names), count)
 
     def compute(self) -> dict:
         """What the JSON file holds."""

@@ -32,6 +32,7 @@ from lidar_perception.scoring.comparison.outcomes import Contender
 from lidar_perception.types import CLASSES, PEDESTRIAN, SENSOR_HEIGHT, InputError
 
 PROPOSER = "PointPillars v4 compact"  # whose proposals the hybrid confirms, if it is there
+PROPOSED = 0.05  # its least score, not calibrated
 NO_WEIGHTS = "no weights come with the package; give some with --weights"
 PERSON = CLASSES[PEDESTRIAN]
 
@@ -152,7 +153,7 @@ def _hybrids(opened: Sequence[Opened], best: PipelineParams
              _seeded(names[1], rescored, best, _own_seed(own), str(classifier.source))]
     if proposer is None:
         return found, [Missing(names[2], "there is no PointPillars to propose")]
-    confirmed = ConfirmedProposals(proposer.detector.with_min_score(MIN_SCORE), classifier.detector,
+    confirmed = ConfirmedProposals(proposer.detector.with_min_score(PROPOSED), classifier.detector,
                                    ConfirmingParams())
     return [*found, always(proposer.name.replace("PointPillars", "PP") + " + PointNet", confirmed,
                            f"{proposer.source} {classifier.source}")], []

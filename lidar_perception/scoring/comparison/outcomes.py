@@ -80,10 +80,12 @@ def in_turn(items: list, turn: int) -> list:
 
 @dataclass
 class ComparisonReport:
-    """The report of each contender, by name; skipped: frames that could not be read."""
+    """The report of each contender, by name; drawings: of drives, for intervals, 0 for none;
+    skipped: frames that could not be read."""
 
     contenders: list[Contender]
     reports: dict[str, DetectionReport] = field(init=False)
+    drawings: int = 0
     skipped: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -101,19 +103,24 @@ class ComparisonReport:
 
     def compute(self) -> dict:
         """What the JSON file holds of the contenders, by name, and of the labels."""
-        rows = {each.name: outcome(each, self.reports[each.name]) for each in self.contenders}
+        rows = {each.name: outcome(each, self.reports[each.name], self.drawings)
+                for each in self.contenders}
         return {"frames": len(self.first.frames), "objects": objects(self.first), "rows": rows,
                 "skipped": self.skipped}
 
 
-def outcome(contender: Contender, report: DetectionReport) -> dict:
+def outcome(contender: Contender, report: DetectionReport, drawings: int = 0) -> dict:
     """As JSON: percent, ms, counts. failed: frames that it refused, with the reason; their objects
-    count as missed."""
+    count as missed. intervals: of `drawings` drawings of the drives."""
     ap, centres = report.compute()["ap"], report.pedestrians
     precision = {name: {row: {level: _r40(ap[name][row][level]) for level in DIFFICULTIES}
                         for row in AP_ROWS} if name in contender.classes else None
                  for name in ap}
     scores = {"operating": contender.operating, "best": centres.best_score()}
+    intervals = {"intervals": {
+        "ap": {name: rows if name in contender.classes else None
+               for name, rows in report.intervals(drawings).items()},
+        "f1": centres.f1_interval(contender.operating, drawings)}} if drawings else {}
     return {
         "weights": contender.source, "classes": list(contender.classes),
         "ap": precision, "mean_ap": {row: mean_moderate(precision, row) for row in AP_ROWS},
@@ -122,7 +129,7 @@ def outcome(contender: Contender, report: DetectionReport) -> dict:
             for key, score in scores.items()},
         "ms": float(np.median(report.ms)) if report.ms else None,
         "ms_of_frames": [round(ms, 3) for ms in report.ms],
-        "frames": len(report.ms), "failed": report.skipped}
+        "frames": len(report.ms), "failed": report.skipped, **intervals}
 
 
 def objects(report: DetectionReport) -> dict[str, dict[str, int]]:

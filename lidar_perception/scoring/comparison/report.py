@@ -12,10 +12,19 @@ from rich.markup import escape
 
 from lidar_perception.scoring.average_precision import FEW
 from lidar_perception.scoring.comparison.outcomes import AP_ROWS
+from lidar_perception.scoring.intervals import SHARE
 from lidar_perception.scoring.kitti.protocol import RELAXED, SCORED, STRICT
+from lidar_perception.scoring.kitti.report import INTERVALS
 from lidar_perception.scoring.kitti.tables import CENTRE_F1
 from lidar_perception.scoring.pictures import save_picture
-from lidar_perception.scoring.tables import counts, narrow_table, number, percent, print_skipped
+from lidar_perception.scoring.tables import (
+    between,
+    counts,
+    narrow_table,
+    number,
+    percent,
+    print_skipped,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -32,6 +41,7 @@ def print_comparison(content: dict, console: Console) -> None:
     """Average precision, pedestrians by centre distance, times, and what is missing."""
     _print_precision(content, console)
     _print_pedestrians(content, console)
+    _print_intervals(content, console)
     for reason in dict.fromkeys(each["reason"] for each in content["missing"]):
         names = [each["name"] for each in content["missing"] if each["reason"] == reason]
         console.print(f"[yellow]missing[/]: {', '.join(names)}: {escape(reason)}")
@@ -78,6 +88,24 @@ def _print_pedestrians(content: dict, console: Console) -> None:
         "that another choice, `from`, reaches on these labels. ms: median of the frames it was run "
         "on. STM-CPA takes its seed from the labels, which also says which frames have a "
         "pedestrian; `auto` finds it itself. The paper's figures are those of its 1779 frames.")
+    console.print(table)
+
+
+def _print_intervals(content: dict, console: Console) -> None:
+    rows = {name: row["intervals"] for name, row in content["rows"].items() if "intervals" in row}
+    if not rows:
+        return
+    shown = INTERVALS[0], INTERVALS[-1]
+    table = narrow_table(f"{SHARE} % intervals, drawn by drive", "",
+                         *(f"{name[:3]} {SHORT[row]}" for name in SCORED for row in shown),
+                         "F1", width=7)
+    table.add_row("overlap above", *(f"{(RELAXED if 'relaxed' in row else STRICT)[name]:g}"
+                                     for name in SCORED for row in shown), style="dim",
+                  end_section=True)
+    for name, said in rows.items():
+        table.add_row(name, *(between(said["ap"][each] and said["ap"][each][row])
+                              for each in SCORED for row in shown), between(said["f1"]))
+    table.caption = "AP of moderate labels; F1 of pedestrians at the score in use."
     console.print(table)
 
 

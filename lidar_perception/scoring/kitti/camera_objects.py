@@ -97,7 +97,8 @@ def camera_objects(objects: GroundTruth, calibration: Calibration | None) -> Cam
     bearing = np.arctan2(location[:, 0], location[:, 2])
     computed = np.where(whole, wrap_angle(turn - bearing), np.nan)
     return CameraObjects(
-        class_ids=np.array([CLASSES.index(label["class"]) for label in labels], np.int32),
+        class_ids=np.array([CLASSES.index(name if (name := label["class"]) in CLASSES else "Misc")
+                            for label in labels], np.int32),
         boxes=np.column_stack([location[:, 2], -location[:, 0], sides[:, 0] / 2 - location[:, 1],
                                sides[:, [2, 1, 0]], -turn - np.pi / 2]),
         image_boxes=np.where(has_pixels, given, projected),

@@ -13,6 +13,7 @@ import numpy as np
 
 from lidar_perception.scoring.centres.scores import CentreScores
 from lidar_perception.scoring.detections import Detected
+from lidar_perception.scoring.intervals import blocks, interval
 from lidar_perception.scoring.kitti.camera_objects import camera_objects, scored_labels
 from lidar_perception.scoring.kitti.matched_heights import heights_off, matched_heights
 from lidar_perception.scoring.kitti.protocol import (
@@ -32,12 +33,15 @@ from lidar_perception.types import PEDESTRIAN, Detections, InputError
 ROWS = {"image": ("image", STRICT), "bev": ("bev", STRICT), "3d": ("3d", STRICT),
         "bev_relaxed": ("bev", RELAXED), "3d_relaxed": ("3d", RELAXED)}
 
+INTERVALS = "bev_relaxed", "bev", "3d"
+
 
 @dataclass
 class DetectionReport:
     """Frames, and what could not be scored; ms of the detector by frame, where it was run here."""
 
     frames: list[ComparedFrame] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
     pedestrians: CentreScores = field(default_factory=CentreScores)
     ms: list[float] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
@@ -63,11 +67,12 @@ class DetectionReport:
         except InputError as error:
             raise InputError(f"{result.name}: {error}") from None
         self.frames.append(compared(true_objects, objects))
+        self.names.append(result.name)
         self.with_camera &= calibration is not None
         chosen = found.class_ids == PEDESTRIAN
         chosen &= objects.pixels_high[:len(found)] > 0
         self.pedestrians.update(truth.of_class(PEDESTRIAN), found.boxes[chosen],
-                                objects.scores[:len(found)][chosen])
+                                objects.scores[:len(found)][chosen], result.name)
 
     def compute(self) -> dict:
         """What the JSON file holds; ap in percent."""
@@ -83,6 +88,21 @@ class DetectionReport:
             result["diagnosis"] = [line for name in SCORED if (line := heights_off(
                 name, result["ap"][name], result["matched"][name]))]
         return result
+
+    def intervals(self, count: int) -> dict[str, dict[str, list[float] | None]]:
+        """By class and row of INTERVALS, [low, high] of AP at R40, moderate, from `count` drawings
+        of the drives; see intervals.py. None without objects."""
+        parts = blocks(self.names)
+
+        def of(name: str, row: str) -> list[float] | None:
+            metric, overlaps = ROWS[row]
+
+            def r40(frames: np.ndarray) -> float | None:
+                value = precision(Comparison.of([self.frames[i] for i in frames]), name, metric,
+                                  overlaps[name], "moderate")
+                return None if value is None else value.r40
+            return interval(r40, parts, count)
+        return {name: {row: of(name, row) for row in INTERVALS} for name in SCORED}
 
     def _class_content(self, together: Comparison, name: str) -> dict:
         rows = {row: {level: precision(together, name, metric, overlaps[name], level)

@@ -7,8 +7,11 @@ from rich.markup import escape
 
 from lidar_perception.classes import BY_SIZE
 from lidar_perception.scoring.average_precision import FEW
+from lidar_perception.scoring.intervals import SHARE
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES
+from lidar_perception.scoring.kitti.report import INTERVALS
 from lidar_perception.scoring.tables import (
+    between,
     counts,
     narrow_table,
     number,
@@ -80,6 +83,16 @@ def _print_paper(content: dict, console: Console) -> None:
                       f"{PAPER_MAP[name]:.2f}", style="dim")
     table.caption = ("Easy, moderate, hard; Car at overlap 0.7, the others at 0.5. The paper does "
                      "not say whether at 11 or 40 recall points.")
+    console.print(table)
+
+
+def print_intervals(content: dict[str, dict], console: Console) -> None:
+    """Of AP, as DetectionReport.intervals gives them."""
+    table = narrow_table(f"{SHARE} % intervals of AP (R40, moderate), drawn by drive", "",
+                         *(TITLES[row] + overlap for row, overlap in zip(
+                             INTERVALS, (", relaxed", "", ""))), width=10)
+    for name, rows in content.items():
+        table.add_row(name, *(between(rows[row]) for row in INTERVALS))
     console.print(table)
 
 

@@ -5,26 +5,22 @@ So a network sees the errors that it will see later: objects in pieces, objects 
 
 from __future__ import annotations
 
-import hashlib
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
-from lidar_perception import __version__
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of, middles, points_of
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.runs.files import write_bytes
 from lidar_perception.scoring.points.clusters import labelled
-from lidar_perception.training.augment import TrainingScene
-from lidar_perception.types import CLASSES, LidarFrame
+from lidar_perception.training.augment import TrainingScene, raised
+from lidar_perception.training.cache import kept, path_in
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, LidarFrame
 
 AROUND = 0.3  # m: points so near to an object are looked at, too
 DECOYS = 24   # in a scene
@@ -59,30 +55,26 @@ class CutScenes:
         """The frame that it is cut from, to validate on."""
         return self.scenes.frame(i)
 
+    def path(self, i: int) -> Path | None:
+        """The file that keeps the clusters of scene i."""
+        return path_in(self.cache, self.scenes.key(i), self.config.ground, self.config.clustering,
+                       self.config.classes, self.min_points)
+
+    def keep(self, i: int) -> None:
+        """Put it into the cache."""
+        self.scene(i)
+
     def scene(self, i: int) -> CutScene:
         """InputError naming the file that cannot be used."""
-        path = self._path(i)
-        if path is not None and path.is_file():
-            try:
-                return _read(path)
-            except (OSError, ValueError, KeyError, EOFError, BadZipFile):
-                path.unlink(missing_ok=True)  # it is made again
-        made = cut(self.scenes.scene(i), self.config, self.min_points)
-        if path is not None:
-            _write(path, made)
-        return made
-
-    def _path(self, i: int) -> Path | None:
-        if self.cache is None:
-            return None
-        made = (self.scenes, self.config.ground, self.config.clustering, self.config.classes,
-                self.min_points, __version__)
-        return self.cache / f"{hashlib.sha1(repr(made).encode()).hexdigest()[:12]}_{i:08}.npz"
+        return kept(self.path(i),
+                    lambda: cut(self.scenes.scene(i), self.config, self.min_points), _read, _arrays)
 
 
 def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutScene:
-    """The clusters of a scene; after them the points around each object that is wanted, and decoys:
-    background cut out in the same way, as the network judges what is in a detector's boxes, too."""
+    """The clusters of a scene, as from SENSOR_HEIGHT; after them the points around each object that
+    is wanted, and decoys: background cut out in the same way, as the network judges what is in a
+    detector's boxes, too."""
+    scene = raised(scene, scene.height - SENSOR_HEIGHT)
     frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
     ground = segment_ground(frame, config.ground)
     clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering),
@@ -126,14 +118,10 @@ def decoys(background: Clusters, boxes: np.ndarray, config: PointNetConfig) -> n
     return found[~(bev_iou(found, room) > 0).any(axis=1)]
 
 
-def _write(path: Path, scene: CutScene) -> None:
-    content = io.BytesIO()
-    np.savez(content, **vars(scene.clusters), labels=scene.labels, boxes=scene.boxes,
-             loose=scene.loose)
-    write_bytes(path, content.getbuffer())
+def _arrays(scene: CutScene) -> dict[str, np.ndarray]:
+    return dict(**vars(scene.clusters), labels=scene.labels, boxes=scene.boxes, loose=scene.loose)
 
 
-def _read(path: Path) -> CutScene:
-    with np.load(path) as arrays:
-        clusters = Clusters(*(arrays[name] for name in ("points", "first", "ids", "ground")))
-        return CutScene(clusters, arrays["labels"], arrays["boxes"], arrays["loose"])
+def _read(arrays: Any) -> CutScene:
+    clusters = Clusters(*(arrays[name] for name in ("points", "first", "ids", "ground")))
+    return CutScene(clusters, arrays["labels"], arrays["boxes"], arrays["loose"])

@@ -25,16 +25,19 @@ from lidar_perception.detectors.pointnet.clusters import (
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
 from lidar_perception.detectors.pointnet.predict import found, outputs_of, predict
+from lidar_perception.detectors.view import in_sensor_frame
 from lidar_perception.geometry import points_in_box
+from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.detections import Detected
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import noisy, varied
 from lidar_perception.training.data import Batches, ReadScenes, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes
-from lidar_perception.training.record import begun_with, keeper, metrics_of
+from lidar_perception.training.record import begun_with, judged, keeper
 from lidar_perception.training.run import Task
-from lidar_perception.types import GroundTruth, InputError
+from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
 FEWEST = 3          # points that are left of a cluster, at least
 SCORED_POINTS = 10  # clusters with fewer do not count in the accuracy
@@ -162,13 +165,15 @@ def make_loss(config: PointNetConfig, device: torch.device) -> Callable:
 
 @dataclass(frozen=True)
 class ValidationClusters:
-    """A scene to validate on: the clusters that clustering made, with the truth of its frame."""
+    """A scene to validate on: the clusters that clustering made, with the truth of its frame.
+    height: of its sensor, metres."""
 
     name: str
     clusters: Clusters
     labels: np.ndarray
     truth: GroundTruth
     calibration: Calibration | None
+    height: float = SENSOR_HEIGHT
 
 
 def clusters_to_validate(source: CutScenes, i: int) -> ValidationClusters:
@@ -177,12 +182,13 @@ def clusters_to_validate(source: CutScenes, i: int) -> ValidationClusters:
     made = np.flatnonzero(~scene.loose)
     frame = source.frame(i)
     return ValidationClusters(frame.name, scene.clusters.take(made), scene.labels[made],
-                              frame.truth(), frame.calibration())
+                              frame.truth(), frame.calibration(), frame.sensor_height)
 
 
-def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> dict[str, float]:
-    """Calibrate the network on the scenes and score it: score, the mean AP from above at the
-    relaxed overlaps (moderate, R40), and each class's; accuracy, the share of clusters of
+def validated(network: PointNet, scenes: Sequence[ValidationClusters]
+              ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+    """Calibrate the network on the scenes and score it, see Task: score, the mean AP from above at
+    the relaxed overlaps (moderate, R40), and each class's; accuracy, the share of clusters of
     SCORED_POINTS or more, and of the objects among them, whose class is right."""
     config = network.config
     labels = np.concatenate([s.labels for s in scenes])
@@ -192,18 +198,19 @@ def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> dict[s
         for s in scenes if len(s.clusters)])
     calibrate(network, logits, torch.from_numpy(labels))
     report, predictions = DetectionReport(), []
-    for scene in scenes:
+    for scene in track(scenes, "validating", len(scenes)):
         predictions.append(predict(network, scene.clusters))
         boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
+        boxes = in_sensor_frame(boxes, SensorPoseParams(height=scene.height))
         report.update(Detected(scene.name, scene.truth, boxes, scene.calibration))
-    metrics = metrics_of(report.compute(), "bev", config.classes)
+    metrics, calibration = judged(report, "bev", config.classes)
     known = (labels >= 0) & (sizes >= SCORED_POINTS)
     probabilities = np.concatenate([p.probabilities for p in predictions])[known]
     right, objects = probabilities.argmax(axis=1) == labels[known], labels[known] < len(
         config.classes)
     return {**metrics, "accuracy": 100 * float(right.mean()) if len(right) else math.nan,
             "object_accuracy": 100 * float(right[objects].mean()) if objects.any() else math.nan,
-            "calibration_error": calibration_error(probabilities, labels[known])}
+            "calibration_error": calibration_error(probabilities, labels[known])}, calibration
 
 
 def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches,
@@ -214,7 +221,7 @@ def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches
     network = begun_with(make_pointnet(config), init, PointNetConfig).to(device)
     scenes: list[ValidationClusters] = []
 
-    def validate(module: PointNet) -> dict[str, float]:
+    def validate(module: PointNet) -> tuple:
         if not scenes:
             for item, in loaded(validation, ([n] for n in range(len(validation))), batches.jobs):
                 if item.sample is not None:

@@ -34,17 +34,19 @@ from lidar_perception.detectors.pointpillars.targets import (
     stacked,
 )
 from lidar_perception.detectors.view import visible
+from lidar_perception.ground.params import SensorPoseParams
+from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.detections import detected
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.scoring.kitti.report import DetectionReport
-from lidar_perception.training.augment import TrainingScene, augmented, faced
+from lidar_perception.training.augment import TrainingScene, augmented, faced, raised
 from lidar_perception.training.data import Batches, ReadScenes, loaded
 from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
 from lidar_perception.training.putting import inside
-from lidar_perception.training.record import begun_with, keeper, metrics_of
+from lidar_perception.training.record import begun_with, judged, keeper
 from lidar_perception.training.run import Task
-from lidar_perception.types import CLASSES, InputError, LidarFrame
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError, LidarFrame
 
 # Boxes of low score cost precision only where recall has ended; fewer of them are quicker.
 VALIDATED = DetectorParams(pointpillars=PointPillarsParams(scores=ScoreParams.all_alike(0.1),
@@ -84,17 +86,18 @@ class Preparation:
 
     def __call__(self, scene: TrainingScene, rng: np.random.Generator) -> Sample:
         """InputError if the network would see no point."""
-        low, high = np.array(self.config.low), np.array(self.config.high)
+        lower = np.array([0, 0, scene.height - SENSOR_HEIGHT])  # than what the network sees
+        low, high = np.array(self.config.low) - lower, np.array(self.config.high) - lower
         scene = faced(scene, self.augment, low, high, rng)
         if self._objects is not None and rng.random() < self.augment.crowded:
             scene = with_objects(scene, self._objects, self.augment, low, high, rng)
         scene = augmented(scene, self.augment, rng)
         frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
-        _, seen = visible(frame, self.config)
+        _, seen = visible(frame, self.config, SensorPoseParams(height=scene.height))
         inputs = network_input(seen, self.config)
         if len(inputs.points) < 2:
             raise InputError("a scene has no point where the network looks")
-        boxes, labels, counted = self._objects_to_find(scene, seen.xyz)
+        boxes, labels, counted = self._objects_to_find(raised(scene, lower[2]), seen.xyz)
         return Sample(inputs.points, inputs.cluster_map, boxes, labels, counted)
 
     def _objects_to_find(self, scene: TrainingScene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -113,8 +116,9 @@ class Preparation:
 
 
 def narrowed(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig:
-    """The config with a range that ends so far ahead and to each side, metres, made longer to whole
-    cells of the coarsest map, and at most as far as before; 0 leaves it."""
+    """The config with a range that ends so far ahead, and behind if it sees what is there, and to
+    each side, metres, made longer to whole cells of the coarsest map, and at most as far as before;
+    0 leaves it."""
     step = config.cell * np.prod(config.block_strides)
 
     def whole(length: float) -> float:
@@ -123,7 +127,8 @@ def narrowed(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig
     x, y = whole(ahead), whole(aside)
     low, high = list(config.low), list(config.high)
     if ahead:
-        high[0] = min(high[0], low[0] + x)
+        high[0] = min(high[0], max(low[0], 0.0) + x)
+        low[0] = max(low[0], -x) if low[0] < 0 else low[0]
     if aside:
         low[1], high[1] = max(low[1], -y), min(high[1], y)
     return replace(config, low=tuple(low), high=tuple(high))
@@ -167,17 +172,21 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
 def frame_to_validate(source: Any, i: int) -> Frame:
     """Frame i of a source, read. InputError naming the file that cannot be used."""
     frame = source.frame(i)
-    return Frame.of(frame.name, frame.load(), frame.truth(), frame.calibration())
+    return Frame.of(frame.name, frame.load(), frame.truth(), frame.calibration(),
+                    sensor_height=frame.sensor_height)
 
 
 def validation_report(detector: Detector, scenes: ReadScenes, jobs: int = 0) -> DetectionReport:
     """The detector on every scene, by KITTI's protocol."""
     report = DetectionReport()
-    for item, in loaded(scenes, ([n] for n in range(len(scenes))), jobs):
+    items = loaded(scenes, ([n] for n in range(len(scenes))), jobs)
+    for item, in track(items, "validating", len(scenes)):
         report.skipped += item.skipped
         if item.sample is not None:
             frame = item.sample
-            report.update(detected(detector, frame, frame.truth(), frame.calibration()))
+            height = frame.sensor_height
+            at = detector if height == SENSOR_HEIGHT else detector.mounted_at(height)
+            report.update(detected(at, frame, frame.truth(), frame.calibration()))
     return report
 
 
@@ -191,11 +200,11 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
     network = begun_with(make_network(config), init, NetworkConfig)
     network = network.to(device, memory_format=torch.channels_last)
 
-    def validate(module: PointPillars) -> dict[str, float]:
+    def validate(module: PointPillars) -> tuple:
         detector = PointPillarsDetector(TorchNetwork(module, device), Header(config), device,
                                         VALIDATED)
-        content = validation_report(detector, validation, batches.jobs).compute()
-        return metrics_of(content, params.score, config.classes)
+        return judged(validation_report(detector, validation, batches.jobs), params.score,
+                      config.classes)
 
     seen = narrowed(config, params.ahead, params.aside)
     return Task(network, make_loss(seen, device), batches, validate,

@@ -1,0 +1,150 @@
+"""label: a drive's labels, made by a person on a page in the browser."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from lidar_perception.cli.data import (
+    a_path,
+    data_option,
+    json_option,
+    opened,
+    weights_option,
+    write_json,
+)
+from lidar_perception.runs.terminal import console, errors, progress
+from lidar_perception.types import InputError
+
+if TYPE_CHECKING:
+    from lidar_perception.data.frame import Recording
+    from lidar_perception.labeling.drive import Drive
+    from lidar_perception.labeling.session import Session
+
+
+@click.command()
+@data_option
+@click.option("--sequence", metavar="NAME", help="The drive of PATH to label, where it has "
+              "several.")
+@a_path("--out", "Folder of the journal, with which it is gone on. Default: out/label/NAME OF THE "
+        "DRIVE.", "FOLDER")
+@click.option("--port", type=click.IntRange(0, 65535), default=0, show_default=True,
+              help="Port on 127.0.0.1; 0: any that is free.")
+@click.option("--open/--no-open", "browser", default=True, help="Open the page in a browser.  "
+              "[default: open]")
+@weights_option
+@click.option("--propose/--no-propose", default=True, help="Look for proposals in the whole drive "
+              "at once, unless the journal has some.  [default: propose]")
+@click.option("--show-labels", is_flag=True, help="Show the labels that the drive has.")
+@click.option("--import", "imports", multiple=True, metavar="FORMAT:PATH",
+              help="Take the labels at PATH, before the page is served.")
+@click.option("--export", "exports", metavar="FORMAT", help="Write the accepted tracks of the "
+              "journal to --to, and end.")
+@a_path("--to", "Where --export writes.", "PATH")
+@click.option("--force", is_flag=True, help="With --export: replace what is there.")
+@click.option("--simulate-annotator", is_flag=True, help="Let a script that knows the labels do "
+              "the work, in each drive of PATH, and count its clicks, keys and drags.")
+@json_option
+def label(data: Path, sequence: str | None, out: Path | None, weights: Path | None,
+          imports: tuple[str, ...], exports: str | None, to: Path | None, force: bool,
+          simulate_annotator: bool, json_file: Path | None, **page: Any) -> None:
+    """Label a drive on a page in the browser: click, accept, correct.
+
+    Everything is kept at once in FOLDER/journal.jsonl; ctrl-C ends.
+
+    \b
+    Examples:
+      lidar-perception label --data /data/kitti/tracking
+      lidar-perception label --data drive --out labels --no-open --port 8080
+      lidar-perception label --data drive --export kitti_tracking --to labels
+    """
+    from lidar_perception.detectors.open import FUSED
+    from lidar_perception.labeling.drive import one_drive
+    from lidar_perception.labeling.session import session
+
+    if (exports is None) != (to is None):
+        raise click.UsageError("--export and --to go together")
+    recording, detector = opened(data), str(weights or FUSED)
+    if simulate_annotator:
+        write_json(json_file, _simulated(recording, sequence, detector))
+        return
+    drive = one_drive(recording, sequence)
+    with session(drive, out or Path("out/label") / drive.name, detector) as made:
+        if made.journal.message:
+            errors.print(made.journal.message, style="yellow", soft_wrap=True, markup=False)
+        for each in imports:
+            named, _, path = each.partition(":")
+            made.do({"do": "import", "format": named, "path": path})
+        if exports is not None:
+            written = made.export(exports, str(Path(str(to)).absolute()), force)
+            console.print(f"{written['path']}: {written['boxes']} boxes in {written['frames']} "
+                          "frames", soft_wrap=True, markup=False)
+        else:
+            _serve(drive, made, **page)
+
+
+def _serve(drive: Drive, made: Session, port: int, browser: bool, propose: bool,
+           show_labels: bool) -> None:
+    import asyncio
+    import webbrowser
+
+    from lidar_perception.labeling.exchange import FORMATS
+    from lidar_perception.labeling.server import Served, serve
+
+    def started(url: str) -> None:
+        console.print(url, soft_wrap=True, markup=False)
+        errors.print(f"journal: {made.journal.path}; ctrl-C ends", soft_wrap=True, markup=False,
+                     style="dim")
+        if propose and not made.was_proposed:
+            made.do({"do": "propose"})
+        if browser:
+            webbrowser.open(url)
+    asyncio.run(serve(Served(drive, made, _labels(drive) if show_labels else None,
+                             can_export=tuple(FORMATS), export=made.export), port, started))
+
+
+def _labels(drive: Drive) -> Any:
+    """The labels of frame i, as the page has them."""
+    def layers(i: int, score: float) -> dict[str, Any]:
+        truth = drive.frames[i].truth()
+        labels = [] if truth is None else [
+            [*box.tolist(), name, extra.get("track_id")]
+            for box, name, extra in zip(truth.boxes, truth.labels, truth.extras)]
+        return {"labels": labels, "detections": {}, "matches": {}}
+    return layers
+
+
+def _simulated(recording: Recording, sequence: str | None, weights: str) -> dict[str, Any]:
+    from lidar_perception.data.frame import BOXES
+    from lidar_perception.labeling.annotator import Annotator, totals
+    from lidar_perception.labeling.drive import one_drive
+    from lidar_perception.labeling.session import session
+
+    recording.require(BOXES, "label --simulate-annotator")
+    found: dict[str, Any] = {}
+    names = dict.fromkeys(frame.sequence for frame in recording)
+    for name in names if sequence is None else [sequence]:
+        drive = one_drive(recording, name)
+        with tempfile.TemporaryDirectory() as folder, session(drive, Path(folder), weights) as made:
+            _propose(drive, made)
+            found[drive.name] = done = Annotator(made).work()
+        console.print(f"{drive.name}: {done['people']} pedestrians, {done['boxes']} boxes: "
+                      f"{done['actions']} actions, by hand {done['by_hand']}, without tracks "
+                      f"{done['without_tracks']}", soft_wrap=True, markup=False)
+    if not any(done["boxes"] for done in found.values()):
+        raise InputError(f"{recording.path} has no labelled pedestrian; give another drive")
+    sums = totals(found)
+    console.print(f"all: {sums['actions']} actions, {sums['share_of_by_hand']:.0%} of those by "
+                  f"hand; {sums['share_corrected_in_full']:.0%} where a box is put right in size "
+                  f"and heading too; without tracks {sums['share_without_tracks']:.0%}",
+                  soft_wrap=True, markup=False)
+    return {"data": str(recording.path), "drives": found, "all": sums}
+
+
+def _propose(drive: Drive, made: Session) -> None:
+    with progress() as bar:
+        task = bar.add_task(f"{drive.name}: looking for proposals", total=len(drive.frames))
+        made.propose(told=lambda count: bar.update(task, completed=count))

@@ -1,0 +1,127 @@
+"""setup: measure a sensor and its mounting from unlabelled clouds."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import click
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
+from rich.table import Table
+
+from lidar_perception.cli.data import a_path
+from lidar_perception.runs.files import make_folder, write_text
+from lidar_perception.runs.terminal import console, errors, progress
+from lidar_perception.types import InputError
+
+FILES = ("sensor.yaml", "robot.param.yaml", "report.html", "lidar_perception.rviz",
+         "foxglove_layout.json")
+COLORS = {"sure": "green", "fair": "default", "doubtful": "yellow"}
+HINT_TOLERANCE = 0.1  # metres
+
+
+@click.command()
+@a_path("--data", "A bag, a .pcd or .bin file or a folder of them, or a KITTI, nuScenes or "
+        "SemanticKITTI folder. No label is needed.", "PATH", required=True)
+@a_path("--out", "Folder for the files.", "FOLDER", required=True)
+@click.option("--topic", metavar="TOPIC", help="Clouds of a bag that holds those of several "
+              "sensors.")
+@click.option("--scans", type=click.IntRange(1), default=40, show_default=True,
+              help="Number of clouds to look at, in pairs spread over all.")
+@click.option("--height-hint", type=click.FloatRange(0, 50, min_open=True), metavar="METRES",
+              help="Height of the sensor as you know it; a doubt is said where the clouds say "
+              "another one.")
+@click.option("--force", is_flag=True, help="Replace the files of an earlier run.")
+def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: float | None,
+          force: bool) -> None:
+    """Measure a LiDAR, its mounting and the robot's body from unlabelled clouds.
+
+    Writes sensor.yaml, which `simulate --sensor` takes, robot.param.yaml for the nodes, layouts for
+    RViz and Foxglove, and report.html, which says how each value was measured and how sure it is.
+    Best are some minutes of driving in the open.
+
+    \b
+    Examples:
+      lidar-perception setup --data drive.bag --topic /points --out robot
+      lidar-perception simulate --sensor robot/sensor.yaml --out street
+      lidar-perception run perception --ros-args --params-file robot/robot.param.yaml
+    """
+    there = [name for name in FILES if (out / name).exists()]
+    if there and not force:
+        raise InputError(f"{out / there[0]} exists already; give another folder or --force")
+    from lidar_perception.data.raw_clouds import open_clouds, spread
+    from lidar_perception.sensor_setup.files import params_yaml, sensor_yaml
+    from lidar_perception.sensor_setup.findings import doubts, findings
+    from lidar_perception.sensor_setup.measure import measured
+    from lidar_perception.sensor_setup.report import report_html
+    from lidar_perception.sensor_setup.scans import scan_of
+
+    clouds = open_clouds(data, topic)
+    errors.print(escape(f"{data}: {clouds.layout}, {clouds.count} clouds"), soft_wrap=True,
+                 style="dim")
+    numbers, found, skipped = [], [], []
+    chosen = spread(clouds.count, scans)
+    with progress() as bar:
+        task = bar.add_task("reading", total=len(chosen) + 2)
+        for i in chosen:
+            try:
+                found.append(scan_of(clouds.load(i), f"cloud {i} of {data}"))
+                numbers.append(i)
+            except InputError as error:
+                skipped.append(str(error))
+            bar.advance(task)
+        if not found:
+            raise InputError(skipped[0])
+        bar.update(task, description="measuring")
+        m = measured(found, numbers, str(data), clouds.count, clouds.stamps_ns)
+        bar.update(task, description="drawing", advance=1)
+        texts = {"sensor.yaml": sensor_yaml(m), "robot.param.yaml": params_yaml(m)}
+        page = report_html(m, texts)
+    make_folder(out)
+    for name, text in {**texts, "report.html": page,
+                       **_layouts(topic or "/points", m.scans[0].frame_id)}.items():
+        write_text(out / name, text)
+    _print(findings(m))
+    for line in skipped:
+        console.print(f"[yellow]left out[/]: {escape(line)}", soft_wrap=True)
+    for line in doubts(m) + _hint(m, height_hint):
+        console.print(f"[yellow]doubt[/]: {escape(line)}", soft_wrap=True)
+    console.print(f"{out}: {', '.join(name for name in FILES if (out / name).exists())}",
+                  soft_wrap=True, highlight=False)
+
+
+def _hint(m: Any, height: float | None) -> list[str]:
+    if height is None or m.mount is None or abs(m.mount.height - height) < HINT_TOLERANCE:
+        return []
+    return [f"the sensor is {m.mount.height:.2f} m above the ground and not {height:g}: measure it "
+            "by hand, or look in the report at which plane was fitted"]
+
+
+def _print(rows: list[Any]) -> None:
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in ("what", "value", "how sure"):
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(row.what, escape(row.value), f"[{COLORS[row.sure]}]{row.sure}[/]")
+    console.print(table)
+
+
+def _layouts(topic: str, frame: str) -> dict[str, str]:
+    """The layouts for RViz and Foxglove that come with the package, with this topic and frame; none
+    where they are not installed."""
+    places = (Path(__file__).parents[2] / "config",
+              Path(sys.prefix) / "share/lidar_perception/config")
+    folder = next((p for p in places if (p / FILES[-1]).is_file()), None)
+    if folder is None:
+        return {}
+    rviz = (folder / FILES[-2]).read_text(encoding="utf-8")
+    foxglove = (folder / FILES[-1]).read_text(encoding="utf-8")
+    if frame:
+        rviz = rviz.replace("Fixed Frame: velodyne", f"Fixed Frame: {frame}")
+        foxglove = foxglove.replace('"velodyne"', json.dumps(frame))
+    foxglove = foxglove.replace('"/points"', json.dumps(topic))
+    rviz = rviz.replace("        Value: points\n", f"        Value: {topic}\n")
+    return {FILES[-2]: rviz, FILES[-1]: foxglove}

@@ -1,0 +1,80 @@
+"""Tracks to the labels of a drive and back, as the formats read and write them.
+
+What a file says that tracks have no place for stays with them: of a box in Track.extra, by frame;
+of frames and of the drive in State.kept.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+from lidar_perception.data.frame import Frame
+from lidar_perception.labeling.labels import NO_TRACK, DriveLabels, FrameLabels
+from lidar_perception.labeling.state import ACCEPTED, KEY, Box, State, Track
+
+IMPORTED = "imported"  # source of a track
+ID, SCORE, REST = "track_id", "score", "rest"  # of Track.extra
+
+
+def from_labels(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str, Any]]:
+    """Accepted tracks of key boxes, numbered from first_id; and what State.kept is to hold. Boxes
+    of one track id and one class are a track; a box without an id is one of its own."""
+    found: dict[tuple[Any, ...], list[tuple[int, Box, dict[str, Any]]]] = {}
+    for f, frame in enumerate(labels.frames):
+        for k, name in enumerate(frame.class_names):
+            number, score = int(frame.track_ids[k]), float(frame.scores[k])
+            said = {ID: number, REST: frame.extra[k],
+                    **({} if math.isnan(score) else {SCORE: score})}
+            key = (number, name) if number != NO_TRACK else (NO_TRACK, f, k)
+            known = found.setdefault(key, [])
+            if any(f == other for other, _, _ in known):  # an id twice in a frame: two tracks
+                known = found.setdefault((NO_TRACK, f, k), [])
+            known.append((f, Box.of(frame.boxes[k], KEY), {"class": name, **said}))
+    tracks = []
+    for number, rows in enumerate(found.values(), first_id):
+        extra = {f: {k: v for k, v in said.items() if k != "class"} for f, _, said in rows}
+        tracks.append(Track(number, rows[0][2]["class"], ACCEPTED, 1.0, IMPORTED,
+                            {f: box for f, box, _ in rows}, frozenset(), extra))
+    notes = {str(f): [list(note) for note in frame.notes]
+             for f, frame in enumerate(labels.frames) if frame.notes}
+    return tracks, {"notes": notes, "extra": labels.extra}
+
+
+def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
+    """The accepted tracks, frame by frame, by their ids, or by those that they were imported
+    with."""
+    ids = _exported_ids(state)
+    rows: list[list[tuple[Track, Box, dict[str, Any]]]] = [[] for _ in frames]
+    for number in sorted(ids):
+        track = state.tracks[number]
+        for f, box in track.boxes.items():
+            rows[f].append((track, box, track.extra.get(f, {})))
+    notes = state.kept.get("notes", {})
+    return DriveLabels([
+        FrameLabels.of(frame.name, frame.stamp_ns, [box.values for _, box, _ in rows[f]],
+                       [track.class_name for track, _, _ in rows[f]],
+                       [ids[track.id] for track, _, _ in rows[f]],
+                       [said.get(SCORE, math.nan) for _, _, said in rows[f]],
+                       [said.get(REST, {}) for _, _, said in rows[f]],
+                       [(name, said) for name, said in notes.get(str(f), [])])
+        for f, frame in enumerate(frames)], dict(state.kept.get("extra", {})))
+
+
+def _exported_ids(state: State) -> dict[int, int]:
+    """Of the accepted tracks."""
+    chosen = [t for t in state.tracks.values() if t.state == ACCEPTED]
+    found: dict[int, int] = {}
+    taken = set[int]()
+    for t in chosen:
+        said = {extra[ID] for extra in t.extra.values() if ID in extra}
+        if len(said) == 1 and (number := said.pop()) not in taken:
+            found[t.id] = number
+            taken |= {number} - {NO_TRACK}
+    for t in chosen:
+        if t.id not in found:
+            found[t.id] = t.id if t.id not in taken else max(taken | set(state.tracks)) + 1
+            taken.add(found[t.id])
+    return found
+

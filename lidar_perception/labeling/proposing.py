@@ -1,0 +1,186 @@
+"""Proposals for the labels as they are: the survey of the drive, run beside the page, and what it
+means for the tracks that are there already."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.candidates.configurations import BEST
+from lidar_perception.candidates.seeds import Seed, seed_from_points
+from lidar_perception.candidates.silhouette import similarity, to_pixels
+from lidar_perception.detectors.open import FUSED
+from lidar_perception.geometry import points_in_box
+from lidar_perception.labeling.drive import Drive
+from lidar_perception.labeling.interpolation import Motion, corrected
+from lidar_perception.labeling.proposals import CANDIDATES, SAME, SeedLook, proposed
+from lidar_perception.labeling.state import REJECTED, State, Track
+from lidar_perception.labeling.survey import Look, surveyed
+from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
+
+Array = np.ndarray[Any, Any]
+MARGIN = 0.1    # metres around a box whose points are a seed's
+SHARE = 0.5     # of the boxes of the shorter of two tracks that are one
+REACH = 0.7     # metres between the centres of boxes that are one, or this share of the length:
+ALONG = 0.4
+
+
+class Proposer:
+    """Proposals for a drive. weights: of a detector, as open_detector takes them; "": none. looks:
+    of all frames, once they were surveyed, else None."""
+
+    def __init__(self, drive: Drive, weights: str = FUSED) -> None:
+        self.drive, self.weights = drive, weights
+        self.looks: list[Look] | None = None
+        self._seeds: dict[tuple[int, tuple[float, ...]], Seed | None] = {}
+
+    def survey(self, done: Callable[[int], bool], here: bool = False) -> bool:
+        """Look at all frames, in a process of its own or here; done is told how many there are, and
+        says whether to go on. Whether all were."""
+        looks: list[Look] = []
+        with closing(surveyed(self.drive, self.weights, here)) as survey:
+            for _, look in survey:
+                looks.append(look)
+                if not done(len(looks)):
+                    return False
+        self.looks = looks
+        return True
+
+    def poses(self) -> list[list[float]] | None:
+        """Of the frames, by the scans, where the drive has none; None where they are unknown."""
+        if self.drive.motion.poses is not None or not self.looks:
+            return None
+        found = [look.pose for look in self.looks if look.pose is not None]
+        return [np.round(pose, 6).ravel().tolist() for pose in found] if len(found) == len(
+            self.looks) else None
+
+    def proposals(self, state: State, motion: Motion) -> tuple[list[Track], list[int]]:
+        """Tracks that are new or other than they were, and the ids of those to remove. The drive is
+        surveyed."""
+        seeds = [SeedLook(seed.silhouette(BEST), seed.height) for seed in self.seeds(state)]
+        placed = {f: (np.array(b.values), t.class_name) for t in state.tracks.values()
+                  if is_placed(t) for f, b in t.boxes.items()}
+        stamps = [frame.stamp_ns for frame in self.drive.frames]
+        return merged(state, proposed(self.looks or [], seeds, stamps, motion, placed), motion)
+
+    def seeds(self, state: State) -> list[Seed]:
+        """Those of the state that have points enough."""
+        found = [self._seed(state.tracks[t], f) for f, t in state.seeds if t in state.tracks]
+        return [seed for seed in found if seed is not None]
+
+    def _seed(self, track: Track, frame: int) -> Seed | None:
+        if frame not in track.boxes or track.class_name != CLASSES[PEDESTRIAN]:
+            return None
+        box = track.boxes[frame].values
+        if (frame, box) not in self._seeds:
+            self._seeds[frame, box] = self.cut_out(np.array(box), frame)
+        return self._seeds[frame, box]
+
+    def cut_out(self, box: Array, frame: int) -> Seed | None:
+        """What is in a box (7,) of a frame, as a seed; None where it has too few points."""
+        scan = self.drive.clouds(frame)
+        inside = points_in_box(scan.xyz, box, MARGIN) & ~scan.ground
+        try:
+            return seed_from_points(scan.xyz[inside], box, certain=True)
+        except InputError:
+            return None
+
+    def silhouettes(self, state: State, track: Track, frame: int) -> dict[str, Any]:
+        """Of the seed that a candidate is most like, and of the candidate, as the page has them.
+        InputError where there is none."""
+        seeds = self.seeds(state)
+        if not seeds:
+            raise InputError("there is no seed yet; click a pedestrian")
+        box = track.boxes.get(frame)
+        seen = None if box is None else self.cut_out(np.array(box.values), frame)
+        if seen is None:
+            raise InputError(f"track {track.id} has too few points in frame {frame} to be compared")
+        image, templates = seen.silhouette(BEST), [seed.silhouette(BEST) for seed in seeds]
+        alike = [float(similarity(image[None], t, BEST.stm)[0]) for t in templates]
+        best = int(np.argmax(alike))
+        return {"seed": _drawn(templates[best]), "candidate": _drawn(image),
+                "similarity": alike[best]}
+
+    def detected(self, frame: int, box: Array, class_name: str) -> Array:
+        """(7,) the box of a detection of the class where a clicked cluster's box (7,) is; that one
+        where there is none."""
+        if self.looks is None or class_name not in CLASSES:
+            return box
+        found = self.looks[frame].detections
+        found = found[found.class_ids == CLASSES.index(class_name)]
+        apart = np.hypot(found.boxes[:, 0] - box[0], found.boxes[:, 1] - box[1])
+        if apart.min(initial=np.inf) > max(SAME, ALONG * box[3]):
+            return box
+        return found.boxes[int(apart.argmin())].astype(np.float64)
+
+
+def _drawn(image: Array) -> dict[str, Any]:
+    pixels = to_pixels(image)
+    return {"rows": pixels.shape[0], "cols": pixels.shape[1],
+            "bits": "".join("01"[bit] for bit in pixels.ravel().astype(int))}
+
+
+def is_placed(track: Track) -> bool:
+    """Whether a person put it into one frame, and it waits to be followed through the others."""
+    return track.touched and len(track.boxes) == 1 and track.state != REJECTED
+
+
+def merged(state: State, made: Sequence[Track], motion: Motion) -> tuple[list[Track], list[int]]:
+    """What new proposals mean for the tracks that are there: those that a person has had a hand in
+    stay, but for one that was placed, which is followed through the drive; a proposal where one was
+    before takes its place and id; proposals that are no more are removed."""
+    there = _Places(state.tracks)
+    waiting = {t.id for t in state.tracks.values()
+               if not t.touched and t.source in (FUSED, CANDIDATES)}
+    found: list[Track] = []
+    free, taken = state.next_id, set[int]()
+    for new in made:
+        old = there.same(new)
+        by_person = [t for t in old if t.id not in waiting]
+        if by_person:
+            placed = next((t for t in by_person if is_placed(t) and t.id not in taken), None)
+            if placed is not None:
+                taken.add(placed.id)
+                found.append(followed(placed, new, motion))
+            continue
+        number = next((t.id for t in old if t.id not in taken), free)
+        free += number == free
+        taken.add(number)
+        found.append(replace(new, id=number))
+    return ([t for t in found if t != state.tracks.get(t.id)], sorted(waiting - taken))
+
+
+def followed(placed: Track, new: Track, motion: Motion) -> Track:
+    """A track that has one box, through the frames of a proposal: corrected by that box."""
+    (frame, box), = placed.boxes.items()
+    boxes = {f: b for f, b in new.boxes.items() if f not in placed.gone}
+    return replace(placed, boxes=corrected(boxes, placed.gone, frame, box.values, motion))
+
+
+class _Places:
+    """Where tracks are, by frame."""
+
+    def __init__(self, tracks: Mapping[int, Track]) -> None:
+        self._tracks = tracks
+        rows: dict[int, list[tuple[float, ...]]] = {}
+        for t in tracks.values():
+            for f, b in t.boxes.items():
+                rows.setdefault(f, []).append((t.id, b.values[0], b.values[1], b.values[3]))
+        self._rows = {f: np.array(r) for f, r in rows.items()}
+
+    def same(self, new: Track) -> list[Track]:
+        """Those that are one with a proposal, the one with the most boxes in common first."""
+        votes: Counter[int] = Counter()
+        for f, b in new.boxes.items():
+            rows = self._rows.get(f)
+            if rows is not None:
+                apart = np.hypot(rows[:, 1] - b.values[0], rows[:, 2] - b.values[1])
+                near = apart <= np.maximum(REACH, ALONG * np.minimum(rows[:, 3], b.values[3]))
+                votes.update(rows[near, 0].astype(int).tolist())
+        shorter = {n: min(len(self._tracks[n].boxes), len(new.boxes)) for n in votes}
+        return [self._tracks[n] for n, count in votes.most_common() if count >= SHARE * shorter[n]]

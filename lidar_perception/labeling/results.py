@@ -1,0 +1,197 @@
+"""Results to be looked at: labels and what each source detected, frame by frame, with what is
+missed and what is false; tracks. Read from a bag, from result files, or detected when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.camera import Camera
+from lidar_perception.classes import CLASSES, DETECTED, PEDESTRIAN, TABLE
+from lidar_perception.data.bag import Bag
+from lidar_perception.data.frame import Frame
+from lidar_perception.data.kitti.results import read_results
+from lidar_perception.detectors.contract import Detector
+from lidar_perception.geometry import bev_iou
+from lidar_perception.groups import renumbered
+from lidar_perception.labeling.drive import Drive, Scan, scan_of, scanned
+from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_to_one
+from lidar_perception.types import Detections, GroundTruth, InputError
+from lidar_perception.wire.messages import column, to_detections, to_frame
+from lidar_perception.wire.topics import POINTS, TRUTH
+from msg_utils.markers import MarkedObjects, from_marker_array
+
+Array = np.ndarray[Any, Any]
+SIMILAR = {row.name: row.looks_like or row.name for row in TABLE}
+MARKERS, CLOUD = "visualization_msgs/msg/MarkerArray", "sensor_msgs/msg/PointCloud2"
+FOUND, TRACKS = "/output/detections", "/output/tracks"  # the end of a topic, of whatever node
+CLUSTERED = ("/clustering/output/points", "/perception/output/points", POINTS)
+KEPT = 2000                                  # frames whose detections are kept
+
+
+def with_recorded_scans(drive: Drive) -> Drive:
+    """The drive of a bag, with the ground and clusters that are recorded in it."""
+    return replace(drive, scan=recorded_scan)
+
+
+@dataclass(frozen=True)
+class Source:
+    """find(i, frame): what was detected in frame i; classes: names of those that it can detect."""
+
+    find: Callable[[int, Frame], Detections]
+    classes: frozenset[str] = frozenset(DETECTED)
+
+
+@dataclass(frozen=True)
+class Results:
+    """sources by name; tracks as the page has them."""
+
+    sources: Mapping[str, Source] = field(default_factory=dict)
+    tracks: tuple[dict[str, Any], ...] = ()
+
+    def layers(self, i: int, frame: Frame, min_score: float) -> dict[str, Any]:
+        """Labels and detections of frame i as /api/labels has them, and what of them is missed and
+        false from this score on."""
+        truth, camera = frame.truth(), frame.camera()
+        found = {name: source.find(i, frame) for name, source in self.sources.items()}
+        labels = [] if truth is None else [
+            [*map(float, box), name, extra.get("track_id")]
+            for box, name, extra in zip(truth.boxes, truth.labels, truth.extras)]
+        rows = {name: [[*map(float, box), CLASSES[c], float(score)] for box, c, score
+                       in zip(d.boxes, d.class_ids, d.scores)] for name, d in found.items()}
+        matches = {} if truth is None else {
+            name: compared(truth, d, min_score, camera, self.sources[name].classes)
+            for name, d in found.items()}
+        return {"labels": labels, "detections": rows, "matches": matches}
+
+
+def compared(truth: GroundTruth, found: Detections, min_score: float, camera: Camera | None = None,
+             classes: frozenset[str] = frozenset(DETECTED)) -> dict[str, list[int]]:
+    """Row numbers of labels that are missed, and of detections of at least min_score that are
+    false, for each of the classes: a hit overlaps seen from above by the class's relaxed share, or
+    is a pedestrian with its centre within 1 m. What only looks like a class, a van like a car, is
+    neither; nor is a detection outside the camera's view, where there is one: labels end there."""
+    missed, false = [], []
+    true_names = np.array([SIMILAR[CLASSES[c]] for c in truth.class_ids], object)
+    for name in classes & DETECTED.keys():
+        alike = np.flatnonzero(true_names == name)
+        rows = np.flatnonzero((found.class_ids == CLASSES.index(name))
+                              & (found.scores >= min_score))
+        boxes, others = found.boxes[rows].astype(np.float64), truth.boxes[alike]
+        share = bev_iou(boxes, others)
+        hit = share >= DETECTED[name].relaxed
+        if name == CLASSES[PEDESTRIAN]:
+            far = np.linalg.norm(boxes[:, None, :2] - others[None, :, :2], axis=2)
+            hit |= far <= MAX_CENTRE_DISTANCE
+        i, j = one_to_one(1.0 - share, hit) if hit.size else (np.zeros(0, int), np.zeros(0, int))
+        own = truth.class_ids[alike] == CLASSES.index(name)
+        missed += alike[own & ~np.isin(np.arange(len(alike)), j)].tolist()
+        wrong = np.delete(rows, i)
+        if camera is not None and len(wrong):
+            wrong = wrong[camera.in_view(found.boxes[wrong, :3])]
+        false += wrong.tolist()
+    return {"missed": sorted(missed), "false": sorted(false)}
+
+
+def by_detector(detector: Detector) -> Source:
+    """Detects in a frame when it is asked for, once."""
+    @lru_cache(maxsize=KEPT)
+    def detect(i: int, frame: Frame) -> Detections:
+        return detector(frame.load()).detections
+    return Source(detect, frozenset(detector.classes))
+
+
+def by_files(folder: Path) -> Source:
+    """KITTI result files, folder/NAME.txt; a frame without one has no detections. InputError where
+    a file is no result, or the recording has no camera."""
+    if not folder.is_dir():
+        raise InputError(f"there is no folder {folder} with result files")
+
+    @lru_cache(maxsize=KEPT)
+    def read(i: int, frame: Frame) -> Detections:
+        calibration, path = frame.calibration(), folder / f"{frame.name}.txt"
+        if calibration is None:
+            raise InputError(f"frame {frame.name} has no camera calibration, in whose frame "
+                             "KITTI's result files are")
+        if not path.exists():
+            return Detections.none()
+        rows = read_results(path, calibration.lidar_to_camera)
+        return Detections.of(rows.boxes, rows.class_ids, [e["score"] for e in rows.extras])
+    return Source(read)
+
+
+def points_topic(path: Path) -> str:
+    """The topic of a bag with the clouds that say most: clustered ones, else /points, else the only
+    one there. InputError where that is not clear."""
+    with Bag(path) as bag:
+        clouds = sorted(topic for topic, kind in bag.topics.items()
+                        if kind == CLOUD and bag.counts[topic])
+    known = [topic for topic in CLUSTERED if topic in clouds]
+    if not known and len(clouds) != 1:
+        raise InputError(f"{path} has clouds on {', '.join(clouds) or 'no topic'}; name one with "
+                         "--points")
+    return (known or clouds)[0]
+
+
+def recorded(path: Path, stamps: list[int]) -> Results:
+    """What a bag holds beside its clouds, whose stamps are given: detections of every node, tracks.
+    A message belongs to the cloud of its stamp."""
+    with Bag(path) as bag:
+        wanted = {topic for topic, kind in bag.topics.items() if kind == MARKERS and topic != TRUTH
+                  and topic.endswith((FOUND, TRACKS))}
+        found: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in sorted(wanted)}
+        for topic, _, message in bag.messages(wanted):
+            objects = from_marker_array(message)
+            found[topic][objects.stamp_ns] = objects
+    numbers = {stamp: i for i, stamp in enumerate(stamps)}
+    sources: dict[str, Source] = {}
+    tracks: list[dict[str, Any]] = []
+    for topic, by_stamp in found.items():
+        frames = {numbers[stamp]: each for stamp, each in by_stamp.items() if stamp in numbers}
+        if topic.endswith(TRACKS):
+            tracks += _tracks(frames, topic, len(tracks))
+        else:
+            sources[_short(topic)] = _given({i: to_detections(f) for i, f in frames.items()})
+    return Results(sources, tuple(tracks))
+
+
+def _short(topic: str) -> str:
+    """Of /fused_detector/output/detections the node's name."""
+    return topic.strip("/").removesuffix(FOUND)
+
+
+def _given(found: Mapping[int, Detections]) -> Source:
+    classes = {CLASSES[c] for each in found.values() for c in each.class_ids}
+    return Source(lambda i, frame: found.get(i, Detections.none()), frozenset(classes))
+
+
+def recorded_scan(frame: Frame) -> Scan:
+    """The cloud of a frame of a bag with the ground and clusters that are recorded in it; those of
+    our own where there are none. InputError where it cannot be read."""
+    message = frame.native()
+    cloud, indices = to_frame(message, intensity_max=0.0)
+    ground, ids = (column(message, name, indices) for name in ("ground", "cluster_id"))
+    if ground is None or ids is None:
+        return scanned(frame)
+    return scan_of(cloud, ground > 0, renumbered(ids)[0])
+
+
+def _tracks(frames: Mapping[int, MarkedObjects], topic: str, before: int) -> list[dict[str, Any]]:
+    """Tracks as the page has them, numbered from before + 1 on where there are several trackers."""
+    made: dict[int, dict[str, Any]] = {}
+    for i in sorted(frames):
+        objects = frames[i]
+        for box, label, number, score in zip(objects.boxes, objects.labels, objects.ids.tolist(),
+                                             objects.scores):
+            track = made.setdefault(number, {
+                "id": before + number if before else number, "class": label, "state": "accepted",
+                "score": 0.0, "source": topic.strip("/").split("/")[0], "boxes": [],
+                "uncertainty": 0.0})
+            track["score"] = max(track["score"], float(score))
+            track["boxes"].append([i, *map(float, box), "proposed"])
+    return list(made.values())

@@ -1,0 +1,248 @@
+"""A drive with its labels, and all that can be done to them: the server and the simulated annotator
+both work through this."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.detectors.open import FUSED
+from lidar_perception.labeling.actions import (
+    Action,
+    apply,
+    box_of,
+    class_of,
+    frame_of,
+    motion_of,
+    numbers,
+    rounded,
+    track_of,
+)
+from lidar_perception.labeling.drive import Drive
+from lidar_perception.labeling.exchange import export_labels, import_labels, recognised
+from lidar_perception.labeling.interpolation import Motion
+from lidar_perception.labeling.journal import Journal, header, opened
+from lidar_perception.labeling.labelled import from_labels, to_labels
+from lidar_perception.labeling.proposing import Proposer
+from lidar_perception.labeling.snap import around_click, to_cluster, to_ground, to_size
+from lidar_perception.labeling.state import (
+    ACCEPTED,
+    KEY,
+    Box,
+    Change,
+    State,
+    Track,
+    progress,
+    track_to_json,
+)
+from lidar_perception.runs.files import short
+from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
+
+Array = np.ndarray[Any, Any]
+
+Listener = Callable[[dict[str, Any]], None]
+
+
+class Session:
+    """May be called from several threads. listeners: told of every action, as /api/events has
+    it; busy: what goes on, as PROGRESS has it."""
+
+    def __init__(self, drive: Drive, journal: Journal, weights: str = FUSED) -> None:
+        self.drive, self.journal, self.state = drive, journal, State()
+        self.proposer = Proposer(drive, weights)
+        self.listeners: list[Listener] = []
+        self.busy: dict[str, Any] | None = None
+        self.was_proposed = any(line.get("do") == "propose" for line in journal.lines)
+        self._cancelled = False
+        self._lock = threading.RLock()
+        for line in journal.lines:
+            self.state, _ = apply(self.state, line, drive.motion)
+        journal.lines.clear()
+
+    @property
+    def motion(self) -> Motion:
+        """Times, and poses as far as they are known."""
+        return motion_of(self.state, self.drive.motion)
+
+    def do(self, action: Mapping[str, Any], by: str = "") -> int:
+        """Do an action of a page; its number. InputError where it cannot be done, or not be
+        written: then nothing has changed."""
+        if action.get("do") in ("propose", "cancel"):
+            return self._start_proposing(by) if action["do"] == "propose" else self.cancel()
+        with self._lock:
+            return self._record(self._computed(_asked(action)), by)
+
+    def cancel(self) -> int:
+        """End what goes on; the number of the last action."""
+        self._cancelled = True
+        return self.state.seq
+
+    def _start_proposing(self, by: str) -> int:
+        with self._lock:
+            if self.busy is not None:
+                raise InputError("proposals are being made already")
+            self.busy = {"what": "proposing", "done": 0, "of": len(self.drive.frames)}
+            self._cancelled = False
+        threading.Thread(target=self._propose_beside, args=(by,), daemon=True).start()
+        return self.state.seq
+
+    def _propose_beside(self, by: str) -> None:
+        try:
+            self.propose(by)
+        except Exception as error:  # of a thread nobody waits for: the page is told
+            self.tell({"error": str(error) if isinstance(error, InputError) else
+                       f"no proposals: {type(error).__name__}: {short(error)}"})
+        finally:
+            self.busy = None
+            self.tell({"progress": self.progress()})
+
+    def propose(self, by: str = "", here: bool = False,
+                told: Callable[[int], object] = lambda count: None) -> None:
+        """Look at the drive, in a process of its own or here, and write down the proposals; nothing
+        is written if it is cancelled. told: how many frames were looked at. InputError where a
+        frame or the weights cannot be read."""
+        def done(count: int) -> bool:
+            told(count)
+            if self.busy is not None:
+                self.busy = {**self.busy, "done": count}
+                self.tell({"progress": self.progress()})
+            return not self._cancelled
+        if self.proposer.looks is None and not self.proposer.survey(done, here):
+            return
+        with self._lock:
+            if not self.state.poses and (poses := self.proposer.poses()) is not None:
+                self._record({"do": "poses", "poses": poses}, by)
+            self._record({"do": "propose", **self._proposals(self.state)}, by)
+
+    def _proposals(self, state: State) -> dict[str, Any]:
+        tracks, removed = self.proposer.proposals(state, motion_of(state, self.drive.motion))
+        return {"tracks": [track_to_json(t) for t in tracks], "removed": removed}
+
+    def _computed(self, action: Action) -> Action:
+        """The action with what is computed for it, as the journal has it."""
+        name = action.get("do")
+        if name == "seed":
+            return self._seeded(action)
+        if name == "snap":
+            return {**action, "box": rounded(self._snapped(action))}
+        if name == "import":
+            return self._imported(action)
+        if name == "accept":
+            track = track_of(self.state, action.get("track"))
+            if track.class_name == CLASSES[PEDESTRIAN] and track.boxes:
+                return {**action, "seed": track.nearest_frame()}
+        return action
+
+    def _imported(self, action: Action) -> Action:
+        path, named = action.get("path"), action.get("format") or ""
+        if not isinstance(path, str) or not isinstance(named, str):
+            raise InputError("an import needs the path of labels, and may name their format")
+        labels = import_labels(Path(path), named or recognised(Path(path)), self.drive.frames)
+        tracks, kept = from_labels(labels, self.state.next_id)
+        return {**action, "tracks": [track_to_json(t) for t in tracks], "kept": kept}
+
+    def export(self, named: str, out: str, force: bool = False) -> dict[str, Any]:
+        """Write the accepted tracks in a format of exchange.FORMATS, to a path or, by its name,
+        into the journal's folder; as /api/export has it. InputError where that cannot be."""
+        path = Path(out).expanduser()
+        if not out or ".." in path.parts:
+            raise InputError(f"{out!r} is no name for an export; give one without '..'")
+        written = export_labels(to_labels(self.state, self.drive.frames), named,
+                                self.journal.path.parent / path, self.drive.frames, force)
+        return {"path": str(written.path), "boxes": written.boxes, "frames": written.frames}
+
+    def _seeded(self, action: Action) -> Action:
+        frame, named = frame_of(action, self.drive.motion), class_of(action)
+        click = np.array(numbers(action, "xyz", 3))
+        box = around_click(self.drive.clouds(frame), click, named)
+        box = self.proposer.detected(frame, box, named)
+        track = Track(self.state.next_id, named, ACCEPTED, 1.0, "click",
+                      {frame: Box(tuple(rounded(box)), KEY)})
+        alone = {**action, "track": track.id, "tracks": [track_to_json(track)]}
+        if self.proposer.looks is None:
+            return alone
+        made = self._proposals(apply(self.state, alone, self.drive.motion)[0])
+        if all(found["id"] != track.id for found in made["tracks"]):
+            made["tracks"] += alone["tracks"]
+        return {**alone, **made}
+
+    def _snapped(self, action: Action) -> Array:
+        track, frame = track_of(self.state, action.get("track")), frame_of(action,
+                                                                          self.drive.motion)
+        box = np.array(box_of(track, frame).values)
+        if action.get("to") == "size":
+            others = [b.values[3:6] for f, b in track.boxes.items() if f != frame]
+            keys = [b.values[3:6] for f, b in track.boxes.items() if f != frame and b.kind == KEY]
+            return to_size(box, np.median(keys or others or [tuple(box[3:6])], axis=0))
+        if action.get("to") not in ("cluster", "ground"):
+            raise InputError("a box snaps to cluster, ground or size")
+        scan = self.drive.clouds(frame)
+        return to_cluster(scan, box) if action["to"] == "cluster" else to_ground(scan, box)
+
+    def _record(self, action: Action, by: str) -> int:
+        after, change = apply(self.state, action, self.drive.motion)
+        self.journal.append({"seq": after.seq, "time": datetime.now(UTC).isoformat(), "by": by,
+                             **action})
+        self.state = after
+        self._tell(action, change, by)
+        return after.seq
+
+    def _tell(self, action: Action, change: Change, by: str) -> None:
+        tracks = [track_to_json(track) for _, track in change.tracks.values() if track]
+        removed = [n for n, (_, track) in change.tracks.items() if track is None]
+        named = {k: v for k, v in action.items() if k not in ("tracks", "removed", "poses", "kept")
+                 or action["do"] == "merge"}
+        self.tell({"seq": self.state.seq, "by": by, "action": named, "tracks": tracks,
+                   "removed": removed, **self.summary()})
+
+    def tell(self, event: dict[str, Any]) -> None:
+        """All listeners."""
+        for listener in list(self.listeners):
+            listener(event)
+
+    def progress(self) -> dict[str, Any]:
+        """How far the work is, and what goes on."""
+        return {**progress(self.state, len(self.drive.frames)), "busy": self.busy}
+
+    def summary(self) -> dict[str, Any]:
+        """All but the tracks, as the page has it."""
+        state = self.state
+        return {"checked": sorted(state.checked), "seeds": [list(s) for s in state.seeds],
+                "can_undo": state.done is not None, "can_redo": state.undone is not None,
+                "progress": self.progress()}
+
+    def everything(self) -> dict[str, Any]:
+        """As /api/state has it."""
+        with self._lock:
+            return {"seq": self.state.seq, **self.summary(),
+                    "tracks": [track_to_json(t) for t in self.state.tracks.values()]}
+
+
+def _asked(action: Mapping[str, Any]) -> Action:
+    """What a page may say of an action; what is computed for it, it may not."""
+    if action.get("do") == "poses":
+        raise InputError("poses come from the drive")
+    computed = {"seed": ("track", "tracks", "removed"), "propose": ("tracks", "removed"),
+                "import": ("tracks", "removed", "kept"),
+                "accept": ("seed",), "snap": ("box",)}
+    unwanted = ("seq", "time", "by", *computed.get(str(action.get("do")), ()))
+    return {k: v for k, v in action.items() if k not in unwanted}
+
+
+@contextmanager
+def session(drive: Drive, folder: Path, weights: str = FUSED) -> Iterator[Session]:
+    """The labels of a drive in a folder, gone on with from where they were left. InputError for the
+    journal of another drive, and while another process has it."""
+    head = header(drive.name, [f.name for f in drive.frames], [f.stamp_ns for f in drive.frames])
+    with opened(folder, head) as journal:
+        made = Session(drive, journal, weights)
+        try:
+            yield made
+        finally:
+            made.cancel()

@@ -1,0 +1,43 @@
+"""How far a score may be off by the choice of frames: the bootstrap over drives (Efron, 1979).
+
+Frames of one drive show the same street and the same people, so drives are drawn, not frames: as
+many as there are, with replacement. Where a recording has fewer than DRIVES of them, runs of RUN
+frames of a drive take their place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+DRIVES, RUN = 8, 10
+SHARE = 90  # percent of the resamplings that lie within an interval
+
+
+def blocks(names: Sequence[str]) -> list[np.ndarray]:
+    """Indices of the frames with these names that belong together, DRIVE/FRAME; a frame without a
+    drive, as in KITTI's object layout, is one of its own."""
+    drives: dict[str, list[int]] = {}
+    for i, name in enumerate(names):
+        drives.setdefault(name.rpartition("/")[0] or f"/{i}", []).append(i)
+    if len(drives) >= DRIVES:
+        return [*map(np.array, drives.values())]
+    return [np.array(frames[i:i + RUN]) for frames in drives.values()
+            for i in range(0, len(frames), RUN)]
+
+
+def interval(score: Callable[[np.ndarray], float | None], parts: Sequence[np.ndarray], count: int
+             ) -> list[float] | None:
+    """[low, high] of what score(frames) gives for `count` drawings of these parts; frames (F,) are
+    indices. None where fewer than two parts were drawn from, or no drawing has a score."""
+    rng, found = np.random.default_rng(0), []
+    if len(parts) < 2:
+        return None
+    for _ in range(count):
+        drawn = score(np.concatenate([parts[i] for i in rng.integers(len(parts), size=len(parts))]))
+        if drawn is not None:
+            found.append(drawn)
+    if not found:
+        return None
+    return np.percentile(found, [(100 - SHARE) / 2, (100 + SHARE) / 2]).round(2).tolist()

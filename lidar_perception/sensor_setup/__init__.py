@@ -1,0 +1,1 @@
+"""Measures a LiDAR and its mounting from unlabelled clouds."""

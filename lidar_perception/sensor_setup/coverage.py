@@ -1,0 +1,175 @@
+"""What the sensor sees and what it never sees: the robot's own body, and blind sectors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lidar_perception.sensor_setup.beams import Beams
+from lidar_perception.sensor_setup.mount import Mount
+from lidar_perception.sensor_setup.scans import Scan
+
+SECTORS = 360            # of a turn
+ARM = 1.0                # metres; what is nearer in every scan is the robot's, wherever it stands
+BODY_REACH = 4.0         # metres; a moving robot's own returns are within this
+ALWAYS, STEADY = 0.7, 0.06  # share of the scans with such a return, metres by which it may vary
+OFF_GROUND = 0.15        # metres above the ground, from which on a return may be the body's
+MIN_CELLS = 20           # of sector and beam; fewer are chance
+MARGIN = 0.05            # metres around the body
+FAR, CHANGED = 4.0, 0.3  # metres: returns from beyond that differ so much between scans have moved
+STILL = 0.3              # of them, below which the robot stands still: people move around it
+MIN_BLIND = 3            # degrees; narrower gaps are chance
+SEEN = 0.35              # of the sectors give a return to a beam that says something of blind ones
+ROW = 2.0                # degrees between rows where there are no beams
+
+
+class Coverage(NamedTuple):
+    """rows (R,): elevations in degrees of the beams, or of rows where there are none, descending;
+    seen (R, 360): share of the scans with a return there; body (R, 360) bool: returns of the robot
+    itself; box (6,) around its points, or empty; others: share of the points in the box that are
+    not the body's; body_share: of all points; still: whether the robot stood still, None where that
+    cannot be told; blind (R, 360) bool: never a return that is not the body's; blocked: [first row,
+    from, to] in degrees, counter-clockwise; view: [from, to] of the azimuths with returns."""
+
+    rows: np.ndarray
+    seen: np.ndarray
+    body: np.ndarray
+    box: np.ndarray
+    others: float
+    body_share: float
+    still: bool | None
+    blind: np.ndarray
+    blocked: list[tuple[int, float, float]]
+    view: tuple[float, float]
+
+
+def coverage_of(scans: Sequence[Scan], beams: Beams | None, mount: Mount | None) -> Coverage:
+    """What all scans together see."""
+    rows, labels = _rows(scans, beams)
+    near = np.full((len(scans), len(rows), SECTORS), np.inf, np.float32)
+    for image, scan, label in zip(near, scans, labels):
+        cells = label, (scan.azimuth * (SECTORS / 360)).astype(int) % SECTORS
+        known = label >= 0
+        np.minimum.at(image, (cells[0][known], cells[1][known]),
+                      np.linalg.norm(scan.xyz[known], axis=1).astype(np.float32))
+    there = np.isfinite(near)
+    seen = there.mean(axis=0)
+    still = _stands_still(near)
+    body, middle = _body(near, rows, mount, still)
+    mine = [_at(scan, label, body, False) & (np.abs(np.linalg.norm(scan.xyz, axis=1)
+                                                    - _at(scan, label, middle, 0.0)) < 3 * STEADY)
+            for scan, label in zip(scans, labels)]
+    points = np.concatenate([scan.xyz[m] for scan, m in zip(scans, mine)])
+    total = sum(len(scan.xyz) for scan in scans)
+    box, others = np.zeros(0), 0.0
+    if len(points):
+        # A few returns from beside the body, such as people who stand there, do not widen the box.
+        low, high = np.percentile(points, [0.5, 99.5], axis=0)
+        box = np.concatenate([low - MARGIN, high + MARGIN])
+        inside = [((scan.xyz > box[:3]) & (scan.xyz < box[3:])).all(axis=1) for scan in scans]
+        others = float(sum((i & ~m).sum() for i, m in zip(inside, mine))
+                       / max(1, sum(i.sum() for i in inside)))
+    blind = (seen == 0) | body
+    return Coverage(rows, seen, body, box, others, len(points) / max(1, total), still, blind,
+                    _blocked(blind, seen, body), _view(seen))
+
+
+def _rows(scans: Sequence[Scan], beams: Beams | None) -> tuple[np.ndarray, list[np.ndarray]]:
+    if beams is not None:
+        return beams.elevations, beams.labels
+    rows = np.arange(90.0 - ROW / 2, -90.0, -ROW)
+    return rows, [np.clip(((90.0 - scan.elevation) / ROW).astype(int), 0, len(rows) - 1)
+                  for scan in scans]
+
+
+def _at(scan: Scan, labels: np.ndarray, cells: np.ndarray, otherwise: float) -> np.ndarray:
+    """(N,) what cells (R, 360) hold where each point is; otherwise for those of no row."""
+    column = (scan.azimuth * (SECTORS / 360)).astype(int) % SECTORS
+    return np.where(labels >= 0, cells[labels, column], otherwise).astype(cells.dtype)
+
+
+def _stands_still(near: np.ndarray) -> bool | None:
+    """Whether far returns stay where they are; None with one scan, or too few such returns."""
+    if len(near) < 2:
+        return None
+    there = np.isfinite(near)
+    both = there.sum(axis=0) >= max(2, 0.6 * len(near))
+    first = near.min(axis=0)
+    last = np.where(there, near, -1.0).max(axis=0)
+    middle = (first + last) / 2
+    far = both & (middle > FAR)
+    if far.sum() < 100:
+        return None
+    return bool(((last - first)[far] > CHANGED).mean() < STILL)
+
+
+def _body(near: np.ndarray, rows: np.ndarray, mount: Mount | None,
+          still: bool | None) -> tuple[np.ndarray, np.ndarray]:
+    """(R, 360) bool: cells whose nearest return is always there, near and at the same range; and
+    that range."""
+    found = np.isfinite(near)
+    share = found.mean(axis=0)
+    filled = np.where(found, near, np.nan)
+    none = ~found.any(axis=0)
+    filled[:, none] = 1e9
+    middle = np.nanmedian(filled, axis=0)
+    varies = np.nanmedian(np.abs(filled - middle), axis=0)
+    steady = (share >= ALWAYS) & (varies <= STEADY) & (len(near) >= 3)
+    if still is False and len(near) >= 5:
+        body = steady & (middle < BODY_REACH)
+        if mount is not None:
+            up, aside = np.radians(rows)[:, None], np.radians(np.arange(SECTORS) + 0.5)
+            normal = next(p for p in mount.planes if p is not None).normal
+            way = np.stack(np.broadcast_arrays(np.cos(up) * np.cos(aside), np.cos(up)
+                                               * np.sin(aside), np.sin(up)), axis=-1)
+            body &= middle * (way @ normal) + mount.height > OFF_GROUND
+    else:
+        body = steady & (middle < ARM)
+    return body if body.sum() >= MIN_CELLS else np.zeros_like(body), middle
+
+
+def _blocked(blind: np.ndarray, seen: np.ndarray,
+             body: np.ndarray) -> list[tuple[int, float, float]]:
+    """Where all beams from one on are blind, as sectors. Beams that hardly see anything, as those
+    to the sky, say nothing."""
+    open_ = (seen > 0).any(axis=0)
+    says = (seen[:, open_] > 0).mean(axis=1) >= SEEN if open_.any() else np.zeros(len(seen), bool)
+    if not says.any():
+        return []
+    # From the lowest beam upwards: the first that sees in each sector, of those that say something.
+    hidden = np.where(says[:, None], blind, True)
+    lowest = len(blind) - np.cumprod(hidden[::-1], axis=0).sum(axis=0)
+    known = np.append(np.flatnonzero(says), len(blind))
+    first = known[np.searchsorted(known, lowest)]
+    for row in range(len(blind) - 2, -1, -1):  # what meets the robot is hidden, whatever it says
+        first = np.where((first == row + 1) & body[row], row, first)
+    first = np.where(open_, first, 0)
+    out = []
+    step = max(1, len(blind) // 16)  # so that neighbours join
+    level = np.where(first < len(blind), -(-first // step) * step, len(blind))
+    level = np.minimum(level, np.where(first < len(blind), len(blind) - 1, len(blind)))
+    turn = int(np.argmax(np.diff(level, prepend=level[-1]) != 0))
+    rolled = np.roll(level, -turn)
+    starts = np.flatnonzero(np.diff(rolled, prepend=-1) != 0)
+    for start, end in zip(starts, [*starts[1:], SECTORS]):
+        if rolled[start] < len(blind) and end - start >= MIN_BLIND:
+            out.append((int(rolled[start]), float((start + turn) % 360),
+                        float((end + turn - 1) % 360 + 1)))
+    return sorted(out)
+
+
+def _view(seen: np.ndarray) -> tuple[float, float]:
+    """From the end of the widest gap to its beginning; 0, 360 without a gap."""
+    open_ = (seen > 0).any(axis=0)
+    if not open_.any() or open_.all():
+        return 0.0, 360.0
+    turn = int(np.argmax(open_))
+    rolled = np.roll(open_, -turn)
+    edges = np.flatnonzero(np.diff(rolled.astype(int), append=1))
+    falls, rises = edges[0::2], edges[1::2]
+    widest = int(np.argmax(rises - falls))
+    if rises[widest] - falls[widest] < MIN_BLIND:
+        return 0.0, 360.0
+    return float((rises[widest] + 1 + turn) % 360), float((falls[widest] + 1 + turn) % 360)

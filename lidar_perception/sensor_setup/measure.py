@@ -1,0 +1,187 @@
+"""Everything that clouds say of the sensor that made them, and of how it is mounted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.sensor_setup.beams import Beams, azimuth_steps, beams_of, range_noise
+from lidar_perception.sensor_setup.coverage import Coverage, coverage_of
+from lidar_perception.sensor_setup.motion import heading_of, shift_between
+from lidar_perception.sensor_setup.mount import Mount, levelled, mount_of
+from lidar_perception.sensor_setup.scans import Intensity, Scan, intensity_of
+from lidar_perception.sensor_setup.timing import Timing, timing_of
+from lidar_perception.simulation.sensor import NAMES, Sensor, sensor_named
+from lidar_perception.types import InputError
+
+FLAT = 1.0          # degrees: a sensor whose returns are within this sees in one plane
+SAME_MODEL = 0.15   # degrees between beams, the median, of sensors of one model
+FEW_SCANS = 5       # fewer say little of what is the robot's and what is the place's
+SMALL_ROOM = 30.0   # metres: where nothing is farther, the room ends the range and not the sensor
+TURNED = 0.01       # degrees by which points of a beam scatter, from which on they have been moved
+AROUND = (-15.0, 5.0)  # degrees: where people are, in which the distance of beams is measured
+
+
+@dataclass(frozen=True)
+class Measured:
+    """All of it. numbers: of the scans among those of the recording; beams None where there are
+    none, then step and noise are NaN; step, step_error: degrees; twice: share of second returns;
+    noise: m, of noise_pieces; least, greatest: m, of what is not the robot's own; heading: degrees
+    from x to where the robot drives, and how much scans agree, None where it is not known; model:
+    the sensor of config/sensors with such beams, "" for none; model_error: degrees, the median
+    over the beams."""
+
+    source: str
+    numbers: tuple[int, ...]
+    scans: tuple[Scan, ...]
+    total: int
+    intensity: Intensity | None
+    beams: Beams | None
+    step: float
+    step_error: float
+    twice: float
+    noise: float
+    noise_pieces: int
+    coverage: Coverage
+    mount: Mount | None
+    heading: tuple[float, float] | None
+    least: float
+    greatest: float
+    timing: Timing
+    model: str
+    model_error: float
+
+    @property
+    def moved(self) -> bool:
+        """Whether points are not where the sensor saw them, as after a correction for motion."""
+        return self.beams is not None and float(np.median(self.beams.spread)) > TURNED
+
+    @property
+    def as_model(self) -> bool:
+        """Whether the model's beams are surer than the measured ones, which agree with them."""
+        return self.moved and bool(self.model) and self.beams is not None and (
+            sensor_named(self.model).rings == len(self.beams.elevations))
+
+    @property
+    def elevation_step(self) -> float:
+        """Degrees between neighbouring beams, the median where people are; NaN without beams."""
+        if self.beams is None:
+            return np.nan
+        up = self.beams.elevations
+        middle = up[(up >= AROUND[0]) & (up <= AROUND[1])]
+        apart = -np.diff(middle if len(middle) > 2 else up)
+        return float(np.median(apart)) if len(apart) else np.nan
+
+
+def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: int,
+             stamps_ns: np.ndarray | None) -> Measured:
+    """All that can be measured of scans, which are those of these numbers among total ones of the
+    source. InputError for what is of several drivers, or sees in one plane only."""
+    if len({scan.columns for scan in scans}) > 1:
+        raise InputError(f"{source} has clouds of several layouts ({', '.join(scans[0].columns)} "
+                         "and others), as of several sensors; give those of one")
+    up = np.concatenate([scan.elevation for scan in scans])
+    if np.subtract(*np.percentile(up, [99, 1])) < FLAT:
+        raise InputError(f"{source}: all points lie in one plane, as those of a 2D scanner; give "
+                         "clouds of a 3D LiDAR")
+    beams = beams_of(scans)
+    step, step_error, twice, noise, pieces = np.nan, np.nan, 0.0, np.nan, 0
+    if beams is not None:
+        step, step_error, twice = azimuth_steps(scans, beams)
+        noise, pieces = range_noise(scans, beams, step)
+    mount = mount_of(scans)
+    coverage = coverage_of(scans, beams, mount)
+    ranges = np.concatenate([np.linalg.norm(s.xyz, axis=1) for s in scans])
+    away = ranges[~_in_box(np.concatenate([s.xyz for s in scans]), coverage.box)]
+    least, greatest = np.percentile(away if len(away) else ranges, [0.02, 99.995])
+    model, error = model_of(beams)
+    return Measured(source, tuple(numbers), tuple(scans), total, intensity_of(scans), beams, step,
+                    step_error, twice, noise, pieces, coverage, mount,
+                    _heading(scans, numbers, mount), float(least), float(greatest),
+                    timing_of(scans, stamps_ns), model, error)
+
+
+def _in_box(xyz: np.ndarray, box: np.ndarray) -> Any:
+    if not len(box):
+        return np.zeros(len(xyz), bool)
+    return np.logical_and(xyz > box[:3], xyz < box[3:]).all(axis=1)
+
+
+def _heading(scans: Sequence[Scan], numbers: Sequence[int],
+             mount: Mount | None) -> tuple[float, float] | None:
+    """Of scans that follow each other; None without ground."""
+    if mount is None:
+        return None
+    shifts = []
+    for i in range(len(scans) - 1):
+        if numbers[i + 1] - numbers[i] == 1:
+            before, after = (levelled(scan.xyz, mount.roll, mount.pitch)
+                             + [0.0, 0.0, mount.height] for scan in scans[i:i + 2])
+            shift = shift_between(before, after)
+            shifts += [shift] if shift is not None else []
+    return heading_of(shifts)
+
+
+def model_of(beams: Beams | None) -> tuple[str, float]:
+    """Which of config/sensors has these beams, or most of them; "" for none. Degrees between its
+    beams and these, the median."""
+    best, error = "", SAME_MODEL
+    if beams is None:
+        return best, np.nan
+    for name in NAMES:
+        known = np.degrees(sensor_named(name).elevations)
+        if sensor_named(name).wander or not 0.75 <= len(beams.elevations) / len(known) <= 1.05:
+            continue
+        off = np.abs(beams.elevations[:, None] - known).min(axis=1)
+        if np.median(off) < error and np.percentile(off, 90) < 5 * SAME_MODEL:
+            best, error = name, float(np.median(off))
+    return best, error if best else np.nan
+
+
+def sensor_of(found: Measured) -> Sensor:
+    """What was measured as a sensor that can be simulated. What clouds do not say, such as the
+    divergence of the beams, is that of the model with the same beams, or the default. Without beams
+    there is a grid of the same view whose beams wander, with as many points in a turn."""
+    known = sensor_named(found.model) if found.model else None
+    fields: dict[str, Any] = {} if known is None else {name: getattr(known, name) for name in (
+        "divergence", "reach", "pulse", "max_range", "range_noise", "rate", "silent", "floor",
+        "fade")}
+    if np.isfinite(found.noise):
+        fields["range_noise"] = round(found.noise, 4)
+    if found.greatest > SMALL_ROOM or known is None:
+        fields["max_range"] = float(np.ceil(max(found.greatest, SMALL_ROOM)))
+    fields["rate"] = round(found.timing.rate, 2) if np.isfinite(found.timing.rate) else fields.get(
+        "rate", 10.0)
+    if found.mount is not None:
+        fields["height"] = round(found.mount.height, 3)
+    fields["min_range"] = float(np.floor(100 * min(found.least, fields["max_range"] / 2)) / 100)
+    if found.beams is None:
+        return _grid(found, fields)
+    # What one place hides is not what the robot hides: there only the ends of the view count.
+    places = found.coverage.still is False and len(found.scans) >= FEW_SCANS
+    fields["blocked"] = tuple(b for b in found.coverage.blocked if places or b[0] == 0)
+    up, lifts = np.radians(np.round(found.beams.elevations, 4)), np.round(found.beams.lifts, 4)
+    if found.as_model and known is not None:
+        up, lifts = np.array(known.elevations), np.array(known.lifts)
+    if lifts.any():
+        fields["lifts"] = tuple(lifts.tolist())
+    step = found.step if np.isfinite(found.step) else 0.2
+    return Sensor(tuple(up.tolist()), float(np.radians(step)), **fields)
+
+
+def _grid(found: Measured, fields: dict[str, Any]) -> Sensor:
+    up = np.concatenate([scan.elevation for scan in found.scans])
+    high, low = np.percentile(up, [99.8, 0.2])
+    points = np.median([len(scan.xyz) for scan in found.scans])
+    start, end = found.coverage.view
+    share = ((end - start) % 360 or 360) / 360
+    rows = int(np.clip(np.sqrt(points / share * (high - low) / 360), 4, 128))
+    gap = (high - low) / rows
+    columns = int(np.clip(points / share / rows, 90, 4000))
+    if share < 1:
+        fields["blocked"] = ((0, end, start),)
+    return Sensor(tuple(np.radians(high - gap * np.arange(rows)).tolist()), 2 * np.pi / columns,
+                  wander=float(np.radians(gap)), **fields)

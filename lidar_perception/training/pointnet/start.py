@@ -1,0 +1,96 @@
+"""How the training of a cluster network begins: its speed, and the clusters of all scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lidar_perception.detectors.pointnet.config import PointNetConfig
+from lidar_perception.detectors.pointnet.network import make_pointnet
+from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.pointnet.weights_file import weights_file
+from lidar_perception.training.augment import TrainingScene
+from lidar_perception.training.data import Batches, ReadScenes, Stream
+from lidar_perception.training.measuring import seconds_of_step, timed
+from lidar_perception.training.params import PointNetTraining
+from lidar_perception.training.pointnet.cut_scenes import CutScenes, cut
+from lidar_perception.training.pointnet.task import (
+    ClusterPreparation,
+    clusters_to_validate,
+    make_loss,
+    make_task,
+    validated,
+)
+from lidar_perception.training.run import Task
+
+MANY = 8  # frames that are validated to know the time of one, as the calibration takes its own
+
+
+@dataclass(frozen=True)
+class PointNetStart:
+    """See start.Network. config: of the network that is trained."""
+
+    config: PointNetConfig
+    cutting: str = "cutting clusters"
+
+    @property
+    def name(self) -> str:
+        """What is trained, for people."""
+        return f"PointNet {self.config.title}".strip()
+
+    def own_weights(self, params: PointNetTraining) -> Path:
+        """Of the improved network; of others as far as they fit."""
+        return weights_file(PointNetParams())
+
+    def most_cuts(self, params: PointNetTraining) -> int:
+        """All scenes are cut."""
+        return 10**9
+
+    def part(self, params: PointNetTraining) -> dict[str, Any]:
+        """Clusters are looked at wherever they are."""
+        return {}
+
+    def measured(self, params: PointNetTraining, scenes: Sequence[TrainingScene], held_out: Any,
+                 device: torch.device) -> tuple[float, float, float, float]:
+        """With clusters of these scenes."""
+        cut(scenes[0], self.config, params.data.min_points)  # compiles
+        cutting, parts = timed(
+            lambda: [cut(scene, self.config, params.data.min_points) for scene in scenes])
+        network = make_pointnet(self.config).to(device)
+        prepare = ClusterPreparation(self.config, params.augment)
+        step = seconds_of_step(network, make_loss(self.config, device), lambda: [
+            prepare(part, np.random.default_rng(i)) for i, part in enumerate(parts)],
+            params, device)
+        frame = clusters_to_validate(CutScenes(held_out, self.config, params.data.min_points), 0)
+        network.eval()
+        with torch.no_grad():
+            validated(network, [frame])
+            validating = timed(lambda: validated(network, [frame] * MANY))[0] / MANY
+        return cutting / len(scenes), step, step, validating
+
+    def cut(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any],
+            cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
+        """The clusters of all scenes."""
+        cuts = [CutScenes(source, self.config, params.data.min_points, cache / "clusters")
+                for source in (*sources, *held_out)]
+        return cuts, [range(len(source)) for source in cuts]
+
+    def gather(self, params: PointNetTraining, cut: tuple[list[Any], list], out: Path) -> None:
+        """Nothing."""
+
+    def scenes(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any],
+               cut: tuple[list[Any], list], out: Path) -> tuple[Stream, ReadScenes]:
+        """Of the clusters."""
+        learned, judged = cut[0][:len(sources)], cut[0][len(sources):]
+        return (Stream(tuple(learned), ClusterPreparation(self.config, params.augment),
+                       params.seed), ReadScenes(tuple(judged), clusters_to_validate))
+
+    def task(self, params: PointNetTraining, batches: Batches, held_out: ReadScenes, out: Path,
+             device: torch.device, about: dict[str, Any], commit: str, init: Path | None) -> Task:
+        """See make_task."""
+        return make_task(self.config, params, batches, held_out, out, device, about, commit, init)

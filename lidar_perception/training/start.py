@@ -1,0 +1,296 @@
+"""From what is asked for to a run: measure the machine, plan, say so, prepare, train."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+import torch
+
+from lidar_perception.detectors.checkpoint import network_of
+from lidar_perception.detectors.devices import chosen_device
+from lidar_perception.param_fields import with_values
+from lidar_perception.runs.files import make_folder, read_text, write_text
+from lidar_perception.runs.machine import cores
+from lidar_perception.runs.resuming import differences
+from lidar_perception.runs.terminal import duration, errors
+from lidar_perception.simulation.sensor import Sensor
+from lidar_perception.training.asked import Asked
+from lidar_perception.training.augment import TrainingScene
+from lidar_perception.training.data import Batches, ReadScenes, Stream
+from lidar_perception.training.loop import STATE, may_begin, train
+from lidar_perception.training.plan import (
+    STARTING,
+    Data,
+    Plan,
+    Speed,
+    plan,
+    preparing,
+    refitted,
+    training,
+)
+from lidar_perception.training.preparing import keep_all
+from lidar_perception.training.ranks import joined, rank, wait, world
+from lidar_perception.training.run import Progress, Task
+from lidar_perception.training.scenes import SimulatedScenes
+from lidar_perception.training.sources import about_data, sensor_of, training_scenes
+from lidar_perception.types import InputError
+
+RUN = "run.json"  # what was asked for, measured and planned at the first start
+BUDGET = 2.0      # hours
+PACKAGE = Path("package")  # in --init: the weights that come with the package
+ROOM = 0.5        # GB that stay free on the disk
+
+
+class Network(Protocol):
+    """What a network brings to a start; params are those of its training, planned or not."""
+
+    name: str
+    cutting: str  # what is cut from the scenes before the training
+
+    def own_weights(self, params: Any) -> Path:
+        """Those that come with the package. InputError if there are none."""
+
+    def most_cuts(self, params: Any) -> int:
+        """Scenes that are cut at most."""
+
+    def part(self, params: Any) -> dict[str, Any]:
+        """The parameters that train on a part of the range, which is quicker; none if there is no
+        such choice."""
+
+    def measured(self, params: Any, scenes: Sequence[TrainingScene], held_out: Any,
+                 device: torch.device) -> tuple[float, float, float, float]:
+        """Seconds to cut a scene, of a step on the part and on the whole of the range, without the
+        preparation's share of other cores, and to validate a frame."""
+
+    def cut(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any],
+            cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
+        """Sources of what is cut, and the numbers of each that are."""
+
+    def gather(self, params: Any, cut: tuple[list[Any], list], out: Path) -> None:
+        """Write into out what is made of all that was cut."""
+
+    def scenes(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any],
+               cut: tuple[list[Any], list], out: Path) -> tuple[Stream, ReadScenes]:
+        """What is learned from, and what is validated on."""
+
+    def task(self, params: Any, batches: Batches, held_out: ReadScenes, out: Path,
+             device: torch.device, about: dict[str, Any], commit: str, init: Path | None) -> Task:
+        """The task of the loop."""
+
+
+class Ended(NamedTuple):
+    """How a run ended, of so many steps, and what it was fed with."""
+
+    progress: Progress
+    steps: int
+    batches: Batches
+
+
+def check(asked: Asked, init: Path | None) -> None:
+    """InputError, before anything is made, for what cannot be."""
+    if asked.budget is not None and not 0 < asked.budget < math.inf:
+        raise InputError(f"--budget {asked.budget:g} must be a number of hours above 0")
+    if init is not None:
+        network_of(init)
+    if (asked.out / RUN).exists() and not asked.resume:
+        raise InputError(f"{asked.out} holds a training run already; give --resume to resume it, "
+                         "or another --out")
+    may_begin(asked.out, asked.resume)
+
+
+def scenes_of(asked: Asked, params: Any, sensor: Sensor) -> tuple[tuple, tuple]:
+    """Sources to train on and to validate on."""
+    return training_scenes(asked.data, asked.val, asked.split, asked.val_split, params.data,
+                           params.seed, sensor, getattr(params, "range", "") == "around")
+
+
+def start(network: Network, asked: Asked, params: Any,
+          commit: str = "") -> Ended | None:
+    """Train a network; how it ended, None in all but the first of several processes.
+
+    The first start measures this machine, plans and writes the plan to RUN; a resumed run keeps
+    it. All that is prepared is kept in the cache, so that a run may be killed at any time.
+    InputError for what cannot be used, before much is computed.
+    """
+    begun = time.monotonic()
+    init = network.own_weights(params) if asked.init == PACKAGE else asked.init
+    check(asked, init)
+    if not params.data.cache:
+        params = with_values(params, {"data.cache": str(asked.out / "scans")})
+    decided = bool(params.steps or params.epochs)
+    hours = asked.budget if decided else asked.budget or BUDGET
+    with joined(chosen_device(asked.device)) as device:
+        sensor = sensor_of(params.sensor, params.mount_height)
+        if rank() == 0:
+            make_folder(Path(params.data.cache))
+            _settle(network, asked, params, sensor, device)
+        wait()
+        given, params = params, _settled(network, asked, params, sensor)
+        sources, held_out = scenes_of(asked, params, sensor)
+        cut = network.cut(params, sources, held_out, Path(params.data.cache))
+        if rank() == 0:
+            try:
+                _prepare(network, asked, sources, held_out, cut)
+                network.gather(params, cut, asked.out)
+                if not decided:
+                    _refit(asked.out, begun, hours or BUDGET)
+            except KeyboardInterrupt:
+                errors.print("stopped; what is prepared is kept, --resume goes on")
+                raise
+        wait()
+        params = _settled(network, asked, given, sensor)
+        stream, to_validate = network.scenes(params, sources, held_out, cut, asked.out)
+        batches = Batches(stream, params.batch, asked.jobs, rank(), world())
+        about = {**about_data(asked.data, asked.val, stream, held_out, asked.init),
+                 "sensor": {"name": params.sensor, "height": sensor.height, "beams": sensor.rings}}
+        task = network.task(params, batches, to_validate, asked.out, device, about, commit,
+                            init)
+        until = math.inf if hours is None else begun + 3600 * hours
+        progress = train(task, params, asked.out, device, asked.resume, until)
+        return Ended(progress, params.steps, batches) if rank() == 0 else None
+
+
+def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
+            device: torch.device) -> None:
+    """Plan, say so and write it, unless that was done by an earlier start."""
+    path = asked.out / RUN
+    if path.is_file():
+        errors.print(f"resuming {asked.out}", soft_wrap=True)
+        return
+    errors.print("measuring this machine with a few scenes ...")
+    few = with_values(params, {"data.scans": 8, "data.val_scans": 1, "data.cache": ""})
+    sources, held_out = scenes_of(asked, few, sensor)
+    scenes, scan = _some_scenes((*sources, *held_out))
+    cut, step, whole, frame = network.measured(few, scenes, held_out[0], device)
+    speed = Speed(scan, cut, step, whole, frame, scenes[0].points.nbytes * 1.02e-6)
+    data = Data(_simulated(sources), _simulated(held_out), _recorded(sources), _recorded(held_out),
+                params.batch * world(), network.most_cuts(params))
+    given = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps,
+                 bool(network.part(params)))
+    chosen = plan(asked.budget or BUDGET, cores(), speed, data, given, params.epochs)
+    if params.validate_epochs and not params.validate_steps:
+        epoch = max(1, round((chosen.scans + data.recorded) / data.batch))
+        chosen = replace(chosen, validate_steps=params.validation_steps(epoch))
+    _require_room(Path(params.data.cache), params.data.cache_gb, chosen, speed)
+    _say(network, params, sensor, chosen, speed, data)
+    write_text(path, json.dumps({"asked": _decisive(asked, params, sensor), "plan": asdict(chosen),
+                                 "speed": asdict(speed), "data": asdict(data)}, indent=1))
+
+
+def _refit(out: Path, begun: float, hours: float) -> None:
+    """Plan fewer steps, before the first, where the preparation took longer than planned."""
+    if (out / STATE).exists():
+        return
+    known = json.loads(read_text(out / RUN, 10**6))
+    made, speed, data = Plan(**known["plan"]), Speed(**known["speed"]), Data(**known["data"])
+    passed = time.monotonic() - begun
+    slower = max(1.0, (passed - STARTING) / preparing(made, cores(), speed))
+    refit = refitted(made, 3600 * hours - passed, slower, speed, data)
+    if refit != made:
+        errors.print(f"the preparation took {duration(passed)}, {slower:.1f} times as long as "
+                     f"planned: {refit.steps} steps instead of {made.steps}", soft_wrap=True)
+        write_text(out / RUN, json.dumps({**known, "plan": asdict(refit)}, indent=1))
+
+
+def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor) -> Any:
+    """params with the plan of the first start. InputError where something else was asked for."""
+    path = asked.out / RUN
+    try:
+        known = json.loads(read_text(path, 10**6))
+        before, chosen = known["asked"], Plan(**known["plan"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"cannot read {path}: {error}; give another --out") from None
+    now = json.loads(json.dumps(_decisive(asked, params, sensor)))
+    if different := differences(before, now):
+        raise InputError(f"{asked.out} holds a run with {'; '.join(different[:3])}; resume it with "
+                         "the same settings, or give another --out")
+    values = {"steps": chosen.steps, "validate_steps": chosen.validate_steps,
+              "data.scans": chosen.scans, "data.val_scans": chosen.val_scans,
+              **(network.part(params) if chosen.part else {})}
+    return with_values(params, values)
+
+
+def _decisive(asked: Asked, params: Any, sensor: Sensor) -> dict[str, Any]:
+    return {**params.decisive(), "data": list(asked.data), "val": list(asked.val),
+            "split": str(asked.split or ""), "val_split": str(asked.val_split or ""),
+            "init": str(asked.init or ""), "sensor": asdict(sensor)}
+
+
+def _simulated(sources: Sequence[Any]) -> bool:
+    return any(isinstance(source, SimulatedScenes) for source in sources)
+
+
+def _recorded(sources: Sequence[Any]) -> int:
+    return sum(len(source) for source in sources if not isinstance(source, SimulatedScenes))
+
+
+def _some_scenes(sources: Sequence[Any]) -> tuple[list[TrainingScene], float]:
+    """Up to four scenes, and the seconds to simulate one with its share of the street; 0 where
+    nothing is simulated. InputError where none can be read."""
+    for source in sources:
+        if isinstance(source, SimulatedScenes):
+            many = source.per_street
+            source.made(0)  # so that what is compiled is there
+            begun = time.perf_counter()
+            made = [source.made(i) for i in range(many, many + min(many, 4))]
+            return made, (time.perf_counter() - begun) / len(made)
+    scenes: list[TrainingScene] = []
+    reason: InputError | None = None
+    for source in sources:
+        for i in range(min(len(source), 50)):
+            try:
+                scenes.append(source.scene(i))
+            except InputError as error:
+                reason = error
+            if len(scenes) == 4:
+                return scenes, 0.0
+    if not scenes:
+        raise reason or InputError("there is no scene")
+    return scenes, 0.0
+
+
+def _require_room(cache: Path, most_gb: float, chosen: Plan, speed: Speed) -> None:
+    needed = min((chosen.scans + chosen.val_scans) * speed.scan_mb / 1e3, most_gb)
+    free = shutil.disk_usage(cache).free / 1e9
+    if needed + ROOM > free:
+        raise InputError(f"{cache} needs {needed:.1f} GB for scans, and {free:.1f} GB are free: "
+                         "give fewer --data-scans, a smaller --data-cache-gb or another --out")
+
+
+def _say(network: Network, params: Any, sensor: Sensor, chosen: Plan, speed: Speed,
+         data: Data) -> None:
+    scenes = " and ".join(text for count, text in (
+        (chosen.scans, f"{chosen.scans} scans of {params.sensor} at {sensor.height:g} m"),
+        (data.recorded, f"{data.recorded} recorded scenes")) if count)
+    part = network.part(params) if chosen.part else {}
+    where = f" up to {part['ahead']:g} m ahead and {part['aside']:g} m aside" if part else ""
+    errors.print(f"{network.name}: {scenes}, {chosen.steps} steps of {data.batch} scenes{where}, "
+                 f"validated every {chosen.validate_steps} steps on "
+                 f"{chosen.val_scans + data.val_recorded} other scenes", soft_wrap=True)
+    steps, validating = training(chosen, speed, data)
+    only_cut = replace(chosen, scans=0, val_scans=0)
+    cutting = preparing(only_cut, cores(), speed)
+    parts = {"simulating": preparing(chosen, cores(), speed) - cutting, network.cutting: cutting,
+             "steps": steps, "validation": validating}
+    errors.print(f"about {duration(sum(parts.values()))} on {cores()} cores as busy as now, torch "
+                 f"with {torch.get_num_threads()} threads: "
+                 + ", ".join(f"{name} {duration(value)}" for name, value in parts.items()),
+                 soft_wrap=True)
+    errors.print(f"kept in {params.data.cache}; --resume goes on after a stop or a kill",
+                 soft_wrap=True)
+
+
+def _prepare(network: Network, asked: Asked, sources: Sequence[Any], held_out: Sequence[Any],
+             cut: tuple[list[Any], list]) -> None:
+    streets = [s for s in (*sources, *held_out) if isinstance(s, SimulatedScenes)]
+    keep_all(streets, [range(len(s)) for s in streets], asked.jobs, "simulating")
+    keep_all(*cut, asked.jobs, network.cutting)
+
+

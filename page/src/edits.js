@@ -1,0 +1,169 @@
+// What a person can do to tracks: each becomes one action. A box that is dragged, or moved by a
+// held key, is a draft until it is let go.
+
+import { act, nextUncertain } from "./api.js";
+import { moveAlong, turnBy } from "./boxmath.js";
+import { goTo } from "./cloud.js";
+import { say, sayError } from "./messages.js";
+import { boxOf, changed, classOf, select, selectedBox, selectedTrack, store } from "./store.js";
+
+export const STEP = 0.05, TURN = Math.PI / 180; // metres, radians, of one arrow key
+
+const editable = () => store.mode === "label";
+
+function chosen() {
+  const track = selectedTrack();
+  if (!track) say("Select a track first: click its box, or its row in the list.");
+  return track;
+}
+
+export function setDraft(box) {
+  const track = selectedTrack();
+  if (!track || !editable()) return;
+  store.draft = { track: track.id, frame: store.frame, box };
+  changed("draft");
+}
+
+export function dropDraft() {
+  if (!store.draft) return;
+  store.draft = null;
+  changed("draft");
+}
+
+/** Send what was dragged. Where it cannot be saved, the box goes back. */
+export async function commit() {
+  const { draft } = store;
+  if (!draft || draft.sent) return;
+  draft.sent = true;
+  await act({ do: "box", track: draft.track, frame: draft.frame, box: draft.box });
+  if (store.draft === draft) dropDraft();
+}
+
+/** A fine step of the selected box along its own axes, or a turn; commit() when the key is up. */
+export function nudge({ forward = 0, left = 0, up = 0, turn = 0 }) {
+  const box = selectedBox()?.box;
+  if (box) setDraft(turnBy(moveAlong(box, forward * STEP, left * STEP, up * STEP), turn * TURN));
+}
+
+export async function setNumbers(box) {
+  const track = chosen();
+  if (track) await act({ do: "box", track: track.id, frame: store.frame, box });
+}
+
+async function onTrack(action) {
+  const track = editable() && chosen();
+  return track ? act({ ...action, track: track.id }) : false;
+}
+
+/** accept, reject or reopen; then on to the next uncertain one, where that is wanted. */
+export async function decide(verb) {
+  const track = editable() && chosen();
+  if (!track || !await act({ do: verb, track: track.id })) return;
+  if (store.advance && verb !== "reopen") await next();
+}
+
+export async function next() {
+  try {
+    const { track, frame } = await nextUncertain(store.selected);
+    if (track === null) {
+      say("Nothing is left to decide.");
+      return;
+    }
+    if (!store.tracks.get(track)?.byFrame.has(store.frame)) await goTo(frame);
+    select(track);
+    changed("focus");
+  } catch (error) {
+    sayError(error.message);
+  }
+}
+
+export function setClass(name) {
+  if (!selectedTrack()) {
+    store.newClass = name;
+    say(`New boxes and seeds are now of class ${name}.`);
+    changed("tool");
+    return null;
+  }
+  return onTrack({ do: "class", class: name });
+}
+
+export const classToAdd = () => store.newClass
+  ?? (classOf("Pedestrian") ? "Pedestrian" : store.drive.classes[0]?.name ?? "Pedestrian");
+
+export const snap = (to) => onTrack({ do: "snap", frame: store.frame, to });
+export const removeBox = () => onTrack({ do: "remove_box", frame: store.frame });
+export const split = () => onTrack({ do: "split", frame: store.frame });
+
+/** This frame's box of the selected track also in the next frame; then go there. */
+export async function copyOn() {
+  const track = chosen(), from = store.frame;
+  if (!track || from + 1 >= store.drive.frames.length) return;
+  if (await act({ do: "copy", track: track.id, from, to: from + 1 })) await goTo(from + 1);
+}
+
+/** Give this frame's box back to the interpolation between the boxes before and after it. */
+export async function interpolate() {
+  const track = chosen();
+  if (!track) return;
+  const frames = [...track.byFrame].filter(([frame, { kind }]) => kind === "key"
+    && frame !== store.frame).map(([frame]) => frame);
+  const before = Math.max(...frames.filter((frame) => frame < store.frame));
+  const after = Math.min(...frames.filter((frame) => frame > store.frame));
+  if (!Number.isFinite(before) || !Number.isFinite(after)) {
+    say("Interpolating needs a box set by hand before this frame and one after it.");
+    return;
+  }
+  await act({ do: "interpolate", track: track.id, frame: store.frame });
+}
+
+export async function merge() {
+  const track = chosen();
+  if (!track) return;
+  if (store.also.size === 0) {
+    say("Select a second track with Ctrl and a click, then merge.");
+    return;
+  }
+  for (const other of [...store.also]) {
+    if (!await act({ do: "merge", tracks: [track.id, other] })) return;
+  }
+  select(track.id);
+}
+
+export async function seedAt(xyz) {
+  const before = new Set(store.tracks.keys());
+  if (!await act({ do: "seed", frame: store.frame, xyz, class: classToAdd() })) return;
+  selectNew(before);
+}
+
+export async function addAt([x, y]) {
+  const name = classToAdd(), size = classOf(name)?.size ?? [1, 1, 1.7];
+  const z = store.cloud.floor + size[2] / 2, before = new Set(store.tracks.keys());
+  const box = [x, y, z, ...size, 0];
+  if (await act({ do: "add", frame: store.frame, box, class: name })) selectNew(before);
+}
+
+function selectNew(before) {
+  const added = [...store.tracks.values()].filter((track) => !before.has(track.id)
+    && boxOf(track)).sort((a, b) => (b.source === "click") - (a.source === "click") || a.id - b.id);
+  if (added.length) select(added[0].id);
+}
+
+export async function checkFrame() {
+  if (!editable()) return;
+  const now = !store.checked.has(store.frame);
+  if (await act({ do: "check", frame: store.frame, checked: now }) && now) await goTo(store.frame + 1);
+}
+
+export const undo = () => editable() && (store.canUndo ? act({ do: "undo" }) : say("Nothing to undo."));
+export const redo = () => editable() && (store.canRedo ? act({ do: "redo" }) : say("Nothing to redo."));
+export const propose = () => act({ do: "propose" });
+
+/** The next or the last frame in which the selected track has a box set by hand. */
+export function toKey(step) {
+  const track = selectedTrack();
+  if (!track) return;
+  const frames = [...track.byFrame].filter(([, { kind }]) => kind === "key").map(([frame]) => frame);
+  const onwards = frames.filter((frame) => (frame - store.frame) * step > 0);
+  if (onwards.length) goTo(step > 0 ? Math.min(...onwards) : Math.max(...onwards));
+  else say(`No box set by hand ${step > 0 ? "after" : "before"} this frame.`);
+}

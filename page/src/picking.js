@@ -1,0 +1,65 @@
+// What lies under the pointer: a point of the cloud, or a box.
+
+import * as THREE from "three";
+import { rayBox } from "./boxmath.js";
+import { shownBoxes } from "./colours.js";
+import { camera, renderer } from "./scene.js";
+import { store } from "./store.js";
+
+const REACH = 9; // pixels round the pointer in which a point is taken
+const ahead = new THREE.Vector3(), matrix = new THREE.Matrix4();
+
+/** The ray of a place on the page: {origin, direction}. */
+export function rayAt(clientX, clientY) {
+  const area = renderer.domElement.getBoundingClientRect();
+  ahead.set((clientX - area.left) / area.width * 2 - 1, 1 - (clientY - area.top) / area.height * 2, 0.5)
+    .unproject(camera).sub(camera.position).normalize();
+  return { origin: camera.position.toArray(), direction: ahead.toArray() };
+}
+
+/** Where a point of the sensor's frame is in the picture, pixels; null behind the camera. */
+export function project(x, y, z) {
+  const area = renderer.domElement;
+  ahead.set(x, y, z).applyMatrix4(camera.matrixWorldInverse);
+  if (ahead.z > -camera.near) return null;
+  ahead.applyMatrix4(camera.projectionMatrix);
+  return [(ahead.x + 1) / 2 * area.clientWidth, (1 - ahead.y) / 2 * area.clientHeight];
+}
+
+/** Index of the point of the cloud that is seen under the pointer, or -1. All points are put
+ * through the camera's matrix, which costs less than a tree of a cloud that is new each frame; of
+ * those within reach the nearest to the eye wins, unless one little behind is nearer to the
+ * pointer. */
+export function pointAt(clientX, clientY) {
+  const { cloud } = store;
+  if (!cloud) return -1;
+  const area = renderer.domElement.getBoundingClientRect();
+  const px = (clientX - area.left) / area.width * 2 - 1, py = 1 - (clientY - area.top) / area.height * 2;
+  const m = matrix.multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse).elements;
+  const { xyz, count } = cloud, halfWidth = area.width / 2, halfHeight = area.height / 2;
+  let best = -1, least = Infinity;
+  for (let i = 0, k = 0; i < count; i++, k += 3) {
+    const x = xyz[k], y = xyz[k + 1], z = xyz[k + 2];
+    const w = m[3] * x + m[7] * y + m[11] * z + m[15];
+    if (w < camera.near) continue;
+    const dx = ((m[0] * x + m[4] * y + m[8] * z + m[12]) / w - px) * halfWidth;
+    if (dx > REACH || dx < -REACH) continue;
+    const dy = ((m[1] * x + m[5] * y + m[9] * z + m[13]) / w - py) * halfHeight;
+    const off = dx * dx + dy * dy;
+    if (off > REACH * REACH) continue;
+    const cost = w * (1 + off / (REACH * REACH)) * (cloud.ground[i] ? 1.15 : 1);
+    if (cost < least) { least = cost; best = i; }
+  }
+  return best;
+}
+
+/** The track whose box the pointer meets first, the selected one before all others: id or null. */
+export function trackAt(clientX, clientY) {
+  const { origin, direction } = rayAt(clientX, clientY);
+  let best = null, least = Infinity;
+  for (const { track, box } of shownBoxes()) {
+    const along = rayBox(origin, direction, box);
+    if (along !== null && along < least) { least = along; best = track.id; }
+  }
+  return best;
+}

@@ -1,0 +1,103 @@
+// The pointer in the 3D view: select, drag, click a seed, add a box.
+
+import { rayBox } from "./boxmath.js";
+import { addAt, seedAt } from "./edits.js";
+import { say } from "./messages.js";
+import { dragBody } from "./overlay.js";
+import { pointAt, rayAt, trackAt } from "./picking.js";
+import { controls, mark, renderer } from "./scene.js";
+import { changed, on, select, selectedBox, store } from "./store.js";
+
+const canvas = renderer.domElement;
+const STILL = 4; // pixels; less is a click, more turns the camera
+
+let down = null, hovering = 0;
+
+// Before the camera's own listeners, so that a box can be dragged instead.
+canvas.addEventListener("pointerdown", (event) => {
+  canvas.focus({ preventScroll: true });
+  if (event.button !== 0) return;
+  down = [event.clientX, event.clientY];
+  const box = selectedBox()?.box;
+  const plain = !event.ctrlKey && !event.metaKey && !event.shiftKey;
+  if (store.mode !== "label" || store.tool !== "select" || !box || !plain) return;
+  const { origin, direction } = rayAt(event.clientX, event.clientY);
+  if (rayBox(origin, direction, box) === null) return;
+  if (dragBody(canvas, event)) event.stopImmediatePropagation();
+}, { capture: true });
+
+canvas.addEventListener("pointerup", (event) => {
+  if (!down || event.button !== 0) return;
+  const moved = Math.hypot(event.clientX - down[0], event.clientY - down[1]);
+  down = null;
+  if (moved <= STILL) click(event);
+});
+
+function click(event) {
+  if (store.tool === "select") {
+    const id = trackAt(event.clientX, event.clientY);
+    select(id, { more: event.ctrlKey || event.metaKey });
+    return;
+  }
+  const index = pointAt(event.clientX, event.clientY);
+  if (index < 0) {
+    say("There is no point here; click on one of the object's points.");
+    return;
+  }
+  const xyz = [...store.cloud.xyz.subarray(3 * index, 3 * index + 3)];
+  if (store.tool === "seed") seedAt(xyz);
+  else addAt(xyz);
+}
+
+canvas.addEventListener("pointermove", (event) => {
+  if (event.buttons || hovering) return;
+  hovering = requestAnimationFrame(() => {
+    hovering = 0;
+    hover(event);
+  });
+});
+canvas.addEventListener("pointerleave", () => { mark(0); setHover(null); });
+
+function hover(event) {
+  if (store.tool === "seed") {
+    const index = pointAt(event.clientX, event.clientY);
+    mark(index < 0 ? 0 : store.cloud.cluster[index]);
+    return;
+  }
+  const id = store.tool === "select" ? trackAt(event.clientX, event.clientY) : null;
+  setHover(id);
+  canvas.style.cursor = id === null ? "" : id === store.selected && store.mode === "label"
+    ? "move" : "pointer";
+}
+
+function setHover(id) {
+  if (id === store.hover) return;
+  store.hover = id;
+  changed("hover");
+}
+
+export function setTool(tool) {
+  store.tool = store.mode === "view" ? "select" : tool;
+  changed("tool");
+}
+
+/** What a click would do in the middle of the view, for who works without a mouse. */
+export function useCentre() {
+  const area = canvas.getBoundingClientRect();
+  click({ clientX: area.left + area.width / 2, clientY: area.top + area.height / 2 });
+}
+
+on("tool", () => {
+  mark(0);
+  canvas.style.cursor = store.tool === "select" ? "" : "crosshair";
+  canvas.dataset.tool = store.tool;
+  document.getElementById("cross").toggleAttribute("hidden", store.tool === "select");
+  controls.update();
+});
+
+canvas.addEventListener("dblclick", (event) => {
+  const index = pointAt(event.clientX, event.clientY);
+  if (index < 0 || store.tool !== "select") return;
+  controls.target.fromArray(store.cloud.xyz, 3 * index);
+  controls.update();
+});

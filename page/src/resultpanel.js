@@ -1,0 +1,53 @@
+// The panel of view mode: which boxes are shown, from which score on, and what is wrong.
+
+import { element } from "./dom.js";
+import { FALSE, MISSED, reload, resultCounts } from "./results.js";
+import { changed, on, store } from "./store.js";
+
+const LAYERS = [["labels", "Labels", "#94a3b8"], ["errors", "Missed and false", MISSED],
+                ["tracks", "Tracks", null], ["trails", "Ways of tracks", null]];
+const panel = document.getElementById("results");
+
+function check(name, title, colour, value, set) {
+  const box = element("input", { type: "checkbox", checked: value, "data-layer": name,
+    onchange: () => set(box.checked) });
+  return element("label", { class: "layer" }, box,
+    element("i", { class: "dot", style: colour ? `background:${colour}` : "" }), title);
+}
+
+function build() {
+  if (store.mode !== "view") return;
+  const layers = LAYERS.map(([name, title, colour]) => check(name, title, colour, store.layers[name],
+    (value) => { store.layers[name] = value; changed("layers"); }));
+  const sources = [...store.sources].map(([name, source]) => check(name, name, source.colour,
+    source.shown, (value) => { source.shown = value; changed("layers"); }));
+  const number = element("output", {}, store.minScore.toFixed(2));
+  const slider = element("input", { type: "range", id: "score", min: 0, max: 1, step: 0.01,
+    value: store.minScore, "aria-label": "Least score", oninput: () => {
+      store.minScore = Number(slider.value);
+      number.textContent = store.minScore.toFixed(2);
+      changed("layers");
+    }, onchange: reload });
+  panel.replaceChildren(element("h2", {}, "Shown"), ...layers,
+    element("h2", {}, "Detections"), ...(sources.length ? sources
+      : [element("p", { class: "hint" }, "None in this recording.")]),
+    element("div", { class: "slider" }, element("span", {}, "Score from"), slider, number),
+    element("h2", {}, "This frame"), element("div", { id: "counts" }));
+  count();
+}
+
+function count() {
+  const area = document.getElementById("counts");
+  if (!area) return;
+  const { source, labels, missed, found, false: wrong } = resultCounts();
+  const row = (title, value, colour) => element("div", { class: "count-row" },
+    element("span", {}, title), element("b", { style: colour ? `color:${colour}` : "" },
+      value === null ? "–" : String(value)));
+  area.replaceChildren(row("labels", labels), row(source ? `by ${source}` : "detections", found),
+    row("missed", missed, missed ? MISSED : ""), row("false", wrong, wrong ? FALSE : ""));
+}
+
+export function openResults() {
+  on("drive sources", build);
+  on("results layers", count);
+}

@@ -1,0 +1,213 @@
+// The 3D view: one cloud, the boxes, a camera. It draws when something has changed, and only then.
+
+import * as THREE from "three";
+import { OrbitControls } from "three/addons/controls/OrbitControls.js";
+import { paint, theme } from "./colours.js";
+import { on, selectedBox, store } from "./store.js";
+
+// Points drawn while the camera moves; their order is random.
+export const limits = { thinned: 30_000 };
+const REST_MS = 160;
+const BACKGROUND = { dark: 0x11151c, light: 0xf5f7fa };
+const RINGS = [10, 20, 40, 60, 80];
+
+const canvas = document.getElementById("scene");
+export const renderer = new THREE.WebGLRenderer({ canvas, antialias: !drawsInSoftware() });
+export const scene = new THREE.Scene();
+export const camera = new THREE.PerspectiveCamera(50, 1, 0.3, 600);
+camera.up.set(0, 0, 1);
+export const controls = new OrbitControls(camera, canvas);
+controls.zoomToCursor = true;
+controls.enableDamping = false;
+controls.maxPolarAngle = Math.PI * 0.495;
+controls.minDistance = 1;
+controls.maxDistance = 250;
+
+const material = new THREE.ShaderMaterial({
+  uniforms: { size: { value: 2 } },
+  vertexShader: `attribute vec4 colour; uniform float size; varying vec3 shade;
+    void main() { shade = colour.rgb; gl_Position = projectionMatrix * modelViewMatrix
+      * vec4(position, 1.0); gl_PointSize = size * clamp(28.0 / gl_Position.w, 1.0, 2.5); }`,
+  fragmentShader: "varying vec3 shade; void main() { gl_FragColor = vec4(shade, 1.0); }",
+});
+const points = new THREE.Points(new THREE.BufferGeometry(), material);
+points.frustumCulled = false;
+scene.add(points);
+const rings = new THREE.LineSegments(new THREE.BufferGeometry(),
+                                     new THREE.LineBasicMaterial({ transparent: true }));
+rings.frustumCulled = false;
+scene.add(rings);
+
+/** Whether there is no GPU; smooth edges then cost two thirds of the time of a picture. */
+function drawsInSoftware() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  const known = gl?.getExtension("WEBGL_debug_renderer_info");
+  const name = known ? gl.getParameter(known.UNMASKED_RENDERER_WEBGL) : "";
+  gl?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software/i.test(name);
+}
+
+/** Called after each picture, for what is laid over it. */
+export const afterDrawing = [];
+export const drawn = { ms: 0, pictures: 0, points: 0 }; // the last picture, for measuring
+
+let asked = false, resting = 0, still = true, shownCloud = null, marked = 0;
+
+export function draw() {
+  if (asked) return;
+  asked = true;
+  requestAnimationFrame(() => {
+    asked = false;
+    const start = performance.now();
+    renderer.render(scene, camera);
+    for (const then of afterDrawing) then();
+    drawn.ms = performance.now() - start;
+    drawn.pictures += 1;
+    drawn.points = Math.min(points.geometry.drawRange.count, store.cloud?.count ?? 0);
+  });
+}
+
+function moving() {
+  if (still) thin(true);
+  clearTimeout(resting);
+  resting = setTimeout(() => thin(false), REST_MS);
+  draw();
+}
+controls.addEventListener("change", moving);
+
+function thin(yes) {
+  still = !yes;
+  const all = store.cloud?.count ?? 0;
+  points.geometry.setDrawRange(0, yes || store.playing ? Math.min(limits.thinned, all) : all);
+  draw();
+}
+
+function setCloud() {
+  const { cloud } = store;
+  if (!cloud) return;
+  if (cloud !== shownCloud) {
+    shownCloud = cloud;
+    marked = 0;
+    points.geometry.dispose();
+    points.geometry = new THREE.BufferGeometry();
+    points.geometry.setAttribute("position", new THREE.BufferAttribute(cloud.xyz, 3));
+    points.geometry.setAttribute("colour", new THREE.BufferAttribute(
+      new Uint8Array(4 * cloud.count), 4, true));
+  }
+  repaint();
+  setRings(cloud.floor);
+  moving(); // a thinned picture at once, then all
+}
+
+function repaint() {
+  const colour = points.geometry.getAttribute("colour");
+  if (!colour || !store.cloud) return;
+  paint(colour.array, store.cloud, store.colour, marked);
+  colour.needsUpdate = true;
+  draw();
+}
+
+/** Show one cluster of the cloud apart from the others; 0 for none. */
+export function mark(cluster) {
+  if (cluster === marked) return;
+  marked = cluster;
+  repaint();
+}
+
+function setRings(floor) {
+  const at = [];
+  for (const radius of RINGS) {
+    const steps = 96;
+    for (let k = 0; k < steps; k++) {
+      for (const end of [k, k + 1]) {
+        const angle = end / steps * 2 * Math.PI;
+        at.push(radius * Math.cos(angle), radius * Math.sin(angle), floor);
+      }
+    }
+  }
+  at.push(0, 0, floor, 3, 0, floor); // the way ahead
+  rings.geometry.setAttribute("position", new THREE.Float32BufferAttribute(at, 3));
+}
+
+function setTheme() {
+  const which = theme();
+  scene.background = new THREE.Color(BACKGROUND[which]);
+  rings.material.color.set(which === "dark" ? 0x6b7a94 : 0x8a97ab);
+  rings.material.opacity = which === "dark" ? 0.35 : 0.5;
+  repaint();
+}
+
+function resize() {
+  const { clientWidth: width, clientHeight: height } = canvas.parentElement;
+  if (!width || !height) return;
+  const ratio = Math.min(devicePixelRatio, 2);
+  renderer.setPixelRatio(ratio);
+  renderer.setSize(width, height, false);
+  material.uniforms.size.value = 1.6 * ratio;
+  camera.aspect = width / height;
+  camera.updateProjectionMatrix();
+  draw();
+}
+
+/** The view one begins with: from behind the sensor, ahead. */
+export function resetView() {
+  camera.position.set(-16, 0, 12);
+  controls.target.set(8, 0, -1);
+  controls.update();
+  draw();
+}
+
+/** Look at a place from another, both in the sensor's frame. */
+export function lookAt(place, from) {
+  controls.target.fromArray(place);
+  camera.position.fromArray(from);
+  controls.update();
+  camera.updateMatrixWorld();
+  draw();
+}
+
+export function topView() {
+  const { target } = controls;
+  camera.position.set(target.x - 0.01, target.y, target.z + Math.max(20, distance()));
+  controls.update();
+}
+
+/** Look at the selected box from where one is, near enough to work on it. */
+export function focus() {
+  const box = selectedBox()?.box;
+  if (!box) return;
+  const target = new THREE.Vector3(box[0], box[1], box[2]);
+  const away = camera.position.clone().sub(controls.target);
+  away.setLength(Math.max(5, 2.6 * Math.max(box[3], box[4], box[5])));
+  away.z = Math.max(away.z, 0.45 * away.length());
+  controls.target.copy(target);
+  camera.position.copy(target.clone().add(away));
+  controls.update();
+}
+
+const distance = () => camera.position.distanceTo(controls.target);
+
+/** Move the camera along the ground by shares of its distance, turn it, or go nearer. */
+export function fly(right, ahead, turn = 0, nearer = 1) {
+  const away = camera.position.clone().sub(controls.target);
+  const level = new THREE.Vector3(-away.x, -away.y, 0).normalize();
+  const side = new THREE.Vector3(level.y, -level.x, 0);
+  controls.target.addScaledVector(level, ahead * distance()).addScaledVector(side, right * distance());
+  away.applyAxisAngle(camera.up, turn).multiplyScalar(nearer);
+  camera.position.copy(controls.target).add(away);
+  controls.update();
+}
+
+/** Start drawing. */
+export function openScene() {
+  new ResizeObserver(resize).observe(canvas.parentElement);
+  matchMedia("(prefers-color-scheme: light)").addEventListener("change", setTheme);
+  on("theme", setTheme);
+  on("cloud", setCloud);
+  on("colour", repaint);
+  on("playing", () => thin(!still));
+  on("tracks draft", () => { if (store.colour === "class") repaint(); });
+  setTheme();
+  resize();
+  resetView();
+}

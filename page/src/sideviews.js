@@ -1,0 +1,201 @@
+// Top, side and front of the selected box, level and along its own axes: the points near it, its
+// faces to drag, its body to move, a ring to turn. Each view keeps still while something is dragged.
+
+import { moveFace, moveAlong, toLocal, turnBy } from "./boxmath.js";
+import { theme } from "./colours.js";
+import { element, svg } from "./dom.js";
+import { setDraft } from "./edits.js";
+import { follow } from "./overlay.js";
+import { on, selectedBox, selectedTrack, store } from "./store.js";
+
+// Which local axis goes right and which up, with its sign: 0 length, 1 width, 2 height.
+const VIEWS = [
+  { name: "top", title: "Top", right: 0, up: 1, flip: 1, turns: true },
+  { name: "side", title: "Side", right: 0, up: 2, flip: 1 },
+  { name: "front", title: "Front", right: 1, up: 2, flip: -1 }, // seen from ahead
+];
+const NAMES = "xyz";
+const POINTS = { dark: ["#7f8ea8", "#ffffff", "#3b4558"], light: ["#8794a8", "#0b1220", "#c3ccd8"] };
+const MARGIN = 0.6, KNOB = 20; // metres round the box; pixels from the front to the knob
+
+let anchor = null, near = [], zoom = 1;
+
+function build(view) {
+  view.canvas = element("canvas");
+  view.layer = svg("svg", { class: "handles" });
+  view.ring = svg("line", { class: "stalk" });
+  view.rect = svg("rect", { class: "body", "data-handle": "move" }, svg("title", {}, "Drag to move"));
+  view.front = svg("line", { class: "frontline" });
+  view.group = svg("g", {}, view.rect, view.front);
+  view.handles = [];
+  for (const [axis, vertical] of [[view.right, false], [view.up, true]]) {
+    for (const sign of [1, -1]) {
+      const name = `${sign > 0 ? "+" : "-"}${NAMES[axis]}`;
+      const grip = svg("line", { class: "edge", "data-handle": name });
+      const dot = svg("circle", { class: "handle face", r: 4.5, "data-handle": name });
+      view.group.append(grip, dot);
+      view.handles.push({ axis, sign, vertical, grip, dot });
+    }
+  }
+  view.knob = view.turns ? svg("circle", { class: "handle turn", r: 6, "data-handle": "yaw" },
+                               svg("title", {}, "Drag to turn")) : null;
+  if (view.knob) view.group.append(view.ring, view.knob);
+  view.layer.append(view.group);
+  view.size = element("span", { class: "measure" });
+  view.panel = element("figure", { class: "sideview", "data-view": view.name }, view.canvas,
+                       view.layer, element("figcaption", {}, view.title), view.size);
+  view.layer.addEventListener("pointerdown", (event) => grab(view, event));
+  view.panel.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    zoom = Math.min(6, Math.max(0.25, zoom * Math.exp(-event.deltaY / 600)));
+    redraw();
+  }, { passive: false });
+  return view.panel;
+}
+
+/** Metres to pixels: the box with a margin fills the view. */
+function scaleOf(view, width, height) {
+  const along = anchor[3 + view.right] + 2 * MARGIN, across = anchor[3 + view.up] + 2 * MARGIN;
+  return zoom * Math.min(width / along, height / across);
+}
+
+/** Points in a block round the anchor, in its axes: [u, v, w, ground] a point. */
+function gather() {
+  near = [];
+  const { cloud } = store;
+  if (!cloud || !anchor) return;
+  const reach = Math.hypot(anchor[3], anchor[4]) / 2 + 6, { xyz } = cloud;
+  for (let i = 0; i < cloud.count; i++) {
+    const x = xyz[3 * i], y = xyz[3 * i + 1];
+    if (Math.abs(x - anchor[0]) > reach || Math.abs(y - anchor[1]) > reach) continue;
+    const at = toLocal(anchor, x, y, xyz[3 * i + 2]);
+    if (Math.abs(at[2]) < anchor[5] / 2 + 3) near.push([...at, cloud.ground[i]]);
+  }
+}
+
+function grab(view, event) {
+  const name = event.target.dataset?.handle, start = selectedBox()?.box;
+  if (!name || !start || event.button !== 0 || store.mode !== "label") return;
+  event.preventDefault();
+  const area = view.layer.getBoundingClientRect(), scale = scaleOf(view, area.width, area.height);
+  const held = anchor.slice(), first = [event.clientX, event.clientY];
+  const turned = start[6] - held[6];
+  follow(event.target, event, (e) => {
+    let across = (e.clientX - first[0]) / scale * view.flip, up = -(e.clientY - first[1]) / scale;
+    if (name === "yaw") {
+      const u = (e.clientX - area.left - area.width / 2) / scale;
+      const v = -(e.clientY - area.top - area.height / 2) / scale;
+      const centre = toLocal(held, ...start.slice(0, 3));
+      setDraft(turnBy(start, Math.atan2(v - centre[1], u - centre[0]) - turned));
+      return;
+    }
+    if (view.turns) { // into the axes of the box, which may be turned in this view
+      const c = Math.cos(turned), s = Math.sin(turned);
+      [across, up] = [c * across + s * up, -s * across + c * up];
+    }
+    const moved = [0, 0, 0];
+    moved[view.right] = across;
+    moved[view.up] = up;
+    if (name === "move") {
+      setDraft(moveAlong(start, ...moved));
+    } else {
+      const axis = NAMES.indexOf(name[1]), sign = name[0] === "+" ? 1 : -1;
+      setDraft(moveFace(start, axis, sign, moved[axis] * sign));
+    }
+  });
+}
+
+function inside(point, box) {
+  const c = Math.cos(box[6] - anchor[6]), s = Math.sin(box[6] - anchor[6]);
+  const centre = toLocal(anchor, box[0], box[1], box[2]);
+  const u = point[0] - centre[0], v = point[1] - centre[1];
+  return Math.abs(c * u + s * v) <= box[3] / 2 && Math.abs(-s * u + c * v) <= box[4] / 2
+    && Math.abs(point[2] - centre[2]) <= box[5] / 2;
+}
+
+function drawView(view, box) {
+  const { clientWidth: width, clientHeight: height } = view.panel;
+  const ratio = Math.min(devicePixelRatio, 2), { canvas } = view;
+  if (canvas.width !== width * ratio || canvas.height !== height * ratio) {
+    canvas.width = width * ratio;
+    canvas.height = height * ratio;
+  }
+  const pen = canvas.getContext("2d");
+  pen.clearRect(0, 0, canvas.width, canvas.height);
+  view.group.style.display = box ? "" : "none";
+  view.size.textContent = box ? sizes(view, box) : "";
+  if (!box) return;
+  const scale = scaleOf(view, width, height), depth = 3 - view.right - view.up;
+  const [outside, within, ground] = POINTS[theme()], dot = (near.length > 3000 ? 1.2 : 1.8) * ratio;
+  const lists = [[], [], []];
+  for (const point of near) {
+    const isIn = inside(point, box);
+    if (depth !== 2 && Math.abs(point[depth]) > anchor[3 + depth] / 2 + 0.3 && !isIn) continue;
+    lists[isIn ? 2 : point[3] ? 0 : 1].push(point);
+  }
+  for (const [k, colour] of [ground, outside, within].entries()) {
+    pen.fillStyle = colour;
+    for (const point of lists[k]) {
+      pen.fillRect((width / 2 + point[view.right] * scale * view.flip) * ratio - dot / 2,
+                   (height / 2 - point[view.up] * scale) * ratio - dot / 2, dot, dot);
+    }
+  }
+  placeHandles(view, box, width, height, scale);
+}
+
+function placeHandles(view, box, width, height, scale) {
+  const centre = toLocal(anchor, box[0], box[1], box[2]);
+  const turned = view.turns ? -(box[6] - anchor[6]) * 180 / Math.PI : 0;
+  const x = width / 2 + centre[view.right] * scale * view.flip, y = height / 2 - centre[view.up] * scale;
+  const a = box[3 + view.right] * scale / 2, b = box[3 + view.up] * scale / 2;
+  const set = (node, values) => {
+    for (const [name, value] of Object.entries(values)) node.setAttribute(name, value.toFixed?.(2) ?? value);
+  };
+  set(view.group, { transform: `translate(${x} ${y}) rotate(${turned})` });
+  set(view.rect, { x: -a, y: -b, width: 2 * a, height: 2 * b });
+  set(view.front, view.right === 0 ? { x1: a, x2: a, y1: -b, y2: b } : { x1: 0, x2: 0, y1: 0, y2: 0 });
+  for (const { sign, vertical, grip, dot } of view.handles) {
+    const side = vertical ? -sign : sign * view.flip;
+    set(grip, vertical ? { x1: -a, x2: a, y1: side * b, y2: side * b }
+      : { x1: side * a, x2: side * a, y1: -b, y2: b });
+    set(dot, vertical ? { cx: 0, cy: side * b } : { cx: side * a, cy: 0 });
+  }
+  if (view.knob) {
+    set(view.ring, { x1: a, x2: a + KNOB, y1: 0, y2: 0 });
+    set(view.knob, { cx: a + KNOB, cy: 0 });
+  }
+}
+
+function sizes(view, box) {
+  return `${box[3 + view.right].toFixed(2)} × ${box[3 + view.up].toFixed(2)} m`;
+}
+
+let asked = false;
+function redraw() {
+  if (asked) return;
+  asked = true;
+  requestAnimationFrame(() => {
+    asked = false;
+    const box = selectedBox()?.box ?? null;
+    if (box && !store.draft && !same(anchor, box)) {
+      anchor = box.slice();
+      gather();
+    }
+    const colour = selectedTrack() ? "" : "none";
+    for (const view of VIEWS) {
+      view.panel.classList.toggle("empty", !box);
+      drawView(view, anchor && colour === "" ? box : null);
+    }
+  });
+}
+
+const same = (a, b) => a !== null && a.every((value, k) => value === b[k]);
+
+export function openSideViews() {
+  const area = document.getElementById("sideviews");
+  area.append(...VIEWS.map(build));
+  new ResizeObserver(redraw).observe(area);
+  on("cloud", () => { anchor = null; redraw(); });
+  on("selection tracks draft theme", redraw);
+}
+

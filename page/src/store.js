@@ -1,0 +1,118 @@
+// What the page knows, in one place. Parts subscribe to the names of what changed; nobody else
+// holds a copy of a track.
+
+const listeners = new Map();
+const pending = new Set();
+
+export const store = {
+  drive: null, mode: "label",
+  seq: 0, tracks: new Map(), checked: new Set(), seeds: [], canUndo: false, canRedo: false,
+  progress: null,
+  wanted: 0, // the frame that was asked for
+  frame: 0, // the frame that is shown; every edit is of this one
+  cloud: null, // of the frame that is shown
+  selected: null, also: new Set(), hover: null,
+  tool: "select", // "select", "seed", "add"
+  draft: null, // {track, frame, box}: only while something is dragged, or a key held
+  colour: "height", names: true, online: true, playing: false, advance: true,
+  filter: "left", shownTracks: [],
+  results: { labels: [], detections: {}, matches: {} }, sources: new Map(), minScore: 0.3,
+  layers: { labels: true, errors: true, tracks: true, trails: true },
+};
+
+export function on(names, listener) {
+  for (const name of names.split(" ")) {
+    if (!listeners.has(name)) listeners.set(name, []);
+    listeners.get(name).push(listener);
+  }
+}
+
+/** Tell who subscribed, once per turn of the event loop however often it is called. */
+export function changed(...names) {
+  if (pending.size === 0) queueMicrotask(flush);
+  for (const name of names) pending.add(name);
+}
+
+function flush() {
+  const names = [...pending];
+  pending.clear();
+  const called = new Set();
+  for (const name of names) {
+    for (const listener of listeners.get(name) ?? []) {
+      if (!called.has(listener)) {
+        called.add(listener);
+        listener();
+      }
+    }
+  }
+}
+
+function toTrack(sent) {
+  const byFrame = new Map();
+  for (const row of sent.boxes) byFrame.set(row[0], { box: row.slice(1, 8), kind: row[8] });
+  const frames = [...byFrame.keys()].sort((a, b) => a - b);
+  return { ...sent, byFrame, first: frames[0] ?? 0, last: frames.at(-1) ?? 0 };
+}
+
+export function setState(state) {
+  store.tracks = new Map(state.tracks.map((track) => [track.id, toTrack(track)]));
+  store.seeds = state.seeds ?? [];
+  takeCounts(state);
+  forgetMissing();
+  store.draft = null;
+  changed("tracks", "progress", "selection", "draft");
+}
+
+/** One action of any page. */
+export function applyEvent(event) {
+  for (const track of event.tracks ?? []) store.tracks.set(track.id, toTrack(track));
+  for (const id of event.removed ?? []) store.tracks.delete(id);
+  if (event.seeds) store.seeds = event.seeds;
+  takeCounts(event);
+  forgetMissing();
+  changed("tracks", "progress", "selection");
+}
+
+function takeCounts(from) {
+  store.seq = from.seq ?? store.seq;
+  store.checked = from.checked ? new Set(from.checked) : store.checked;
+  store.canUndo = from.can_undo ?? store.canUndo;
+  store.canRedo = from.can_redo ?? store.canRedo;
+  store.progress = from.progress ?? store.progress;
+}
+
+function forgetMissing() {
+  if (store.selected !== null && !store.tracks.has(store.selected)) store.selected = null;
+  for (const id of store.also) if (!store.tracks.has(id)) store.also.delete(id);
+}
+
+export function select(id, { more = false } = {}) {
+  if (more && store.selected !== null && id !== null && id !== store.selected) {
+    if (!store.also.delete(id)) store.also.add(id);
+  } else {
+    store.selected = id;
+    store.also.clear();
+  }
+  changed("selection");
+}
+
+export function selectedTrack() {
+  return store.selected === null ? null : store.tracks.get(store.selected) ?? null;
+}
+
+/** The box of a track in the frame shown, as it is dragged just now: {box, kind} or null. */
+export function boxOf(track, frame = store.frame) {
+  const { draft } = store;
+  if (draft && track && draft.track === track.id && draft.frame === frame) {
+    return { box: draft.box, kind: "key" };
+  }
+  return track?.byFrame.get(frame) ?? null;
+}
+
+export function selectedBox() {
+  return boxOf(selectedTrack());
+}
+
+export function classOf(name) {
+  return store.drive?.classes.find((entry) => entry.name === name) ?? null;
+}

@@ -1,0 +1,136 @@
+// The bar above: the drive, how far one is, undo, tools, theme, help; dialogs that belong to it.
+
+import { act, exportLabels } from "./api.js";
+import { element, icon } from "./dom.js";
+import { propose, redo, undo } from "./edits.js";
+import { COLOURS, setColour, showHelp } from "./keys.js";
+import { say, showLog } from "./messages.js";
+import { step, togglePlay } from "./playback.js";
+import { setTool } from "./pointer.js";
+import { focus, resetView, topView } from "./scene.js";
+import { changed, on, store } from "./store.js";
+
+const by = (id) => document.getElementById(id);
+const RUN = {
+  undo, redo, propose, play: togglePlay, previous: () => step(-1), next: () => step(1), focus,
+  "log-open": showLog, "help-open": showHelp, theme: nextTheme, export: () => by("export-dialog").showModal(),
+  import: () => by("import-dialog").showModal(), reset: resetView, above: topView,
+  "tool-select": () => setTool("select"), "tool-seed": () => setTool("seed"),
+  "tool-add": () => setTool("add"),
+};
+
+const THEMES = ["auto", "light", "dark"];
+
+function nextTheme() {
+  const now = document.documentElement.dataset.theme;
+  setTheme(THEMES[(THEMES.indexOf(now) + 1) % THEMES.length]);
+}
+
+export function setTheme(name) {
+  document.documentElement.dataset.theme = name;
+  by("theme").title = `Theme: ${name === "auto" ? "as the system" : name}`;
+  try { localStorage.setItem("theme", name); } catch { /* then it holds for this page */ }
+  changed("theme");
+}
+
+export function openTopbar() {
+  for (const button of document.querySelectorAll("[data-icon]")) button.prepend(icon(button.dataset.icon));
+  for (const [id, run] of Object.entries(RUN)) {
+    const button = by(id);
+    if (button) button.onclick = run;
+  }
+  let kept = new URLSearchParams(location.search).get("theme");
+  try { kept ??= localStorage.getItem("theme") ?? "auto"; } catch { /* not allowed to keep anything */ }
+  setTheme(THEMES.includes(kept) ? kept : "auto");
+  for (const how of COLOURS) by("colour").append(element("option", { value: how }, how));
+  by("colour").onchange = () => setColour(by("colour").value);
+  by("advance").onchange = () => { store.advance = by("advance").checked; };
+  for (const dialog of document.querySelectorAll("dialog")) {
+    dialog.addEventListener("click", (event) => { if (event.target === dialog) dialog.close(); });
+    for (const close of dialog.querySelectorAll("[data-close]")) close.onclick = () => dialog.close();
+  }
+  by("export-form").onsubmit = sendExport;
+  by("import-form").onsubmit = sendImport;
+  on("drive", showDrive);
+  on("progress drive", showProgress);
+  on("selection drive", () => {
+    document.documentElement.dataset.chosen = String(store.selected !== null);
+  });
+  on("connection", () => {
+    by("lost").hidden = store.online;
+    by("lost").textContent = store.refused
+      ? "The server was started again. Open the address that it printed: its token is a new one."
+      : "Connection lost. What was saved is safe; trying again…";
+  });
+  on("colour", () => { by("colour").value = store.colour; });
+  on("tool drive", showTool);
+  on("playing", () => {
+    by("play").replaceChildren(icon(store.playing ? "pause" : "play"));
+    by("play").setAttribute("aria-label", store.playing ? "Stop" : "Play");
+  });
+}
+
+function showDrive() {
+  const { name, path, layout, frames, can_export: formats } = store.drive;
+  document.title = `${name} · ${store.mode === "view" ? "view" : "label"}`;
+  document.documentElement.dataset.mode = store.mode;
+  by("drive").textContent = name;
+  by("drive").title = path;
+  by("layout").textContent = `${layout} · ${frames.length} frame${frames.length === 1 ? "" : "s"}`;
+  const choices = () => (formats ?? []).map((format) =>
+    element("option", { value: format }, format.replaceAll("_", " ")));
+  by("export-format").replaceChildren(...choices());
+  by("import-format").replaceChildren(element("option", { value: "" }, "as it is recognised"),
+                                      ...choices());
+}
+
+function showProgress() {
+  const { progress } = store;
+  by("undo").disabled = !store.canUndo;
+  by("redo").disabled = !store.canRedo;
+  if (!progress) return;
+  const { tracks, accepted, rejected, left, frames, checked, busy } = progress;
+  by("bar-accepted").style.flexGrow = accepted;
+  by("bar-rejected").style.flexGrow = rejected;
+  by("bar-left").style.flexGrow = tracks ? left : 1;
+  by("progress-text").textContent = `${left} left · ${accepted} accepted · ${rejected} rejected · `
+    + `${checked} of ${frames} frames checked`;
+  if (by("busy").hidden !== !busy) changed("busy");
+  by("busy").hidden = !busy;
+  if (busy) {
+    by("busy").textContent = `${busy.what} ${busy.done} of ${busy.of}`;
+    by("busy").style.setProperty("--done", busy.of ? busy.done / busy.of : 0);
+  }
+  by("propose").disabled = Boolean(busy);
+}
+
+function showTool() {
+  for (const name of ["select", "seed", "add"]) {
+    by(`tool-${name}`).setAttribute("aria-pressed", String(store.tool === name));
+  }
+  by("tool-hint").textContent = {
+    select: "", seed: "Click a person: similar ones are looked for in the whole drive. Esc ends.",
+    add: "Click where the new box stands. Esc ends.",
+  }[store.tool];
+}
+
+async function sendExport(event) {
+  event.preventDefault();
+  const line = by("export-error");
+  line.textContent = "";
+  try {
+    const { path, boxes, frames } = await exportLabels({ format: by("export-format").value,
+      out: by("export-out").value, force: by("export-force").checked });
+    by("export-dialog").close();
+    say(`Exported ${boxes} boxes of ${frames} frames to ${path}`);
+  } catch (error) {
+    line.textContent = error.message;
+  }
+}
+
+async function sendImport(event) {
+  event.preventDefault();
+  if (await act({ do: "import", path: by("import-path").value, format: by("import-format").value })) {
+    by("import-dialog").close();
+  }
+}

@@ -1,0 +1,55 @@
+"""Make the scores of weights probabilities: fit the lines in their headers to scans of streets that
+they were not trained on. Weights, and the order of the scores, stay as they are.
+
+    lidar-perception simulate --format kitti --frames 360 --people 2.5 --seed 700000 --out scans
+    python scripts/calibrate_weights.py scans v4.safetensors pointnet.safetensors
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import click
+
+from lidar_perception.data.open import open_recording
+from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.checkpoint import POINTNET, network_of, save_checkpoint
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointnet.network import load_pointnet
+from lidar_perception.detectors.pointpillars.network import load_network
+from lidar_perception.runs.terminal import console
+from lidar_perception.scoring.detections import by_detector
+from lidar_perception.scoring.kitti.protocol import Comparison
+from lidar_perception.scoring.kitti.reliability import lines
+from lidar_perception.scoring.kitti.report import DetectionReport
+from lidar_perception.scoring.run import fill
+
+LEAST = 0.02  # score of the boxes that count
+
+
+def uncalibrated(weights: Path) -> NetworkDetector:
+    """The detector of a checkpoint with its network's own scores."""
+    return open_detector(weights, "cpu").raw().with_min_score(LEAST)
+
+
+@click.command()
+@click.argument("scans", type=click.Path(exists=True, path_type=Path))
+@click.argument("weights", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
+@click.option("--jobs", default=1)
+@click.option("--limit", type=int, help="Only so many scans.")
+def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -> None:
+    """Calibrate checkpoints, in place."""
+    for path in weights:
+        report = DetectionReport()
+        fill(report, open_recording(scans),
+             partial(by_detector, partial(uncalibrated, path), 1.0, None), jobs=jobs, limit=limit)
+        found = lines(Comparison.of(report.frames))
+        header, network = (load_pointnet if network_of(path) == POINTNET else load_network)(path)
+        save_checkpoint(path, network, replace(header, calibration=found), half=True)
+        console.print(f"{path.name}: {found}", soft_wrap=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,176 @@
+"""Clouds with all their columns come back as they were written, from any file."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from lidar_perception.data.bag import BagWriter
+from lidar_perception.data.pcd import read_pcd, unpacked_lzf
+from lidar_perception.data.raw_clouds import open_clouds, spread
+from lidar_perception.types import InputError
+from lidar_perception.wire.codec import bag_message
+from msg_utils.point_cloud2 import from_array, to_array
+from msg_utils.stamps import header_message
+
+LAYOUT = [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "u1"), ("ring", "<u2"),
+          ("t", "<u4"), ("normal", "<f4", (3,)), ("stamp", "<u8")]
+
+
+def points(n=200):
+    rng = np.random.default_rng(1)
+    made = np.zeros(n, LAYOUT)
+    for name in made.dtype.names:
+        part = made[name]
+        part[...] = (rng.normal(0, 10, part.shape) if part.dtype.kind == "f"
+                     else rng.integers(0, np.iinfo(part.dtype).max // 2, part.shape, np.int64))
+    made["ring"] = np.arange(n) // 20  # runs, which compress
+    return made
+
+
+def packed_lzf(data):
+    """A greedy LZF: runs from before where three bytes were seen, else literals."""
+    out, literal, seen, i = bytearray(), bytearray(), {}, 0
+
+    def flush():
+        for k in range(0, len(literal), 32):
+            out.append(len(literal[k:k + 32]) - 1)
+            out.extend(literal[k:k + 32])
+        literal.clear()
+
+    while i < len(data):
+        key, length = data[i:i + 3], 0
+        back = i - seen.get(key, -1) - 1
+        if len(key) == 3 and key in seen and back < 8192:
+            start = seen[key]
+            while i + length < len(data) and length < 264 and (
+                    data[start + length] == data[i + length]):
+                length += 1
+            flush()
+            short = min(length - 2, 7)
+            out.append(short << 5 | back >> 8)
+            if short == 7:
+                out.append(length - 9)
+            out.append(back & 255)
+            seen[key] = i
+            i += length
+        else:
+            seen[key] = i
+            literal.append(data[i])
+            i += 1
+    flush()
+    return bytes(out)
+
+
+def pcd(cloud, kind):
+    kinds = {"f": "F", "u": "U", "i": "I"}
+    parts = [cloud.dtype[name] for name in cloud.dtype.names]
+    head = "\n".join((
+        "# .PCD v0.7", "VERSION 0.7", "FIELDS " + " ".join(cloud.dtype.names),
+        "SIZE " + " ".join(str(p.base.itemsize) for p in parts),
+        "TYPE " + " ".join(kinds[p.base.kind] for p in parts),
+        "COUNT " + " ".join(str(int(np.prod(p.shape, dtype=int))) for p in parts),
+        f"WIDTH {len(cloud)}", "HEIGHT 1", "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(cloud)}",
+        f"DATA {kind}", "")).encode()
+    if kind == "ascii":
+        return head + "\n".join(" ".join(repr(v.item()) for name in cloud.dtype.names
+                                         for v in np.atleast_1d(row[name])) for row in cloud
+                                ).encode()
+    if kind == "binary":
+        return head + cloud.tobytes()
+    plain = b"".join(np.ascontiguousarray(cloud[name]).tobytes() for name in cloud.dtype.names)
+    data = packed_lzf(plain)
+    return head + struct.pack("<II", len(data), len(plain)) + data
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary", "binary_compressed"])
+def test_a_pcd_file_gives_the_points_that_were_written(tmp_path, kind):
+    path = tmp_path / "one.pcd"
+    path.write_bytes(pcd(points(), kind))
+    assert read_pcd(path).dtype.names == points().dtype.names
+    assert np.array_equal(read_pcd(path), points())
+    for cut in (0, 40, len(path.read_bytes()) // 2):
+        path.write_bytes(pcd(points(), kind)[:cut])
+        with pytest.raises(InputError, match=r"one\.pcd") as error:
+            read_pcd(path)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("data", [b"", b"a", b"abc" * 500, bytes(9000), bytes(range(256)) * 40])
+def test_lzf_unpacks_what_was_packed(data):
+    assert unpacked_lzf(packed_lzf(data), len(data)) == data
+    with pytest.raises(ValueError):
+        unpacked_lzf(packed_lzf(data), len(data) + 1)
+
+
+ONE = "FIELDS x\nSIZE 4\nTYPE F\n"
+
+
+@pytest.mark.parametrize("text", [
+    "", "FIELDS x\nDATA binary\n", "no cloud", ONE + "POINTS 999999999999\nDATA binary\n",
+    ONE.replace("F\n", "Q\n") + "POINTS 1\nDATA ascii\n1", ONE + "POINTS 1\nDATA zip\n1"])
+def test_what_is_no_pcd_file_is_named(tmp_path, text):
+    path = tmp_path / "one.pcd"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"one\.pcd"):
+        read_pcd(path)
+
+
+def test_folders_of_files_and_kitti_and_nuscenes_records(tmp_path):
+    for i in range(3):
+        (tmp_path / f"{i}.pcd").write_bytes(pcd(points(50 + i), "binary"))
+    clouds = open_clouds(tmp_path)
+    assert clouds.count == 3 and clouds.stamps_ns is None and "3 .pcd files" in clouds.layout
+    assert [len(to_array(clouds.load(i))) for i in range(3)] == [50, 51, 52]
+    assert open_clouds(tmp_path / "1.pcd").count == 1
+    rng = np.random.default_rng(0)
+    four = rng.normal(0, 10, (500, 4)).astype(np.float32)  # 8000 bytes: 400 records of five, too
+    (tmp_path / "a.bin").write_bytes(four.tobytes())
+    five = np.column_stack([four, rng.integers(0, 32, 500)]).astype(np.float32)
+    (tmp_path / "b.bin").write_bytes(five.tobytes())
+    a, b = (to_array(open_clouds(tmp_path / name).load(0)) for name in ("a.bin", "b.bin"))
+    assert a.dtype.names == ("x", "y", "z", "intensity")
+    assert b.dtype.names == (*a.dtype.names, "ring")
+    assert np.array_equal(a["z"], four[:, 2]) and np.array_equal(b["ring"], five[:, 4])
+    with pytest.raises(InputError, match="there is no"):
+        open_clouds(tmp_path / "none")
+
+
+def in_a_bag(n):
+    made = points(n)
+    layout = [(name, kind) for name, kind, *_ in LAYOUT[:5]]
+    cloud = np.empty(n, layout)
+    for name, _ in layout:
+        cloud[name] = made[name]
+    return cloud
+
+
+def write(path, topics, count=4):
+    with BagWriter(path) as bag:
+        for topic in topics:
+            bag.add_topic(topic, "sensor_msgs/msg/PointCloud2")
+        for i in range(count):
+            for topic in topics:
+                header = header_message(i * 10**8, topic.strip("/"), bag_message)
+                bag.write(topic, i * 10**8, from_array(in_a_bag(90 + i), header, bag_message))
+
+
+def test_a_bag_of_one_sensor_is_read_and_of_several_the_one_that_is_named(tmp_path):
+    write(tmp_path / "one", ["/front/scan"])
+    clouds = open_clouds(tmp_path / "one")
+    assert clouds.count == 4 and clouds.stamps_ns.tolist() == [0, 10**8, 2 * 10**8, 3 * 10**8]
+    assert np.array_equal(to_array(clouds.load(2)), in_a_bag(92))
+    write(tmp_path / "three", ["/left", "/right", "/rear"])
+    with pytest.raises(InputError, match="--topic: /left, /rear, /right"):
+        open_clouds(tmp_path / "three")
+    assert open_clouds(tmp_path / "three", "/rear").load(1).header.frame_id == "rear"
+    with pytest.raises(InputError, match="no topic /other"):
+        open_clouds(tmp_path / "three", "/other")
+
+
+def test_scans_are_looked_at_in_pairs_spread_over_all():
+    assert spread(5, 10) == [0, 1, 2, 3, 4]
+    chosen = spread(1000, 40)
+    assert len(chosen) == 40 and chosen[:2] == [0, 1] and chosen[-2:] == [998, 999]
+    assert (np.diff(chosen)[::2] == 1).all() and (np.diff(chosen)[1::2] > 40).all()
+    assert spread(3, 1) == [0, 1] and spread(1, 1) == [0]

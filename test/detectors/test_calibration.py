@@ -1,0 +1,65 @@
+"""Scores as probabilities: order stays, thresholds mean probabilities, broken lines are refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from detection_samples import eager, frame, lively, random_detector, same, tiny
+from hypothesis import given
+from hypothesis import strategies as st
+from pointnet_samples import random_detector as random_pointnet
+
+from lidar_perception.detectors.calibration import calibrated, raw_score
+from lidar_perception.detectors.checkpoint import Header, read_header, save_checkpoint
+from lidar_perception.types import CLASSES, Detections, InputError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+LINES = {"Car": (0.6, 0.5), "Pedestrian": (1.4, -0.8)}
+
+
+@given(st.lists(st.floats(0, 1, width=32), min_size=1, max_size=30), st.floats(0.05, 20),
+       st.floats(-20, 20))
+def test_the_order_stays_and_a_threshold_is_found_again(scores, slope, offset):
+    lines = {"Car": (slope, offset)}
+    scores = np.sort(np.array(scores, np.float32))
+    found = Detections.of(np.ones((len(scores), 7)), CLASSES.index("Car"), scores)
+    after = calibrated(found, lines).scores
+    assert (np.diff(after) >= 0).all() and after.dtype == np.float32
+    assert ((after >= 0) & (after <= 1)).all()
+    others = Detections.of(found.boxes, CLASSES.index("Cyclist"), scores)
+    np.testing.assert_array_equal(calibrated(others, lines).scores, scores)
+    for score in (0.0, 0.01, 0.3, 0.97, 1.0):
+        raw = raw_score("Car", score, lines)
+        assert 0 <= raw <= 1
+        if 1e-6 < raw < 1 - 1e-6:
+            again = calibrated(Detections.of(found.boxes[:1], 0, raw), lines).scores[0]
+            assert again == pytest.approx(score, abs=2e-2 if slope > 5 else 1e-3)
+
+
+@pytest.mark.parametrize("make", [lambda: random_detector("v4", eager(score=0.0)), random_pointnet],
+                         ids=["PointPillars", "PointNet"])
+def test_a_detector_finds_the_same_boxes_and_its_threshold_is_a_probability(make):
+    detector, scan = make().with_min_score(0.0), frame()
+    plain = detector(scan).detections
+    detector.header = replace(detector.header, calibration=LINES)
+    found = detector(scan).detections
+    assert len(found) and same(found, calibrated(plain, LINES), atol=1e-6)
+    assert same(detector.raw()(scan), plain)
+    middle = float(np.median(found.scores))
+    # What is weak suppresses nothing that is strong, so a threshold takes the weak away alone.
+    strict = detector.with_min_score(middle)(scan).detections
+    assert 0 < len(strict) <= len(found) and (strict.scores >= np.float32(middle) - 1e-6).all()
+    best = detector.with_min_score(1.0)(scan).best
+    assert len(detector.with_min_score(1.0)(scan).detections) == 0 and set(best) == {
+        *detector.classes}
+
+
+@pytest.mark.parametrize("broken", [{"Car": [0, 1]}, {"Car": [1]}, {"Car": [-1, 0]}, {"Car": None},
+                                    {"Lamp": [1, 0]}, {"Car": [1, 1e9]}, {"Car": ["a", 0]}])
+def test_lines_that_do_not_rise_are_refused(tmp_path, broken):
+    header = Header(tiny("v0"), calibration=broken)
+    save_checkpoint(tmp_path / "w.safetensors", lively(tiny("v0")), header)
+    with pytest.raises(InputError, match="calibration that cannot be used"):
+        read_header(tmp_path / "w.safetensors")

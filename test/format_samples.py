@@ -1,0 +1,85 @@
+"""Drives without files and made-up labels of them, for the tests of formats."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from samples import INTRINSICS, LIDAR_TO_CAMERA
+
+from lidar_perception.camera import Calibration
+from lidar_perception.data.frame import Frame
+from lidar_perception.labeling.labels import DriveLabels, FrameLabels
+from lidar_perception.types import LidarFrame
+
+CALIBRATION = Calibration(INTRINSICS, LIDAR_TO_CAMERA, 1242, 375)
+DRIVES = {"one": ("0000",), "several": ("0003", "0011")}
+NOTES = ("openlabel", "bag", "bag_labels")
+KITTI = ("kitti_object", "kitti_tracking")
+# What a format rounds, metres and radians.
+EXACT = {"kitti_object": 2e-6, "kitti_tracking": 2e-6, "openlabel": 1e-12,
+         "nuscenes_detection": 1e-9, "nuscenes_tracking": 1e-9, "labelcloud": 1e-8,
+         "labelcloud_rel": 1e-8, "labelcloud_vertices": 5e-8, "sustech": 1e-12, "bag": 1e-12,
+         "bag_labels": 1e-12}
+
+
+def pose(i: int) -> np.ndarray:
+    """Where the LiDAR is in frame i, on a slope."""
+    turn, rise = 0.1 * i, 0.02
+    about_z = np.array([[math.cos(turn), -math.sin(turn), 0], [math.sin(turn), math.cos(turn), 0],
+                        [0, 0, 1]])
+    about_y = np.array([[math.cos(rise), 0, math.sin(rise)], [0, 1, 0],
+                        [-math.sin(rise), 0, math.cos(rise)]])
+    at = np.eye(4)
+    at[:3, :3], at[:3, 3] = about_z @ about_y, [100 + 2.0 * i, -50, 3]
+    return at
+
+
+def drive(name: str, frames: int = 3, camera: bool = True) -> list[Frame]:
+    """Frames of each of the sequences of one of DRIVES; the numbers begin at 5."""
+    rng = np.random.default_rng(0)
+    found = []
+    for s, sequence in enumerate(DRIVES[name]):
+        for i in range(5, 5 + frames):
+            stamp = 1_700_000_000_000_000_000 + (100 * s + i) * 100_000_000
+            xyz = rng.uniform(-20, 20, (50, 3)).astype(np.float32)
+            found.append(Frame.of(f"{sequence}/{i:06}", LidarFrame.of(xyz, None, stamp, "velodyne"),
+                                  calibration=CALIBRATION if camera else None,
+                                  pose=pose(i).copy, sequence=sequence, index=i))
+    return found
+
+
+def labels_of(frames: list[Frame], format: str, seed: int = 0) -> DriveLabels:
+    """Boxes all around the sensor with all that a format keeps; the second frame has none."""
+    rng = np.random.default_rng(seed)
+    names = ["Car", "Pedestrian", "Van", "Cyclist", "e-scooter"]
+    found = []
+    for number, frame in enumerate(frames):
+        count = 0 if number == 1 else 4
+        boxes = np.column_stack([rng.uniform(-40, 40, (count, 2)), rng.uniform(-2, 1, count),
+                                 rng.uniform(0.3, 5, (count, 3)),
+                                 rng.uniform(-math.pi, math.pi, count)])
+        ids = np.array([3, 17, 2**31 + 5, -1])[:count]
+        scores = [0.25, float("nan"), 1.0, 0.123456][:count]
+        extra = [{"occluded": 2, "obj_attr": "dark, ünder a tree", "seen": {"by": [1, "two"]}}
+                 ] * count
+        notes = [("DontCare", {"bbox": [1.0, 2.0, 3.0, 4.0]})] * (format in NOTES)
+        if format == "kitti_object":
+            ids = np.full(count, -1)
+        found.append(FrameLabels.of(frame.name, frame.stamp_ns, boxes,
+                                    rng.choice(names, count).tolist(), ids, scores, extra, notes))
+    return DriveLabels(found)
+
+
+def same(labels: DriveLabels, others: DriveLabels, tolerance: float) -> None:
+    """Boxes within the tolerance, and the rest of each box, whatever their order is."""
+    assert [f.name for f in labels.frames] == [f.name for f in others.frames]
+    assert [f.stamp_ns for f in labels.frames] == [f.stamp_ns for f in others.frames]
+    for a, b in zip(labels.frames, others.frames):
+        one, other = (np.lexsort(f.boxes[:, :3].round(3).T) for f in (a, b))
+        difference = a.boxes[one] - b.boxes[other]
+        difference[:, 6] = (difference[:, 6] + math.pi) % (2 * math.pi) - math.pi
+        assert np.abs(difference).max(initial=0) <= tolerance
+        assert [a.class_names[i] for i in one] == [b.class_names[i] for i in other]
+        np.testing.assert_array_equal(a.track_ids[one], b.track_ids[other])
+        np.testing.assert_allclose(a.scores[one], b.scores[other], rtol=0, atol=5e-7)

@@ -1,0 +1,290 @@
+"""The page of label and view in a real browser, with the real server behind it."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from labeling_pages import Label, boxes_of, drag, faces, labelled_person, middle
+
+from lidar_perception.data.open import open_recording
+from lidar_perception.geometry import wrap_angle
+
+BROWSER = shutil.which("chromium")
+sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="chromium is not installed")
+FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
+         "--disable-background-networking --disable-component-update --disable-sync").split()
+
+
+def free_port() -> int:
+    with socket.socket() as found:
+        found.bind(("127.0.0.1", 0))
+        return found.getsockname()[1]
+
+
+@contextmanager
+def serving(*arguments):
+    """A server of the command, and the address that it prints."""
+    process = subprocess.Popen([sys.executable, "-m", "lidar_perception.cli.main", *arguments],
+                               stdout=subprocess.PIPE, text=True)
+    try:
+        url = process.stdout.readline().strip()
+        assert url.startswith("http://127.0.0.1:"), url
+        yield process, url
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with sync_api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=BROWSER, args=FLAGS)
+        yield started
+        started.close()
+
+
+@pytest.fixture(scope="module")
+def labels(drive_bag, tmp_path_factory):
+    """The labelling of a drive, at the address that stays the same when its server is started
+    again."""
+    out, port = tmp_path_factory.mktemp("labels"), free_port()
+    arguments = ("label", "--data", str(drive_bag), "--out", str(out), "--no-open", "--no-propose",
+                 "--port", str(port))
+    with serving(*arguments) as (process, url):
+        yield Label(process, url, out, arguments)
+
+
+@pytest.fixture
+def page(browser, labels):
+    """A page, opened; what was wrong in it fails the test."""
+    with opened(browser, labels.url) as made:
+        yield made
+
+
+@contextmanager
+def opened(browser, url):
+    context = browser.new_context(viewport={"width": 1280, "height": 720})
+    page, wrong = context.new_page(), []
+    page.set_default_timeout(60_000)
+    page.on("pageerror", lambda error: wrong.append(error))
+    page.on("request", lambda r: wrong.append(r.url) if "127.0.0.1" not in r.url
+            and not r.url.startswith(("data:", "blob:")) else None)
+    page.goto(url)
+    page.wait_for_selector("html[data-ready=true]", state="attached")
+    yield page
+    context.close()
+    assert wrong == []
+
+
+@pytest.fixture(scope="module")
+def person(drive_bag):
+    """(7,) the box of a labelled person near the sensor in the first frame."""
+    return labelled_person(next(iter(open_recording(drive_bag))))
+
+
+def test_a_click_on_a_person_makes_a_track_and_a_seed(page, labels, person):
+    seeds = len(labels.state()["seeds"])
+    number = labels.seed(page, person)
+    state, box = labels.state(), labels.box(number)
+    assert len(state["seeds"]) == seeds + 1 and state["seeds"][-1][1] == number
+    assert math.dist(box[:2], person[:2]) < 0.6
+    assert labels.lines()[-1]["do"] == "seed"
+    assert page.inner_text("#who") == f"Track {number}"
+
+
+def test_a_seed_needs_no_mouse(page, labels, person):
+    before = set(labels.tracks())
+    labels.look_at(page, person)
+    page.locator("#tracks").focus()
+    for key in ("Escape", "s", "Enter"):  # what is in the middle of the view
+        page.keyboard.press(key)
+    page.wait_for_function("before => page.store.selected !== null "
+                           "&& !before.includes(page.store.selected)", arg=sorted(before))
+    box = labels.box(page.evaluate("page.store.selected"))
+    assert math.dist(box[:2], person[:2]) < 0.6
+
+
+def test_keys_accept_reject_and_open_again_and_the_progress_is_in_sight(page, labels, person):
+    number = labels.chosen(page, person)
+    for key, state in (("r", "rejected"), ("a", "accepted"), ("u", "proposed")):
+        page.keyboard.press(key)
+        labels.wait(page, number, lambda t, s=state: t["state"] == s)
+        page.wait_for_function("s => document.getElementById('state').textContent === s",
+                               arg=state)
+        progress = labels.state()["progress"]
+        page.wait_for_function("s => document.getElementById('progress-text').textContent"
+                               ".startsWith(s)", arg=f"{progress['left']} left")
+
+
+@pytest.mark.parametrize(("where", "name", "way"), [
+    ("[data-view=top]", "+x", (40, 0)), ("[data-view=side]", "+z", (0, -25)),
+    ("[data-view=front]", "-y", (20, 0)), ("#handles", "+z", (0, -40))])
+def test_a_dragged_face_moves_alone(page, labels, person, where, name, way):
+    number = labels.chosen(page, person)
+    before = labels.box(number)
+    drag(page, middle(page, f"{where} circle[data-handle='{name}']"), way)
+    labels.wait(page, number, lambda t: boxes_of(t)[0] != before)
+    old, new = faces(before), faces(labels.box(number))
+    moved = [face for face in old if not np.allclose(old[face], new[face], atol=1e-6)]
+    assert moved == [name], moved
+    assert new[name] > old[name]
+
+
+def test_the_body_is_dragged_level_and_turns_about_its_centre(page, labels, person):
+    number = labels.chosen(page, person)
+    before = labels.box(number)
+    drag(page, middle(page, "[data-view=top] rect.body"), (30, 10))
+    labels.wait(page, number, lambda t: boxes_of(t)[0] != before)
+    moved = labels.box(number)
+    assert moved[2:] == pytest.approx(before[2:]) and math.dist(moved[:2], before[:2]) > 0.1
+    x, y = middle(page, "[data-view=top] circle.turn")
+    centre = middle(page, "[data-view=top]")
+    drag(page, (x, y), (centre[0] - x, centre[1] - 60 - y))  # from the right to above: a quarter
+    labels.wait(page, number, lambda t: boxes_of(t)[0] != moved)
+    turned = labels.box(number)
+    assert turned[:6] == pytest.approx(moved[:6], abs=1e-6)
+    assert wrap_angle(turned[6] - moved[6]) == pytest.approx(math.pi / 2, abs=0.1)
+
+
+def test_arrow_keys_step_along_the_box_and_a_held_key_is_one_action(page, labels, person):
+    number = labels.chosen(page, person)
+    before, actions = labels.box(number), labels.state()["seq"]
+    for _ in range(3):
+        page.keyboard.down("ArrowUp")
+    page.keyboard.up("ArrowUp")
+    labels.wait(page, number, lambda t: boxes_of(t)[0] != before)
+    after = labels.box(number)
+    step = 0.15 * np.array([math.cos(before[6]), math.sin(before[6])])
+    assert np.subtract(after[:2], before[:2]) == pytest.approx(step, abs=1e-6)
+    assert labels.state()["seq"] == actions + 1
+    page.keyboard.press("Shift+ArrowLeft")
+    labels.wait(page, number, lambda t: boxes_of(t)[0] != after)
+    assert wrap_angle(labels.box(number)[6] - before[6]) == pytest.approx(math.radians(1))
+
+
+def test_undo_and_redo_go_back_and_forth_over_every_step(page, labels, person):
+    number = labels.chosen(page, person)
+    states = [labels.tracks()]
+    for key in ("Shift+ArrowUp", "g", "1", "v"):
+        page.keyboard.press(key)
+        page.wait_for_function("n => page.store.seq >= n", arg=labels.state()["seq"])
+        labels.wait(page, number, lambda t, last=states[-1]: t != last[number])
+        states.append(labels.tracks())
+    page.keyboard.press(",")  # a copy goes on to its frame
+    for key, expected in [*(("Control+z", s) for s in states[-2::-1]),
+                          *(("Control+y", s) for s in states[1:])]:
+        page.keyboard.press(key)
+        labels.wait(page, number, lambda t, e=expected: t == e[number])
+        assert labels.tracks() == expected
+    assert page.locator("#errors .toast").count() == 0
+
+
+def test_two_pages_see_each_others_edits(page, browser, labels, person):
+    number = labels.chosen(page, person)
+    with opened(browser, labels.url) as other:
+        page.keyboard.press("3")
+        name = page.evaluate("page.store.drive.classes[2].name")
+        other.wait_for_function("([n, c]) => page.store.tracks.get(n).class === c",
+                                arg=[number, name])
+        other.wait_for_selector("#notes .toast")
+        other.click("#undo")
+        page.wait_for_function("([n, c]) => page.store.tracks.get(n).class !== c",
+                               arg=[number, name])
+
+
+def test_what_cannot_be_saved_is_said_and_goes_back(page, labels, person):
+    number = labels.chosen(page, person)
+    before = labels.tracks()
+    page.keyboard.press("x")  # there is nothing before its only frame, or after it
+    page.wait_for_selector("#errors .toast")
+    assert labels.tracks() == before and labels.tracks()[number]
+    page.fill("#field-length", "-1")
+    page.keyboard.press("Enter")
+    assert labels.tracks() == before
+    page.wait_for_function("() => Number(document.getElementById('field-length').value) > 0")
+
+
+def test_an_export_is_written_and_nothing_is_written_over_it(page, labels, person):
+    number = labels.chosen(page, person)
+    page.keyboard.press("a")
+    labels.wait(page, number, lambda t: t["state"] == "accepted")
+    for replace, wrong in ((False, False), (False, True), (True, False)):
+        page.click("#export")
+        page.select_option("#export-format", "openlabel")
+        page.fill("#export-out", "labels.json")
+        page.set_checked("#export-force", replace)
+        page.click("#export-form button.primary")
+        if wrong:
+            page.wait_for_function("() => document.getElementById('export-error').textContent")
+            page.click("#export-dialog [data-close]")
+        else:
+            page.wait_for_selector("#export-dialog", state="hidden")
+    assert "openlabel" in json.loads((labels.out / "labels.json").read_text())
+
+
+def test_help_lists_the_keys_and_needs_no_mouse(page):
+    page.keyboard.press("?")
+    page.wait_for_selector("#help[open]")
+    assert "Accept" in page.inner_text("#keys") and "Undo" in page.inner_text("#keys")
+    page.keyboard.press("Escape")
+    page.wait_for_selector("#help", state="hidden")
+    for _ in range(40):  # every command can be reached, and says what it is
+        page.keyboard.press("Tab")
+        name = page.evaluate("""() => { const e = document.activeElement;
+            return e === document.body ? "-" : e.ariaLabel || e.title || e.textContent.trim()
+                || e.labels?.[0]?.textContent; }""")
+        assert name
+
+
+def test_a_killed_server_loses_nothing(page, browser, labels, person):
+    number = labels.chosen(page, person)
+    drag(page, middle(page, "[data-view=top] rect.body"), (10, 20))
+    page.wait_for_function("() => page.store.draft === null")
+    before = labels.tracks()
+    labels.process.send_signal(signal.SIGKILL)
+    page.wait_for_selector("#lost", state="visible")
+    page.keyboard.press("r")
+    page.wait_for_selector("#errors .toast")  # not saved, and said so
+    with serving(*labels.arguments) as (process, url):
+        labels.process, labels.url = process, url
+        assert labels.tracks() == before and before[number]["state"] != "rejected"
+        with opened(browser, url) as again:
+            assert again.evaluate("n => page.store.tracks.has(n)", number)
+        page.wait_for_function("() => document.getElementById('lost').textContent"
+                               ".includes('address')")  # its token is another one now
+
+
+def test_a_wrong_token_and_another_host_are_refused(drive_bag, tmp_path):
+    with serving("label", "--data", str(drive_bag), "--out", str(tmp_path), "--no-open",
+                 "--no-propose") as (_, url):
+        plain = url.partition("?")[0]
+        for address, headers in ((plain, {}), (f"{plain}?token=x", {}),
+                                 (url, {"Host": "example.org"})):
+            with pytest.raises(urllib.error.HTTPError) as refused:
+                urllib.request.urlopen(urllib.request.Request(address, headers=headers))
+            assert refused.value.code == 403
+            assert len(refused.value.read().decode().splitlines()) == 1
+
+
+def test_view_shows_labels_and_detections_from_a_score_on(browser, drive_bag):
+    with serving("view", str(drive_bag), "--no-open") as (_, url), opened(browser, url) as page:
+        truth = next(iter(open_recording(drive_bag))).truth()
+        assert page.evaluate("page.store.results.labels.length") == len(truth)
+        assert page.locator("#accept").is_hidden() and page.locator("#export").is_hidden()
+        page.click("#play")
+        page.wait_for_function("() => page.store.frame >= 2 && page.store.results.frame >= 2")
+        reply = json.loads(page.evaluate("""async () => (await fetch("/api/do", {method: "POST",
+            body: '{"do": "undo"}'})).text()"""))
+        assert "label" in reply["error"]

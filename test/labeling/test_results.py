@@ -1,0 +1,99 @@
+"""Results to be looked at: what is missed and false, what a bag holds, pictures."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lidar_perception.classes import CAR, CLASSES, PEDESTRIAN
+from lidar_perception.cli.main import cli
+from lidar_perception.data.open import open_recording
+from lidar_perception.labeling.drive import one_drive, scanned
+from lidar_perception.labeling.results import (
+    Results,
+    Source,
+    by_files,
+    compared,
+    points_topic,
+    recorded_scan,
+    with_recorded_scans,
+)
+from lidar_perception.types import Detections, GroundTruth, InputError
+
+VAN = CLASSES.index("Van")
+CARS = np.array([[10.0, 0, -1, 4, 1.6, 1.5, 0.3], [20.0, 4, -1, 4, 1.6, 1.5, 2.0]])
+
+
+def truth(boxes, class_ids):
+    return GroundTruth.of(boxes, class_ids)
+
+
+def test_labels_found_as_they_are_leave_nothing_missed_or_false():
+    ids = [CAR, CAR, PEDESTRIAN]
+    boxes = np.vstack([CARS, [[8.0, -3, -1, 0.6, 0.6, 1.7, 0]]])
+    found = Detections.of(boxes, ids, [0.9, 0.4, 0.7])
+    for order in ([0, 1, 2], [2, 0, 1]):
+        assert compared(truth(boxes[order], np.array(ids)[order]), found, 0.0) == {
+            "missed": [], "false": []}
+
+
+def test_a_score_below_the_least_is_as_if_it_were_not_there():
+    found = Detections.of(CARS, CAR, [0.9, 0.4])
+    assert compared(truth(CARS, [CAR, CAR]), found, 0.5) == {"missed": [1], "false": []}
+    assert compared(truth(CARS[:1], [CAR]), found, 0.0) == {"missed": [], "false": [1]}
+
+
+def test_two_boxes_on_one_car_are_one_too_many_and_classes_do_not_mix():
+    found = Detections.of(np.vstack([CARS[:1], CARS[:1]]), CAR, [0.9, 0.8])
+    assert compared(truth(CARS[:1], [CAR]), found, 0.0)["false"] in ([0], [1])
+    other = Detections.of(CARS[:1], PEDESTRIAN, 0.9)
+    assert compared(truth(CARS[:1], [CAR]), other, 0.0) == {"missed": [0], "false": [0]}
+
+
+def test_a_van_is_neither_missed_nor_makes_a_car_there_false():
+    assert compared(truth(CARS[:1], [VAN]), Detections.none(), 0.0) == {"missed": [], "false": []}
+    found = Detections.of(CARS[:1], CAR, 0.9)
+    assert compared(truth(CARS[:1], [VAN]), found, 0.0) == {"missed": [], "false": []}
+
+
+def test_what_a_source_cannot_detect_it_does_not_miss(drive_bag):
+    frame = next(iter(open_recording(drive_bag)))
+    blind = Source(lambda i, frame: Detections.none(), frozenset(["Pedestrian"]))
+    layers = Results({"blind": blind}).layers(0, frame, 0.3)
+    names = {layers["labels"][k][7] for k in layers["matches"]["blind"]["missed"]}
+    assert names == {"Pedestrian"} and layers["detections"] == {"blind": []}
+
+
+def test_the_ground_and_clusters_of_a_bag_without_them_are_our_own(drive_bag):
+    assert points_topic(drive_bag) == "/points"
+    drive = one_drive(open_recording(drive_bag))
+    ours, theirs = scanned(drive.frames[1]), recorded_scan(drive.frames[1])
+    for name in ("xyz", "ground", "cluster_ids"):
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name))
+    assert with_recorded_scans(drive).clouds(1).encoded() == ours.encoded()
+
+
+def test_result_files_that_are_not_there_are_named(tmp_path):
+    with pytest.raises(InputError, match="there is no folder"):
+        by_files(tmp_path / "none")
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+def test_a_screenshot_is_a_picture_of_the_page(drive_bag, tmp_path):
+    import matplotlib.image
+    picture = tmp_path / "page.png"
+    result = CliRunner().invoke(cli, ["view", str(drive_bag), "--frame", "1", "--theme", "light",
+                                      "--screenshot", str(picture)])
+    assert result.exit_code == 0, result.output
+    pixels = matplotlib.image.imread(picture)
+    assert pixels.shape[:2] == (720, 1280)
+    middle = pixels[100:500, 300:900, :3].reshape(-1, 3)
+    assert len(np.unique((middle * 255).astype(int), axis=0)) > 50  # points, in colours
+
+
+def test_a_frame_that_is_not_there_is_said(drive_bag):
+    result = CliRunner().invoke(cli, ["view", str(drive_bag), "--frame", "99", "--no-open"])
+    assert isinstance(result.exception, InputError) and "no frame 99" in str(result.exception)

@@ -1,0 +1,118 @@
+"""What the tests of the page do with it: look at a person, click, drag; ask the server."""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import urllib.request
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic, sleep
+
+import numpy as np
+
+from lidar_perception.classes import PEDESTRIAN
+from lidar_perception.geometry import points_in_box
+
+PATIENCE = 60.0  # seconds
+NEAR = 20.0      # metres
+
+
+def labelled_person(frame) -> np.ndarray:
+    """(7,) the labelled person with most points within NEAR."""
+    cloud = frame.load().xyz
+    boxes = [b for b in frame.truth().of_class(PEDESTRIAN) if math.hypot(b[0], b[1]) < NEAR]
+    return max(boxes, key=lambda b: points_in_box(cloud, b).sum())
+
+
+@dataclass
+class Label:
+    """A running labelling, asked over HTTP beside the page."""
+
+    process: subprocess.Popen
+    url: str
+    out: Path
+    arguments: tuple[str, ...]
+
+    def state(self) -> dict:
+        base, _, token = self.url.partition("?")
+        with urllib.request.urlopen(f"{base}api/state?{token}") as reply:
+            return json.load(reply)
+
+    def tracks(self) -> dict[int, dict]:
+        return {track["id"]: track for track in self.state()["tracks"]}
+
+    def box(self, number: int) -> list[float]:
+        """Of a track in frame 0."""
+        return boxes_of(self.tracks()[number])[0]
+
+    def lines(self) -> list[dict]:
+        """Of the journal."""
+        return [json.loads(line) for line in (self.out / "journal.jsonl").read_text().splitlines()]
+
+    def look_at(self, page, person: np.ndarray) -> None:
+        """From the side of the sensor; the person is in the middle of the view."""
+        x, y, z = map(float, person[:3])
+        away = 5.0 / math.hypot(x, y)
+        page.evaluate("([place, from]) => page.lookAt(place, from)",
+                      [[x, y, z], [x - x * away, y - y * away, z + 1.5]])
+
+    def seed(self, page, person: np.ndarray) -> int:
+        """Look at a person, click it as a seed; the track that it becomes."""
+        before = set(self.tracks())
+        self.look_at(page, person)
+        page.keyboard.press("Escape")
+        page.keyboard.press("s")
+        area = page.locator("#scene").bounding_box()
+        at = page.evaluate("p => page.project(...p)", [*map(float, person[:3])])
+        page.mouse.click(area["x"] + at[0], area["y"] + at[1])
+        page.wait_for_function("before => page.store.selected !== null "
+                               "&& !before.includes(page.store.selected)", arg=sorted(before))
+        page.keyboard.press("Escape")
+        return page.evaluate("page.store.selected")
+
+    def chosen(self, page, person: np.ndarray) -> int:
+        """A track of a person, new for this test, selected and looked at, without going on to the
+        next after a decision."""
+        number = self.seed(page, person)
+        page.uncheck("#advance")
+        page.locator("#scene").focus()
+        page.keyboard.press("f")
+        page.wait_for_timeout(50)
+        return number
+
+    def wait(self, page, number: int, true) -> None:
+        """Until something is true of a track at the server, and the page has heard of it."""
+        end = monotonic() + PATIENCE
+        while not true(self.tracks().get(number)):
+            assert monotonic() < end, (self.tracks().get(number), self.lines()[-3:])
+            sleep(0.02)
+        page.wait_for_function("n => page.store.seq >= n", arg=self.state()["seq"])
+        page.wait_for_function("() => page.store.draft === null")
+
+
+def boxes_of(track: dict) -> dict[int, list[float]]:
+    return {row[0]: row[1:8] for row in track["boxes"]}
+
+
+def faces(box: list[float]) -> dict[str, float]:
+    """How far each face is from the sensor's origin along its own outward axis."""
+    x, y, z, *size, yaw = box
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    along = cos * x + sin * y, -sin * x + cos * y, z
+    return {f"{sign}{axis}": (1 if sign == "+" else -1) * along[k] + size[k] / 2
+            for k, axis in enumerate("xyz") for sign in "+-"}
+
+
+def middle(page, selector: str) -> tuple[float, float]:
+    """Of an element, on the page."""
+    area = page.locator(selector).bounding_box()
+    return area["x"] + area["width"] / 2, area["y"] + area["height"] / 2
+
+
+def drag(page, start: tuple[float, float], way: tuple[float, float]) -> None:
+    page.mouse.move(*start)
+    page.mouse.down()
+    page.mouse.move(start[0] + way[0], start[1] + way[1], steps=5)
+    page.mouse.up()

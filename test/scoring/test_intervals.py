@@ -1,0 +1,52 @@
+"""Intervals: drives are drawn, not frames, and what does not vary has no width."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidar_perception.scoring.centres.scores import CentreScores
+from lidar_perception.scoring.intervals import DRIVES, RUN, blocks, interval
+
+
+@given(st.lists(st.integers(0, 30), min_size=1, max_size=15), st.booleans())
+def test_every_frame_is_in_one_block_and_a_block_is_of_one_drive(lengths, named):
+    names = [f"{drive:04}/{i:06}" if named else f"{drive}{i:06}"
+             for drive, count in enumerate(lengths) for i in range(count)]
+    parts = blocks(names)
+    assert sorted(np.concatenate([np.zeros(0, int), *parts]).tolist()) == [*range(len(names))]
+    for part in parts:
+        drives = {names[i].rpartition("/")[0] for i in part}
+        assert len(drives) == 1 and (named or len(part) == 1)
+    drives = sum(count > 0 for count in lengths)
+    if named and drives >= DRIVES:
+        assert len(parts) == drives
+    else:
+        assert all(len(part) <= RUN for part in parts)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 40))
+def test_an_interval_holds_the_score_and_repeats_itself(seed, count):
+    values = np.random.default_rng(seed).normal(0, 1, count)
+    parts = [np.array([i]) for i in range(count)]
+    low, high = interval(lambda frames: values[frames].mean(), parts, 300)
+    assert low <= values.mean() + 0.01 and high >= values.mean() - 0.01 and low < high
+    assert [low, high] == interval(lambda frames: values[frames].mean(), parts, 300)
+    assert interval(lambda frames: 3.0, parts, 10) == [3.0, 3.0]
+    assert interval(lambda frames: 3.0, parts[:1], 10) is None
+    assert interval(lambda frames: None, parts, 10) is None
+
+
+def test_frames_of_one_drive_that_are_alike_do_not_narrow_it():
+    """Ten frames of a drive say no more than one."""
+    person, elsewhere = np.array([[10.0, 0, 0, 1, 1, 2, 0]]), np.array([[20.0, 0, 0, 1, 1, 2, 0]])
+    once, often = CentreScores(), CentreScores()
+    for drive in range(12):
+        found = person if drive % 2 else elsewhere
+        once.update(person, found, np.ones(1), f"{drive}/0")
+        for i in range(10):
+            often.update(person, found, np.ones(1), f"{drive}/{i}")
+    assert once.f1_interval(0.5, 200) == often.f1_interval(0.5, 200)
+    low, high = once.f1_interval(0.5, 200)
+    assert low < 50 < high

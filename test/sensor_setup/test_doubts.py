@@ -1,0 +1,172 @@
+"""What cannot be told is said, with the remedy; what cannot be used is refused."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from tilted_samples import clouds_of
+
+from lidar_perception.sensor_setup.findings import body_fits, doubts
+from lidar_perception.sensor_setup.measure import measured, sensor_of
+from lidar_perception.sensor_setup.scans import intensity_of, scan_of
+from lidar_perception.sensor_setup.timing import timing_of
+from lidar_perception.types import InputError
+from lidar_perception.wire.codec import bag_message
+from msg_utils.point_cloud2 import from_array, to_array
+from msg_utils.stamps import header_message
+
+
+@cache
+def messages():
+    return tuple(clouds_of("vlp-16", 6))
+
+
+def changed(msg, change, frame_id="lidar"):
+    """The cloud with its structured array changed in place by change(points)."""
+    points = to_array(msg).copy()
+    points = change(points) if change else points
+    return from_array(points, header_message(0, frame_id, bag_message), bag_message)
+
+
+def turned(matrix):
+    """A change that turns all points."""
+    def change(points):
+        xyz = np.column_stack([points[a] for a in "xyz"]) @ np.transpose(matrix)
+        for axis, values in zip("xyz", xyz.T):
+            points[axis] = values
+        return points
+    return change
+
+
+def of(scans, numbers=(0, 1, 10, 11, 20, 21), stamps=None):
+    return measured(scans, numbers[:len(scans)], "drive", 22, stamps)
+
+
+def all_changed(change):
+    return [scan_of(changed(msg, change)) for msg in messages()]
+
+
+def said(m, *parts):
+    return any(all(part in line for part in parts) for line in doubts(m))
+
+
+def test_one_cloud_a_robot_that_stands_and_one_that_drives():
+    scans = all_changed(None)
+    one, still, drives = of(scans[:1]), of(scans[:1] * 5, (0, 1, 2, 3, 4)), of(scans)
+    assert said(one, "one cloud only", "record") and one.coverage.still is None
+    assert said(still, "stands still", "record") and still.coverage.still
+    assert not said(drives, "stands still") and not said(drives, "one cloud")
+
+
+def test_the_robots_body_is_found_and_left_out():
+    """A curved panel behind the sensor, which every scan sees."""
+    rng = np.random.default_rng(0)
+
+    def with_body(points):
+        new = np.zeros(960, points.dtype)
+        new["ring"] = np.tile(np.arange(16), 60)
+        up = np.radians(np.linspace(-15, 15, 16))[new["ring"]]
+        bearing = np.repeat(np.radians(np.linspace(165.2, 194.8, 60)), 16)
+        reach = 0.7 + rng.normal(0, 0.005, 960)
+        new["x"], new["y"], new["z"] = (reach * np.cos(up) * np.cos(bearing),
+                                        reach * np.cos(up) * np.sin(bearing), reach * np.sin(up))
+        return np.concatenate([points[np.hypot(points["x"], points["y"]) > 1.0], new])
+
+    m = of(all_changed(with_body))
+    c = m.coverage
+    assert body_fits(m) and c.body.any() and c.others < 0.1
+    assert (c.box[:2] < [-0.6, -0.1]).all() and (c.box[3:5] > [-0.7, 0.1]).all()
+    assert -0.9 < c.box[0] and c.box[3] < 0 and np.abs(c.box[[2, 5]]).max() < 0.4
+    behind = [(a, b) for ring, a, b in c.blocked if ring == 0]
+    assert any(a <= 168 and b >= 192 for a, b in behind)
+    assert len(of(all_changed(None)).coverage.box) == 0
+
+
+def test_a_sector_that_never_returns_is_the_end_of_the_view():
+    m = of(all_changed(lambda p: p[np.abs(np.arctan2(p["y"], p["x"])) < np.radians(60)]))
+    start, end = m.coverage.view
+    assert abs(start - 300) <= 1 and abs(end - 60) <= 1
+    assert sensor_of(m).open_rays().mean() == pytest.approx(1 / 3, abs=0.02)
+
+
+def test_a_frame_with_y_ahead_or_z_down_is_said():
+    ahead = of(all_changed(turned([[0, -1, 0], [1, 0, 0], [0, 0, 1]])))
+    assert ahead.heading[0] == pytest.approx(90, abs=10) and said(ahead, "90 deg", "base_frame")
+    down = of(all_changed(turned(np.diag([1, -1, -1]))))
+    assert abs(np.degrees(down.mount.roll)) == pytest.approx(175, abs=0.3)
+    assert said(down, "upside down") and down.mount.height == pytest.approx(0.6, abs=0.02)
+
+
+def test_a_frame_that_is_turned_against_the_sensor_has_no_beams_and_gets_a_grid():
+    def levelled(points):
+        points = turned([[0.906, 0, 0.423], [0, 1, 0], [-0.423, 0, 0.906]])(points)
+        points["ring"] = 0
+        return points
+
+    m = of(all_changed(levelled))
+    assert m.beams is None and said(m, "no beams", "grid")
+    grid = sensor_of(m)
+    low, high = np.percentile(np.concatenate([s.elevation for s in m.scans]), [1, 99])
+    assert grid.wander > 0 and grid.rings * grid.columns < 60_000
+    assert np.degrees(grid.elevations[0]) >= high - 1 and np.degrees(
+        grid.elevations[-1] - grid.wander) <= low + 1
+
+
+def test_without_ground_in_sight_the_mount_is_not_known():
+    m = of(all_changed(lambda p: p[p["z"] > 0.3]))
+    assert m.mount is None and said(m, "no ground in sight", "sensor_pose")
+
+
+def test_millimetres_two_dimensions_few_points_and_mixed_layouts_are_refused():
+    def in_millimetres(points):
+        for axis in "xyz":
+            points[axis] *= 1000
+        return points
+
+    for change, named in ((in_millimetres, "millimetres"), (lambda p: p[:50], "50 usable points")):
+        with pytest.raises(InputError, match=named) as error:
+            scan_of(changed(messages()[0], change))
+        assert "\n" not in str(error.value)
+    with pytest.raises(InputError, match="2D scanner"):
+        of(all_changed(lambda p: p[p["ring"] == 8]))
+    mixed = all_changed(None)
+    with pytest.raises(InputError, match="several layouts"):
+        of([mixed[0]._replace(columns=("x", "y", "z")), *mixed[1:]])
+
+
+def test_several_frames_gaps_and_stamps_that_jump_are_said():
+    scans = [scan._replace(frame_id=f"lidar_{i % 2}") for i, scan in enumerate(all_changed(None))]
+    stamps = np.arange(100) * 10**8
+    lossy = np.delete(stamps, [20, 21, 50])
+    m = of(scans, stamps=lossy)
+    assert said(m, "several frames") and said(m, "3 clouds are missing")
+    assert (m.timing.gaps, m.timing.missing) == (2, 3) and m.timing.rate == pytest.approx(10)
+    back = timing_of(scans, np.concatenate([stamps, stamps]))
+    assert back.backwards == 1 and back.missing == 0
+    drives = timing_of(scans, np.concatenate([stamps, stamps + 10**12]))
+    assert drives.missing == 0
+
+
+@pytest.mark.parametrize("values, full, sure", [
+    (np.linspace(0, 0.99, 500), 1.0, True), (np.arange(256.0), 255.0, True),
+    (np.arange(120.0), 255.0, False), (np.arange(30.0), 255.0, False),
+    (np.linspace(0, 99.5, 999), 100.0, True), (np.arange(60000.0), 65535.0, True)])
+def test_the_scale_of_intensities(values, full, sure):
+    scan = replace_intensity(all_changed(None)[0], values)
+    found = intensity_of([scan])
+    assert (found.full, found.sure) == (full, sure)
+    assert intensity_of([scan._replace(intensity=None)]) is None
+    assert intensity_of([scan._replace(intensity=np.zeros(9))]) is None
+
+
+def replace_intensity(scan, values):
+    return scan._replace(intensity=values)
+
+
+def test_what_was_measured_never_changes_what_was_given():
+    scans = all_changed(None)
+    before = [scan.xyz.copy() for scan in scans]
+    m = of(scans)
+    doubts(replace(m, model=""))
+    assert all(np.array_equal(a, s.xyz) for a, s in zip(before, scans))

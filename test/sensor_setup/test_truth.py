@@ -1,0 +1,102 @@
+"""Simulated sensors that lean are measured as they are; real ones as they are known."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from tilted_samples import BARE, MOUNTS, clouds_of
+
+from lidar_perception.data.raw_clouds import open_clouds, spread
+from lidar_perception.sensor_setup.beams import beams_of
+from lidar_perception.sensor_setup.files import params_yaml, sensor_yaml
+from lidar_perception.sensor_setup.findings import doubts, findings
+from lidar_perception.sensor_setup.measure import measured
+from lidar_perception.sensor_setup.scans import scan_of
+from lidar_perception.simulation.sensor import sensor_from_file, sensor_named
+
+CHECKED = ("hdl-64e", "vlp-16", "pandarxt-32")  # by the order, by rings, and by elevations
+
+
+@cache
+def scans(name):
+    return tuple(scan_of(msg) for msg in clouds_of(name))
+
+
+@cache
+def found(name):
+    return measured(scans(name), [0, 1, 10, 11], name, 12, None)
+
+
+@pytest.mark.parametrize("name", CHECKED)
+def test_a_sensor_that_leans_is_measured_as_it_is(name):
+    m, sensor = found(name), sensor_named(name)
+    driver, roll, pitch, height = MOUNTS[name]
+    assert len(m.beams.elevations) == sensor.rings and m.model == name
+    assert np.abs(m.beams.elevations - np.degrees(sensor.elevations)).max() < 0.05
+    assert np.allclose(m.beams.lifts, sensor.lifts or 0.0, atol=0.005)
+    assert m.step == pytest.approx(360 / sensor.columns, rel=0.02)
+    assert m.noise == pytest.approx(sensor.range_noise, rel=0.3)
+    assert m.mount.height == pytest.approx(height, abs=0.02)
+    assert np.degrees([m.mount.roll, m.mount.pitch]) == pytest.approx([roll, pitch], abs=0.2)
+    assert m.heading[0] == pytest.approx(0, abs=10) and m.coverage.still is False
+    for what in ("intensity", "ring", "time"):
+        column = driver[what]
+        assert (column[0] if column else f"no {what}") in next(
+            f.how for f in findings(m) if f.what == "columns")
+    if driver["intensity"]:
+        assert m.intensity.full == driver["intensity"][2] and m.intensity.sure
+        assert m.intensity.zeros == pytest.approx(float(np.mean(np.concatenate(
+            [s.intensity for s in m.scans]) == 0)))
+    if driver["time"]:
+        assert m.timing.rate == pytest.approx(sensor.rate, rel=0.01)
+        assert m.timing.turns == "clockwise"
+
+
+def test_the_file_that_is_written_is_the_sensor_that_was_measured(tmp_path):
+    for name in CHECKED:
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(sensor_yaml(found(name)))
+        sensor, known = sensor_from_file(path), sensor_named(name)
+        assert sensor.columns == known.columns and sensor.divergence == pytest.approx(
+            known.divergence, abs=1e-6)
+        assert np.allclose(sensor.elevations, known.elevations, atol=np.radians(0.05))
+        assert sensor.height == pytest.approx(MOUNTS[name][3], abs=0.02)
+
+
+def test_beams_are_the_same_by_rings_and_by_elevation():
+    with_rings = scans("vlp-16")
+    by_ring, by_elevation = (beams_of(s) for s in (
+        with_rings, [scan._replace(ring=None) for scan in with_rings]))
+    assert (by_ring.how, by_elevation.how) == ("ring", "elevation")
+    assert np.abs(by_ring.elevations - by_elevation.elevations).max() < 1e-3
+    assert np.mean(by_ring.labels[0] == by_elevation.labels[0]) > 0.999
+    one_label_each = {(int(a), int(b)) for a, b in zip(with_rings[0].ring, by_ring.labels[0])}
+    assert len(one_label_each) == 16
+
+
+def test_a_sparser_sensor_gets_wider_neighbourhoods_and_fewer_points():
+    sparse, dense = (params_yaml(found(name)) for name in ("vlp-16", "hdl-64e"))
+    assert "eps: [0.5, 0.7, 0.9, 1.0]" in sparse and "min_samples: 3" in sparse
+    assert "eps: [0.15, 0.3, 0.5, 0.7]" not in sparse and "min_samples: 10" in dense
+
+
+def test_a_bare_cloud_says_what_it_lacks():
+    assert MOUNTS["pandarxt-32"][0] is BARE
+    text = "\n".join(doubts(found("pandarxt-32")))
+    assert "there is no intensity" in text and "the rate cannot be told" in text
+
+
+@pytest.mark.parametrize("folder, model, height, rings", [
+    ("kitti_tracking", "hdl-64e", 1.73, 64), ("nuscenes/unlabelled", "hdl-32e", 1.84, 32),
+    ("sensors/vlp16.pcd", "vlp-16", None, 16), ("sensors/xt32.pcd", "pandarxt-32", None, 32),
+    ("sensors/pandar64.pcd", "pandar64", None, 64)])
+def test_real_sensors_are_known_by_their_beams(data, folder, model, height, rings):
+    clouds = open_clouds(data / folder)
+    numbers = spread(clouds.count, 4)
+    m = measured([scan_of(clouds.load(i)) for i in numbers], numbers, folder, clouds.count, None)
+    assert m.model == model and rings - 2 <= len(m.beams.elevations) <= rings
+    assert m.step == pytest.approx(np.degrees(sensor_named(model).azimuth_step), rel=0.05)
+    if height is None:  # indoors, on a table
+        assert m.mount is None and any("no ground" in line for line in doubts(m))
+    else:
+        assert m.mount.height == pytest.approx(height, abs=0.1)

@@ -1,0 +1,143 @@
+"""Laws of how a training starts: what is refused, planned, kept, and resumed after a kill."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from samples import write
+
+from lidar_perception.cli.main import cli
+from lidar_perception.detectors.checkpoint import read_header
+from lidar_perception.runs import terminal
+from lidar_perception.training import start as start_module
+from lidar_perception.training.loop import STATE
+from lidar_perception.training.start import RUN
+from lidar_perception.types import InputError
+
+SENSOR = "generic:16,-20,5,1,10"
+def words(out: Path, *more: str) -> list[str]:
+    """A training that is small in every way."""
+    return ["train", "pointpillars", "--version", "v0", "--ahead", "10", "--aside", "10", "--data",
+            "sim", "--data-people", "3", "--sensor", SENSOR, "--data-scans", "6",
+            "--data-val-scans", "1", "--steps", "4", "--validate-steps", "4", "--save-steps", "1",
+            "--batch", "1", "--jobs", "0", "--out", str(out), *more]
+
+
+def killed_when(condition, *arguments: str) -> None:
+    """Begin a training, and kill it when condition() holds."""
+    process = subprocess.Popen([sys.executable, "-m", "lidar_perception.cli.main", *arguments],
+                               env={**os.environ, "OMP_NUM_THREADS": "1"}, text=True,
+                               stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    end = time.monotonic() + 240
+    while not condition():
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < end
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+def tensors(out: Path) -> bytes:
+    """All but the header, which says how long it took."""
+    content = (out / "last.safetensors").read_bytes()
+    return content[8 + int.from_bytes(content[:8], "little"):]
+
+
+def test_killed_in_the_preparation_and_in_the_steps_it_ends_as_if_it_had_not_been(
+        tmp_path, one_thread):
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    unbroken = CliRunner().invoke(cli, words(whole, "--jobs", "2"))
+    assert unbroken.exit_code == 0, unbroken.exception
+    lines = unbroken.stderr.splitlines()
+    assert "6 scans of generic" in lines[1] and "4 steps of 1 scenes" in lines[1]
+    assert "simulating" in lines[2] and "validation" in lines[2]
+
+    scans = broken / "scans"
+    killed_when(lambda: len(list(scans.glob("*.npz"))) >= 2, *words(broken))
+    assert not (broken / STATE).exists()
+    before = {path: path.stat().st_mtime_ns for path in scans.rglob("*.npz")}
+    refused = CliRunner().invoke(cli, words(broken))
+    assert isinstance(refused.exception, InputError) and "--resume" in str(refused.exception)
+    killed_when((broken / STATE).exists, *words(broken, "--resume"))
+    assert {path: path.stat().st_mtime_ns for path in before} == before  # not made again
+    assert CliRunner().invoke(cli, words(broken, "--resume")).exit_code == 0
+    assert tensors(broken) == tensors(whole)
+    kept = {path.relative_to(broken): path.read_bytes() for path in broken.rglob("*.npz")}
+    assert kept == {path.relative_to(whole): path.read_bytes() for path in whole.rglob("*.npz")}
+
+
+def refuse(tmp_path: Path, *more: str) -> str:
+    """What the command says in one line of input that it refuses; nothing is made."""
+    result = CliRunner().invoke(cli, ["train", "pointnet", "--data", "sim", "--out",
+                                      str(tmp_path / "run"), *more])
+    assert result.exception is not None and not isinstance(result.exception, SystemExit)
+    assert not list(tmp_path.glob("run/scans/*")) and not (tmp_path / "run" / RUN).exists()
+    line = str(result.exception)
+    assert "\n" not in line
+    return line
+
+
+@pytest.mark.parametrize("hours", ["0", "-1", "nan", "inf"])
+def test_a_budget_that_is_none_is_refused(hours, tmp_path):
+    assert "--budget" in refuse(tmp_path, "--budget", hours)
+
+
+@pytest.mark.parametrize("content, reason", [
+    ("elevations: [3, 2, 400]\nazimuth_step: 0.2\nrate: 10\n", "elevations"),
+    ("elevations: [3]\nazimuth_step: 0\nrate: 10\n", "azimuth_step"),
+    ("beams: 4\n", "beams"),
+])
+def test_a_sensor_that_cannot_be_is_refused(content, reason, tmp_path):
+    path = write(tmp_path / "robot.yaml", content)
+    assert reason in refuse(tmp_path, "--sensor", str(path))
+
+
+def test_a_mount_that_cannot_be_is_refused(tmp_path):
+    assert "mount_height" in refuse(tmp_path, "--mount-height", "-1")
+
+
+def test_a_disk_without_room_is_refused_before_anything_is_simulated(tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(start_module.shutil, "disk_usage",
+                        lambda _: usage._replace(free=5 * 10**8))
+    line = refuse(tmp_path, "--sensor", SENSOR, "--data-scans", "1000", "--steps", "1")
+    assert "GB are free" in line and "--data-scans" in line
+
+
+def test_the_plan_is_kept_and_other_settings_are_no_resumed_run(tmp_path, one_thread):
+    out = tmp_path / "run"
+    sensor = write(tmp_path / "robot.yaml",
+                   "elevations: [2, -3, -8, -13, -18]\nazimuth_step: 1.5\nrate: 10\nheight: 0.9\n")
+    asked = ["train", "pointnet", "--data", "sim", "--sensor", str(sensor), "--data-scans", "2",
+             "--data-val-scans", "1", "--steps", "2", "--batch", "1", "--jobs", "0", "--init",
+             "package", "--out", str(out)]
+    assert CliRunner().invoke(cli, [*asked, "--mount-height", "0.6"]).exit_code == 0
+    said = read_header(out / "last.safetensors").training
+    assert said["sensor"] == {"name": str(sensor), "height": 0.6, "beams": 5}
+    header = read_header(out / "last.safetensors")
+    assert header.unlike(0.7) is None and "at 0.6 m, and used with one at 1.73 m" in header.unlike(
+        1.73)
+    plan = json.loads((out / RUN).read_text())["plan"]
+    assert (plan["scans"], plan["steps"]) == (2, 2)
+    other = CliRunner().invoke(cli, [*asked, "--resume"])
+    assert "0.9" in str(other.exception) and "0.6" in str(other.exception)
+    again = [*asked, "--mount-height", "0.6", "--resume", "--budget", "7"]
+    assert CliRunner().invoke(cli, again).exit_code == 0
+
+
+def test_where_there_is_no_terminal_progress_comes_line_by_line(monkeypatch, capsys):
+    monkeypatch.setattr(terminal, "EVERY", 0.0)
+    assert list(terminal.track(iter("abc"), "cutting", 3)) == ["a", "b", "c"]
+    lines = capsys.readouterr().err.splitlines()
+    assert [line.partition(",")[0] for line in lines] == [
+        f"cutting: {i} of 3" for i in (1, 2, 3)]
+    assert "left" in lines[-1]
