@@ -51,7 +51,7 @@ class Camera:
 
     def in_view(self, xyz: np.ndarray) -> np.ndarray:
         """(N,) bool: points (N, 3) in front of the camera that fall into the image."""
-        return _in_view(xyz, self.projection, self.width, self.height)
+        return _in_view(np.ascontiguousarray(xyz), self.projection, self.width, self.height)
 
     def in_regions(self, xyz: np.ndarray, regions: np.ndarray) -> np.ndarray:
         """(N,) bool: points (N, 3) in front of the camera that fall into any of regions (R, 4)

@@ -11,8 +11,9 @@ from msg_utils.markers import MarkedObjects, box_pose, pose_yaw
 from msg_utils.stamps import to_ns
 
 
-def to_detection_array(boxes: np.ndarray, labels: Sequence[str], scores: Sequence[float], *,
-                       header: Any, make: Any, ids: Sequence[int] | None = None,
+def to_detection_array(boxes: np.ndarray, labels: Sequence[str],
+                       scores: Sequence[float] | np.ndarray, *, header: Any, make: Any,
+                       ids: Sequence[int] | np.ndarray | None = None,
                        covariances: np.ndarray | None = None) -> Any:
     """Detection3DArray of boxes (K, 7) [x y z l w h yaw], one hypothesis each; ids as those of the
     markers, by default 0..K-1. covariances (K, 6, 6) of x y z and the turns about them, metres and

@@ -15,6 +15,12 @@ settings.register_profile("any machine", deadline=None)  # no test measures time
 settings.load_profile("any machine")
 
 
+def pytest_itemcollected(item):
+    """Hypothesis runs the same lines a hundred times; to measure them takes longer than to run."""
+    if getattr(item.obj, "is_hypothesis_test", False):
+        item.add_marker("no_cover")
+
+
 @pytest.fixture(scope="session")
 def data() -> Path:
     """Real scans that lie beside the checkout, never in it."""

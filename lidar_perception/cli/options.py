@@ -49,7 +49,7 @@ def parameter_options(defaults: Any) -> Callable:
             return function(*args, params=params, **kwargs)
 
         wrapper.__name__, wrapper.__doc__ = function.__name__, function.__doc__
-        wrapper.__click_params__ = getattr(function, "__click_params__", [])
+        setattr(wrapper, "__click_params__", getattr(function, "__click_params__", []))  # noqa: B010
         for name, f in reversed(parameter_fields(defaults).items()):
             wrapper = _option(name, f, defaults)(wrapper)
         named = [name for name, values in CONFIGURATIONS.items()

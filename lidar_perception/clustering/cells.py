@@ -145,7 +145,7 @@ def gather(cells, a, out):
 
 
 @njit(cache=True, nogil=True)
-def crowded(cells, reach2, enough, work=np.inf):
+def crowded(cells, reach2, enough, work):
     """(N,) bool, cell by cell: at least `enough` points lie within reach, itself included. reach2
     (N,): the square of each point's own, at most that of the cells. And how much is left of the
     work, a number of distances; once it is below 0, the rest is not looked at."""

@@ -105,7 +105,7 @@ def _touching(xyz: np.ndarray, labels: np.ndarray, inner: np.ndarray, outer: np.
         kept, _ = thinned(xyz[rows], reach, label)
         tree = tree_of(xyz[rows[kept]])
         pairs, _ = touching(tree, label[kept][tree.order], side[kept][tree.order],
-                            (reach * (1 + SLACK)) ** 2)
+                            (reach * (1 + SLACK)) ** 2, np.inf)
     return known[pairs]
 
 

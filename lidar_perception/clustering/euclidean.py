@@ -17,9 +17,10 @@ The equations are missing from the text of the paper; this is our reading of wha
 So the clusters do not depend on the order of the points. No pairs are stored: memory grows with
 the number of points only. Where the grid takes more than PATIENCE distances a point, because it
 is crowded with points out of reach of each other, a tree finds the same. Only the local threshold
-has to look at every pair: it is exact up to DENSE distances a point, where real scans take less
-than 1,000, and WORK a cloud, twice what the densest scan known takes; of denser clouds it takes a
-sample of each cell, the same of the same points.
+has to look at every pair: it is exact up to DENSE distances a point, where scans of KITTI take
+less than 1,700 and one of a Pandar64 among near surfaces 21,000, and WORK a cloud, twice what the
+densest scan known takes; of denser clouds it takes a sample of each cell, the same of the same
+points.
 """
 
 from __future__ import annotations
@@ -72,7 +73,7 @@ def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
         cells = cells_of(xyz, reach.max())
     component, enough = np.empty(n, np.int32), params.beta * np.log(n)
     reach2 = reach[cells.order] ** 2
-    leads, left = crowded(cells, reach2, enough, patience * n)
+    leads, left = crowded(cells, reach2, enough, float(patience * n))
     component[cells.order], left = _components(cells, np.stack([*cells.xyz, reach2], axis=1), leads,
                                                left)
     if left < 0:
@@ -201,7 +202,7 @@ def _components_by_tree(tree: Tree, reach2: np.ndarray, enough: float) -> np.nda
         thin = tree_of(tree.points[leads][kept])
         found = np.empty(len(kept), np.int64)
         found[thin.order] = connected(thin, widest[thin.order] * (1 + SLACK) ** 2,
-                                      np.ones(len(kept), bool), 0.0)[0]
+                                      np.ones(len(kept), bool), 0.0, np.inf)[0]
         component[leads] = found[group]
     leader = nearest_leaders(tree, reach2, leads)[0]
     return np.where(leader >= 0, component[leader], component)
@@ -270,7 +271,7 @@ def _merged(xyz: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
     if len(centre) > 2:
         tree = tree_of(centre[1:])
         every = np.ones(len(tree.order), bool)
-        joined = connected(tree, diameter[1:][tree.order], every, gamma)[0]
+        joined = connected(tree, diameter[1:][tree.order], every, gamma, np.inf)[0]
         component = np.empty(len(joined), np.int64)
         component[tree.order] = joined
         parent[1:] = np.unique(component, return_index=True)[1][component] + 1

@@ -17,7 +17,7 @@ def dbscan_by_growing(xyz: np.ndarray, eps: float, min_samples: int) -> np.ndarr
     cells = cells_of(xyz, eps)
     if np.diff(cells.start) @ cells.size > LIMIT * len(xyz):
         return None
-    core = crowded(cells, np.full(len(xyz), eps * eps), min_samples)[0]
+    core = crowded(cells, np.full(len(xyz), eps * eps), float(min_samples), np.inf)[0]
     labels = np.empty(len(xyz), np.int32)
     labels[cells.order] = _grow(cells, np.ascontiguousarray(cells.xyz.T), core, eps * eps)
     return labels

@@ -44,8 +44,8 @@ def oriented_boxes(xyz: np.ndarray, labels: np.ndarray, shape: str) -> np.ndarra
     """
     if shape not in BOX_SHAPES:
         raise ValueError(f"shape = {shape!r} must be one of {', '.join(BOX_SHAPES)}")
-    xyz = np.ascontiguousarray(xyz, np.float32)
     count = cluster_count(labels)
+    xyz, labels = np.ascontiguousarray(xyz, np.float32), np.ascontiguousarray(labels, np.int32)
     low, high, sizes = extents(xyz, labels, count)
     low[sizes == 0] = high[sizes == 0] = 0
     boxes = np.zeros((count, 7), np.float32)

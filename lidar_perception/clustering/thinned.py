@@ -18,9 +18,9 @@ PATIENCE = 2_000               # distances a point
 ENOUGH = 2**30                 # or so many in all, about a second
 
 
-def patience(count: int) -> int:
+def patience(count: int) -> float:
     """Distances that an exact search of so many points may take."""
-    return max(PATIENCE * count, ENOUGH)
+    return float(max(PATIENCE * count, ENOUGH))
 
 
 def thinned(xyz: np.ndarray, reach: np.ndarray | float,

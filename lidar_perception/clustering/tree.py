@@ -195,7 +195,7 @@ def _linked(squared, a, b, gamma):
 
 
 @njit(cache=True, nogil=True)
-def connected(tree, size, among, gamma, most_work=np.inf):
+def connected(tree, size, among, gamma, most_work):
     """(N,) the connected set of each of the points chosen, among (N,) bool, -1 of the others: sets
     of points that are linked by their sizes (N,), see _linked, all in the order of the tree. And
     how many distances were computed; if more than most_work, the sets are not complete."""
@@ -281,7 +281,7 @@ def _before(p, q):
 
 
 @njit(cache=True, nogil=True)
-def touching(tree, label, side, reach2, most_work=np.inf):
+def touching(tree, label, side, reach2, most_work):
     """(P, 2) pairs of labels that connect what all pairs would: of points, one of either side,
     within reach of each other. label (N,) from 0 on, side (N,) 0 or 1, in the order of the tree;
     points of one label are connected. P is less than the number of labels. And how many distances

@@ -15,7 +15,8 @@ TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Paramete
          str: Parameter.Type.STRING}
 LISTS = {int: Parameter.Type.INTEGER_ARRAY, float: Parameter.Type.DOUBLE_ARRAY,
          str: Parameter.Type.STRING_ARRAY}
-AS_FLOATS = {  # what is given, what is declared -> the value as declared
+# What is given, what is declared -> the value as declared.
+AS_FLOATS: dict[tuple[Any, Any], Any] = {
     (Parameter.Type.INTEGER, Parameter.Type.DOUBLE): float,
     (Parameter.Type.INTEGER_ARRAY, Parameter.Type.DOUBLE_ARRAY): lambda v: [*map(float, v)],
 }

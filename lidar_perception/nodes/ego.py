@@ -151,6 +151,7 @@ class EgoInput:
         if not 0 < gap <= 2 * self.params().max_gap:  # a map of another place, or of another time
             self.icp, self.scans = Odometry(), TransformTree()
         self.scan_ns = stamp_ns
+        assert self.icp is not None  # made by the first scan
         pose = self.icp(xyz)
         self.scans.set(START, SCAN, stamp_ns, pose[:3, 3],
                        Rotation.from_matrix(pose[:3, :3]).as_quat())

@@ -204,7 +204,7 @@ class Processes:
         if domain is not None:
             self.environment.update(ROS_DOMAIN_ID=str(domain),
                                     ROS_AUTOMATIC_DISCOVERY_RANGE="LOCALHOST")
-        self.running: dict[str, subprocess.Popen] = {}
+        self.running: dict[str, Any] = {}  # as subprocess.Popen
 
     def __enter__(self) -> Processes:
         self.logs.mkdir(parents=True, exist_ok=True)
@@ -221,8 +221,12 @@ class Processes:
         rules = {**remap, **({"__ns": f"/{namespace}"} if namespace else {}),
                  **({"__node": node} if executable_of(node) != node else {})}
         remapping = [word for rule in rules.items() for word in ("-r", ":=".join(rule))]
-        self.run(name, [sys.executable, "-m", "lidar_perception.nodes.main", executable_of(node),
-                        "--ros-args", "--params-file", str(file), *remapping])
+        self.run_node(name, [executable_of(node), "--ros-args", "--params-file", str(file),
+                             *remapping])
+
+    def run_node(self, name: str, arguments: Sequence[str]) -> None:
+        """Start one of our executables."""
+        self.run(name, [sys.executable, "-m", "lidar_perception.nodes.main", *arguments])
 
     def run(self, name: str, command: Sequence[str]) -> None:
         """Start any program; what it writes goes to the log."""

@@ -21,9 +21,10 @@ SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FA
 RETRY_PERIOD = 5.0  # seconds at least, and RETRY_SHARE times as long as an attempt takes
 RETRY_SHARE = 10.0
 UNCONFIGURED, INACTIVE = "not configured", "not active"
-ENTITIES = {"publishers": Node.destroy_publisher, "subscriptions": Node.destroy_subscription,
-            "clients": Node.destroy_client, "services": Node.destroy_service,
-            "timers": Node.destroy_timer, "guards": Node.destroy_guard_condition}
+ENTITIES: dict[str, Any] = {
+    "publishers": Node.destroy_publisher, "subscriptions": Node.destroy_subscription,
+    "clients": Node.destroy_client, "services": Node.destroy_service,
+    "timers": Node.destroy_timer, "guards": Node.destroy_guard_condition}
 
 
 class ManagedNode(LifecycleNodeMixin, LidarNode):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from io import BytesIO
+from typing import Any
 
 from lidar_perception.reproduction.experiment import Figure, Line
 
@@ -19,10 +20,11 @@ def draw(figure: Figure, kind: str = "svg", *, dark: bool = False) -> bytes:
     from matplotlib.figure import Figure as Canvas
 
     back, front, grid = ("#16181c", "#d8dade", "#34383f") if dark else ("white", "black", "#e3e3e3")
-    style = {"figure.facecolor": back, "axes.facecolor": back, "savefig.facecolor": back,
-             "text.color": front, "axes.labelcolor": front, "axes.edgecolor": GREY,
-             "xtick.color": front, "ytick.color": front, "grid.color": grid, "font.size": 9,
-             "legend.frameon": False, "svg.hashsalt": figure.name}
+    style: Any = {
+        "figure.facecolor": back, "axes.facecolor": back, "savefig.facecolor": back,
+        "text.color": front, "axes.labelcolor": front, "axes.edgecolor": GREY,
+        "xtick.color": front, "ytick.color": front, "grid.color": grid, "font.size": 9,
+        "legend.frameon": False, "svg.hashsalt": figure.name}
     with matplotlib.rc_context(style):
         columns = min(COLUMNS, len(figure.panels))
         rows = -(-len(figure.panels) // columns)
@@ -31,7 +33,7 @@ def draw(figure: Figure, kind: str = "svg", *, dark: bool = False) -> bytes:
         canvas = Canvas(figsize=size, dpi=130, layout="constrained")
         FigureCanvasAgg(canvas)
         axes = canvas.subplots(rows, columns, squeeze=False).ravel()
-        shown = {}
+        shown: dict[str, Any] = {}
         for panel, axis in zip(figure.panels, axes):
             for line, color in zip(panel.lines, _colors(panel.lines)):
                 shown.setdefault(line.label, _plot(axis, line, color))

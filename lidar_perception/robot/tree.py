@@ -91,8 +91,8 @@ class TransformTree:
         self._links: dict[str, _Link] = {}  # by the frame that is the child
         self.jumps = 0
 
-    def set(self, parent: str, child: str, stamp_ns: int, translation: Sequence[float],
-            quaternion: Sequence[float], static: bool = False) -> None:
+    def set(self, parent: str, child: str, stamp_ns: int, translation: Sequence[float] | np.ndarray,
+            quaternion: Sequence[float] | np.ndarray, static: bool = False) -> None:
         """The pose of child in parent: translation (3,) metres, quaternion (4,) [x y z w]. static:
         at any time. A child that gets another parent leaves the first. InputError for what is no
         pose, and for a frame in itself."""

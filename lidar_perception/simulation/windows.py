@@ -18,7 +18,7 @@ class Windows(NamedTuple):
     nearer than near (P,) m."""
 
     first: np.ndarray
-    count: np.ndarray
+    count: np.ndarray  # type: ignore[assignment]  # a tuple has a count of its own
     beams: np.ndarray
     near: np.ndarray
 
@@ -59,7 +59,8 @@ def windows(solids: Solids, sensor: Sensor, motion: Motion = STILL,
     count = len(solids)
     found = Windows(np.empty(count, np.int64), np.empty(count, np.int64),
                     np.empty((count, sensor.rings), bool), np.empty(count))
-    shapes = (np.array(part, float) for part in (solids.centre, solids.half, solids.axes, relative))
+    shapes = (np.array(part, float, order="C")
+              for part in (solids.centre, solids.half, solids.axes, relative))
     _windows(found, grid, np.array(solids.kind), *shapes)
     return found
 

@@ -9,15 +9,19 @@ from typing import Any
 
 from lidar_perception.nodes.graph import CLOUDS, Graph, Processes, graph_of, relative
 from lidar_perception.param_fields import flatten
+from lidar_perception.testing.forking import Forked
 from lidar_perception.wire.topics import POINTS
 
 LAST_LINES = 60  # of a log, where a test failed
 
 
 class NodesUnderTest(Processes):
-    """Processes whose logs are shown when a test fails while they run."""
+    """Processes whose logs are shown when a test fails while they run. Our nodes are forked from a
+    process that has loaded their code, unless they are to be fresh: then each is a Python of its
+    own, as in use, and takes seconds to start."""
 
     entered: list[NodesUnderTest] = []  # of all tests
+    fresh = False
 
     def __enter__(self) -> NodesUnderTest:
         super().__enter__()
@@ -27,6 +31,13 @@ class NodesUnderTest(Processes):
     def __exit__(self, *error: Any) -> None:
         self.entered.remove(self)
         super().__exit__(*error)
+
+    def run_node(self, name: str, arguments: Sequence[str]) -> None:
+        """Start one of our executables."""
+        if self.fresh:
+            super().run_node(name, arguments)
+        else:
+            self.running[name] = Forked(arguments, self.environment, self.logs / f"{name}.log")
 
     def start_graph(self, detectors: Sequence[str], params: Any = None, *, single: bool = False,
                     points: str = relative(POINTS), namespace: str = "") -> Graph:

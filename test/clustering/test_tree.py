@@ -71,14 +71,14 @@ def test_every_search_of_the_tree_says_what_all_pairs_say(data):
     np.testing.assert_array_equal(
         nearest(tree)[0], np.where(np.eye(n, dtype=bool), np.inf, squared).min(axis=1))
     reach2 = rng.choice([0.0, 0.125, 0.25, 0.5], n) ** 2
-    for enough in (1, 3, 7.5):
+    for enough in (1.0, 3.0, 7.5):
         np.testing.assert_array_equal(crowded(tree, reach2, enough)[0],
                                       (squared <= reach2[:, None]).sum(axis=1) >= enough)
     among = rng.random(n) < 0.7
     for gamma, linked in (
             (0.0, squared <= np.maximum(reach2[:, None], reach2)),
             (2.0, np.sqrt(squared) < 2.0 * (reach2[:, None] + reach2) / 2)):
-        found = connected(tree, reach2, among, gamma)[0]
+        found = connected(tree, reach2, among, gamma, np.inf)[0]
         sets = connected_components(coo_matrix(linked & among & among[:, None]))[1]
         assert (found[~among] == -1).all() and (found[among] >= 0).all()
         np.testing.assert_array_equal(found[among, None] == found[among],
@@ -103,7 +103,7 @@ def test_touching_connects_what_all_pairs_connect(data):
     reach2 = data.draw(st.sampled_from([0.0, 0.125, 0.25, 0.5])) ** 2
     near = (cdist(tree.points, tree.points, "sqeuclidean") <= reach2) & (side[:, None] != side)
     i, j = np.nonzero(near)
-    pairs = touching(tree, label, side, reach2)[0]
+    pairs = touching(tree, label, side, reach2, np.inf)[0]
     count = label.max() + 1
     assert len(pairs) < count
 
@@ -135,13 +135,13 @@ def works(xyz):
     reach2, leads = np.full(n, 0.3**2), np.ones(n, bool)
     tiny = np.full(n, 1e-6**2)
     side = np.arange(n) % 2
-    return {"nearest": nearest(tree)[1], "crowded": crowded(tree, reach2, 10)[1],
-            "crowded, no reach": crowded(tree, tiny, 10)[1],
-            "connected": connected(tree, reach2, leads, 0.0)[1],
-            "connected, no reach": connected(tree, tiny, leads, 0.0)[1],
+    return {"nearest": nearest(tree)[1], "crowded": crowded(tree, reach2, 10.0)[1],
+            "crowded, no reach": crowded(tree, tiny, 10.0)[1],
+            "connected": connected(tree, reach2, leads, 0.0, np.inf)[1],
+            "connected, no reach": connected(tree, tiny, leads, 0.0, np.inf)[1],
             "leaders": nearest_leaders(tree, reach2, side == 0)[1],
-            "touching": touching(tree, side, side, 0.3**2)[1],
-            "touching, no reach": touching(tree, side, side, 0.0)[1]}
+            "touching": touching(tree, side, side, 0.3**2, np.inf)[1],
+            "touching, no reach": touching(tree, side, side, 0.0, np.inf)[1]}
 
 
 @each
@@ -199,5 +199,5 @@ def test_a_dense_wall_at_a_limit_is_joined_with_few_distances():
     assert distance_aware_dbscan(wall, params).max() == 1
     tree = tree_of(wall)
     side = (np.hypot(*tree.points[:, :2].T) >= 15).astype(np.int64)
-    pairs, work = touching(tree, side, side, 0.15**2)
+    pairs, work = touching(tree, side, side, 0.15**2, np.inf)
     assert len(pairs) == 1 and work < 100

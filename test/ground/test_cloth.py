@@ -126,7 +126,7 @@ def test_cells_are_climbed_as_a_slow_reading_climbs_them(seed, slope):
         if not new:
             break
         touched |= new
-    found = climbed_cells(lowest, height, np.float32(0.1), slope)
+    found = climbed_cells(lowest, height, float(np.float32(0.1)), slope)
     assert {tuple(cell) for cell in np.argwhere(found)} == {
         (r, c) for r, c in touched if lowest[r, c] > np.float32(0.1)}
 

@@ -22,6 +22,7 @@ from lidar_perception.scoring.centres.report import (
     pedestrians,
     seed_source,
 )
+from lidar_perception.testing.processes import NodesUnderTest
 from lidar_perception.wire.messages import column, to_detections, to_frame
 from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import from_marker_array
@@ -49,9 +50,10 @@ def run(setting, drive_bag, tmp_path_factory):
     """One replay: whether in one process, its scores, and the folder with the result bag."""
     single, params = setting
     out = tmp_path_factory.mktemp("run")
-    with Bag(drive_bag) as bag:
+    with Bag(drive_bag) as bag, pytest.MonkeyPatch.context() as patch:
         clouds = bag.counts[POINTS]
-    return single, replay(drive_bag, clouds, out, params, single=single), out
+        patch.setattr("lidar_perception.nodes.replay.Processes", NodesUnderTest)
+        return single, replay(drive_bag, clouds, out, params, single=single), out
 
 
 @pytest.fixture(scope="module")

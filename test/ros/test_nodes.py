@@ -47,6 +47,7 @@ def test_a_signal_during_the_start_ends_with_code_0_too(processes, number):
     """From the moment on when the node has signals wait for it, which is before anything that takes
     time; before that Python itself starts, and nobody can hold them."""
     from time import sleep
+    processes.fresh = True
     processes.start("perception", {}, {})
     process = processes.running["perception"]
     status = Path(f"/proc/{process.pid}/status")

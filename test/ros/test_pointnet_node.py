@@ -140,6 +140,7 @@ UNUSABLE = {  # weights made in a folder; words of the diagnostic
 
 def test_weights_that_cannot_be_used_are_a_diagnostic(shared_processes, peer, tmp_path):
     for i, (make, _) in enumerate(UNUSABLE.values()):
+        shared_processes.fresh = make is missing_weights
         shared_processes.start(NODE, REMAP, {"pointnet.weights": str(make(tmp_path))}, f"bad{i}")
     talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
     for i, (make, words) in enumerate(UNUSABLE.values()):

@@ -199,6 +199,7 @@ def test_without_weights_the_node_lives_says_so_and_finds_nothing(processes, sha
     if missing is None:
         pytest.skip("weights of all versions and sizes come with the package")
     version, size = missing.split()
+    processes.fresh = True
     processes.start(NODE, {"~/input/points": "/in"},
                     {"pointpillars.version": version, "pointpillars.size": size}, "none")
     peer, node = shared_peer, f"none/{NODE}"

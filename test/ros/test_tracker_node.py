@@ -13,12 +13,13 @@ from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, perso
 
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.data.bag import Bag
-from lidar_perception.nodes.graph import ODOMETRY_IN, Processes, graph_of
+from lidar_perception.nodes.graph import ODOMETRY_IN, graph_of
 from lidar_perception.nodes.tracker import TrackerNode
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
 from lidar_perception.testing.peer import Peer
+from lidar_perception.testing.processes import NodesUnderTest
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
@@ -80,7 +81,8 @@ def looped(domain, drive_bag, tmp_path_factory):
                "inside": "/perception/output/tracks"}
     with Bag(drive_bag) as bag:
         clouds = bag.counts[POINTS]
-    with Processes(tmp_path_factory.mktemp("looped"), domain) as processes, Peer(domain) as peer:
+    with NodesUnderTest(tmp_path_factory.mktemp("looped"), domain) as processes, \
+            Peer(domain) as peer:
         heard = {name: peer.listen(topic, MARKERS, ALL_OF_THEM) for name, topic in outputs.items()}
         for node, remap in graph.items():
             extra = ({**flatten(params), "tracking.enabled": True, "input.queue": 2}

@@ -148,9 +148,10 @@ class Head(nn.Module):
         self.scores = nn.Conv2d(channels, per_cell * classes, 1)
         self.codes = nn.Conv2d(channels, per_cell * CODE, 1)
         self.directions = nn.Conv2d(channels, per_cell * BINS, 1)
-        nn.init.normal_(self.scores.weight, std=0.01)
         nn.init.constant_(self.scores.bias, -math.log((1 - PRIOR) / PRIOR))
-        nn.init.normal_(self.codes.weight, std=0.001)
+        for layer, std in ((self.scores, 0.01), (self.codes, 0.001)):
+            if not layer.weight.is_meta:  # there it would load torch's compiler: 2 s, no numbers
+                nn.init.normal_(layer.weight, std=std)
 
     def forward(self, features: Tensor) -> Outputs:
         return Outputs(_by_anchor(self.scores(features), self.classes),

@@ -130,6 +130,7 @@ def _told_apart(boxes: np.ndarray, speed: np.ndarray, labelled: Labelled,
                 before: Sequence[Frame], poses: np.ndarray) -> list[int]:
     """Counts of the far pedestrians that have a cluster, see measure()."""
     first = before[0].truth()
+    assert first is not None  # of labelled frames
     tracks = {e["track_id"]: box for box, e in zip(first.boxes, first.extras) if "track_id" in e}
     to_newest = np.linalg.inv(poses[-1]) @ poses[0]
     counts = [0, 0, 0, 0]

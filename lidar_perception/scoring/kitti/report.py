@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -75,9 +76,10 @@ class DetectionReport:
 
     def compute(self) -> dict:
         """What the JSON file holds; ap in percent."""
-        result = {"frames": len(self.frames), "ap": {}, "map_3d": None, "matched": {},
-                  "diagnosis": [], "pedestrian_centres": self.pedestrians.compute(),
-                  "ms": float(np.median(self.ms)) if self.ms else None, "skipped": self.skipped}
+        result: dict[str, Any] = {
+            "frames": len(self.frames), "ap": {}, "map_3d": None, "matched": {}, "diagnosis": [],
+            "pedestrian_centres": self.pedestrians.compute(),
+            "ms": float(np.median(self.ms)) if self.ms else None, "skipped": self.skipped}
         if self.frames:
             together = Comparison.of(self.frames)
             result["ap"] = {name: self._class_content(together, name) for name in SCORED}

@@ -202,5 +202,5 @@ def _score_bins(table: dict | None, score: str) -> list[dict]:
     """Ratios of all frames together, which have no spread; n is the number of cases."""
     counts = [sum(table[name][k] for k in SCORES[score]) if table else 0
               for name in (*RANGE_NAMES, "all")]
-    return [_row(n, table[name][score] if n else None)
+    return [_row(n, table[name][score] if table and n else None)
             for name, n in zip((*RANGE_NAMES, "all"), counts)]

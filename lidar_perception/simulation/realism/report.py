@@ -47,7 +47,7 @@ def _print_curves(content: dict, console: Console) -> None:
     table = narrow_table("Simulated against real, worst curves first",
                    "curve", "within 20 %", "typical", "worst at", "ratio", fold=True)
     judged = [c for c in content["curves"].values() if c["judged"]]
-    for curve in sorted(judged, key=lambda c: (c["share"], -typical_factor(c))):
+    for curve in sorted(judged, key=lambda c: (c["share"], -(typical_factor(c) or 0.0))):
         worst = max((b for b in curve["bins"] if b["within"] is not None), key=factor_off)
         table.add_row(_title(curve), f"{curve['within']} of {curve['judged']}",
                       number(typical_factor(curve), width=9), worst["bin"],

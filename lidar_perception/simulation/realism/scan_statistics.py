@@ -134,7 +134,7 @@ def object_rows(frame: LidarFrame, truth: GroundTruth, camera: Camera | None) ->
         inside = np.flatnonzero(points_in_box(frame.xyz, box))
         if len(inside) == 0:
             continue
-        values = {"points of all": len(inside)}
+        values: dict[str, float] = {"points of all": len(inside)}
         if truth.extras[i].get("occluded", 0) == 0:
             values |= {"points": len(inside), "density": len(inside) / square_degrees(box)}
             if len(inside) >= MIN_POINTS:
@@ -160,7 +160,7 @@ def square_degrees(box: np.ndarray) -> float:
 
 
 def _seen_whole(camera: Camera | None, box: np.ndarray) -> bool:
-    return camera is None or camera.in_view(box_corners(box[None])[0]).all()
+    return camera is None or bool(camera.in_view(box_corners(box[None])[0]).all())
 
 
 def _bin(values: np.ndarray, limits: np.ndarray) -> np.ndarray:
