@@ -136,6 +136,15 @@ class Peer(Outside):
         self.wait(lambda: self.connected(outputs), f"{', '.join(graph)} to find each other",
                   timeout)
 
+    def wait_for_subscribers(self, node: str, topic: str, others: int = 0,
+                             timeout: float = TIMEOUT) -> None:
+        """Until a node of ours knows, by its diagnostics, all that this peer has of listeners to
+        its topic, and so many others: what it publishes before, these do not get."""
+        name = self.node.resolve_topic_name(topic)
+        wanted = others + sum(name == heard for heard, _ in self.heard)
+        self.wait(lambda: int(self.value_of(node, f"subscribers of {name}") or 0) >= wanted,
+                  f"{wanted} subscribers of {name}", timeout)
+
     def seen(self) -> str:
         """What the nodes say of themselves, and what has come on the topics listened to."""
         said = "; ".join(f"{name} {LEVELS[ord(status.level)]} '{status.message}'"

@@ -146,9 +146,9 @@ def test_tracking_puts_a_tracker_behind_each_detector(launched):
     assert dict(behind.remappings) == {"~/input/points": "/cloud", "~/input/odometry": "/odometry",
                                        "~/input/detections": found}
     assert behind.namespace == "left"
-    own, file, given = behind.parameters
+    file, given = behind.parameters
     assert Path(file).name == "tracker.param.yaml" and Path(file).is_file()
-    assert own.keys() <= node_parameters("tracker").keys() and given == {"use_sim_time": False}
+    assert given == {"use_sim_time": False}
     alone = nodes(tracking="true", detectors="pointpillars")
     assert ("~/input/detections", "pointpillars_detector/output/detections") in (
         alone["tracker"].remappings)

@@ -107,9 +107,9 @@ def test_scans_are_not_needed_for_result_files(kitti, found, tmp_path):
 
 def test_a_checkpoint_is_run_on_every_scan(kitti, detector, tmp_path):
     detector.find = lambda frame: truth_of(kitti)
-    content, text = evaluate(tmp_path, "--data", kitti, "--weights", "v4.safetensors",
+    content, text = evaluate(tmp_path, "--data", kitti, "--weights", "v4.onnx",
                              "--device", "cpu")
-    assert detector.asked == [("v4.safetensors", "cpu", MIN_SCORE, SENSOR_HEIGHT)]
+    assert detector.asked == [("v4.onnx", "cpu", MIN_SCORE, SENSOR_HEIGHT)]
     assert len(detector.scans) == 2
     assert len(detector.scans[0]) == len(open_recording(kitti).frames[0].load())
     assert content["ms"] >= 0 and "ms a frame" in text

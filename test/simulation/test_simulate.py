@@ -199,7 +199,7 @@ def test_resume_names_every_difference(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("options, said", [
-    (["--sensor", "hdl65"], "unknown sensor 'hdl65': must be one of hdl64e"),
+    (["--sensor", "hdl65"], "unknown sensor 'hdl65': must be one of hdl-32e"),
     (["--format", "pcap"], "pcap"), (["--frames", "0"], "0 is not in the range"),
     (["--seed", "-1"], "-1 is not in the range"), (["--streets-of", "201"], "1 .. 200"),
     (["--resume", "--force"], "one of them"), (["--format", "mcap", "--resume"], "with 'convert'")])
