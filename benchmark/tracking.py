@@ -13,7 +13,7 @@ from benchmark.plain_ab3dmot import PlainAb3dmot
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Recording
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.detectors.params import MIN_SCORE
+from lidar_perception.detectors.params import MIN_SCORE, ScoreParams
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, ego_of, observe
@@ -22,7 +22,7 @@ from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, GroundTruth
 
-OPERATING = 0.3  # score from which on the peer is given detections; it does not weigh them
+OPERATING = ScoreParams().car  # from this score on the peer is given detections; it weighs none
 SHOWN = ("HOTA", "DetA", "AssA", "MOTA", "sAMOTA", "AMOTA", "switches", "fragments", "labels",
          "true_tracks", "tracks")
 Step = Callable[["Seen"], tuple[np.ndarray, Detections]]

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 @data_option
 @click.option("--sequence", metavar="NAME", help="The drive of PATH to label, where it has "
               "several.")
-@a_path("--out", "Folder of the journal, with which it is gone on. Default: out/label/NAME OF THE "
-        "DRIVE.", "FOLDER")
+@a_path("--out", "Folder of the journal; one that is there is continued. Default: "
+        "out/label/NAME OF THE DRIVE.", "FOLDER")
 @click.option("--port", type=click.IntRange(0, 65535), default=0, show_default=True,
               help="Port on 127.0.0.1; 0: any that is free.")
 @click.option("--open/--no-open", "browser", default=True, help="Open the page in a browser.  "

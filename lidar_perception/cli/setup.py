@@ -39,9 +39,9 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
           force: bool) -> None:
     """Measure a LiDAR, its mounting and the robot's body from unlabelled clouds.
 
-    Writes sensor.yaml, which `simulate --sensor` takes, robot.param.yaml for the nodes, layouts for
-    RViz and Foxglove, and report.html, which says how each value was measured and how sure it is.
-    Best are some minutes of driving in the open.
+    Writes sensor.yaml, which `simulate --sensor` and `train --sensor` take, robot.param.yaml for
+    the nodes, layouts for RViz and Foxglove, and report.html, which says how each value was
+    measured and how sure it is. Best are some minutes of driving in the open.
 
     \b
     Examples:
