@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
 
 import click
 
 from lidar_perception.nodes import NODES
-from lidar_perception.nodes.main import run
 
 
 @click.command(context_settings=dict(ignore_unknown_options=True, allow_interspersed_args=False))
@@ -20,4 +20,6 @@ def run_node(node: str, arguments: tuple[str, ...]) -> None:
     Example:
       lidar-perception run bag_player --ros-args -p bag:=drive.bag -p rate:=0.5
     """
-    sys.exit(run(node, [node, *arguments]))
+    # In place of this process, some of whose threads block no signal: one would end it at once.
+    os.execv(sys.executable, [sys.executable, "-P", "-m", "lidar_perception.nodes.main", node,
+                              *arguments])

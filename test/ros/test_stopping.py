@@ -49,3 +49,14 @@ def ended():
 def test_ends_whatever_hangs(ended, name, number):
     _, code, output = CASES[name]
     assert ended[name, number] == (output, code)
+
+
+@pytest.mark.parametrize("number", NUMBERS)
+def test_run_ends_its_node_cleanly(number, processes, peer):
+    pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+    command = [sys.executable, "-m", "lidar_perception.cli.main", "run", "evaluator"]
+    processes.run("evaluator", command)
+    peer.wait_for_diagnostics("evaluator")
+    node = processes.running["evaluator"]
+    node.send_signal(number)
+    assert node.wait(timeout=20) == 0
