@@ -33,7 +33,7 @@ from lidar_perception.scoring.recorded import Answered, answered
 from lidar_perception.types import CLASSES, PEDESTRIAN
 from lidar_perception.wire.messages import column, to_detections, to_frame, to_truth
 from lidar_perception.wire.track_markers import drawn_trails
-from msg_utils.markers import from_marker_array
+from msg_utils.stamps import to_ns
 
 CANDIDATES = "candidates"
 
@@ -88,13 +88,13 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
     content = replay(drive, clouds, out, own, detector=detector, rate=rate, single=single,
                      real_time=real_time)
     final = result_topics(single, detector)[FINAL]
-    found, calibration = answered(out / "result", final), next(iter(played)).calibration()
+    found, tracks = answered(out / "result", final, TRACKS)
+    calibration = next(iter(played)).calibration()
     if detector == CANDIDATES:
         print_candidate_report(content, console)
     else:
         content["detections"] = _print_detections(found, calibration)
     _print_pace(content, rate, clouds)
-    tracks = answered(out / "result", TRACKS)
     content["tracks"] = _print_tracks(tracks, calibration, content["poses"])
     write_text(out / "scores.json", json.dumps(content, indent=1))
     picture = _draw_best(out, cloud_topic(single, detector), _drawn(found, detector))
@@ -202,9 +202,9 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, np.nda
     with Bag(out / "result") as bag:
         for topic, _, msg in bag.messages({cloud, TRACKS} & set(bag.topics)):
             if topic == TRACKS:
-                if from_marker_array(msg).stamp_ns == best:
+                if msg.markers and to_ns(msg.markers[0].header.stamp) == best:
                     trails = drawn_trails(msg)
-            elif to_frame(msg)[0].stamp_ns == best:
+            elif to_ns(msg.header.stamp) == best:
                 drawing = msg
     if drawing is None:
         return False

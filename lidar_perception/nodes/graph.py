@@ -81,8 +81,8 @@ def trackers_of(detectors: Sequence[str]) -> dict[str, str]:
 
 
 def _tracker_of(detector: str, single: bool) -> dict[str, str]:
-    node, = (ALONE if single else BEHIND)[detector]
-    return {"~/input/detections": f"{node}/output/detections", **CLOUDS, **ODOMETRY_IN}
+    found = f"{last_node(detector, single)}/output/detections"
+    return {"~/input/detections": found, **CLOUDS, **ODOMETRY_IN}
 
 
 def executable_of(node: str) -> str:

@@ -14,7 +14,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 from lidar_perception.nodes import NODES
-from lidar_perception.runs.threads import wait_asleep
+from lidar_perception.runs.threads import one_thread_each
 
 if TYPE_CHECKING:
     from lidar_perception.nodes.stopping import Stop
@@ -102,11 +102,7 @@ def run(name: str, arguments: list[str]) -> int:
     # Threads inherit the mask, so this comes before any library starts one; what arrives from now
     # on waits for Stop.
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
-    # Threads of a linear algebra library wait actively; nodes that share few cores stand in each
-    # other's way.
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
-    wait_asleep()  # torch's, which takes more than one
+    one_thread_each()  # or nodes that share few cores stand in each other's way
     use_large_shared_memory(fed_by_a_driver(arguments))
     from lidar_perception.nodes.stopping import Stop
     stop = Stop(STOP_SIGNALS)

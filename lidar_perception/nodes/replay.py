@@ -99,7 +99,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
                 before = watch.frames
                 watch.until(finished, SILENCE_TIMEOUT, lambda: processes.check("bag_player"))
         # These are behind the results by as much as their own work takes.
-        for node in ("evaluator", TRACKER)[not scored:]:
+        for node in {"evaluator", TRACKER} & nodes.keys():
             watch.until(lambda n=node: int(watch.value_of(n, "frames") or 0) >= watch.frames,
                         SILENCE_TIMEOUT)
         memory = processes.memory_mb()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 
+ONE_EACH = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 WAIT_ASLEEP = {"OMP_WAIT_POLICY": "passive", "GOMP_SPINCOUNT": "0"}  # the standard; GNU's own
 
 
@@ -14,3 +15,12 @@ def wait_asleep() -> None:
     2910."""
     if not WAIT_ASLEEP.keys() & os.environ.keys():
         os.environ.update(WAIT_ASLEEP)
+
+
+def one_thread_each() -> None:
+    """For processes that share few cores: libraries of linear algebra wait actively, too, so each
+    takes one thread, and torch's, which takes more where it is told to, wait asleep. Call this
+    before they are loaded. What the user has set stays."""
+    for variable in ONE_EACH:
+        os.environ.setdefault(variable, "1")
+    wait_asleep()

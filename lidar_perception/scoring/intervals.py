@@ -7,7 +7,7 @@ frames of a drive take their place.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -31,13 +31,19 @@ def interval(score: Callable[[np.ndarray], float | None], parts: Sequence[np.nda
              ) -> list[float] | None:
     """[low, high] of what score(frames) gives for `count` drawings of these parts; frames (F,) are
     indices. None where fewer than two parts were drawn from, or no drawing has a score."""
-    rng, found = np.random.default_rng(0), []
-    if len(parts) < 2:
-        return None
-    for _ in range(count):
-        drawn = score(np.concatenate([parts[i] for i in rng.integers(len(parts), size=len(parts))]))
-        if drawn is not None:
-            found.append(drawn)
+    return bounds(score(frames) for frames in drawings(parts, count))
+
+
+def drawings(parts: Sequence[np.ndarray], count: int) -> Iterator[np.ndarray]:
+    """(F,) indices of frames, `count` times, always the same; none of fewer than two parts."""
+    rng = np.random.default_rng(0)
+    for _ in range(count if len(parts) > 1 else 0):
+        yield np.concatenate([parts[i] for i in rng.integers(len(parts), size=len(parts))])
+
+
+def bounds(scores: Iterable[float | None]) -> list[float] | None:
+    """[low, high] that hold SHARE percent of the scores; None where there is none."""
+    found = [score for score in scores if score is not None]
     if not found:
         return None
     return np.percentile(found, [(100 - SHARE) / 2, (100 + SHARE) / 2]).round(2).tolist()

@@ -19,13 +19,14 @@ class Answered:
     found: MarkedObjects
 
 
-def answered(path: Path, topic: str) -> list[Answered]:
-    """The labelled frames that have an answer on a topic of a bag, in order of time; of equal
-    stamps the last."""
-    by_stamp: dict[str, dict[int, MarkedObjects]] = {topic: {}, TRUTH: {}}
+def answered(path: Path, *topics: str) -> list[list[Answered]]:
+    """For each of these topics of a bag, the labelled frames that have an answer on it, in order of
+    time; of equal stamps the last."""
+    by_stamp: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in (*topics, TRUTH)}
     with Bag(path) as bag:
         for where, _, msg in bag.messages(by_stamp.keys() & bag.topics.keys()):
             objects = from_marker_array(msg)
             by_stamp[where][objects.stamp_ns] = objects
-    return [Answered(stamp, by_stamp[TRUTH][stamp], by_stamp[topic][stamp])
-            for stamp in sorted(by_stamp[topic].keys() & by_stamp[TRUTH].keys())]
+    truth = by_stamp[TRUTH]
+    return [[Answered(stamp, truth[stamp], by_stamp[topic][stamp])
+             for stamp in sorted(by_stamp[topic].keys() & truth.keys())] for topic in topics]

@@ -19,9 +19,9 @@ from lidar_perception.detectors.fused.evidence import LEAST, MOST
 from lidar_perception.detectors.hybrid.candidates import RescoredCandidates
 from lidar_perception.detectors.hybrid.params import ConfirmingParams, RescoringParams
 from lidar_perception.detectors.hybrid.proposals import ConfirmedProposals
-from lidar_perception.detectors.hybrid.rescoring import combined, rescored_by
 from lidar_perception.detectors.pointnet.clusters import clusters_of, points_of
 from lidar_perception.detectors.pointnet.predict import predict
+from lidar_perception.detectors.pointnet.rescoring import combined, rescored_by
 from lidar_perception.geometry import bev_iou, points_in_box
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame

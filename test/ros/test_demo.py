@@ -26,7 +26,7 @@ def test_the_demo_scores_what_fused_finds_offline(drive_bag, tmp_path):
     assert outcome.exit_code == 0, outcome.output
     scores = json.loads((tmp_path / "scores.json").read_text())
     frames = {frame.stamp_ns: frame for frame in open_recording(drive_bag)}
-    found = answered(tmp_path / "result", result_topics(True, "fused")[FINAL])
+    found, = answered(tmp_path / "result", result_topics(True, "fused")[FINAL])
     assert {f.stamp_ns for f in found} == frames.keys() and scores["results"] == len(frames)
     torch.set_num_threads(len(os.sched_getaffinity(0)))  # sums depend on it; nodes take all cores
     fused = open_detector(sensor_height=next(iter(frames.values())).sensor_height)

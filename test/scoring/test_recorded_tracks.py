@@ -46,7 +46,7 @@ def recorded(request, tmp_path):
 
 def test_recorded_tracks_are_counted_and_scored_where_labels_have_ids(recorded):
     path, with_ids, _ = recorded
-    result = recorded_tracks(answered(path, TRACKS), None)
+    result = recorded_tracks(answered(path, TRACKS)[0], None)
     assert result.count == {"Car": 2, "Cyclist": 1, "Pedestrian": 3}
     if with_ids:
         scores = result.scores["Pedestrian"]
@@ -54,7 +54,7 @@ def test_recorded_tracks_are_counted_and_scored_where_labels_have_ids(recorded):
         assert scores["HOTA"] > 0.8
     else:
         assert result.scores == {} and "track id" in result.problem
-    assert answered(path, "/nothing") == []
+    assert answered(path, "/nothing")[0] == []
 
 
 def test_the_ways_of_tracks_are_in_the_picture(recorded, tmp_path):

@@ -15,9 +15,9 @@ from lidar_perception.candidates.boxes import snap_to_ground
 from lidar_perception.candidates.confidence import confidence, shape_features
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.clustering.shapes import oriented_boxes
-from lidar_perception.detectors.hybrid.rescoring import known, rescored_by
 from lidar_perception.detectors.pointnet.clusters import points_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.detectors.pointnet.rescoring import known, rescored_by
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.groups import group_points
 from lidar_perception.types import Detections, LidarFrame

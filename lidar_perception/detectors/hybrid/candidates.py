@@ -17,10 +17,10 @@ from lidar_perception.detectors.contract import Found, require_columns
 from lidar_perception.detectors.fused.evidence import clipped_logit
 from lidar_perception.detectors.fused.model import probabilities, sources
 from lidar_perception.detectors.hybrid.params import RescoringParams
-from lidar_perception.detectors.hybrid.rescoring import rescored_by, seen_by
 from lidar_perception.detectors.nms import suppressed
 from lidar_perception.detectors.pointnet.clusters import clusters_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.detectors.pointnet.rescoring import rescored_by, seen_by
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
 

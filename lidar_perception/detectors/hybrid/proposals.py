@@ -10,9 +10,9 @@ import numpy as np
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.contract import Detector, Found
 from lidar_perception.detectors.hybrid.params import ConfirmingParams
-from lidar_perception.detectors.hybrid.rescoring import known, rescored_by, seen_by
 from lidar_perception.detectors.pointnet.clusters import points_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.detectors.pointnet.rescoring import known, rescored_by, seen_by
 from lidar_perception.detectors.view import levelled_ground
 from lidar_perception.types import LidarFrame
 

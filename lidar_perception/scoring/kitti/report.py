@@ -13,7 +13,7 @@ import numpy as np
 
 from lidar_perception.scoring.centres.scores import CentreScores
 from lidar_perception.scoring.detections import Detected
-from lidar_perception.scoring.intervals import blocks, interval
+from lidar_perception.scoring.intervals import blocks, bounds, drawings
 from lidar_perception.scoring.kitti.camera_objects import camera_objects, scored_labels
 from lidar_perception.scoring.kitti.matched_heights import heights_off, matched_heights
 from lidar_perception.scoring.kitti.protocol import (
@@ -92,17 +92,15 @@ class DetectionReport:
     def intervals(self, count: int) -> dict[str, dict[str, list[float] | None]]:
         """By class and row of INTERVALS, [low, high] of AP at R40, moderate, from `count` drawings
         of the drives; see intervals.py. None without objects."""
-        parts = blocks(self.names)
-
-        def of(name: str, row: str) -> list[float] | None:
-            metric, overlaps = ROWS[row]
-
-            def r40(frames: np.ndarray) -> float | None:
-                value = precision(Comparison.of([self.frames[i] for i in frames]), name, metric,
-                                  overlaps[name], "moderate")
-                return None if value is None else value.r40
-            return interval(r40, parts, count)
-        return {name: {row: of(name, row) for row in INTERVALS} for name in SCORED}
+        found: dict[tuple[str, str], list[float | None]] = {
+            (name, row): [] for name in SCORED for row in INTERVALS}
+        for frames in drawings(blocks(self.names), count):
+            together = Comparison.of([self.frames[i] for i in frames])
+            for (name, row), scores in found.items():
+                metric, overlaps = ROWS[row]
+                value = precision(together, name, metric, overlaps[name], "moderate")
+                scores.append(None if value is None else value.r40)
+        return {name: {row: bounds(found[name, row]) for row in INTERVALS} for name in SCORED}
 
     def _class_content(self, together: Comparison, name: str) -> dict:
         rows = {row: {level: precision(together, name, metric, overlaps[name], level)
