@@ -15,7 +15,7 @@ import click
 from lidar_perception import __version__
 from lidar_perception.cli.data import dask_option, data_option, limit_option, opened, split_option
 from lidar_perception.reproduction.studies import STUDIES
-from lidar_perception.runs.machine import cpu_name
+from lidar_perception.runs.machine import cores, cpu_name
 from lidar_perception.types import InputError
 
 EXPERIMENTS = {"stm-cpa": "lidar_perception.reproduction.stm_cpa:STM_CPA"}
@@ -62,7 +62,7 @@ def reproduce(experiment: str, study: str | None, data: Path, split: Path | None
     recording = opened(data, split=split)
     recording.require(BOXES, "reproduce")
     started, before = datetime.now().astimezone(), perf_counter()
-    workers = jobs or len(os.sched_getaffinity(0))
+    workers = jobs or cores()
     records = run(chosen, recording, out, jobs=workers, dask=dask, force=force, limit=limit)
     seconds = perf_counter() - before
     sections = chosen.sections(records)

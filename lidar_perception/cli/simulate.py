@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import closing
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from lidar_perception.cli.data import a_path, opened, write_json
 from lidar_perception.data.frame import BOXES
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.runs.folder import is_finished, unfinished
+from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.simulation.dataset import LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import longest_drive
@@ -81,7 +81,7 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
                                    "which can, and turn it into a bag with 'convert'")
         _bag(out, plan, force)
     else:
-        _data_set(out, plan, sensor_name, jobs or len(os.sched_getaffinity(0)), resume, force)
+        _data_set(out, plan, sensor_name, jobs or cores(), resume, force)
 
 
 def _bag(out: Path, plan: Plan, force: bool) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,6 +13,7 @@ from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.outputs import DetectionOutputs
 from lidar_perception.nodes.runtime import CLOUD, OK, WARN
 from lidar_perception.nodes.sensor_check import SensorCheck
+from lidar_perception.runs.machine import cores
 from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.messages import cluster_column, column
 from msg_utils.stamps import to_ns
@@ -61,7 +61,7 @@ class DetectorNode(ManagedNode):
 
         from lidar_perception.detectors.devices import chosen_device
         # 0 leaves torch with what main.py sets in the environment, which is one.
-        torch.set_num_threads(chosen.threads or len(os.sched_getaffinity(0)))
+        torch.set_num_threads(chosen.threads or cores())
         device = chosen.device
         if device.startswith("cuda") and chosen.cpu_fallback:
             try:

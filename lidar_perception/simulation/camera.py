@@ -17,6 +17,10 @@ FORWARD_CAMERA = Calibration(
     lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]),
     width=1242, height=375)
 
+# People who label leave out what they can hardly see. The least of the 20 pedestrians of the real
+# frames at hand has 16 points; of KITTI's they are few that have less than 5.
+MIN_VISIBLE = 0.15  # share of the object
+MIN_POINTS = 5
 
 
 def turned_camera(yaw: float) -> Calibration:
@@ -24,12 +28,6 @@ def turned_camera(yaw: float) -> Calibration:
     cos, sin = np.cos(yaw), np.sin(yaw)
     back = np.array([[cos, sin, 0, 0], [-sin, cos, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     return replace(FORWARD_CAMERA, lidar_to_camera=FORWARD_CAMERA.lidar_to_camera @ back)
-
-
-# People who label leave out what they can hardly see. The least of the 20 pedestrians of the real
-# frames at hand has 16 points; of KITTI's they are few that have less than 5.
-MIN_VISIBLE = 0.15  # share of the object
-MIN_POINTS = 5
 
 
 def worth_a_label(truth: GroundTruth) -> np.ndarray:

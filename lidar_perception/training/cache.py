@@ -44,13 +44,18 @@ def kept(path: Path | None, make: Callable[[], Made], read: Callable[[Any], Made
             path.unlink(missing_ok=True)  # it is made again
     made = make()
     if path is not None and (most_gb == np.inf or size_of(path.parent) < most_gb * 1e9):
-        content = io.BytesIO()
-        np.savez(content, **arrays(made))
         try:
-            write_bytes(path, content.getbuffer())
+            write_arrays(path, arrays(made))
         except InputError as error:
             raise NotKept(str(error)) from None
     return made
+
+
+def write_arrays(path: Path, arrays: dict[str, Any]) -> None:
+    """Write an .npz file, as runs.files.write_bytes does. InputError where it cannot be written."""
+    content = io.BytesIO()
+    np.savez(content, **arrays)
+    write_bytes(path, content.getbuffer())
 
 
 def size_of(folder: Path) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass, replace
 from pathlib import Path
 from zipfile import BadZipFile
@@ -11,8 +10,8 @@ import numpy as np
 
 from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN
 from lidar_perception.geometry import bev_iou
-from lidar_perception.runs.files import write_bytes
 from lidar_perception.training.augment import BORDER, TrainingScene, grown, turned, varied
+from lidar_perception.training.cache import write_arrays
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.putting import floor_under, put_among
 from lidar_perception.types import InputError
@@ -47,9 +46,7 @@ class Database:
 
     def save(self, path: Path) -> None:
         """Write an .npz file."""
-        content = io.BytesIO()
-        np.savez(content, **vars(self))
-        write_bytes(path, content.getbuffer())
+        write_arrays(path, vars(self))
 
     @staticmethod
     def load(path: Path) -> Database:

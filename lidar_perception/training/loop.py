@@ -20,6 +20,7 @@ from typing import Any
 import torch
 
 from lidar_perception.runs.files import make_folder, remove_temporaries, write_bytes
+from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import errors, paused, progress
 from lidar_perception.training.log import Log
 from lidar_perception.training.params import LoopParams
@@ -120,10 +121,11 @@ class Pace:
         self.last_validation = time.monotonic() - begun
 
 
-def may_begin(out: Path, resume: bool) -> Path:
-    """The state's path in out. InputError if there is one, and resume is not asked for; or if out
-    cannot be a folder that is written into, before hours are spent on the data."""
-    path = out / STATE
+def may_begin(out: Path, resume: bool, name: str = STATE) -> Path:
+    """The path in out of a file that a run writes. InputError if there is one, and resume is not
+    asked for; or if out cannot be a folder that is written into, before hours are spent on the
+    data."""
+    path = out / name
     make_folder(out)
     if path.exists() and not resume:
         raise InputError(f"{out} holds a training run already; give --resume to resume it, or "
@@ -168,9 +170,7 @@ def _read(path: Path, asked: dict[str, Any]) -> dict[str, Any]:
     except (OSError, RuntimeError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InputError(f"cannot read {path}: {reason}; remove it to start again") from None
-    different = [f"{name} {before.get(name)!r}, not {value!r}" for name, value in asked.items()
-                 if before.get(name) != value]
-    if different:
+    if different := differences(before, asked):
         raise InputError(f"{path} is of a run with {'; '.join(different[:3])}; resume it with the "
                          "same settings, or give another --out")
     return state

@@ -120,11 +120,9 @@ class SimulatedScenes:
 
     def scene(self, i: int) -> TrainingScene:
         """With the labels all around."""
-        return self._as_scene(*self.scan(i))
-
-    def made(self, i: int) -> TrainingScene:
-        """scene(i), made anew whatever is kept."""
-        return self._as_scene(*self._simulated(i))
+        frame, truth = self.scan(i)
+        return TrainingScene(np.column_stack([frame.xyz, frame.intensity]), truth.boxes,
+                             truth.class_ids, worth_a_label(truth), True, self.sensor.height)
 
     def frame(self, i: int) -> Frame:
         """To validate on: with the labels that KITTI would have in the image of a camera."""
@@ -147,10 +145,6 @@ class SimulatedScenes:
     def _simulated(self, i: int) -> tuple[LidarFrame, GroundTruth]:
         scan = scan_at(*self.at(i), self.sensor, self.streets)
         return scan.frame, scan.truth
-
-    def _as_scene(self, frame: LidarFrame, truth: GroundTruth) -> TrainingScene:
-        return TrainingScene(np.column_stack([frame.xyz, frame.intensity]), truth.boxes,
-                             truth.class_ids, worth_a_label(truth), True, self.sensor.height)
 
 
 EXTRAS = ("track_id", "truncated", "occluded", "num_points", "visible")

@@ -99,10 +99,8 @@ def check(asked: Asked, init: Path | None) -> None:
         raise InputError(f"--budget {asked.budget:g} must be a number of hours above 0")
     if init is not None:
         network_of(init)
-    if (asked.out / RUN).exists() and not asked.resume:
-        raise InputError(f"{asked.out} holds a training run already; give --resume to resume it, "
-                         "or another --out")
-    may_begin(asked.out, asked.resume)
+    for name in RUN, STATE:
+        may_begin(asked.out, asked.resume, name)
 
 
 def scenes_of(asked: Asked, params: Any, sensor: Sensor) -> tuple[tuple, tuple]:
@@ -233,13 +231,13 @@ def _recorded(sources: Sequence[Any]) -> int:
 
 def _some_scenes(sources: Sequence[Any]) -> tuple[list[TrainingScene], float]:
     """Up to four scenes, and the seconds to simulate one with its share of the street; 0 where
-    nothing is simulated. InputError where none can be read."""
+    nothing is simulated. No source has a cache. InputError where none can be read."""
     for source in sources:
         if isinstance(source, SimulatedScenes):
             many = source.per_street
-            source.made(0)  # so that what is compiled is there
+            source.scene(0)  # so that what is compiled is there
             begun = time.perf_counter()
-            made = [source.made(i) for i in range(many, many + min(many, 4))]
+            made = [source.scene(i) for i in range(many, many + min(many, 4))]
             return made, (time.perf_counter() - begun) / len(made)
     scenes: list[TrainingScene] = []
     reason: InputError | None = None

@@ -24,6 +24,8 @@ from lidar_perception.training.start import RUN
 from lidar_perception.types import InputError
 
 SENSOR = "generic:16,-20,5,1,10"
+
+
 def words(out: Path, *more: str) -> list[str]:
     """A training that is small in every way."""
     return ["train", "pointpillars", "--version", "v0", "--ahead", "10", "--aside", "10", "--data",
