@@ -94,6 +94,11 @@ class Calibration:
         to_lidar = Rotation.from_matrix(self.lidar_to_camera[:3, :3].T)
         return to_lidar.as_quat(), -to_lidar.apply(self.lidar_to_camera[:3, 3])
 
+    def equals(self, other: Calibration | None) -> bool:
+        """Whether the other one has the same numbers."""
+        return other is not None and all(
+            np.array_equal(a, b) for a, b in zip(vars(self).values(), vars(other).values()))
+
     def camera(self) -> Camera:
         rotation, translation = self.pose
         return Camera.of(self.intrinsics, rotation, translation, self.width, self.height)

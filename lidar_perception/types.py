@@ -97,6 +97,11 @@ class Detections:
                           {name: said[index] for name, said in self.sources.items()})
 
 
+def class_ids(names: Iterable[str]) -> list[int]:
+    """Into CLASSES; a name that is not there is Misc."""
+    return [CLASSES.index(name if name in CLASSES else "Misc") for name in names]
+
+
 @dataclass(frozen=True)
 class GroundTruth:
     """The labelled objects of one frame, in the LiDAR frame.

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import Reader
 
 from lidar_perception.data.mcap_index import NO_INDEX, check_index
 from lidar_perception.data.record_file import RecordFile
-from lidar_perception.runs.files import regular, short
+from lidar_perception.runs.files import check_free, regular, short
 from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode, encode, typestore
@@ -58,8 +58,7 @@ class BagWriter:
         self._may_write()
 
     def _may_write(self) -> None:
-        if self.path.exists() and not self.force:
-            raise InputError(f"{self.path} exists already; give another name or --force")
+        check_free(self.path, self.force)
         if self.path.exists() and not (self.path / "metadata.yaml").is_file():
             raise InputError(f"{self.path} is no bag, so it is not replaced; give another name")
 

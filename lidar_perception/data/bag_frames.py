@@ -58,7 +58,7 @@ def open_recording(path: Path, *, points: str = POINTS, scans: bool = True) -> R
         frames = BagFrames(path, points, bag.topics[points], bag.counts[points])
         labelled = False
         with suppress(InputError):  # a damaged cloud is named when it is read
-            labelled = any(frames.labels_points(data)
+            labelled = any(frames.labelled(data) is not None
                            for _, _, data in islice(bag.raw({points}), 1))
     has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | (
         {POINT_LABELS} if labelled else set())
@@ -164,18 +164,19 @@ class BagFrames(Sequence):
         except InputError as error:
             raise InputError(f"{self.path}, topic {self.points} at {time} ns: {error}") from None
 
-    def labels_points(self, data: bytes) -> bool:
-        """Whether a serialised cloud has labels of its points; not if it is broken."""
+    def labelled(self, data: bytes) -> Any:
+        """A serialised cloud, decoded, if it has labels of its points; None otherwise, and if it is
+        broken."""
         with suppress(InputError):
-            return {SEMANTIC, INSTANCE} <= {f.name for f in decode(data, self.kind).fields}
-        return False
+            msg = decode(data, self.kind)
+            if {SEMANTIC, INSTANCE} <= {f.name for f in msg.fields}:
+                return msg
+        return None
 
     def _point_truth(self, time: int, data: Callable[[], bytes]) -> PointTruth | None:
-        raw = data()
-        if not self.labels_points(raw):
+        if (msg := self.labelled(data())) is None:
             return None
         try:
-            msg = decode(raw, self.kind)
             indices = to_frame(msg)[1]
             classes, instances = (column(msg, name, indices) for name in (SEMANTIC, INSTANCE))
         except InputError as error:

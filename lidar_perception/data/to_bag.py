@@ -70,7 +70,7 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
                 skipped.append(str(error))
                 continue
             header = header_message(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
-            if calibration is not None and not _same(calibration, written):
+            if calibration is not None and not calibration.equals(written):
                 written = calibration
                 _write_calibration(bag, calibration, frame.stamp_ns, header)
             if pose is not None:
@@ -88,11 +88,6 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
                           from_array(points_of(scan, columns), header, bag_message))
             count += 1
     return count
-
-
-def _same(calibration: Calibration, written: Calibration | None) -> bool:
-    return written is not None and all(
-        np.array_equal(a, b) for a, b in zip(vars(calibration).values(), vars(written).values()))
 
 
 def points_of(scan: LidarFrame, labels: PointTruth | None = None) -> np.ndarray:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,19 +16,18 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data import semantickitti
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.folder import GAP_NS, PERIOD_NS
-from lidar_perception.data.kitti.write import calibration_text, write_velodyne
+from lidar_perception.data.kitti.write import calibration_text, write_object_text, write_velodyne
 from lidar_perception.labeling.datasets_nuscenes import NuscenesTables
 from lidar_perception.labeling.formats import kitti_object, kitti_tracking
 from lidar_perception.labeling.formats.nuscenes import LIKE
 from lidar_perception.labeling.labels import NO_TRACK, DriveLabels, FrameLabels, of_truth
 from lidar_perception.runs.files import whole_folder, write_bytes
+from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import InputError
 
 # For a recording without a camera: its axes, level at the LiDAR, with KITTI's field of view.
-NO_CAMERA = Calibration(
-    intrinsics=np.array([[720.0, 0, 621, 0], [0, 720, 187.5, 0], [0, 0, 1, 0]]),
-    lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]),
-    width=1242, height=375)
+NO_CAMERA = replace(FORWARD_CAMERA, lidar_to_camera=np.array(
+    [[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0], [0, 0, 0, 1]]))
 
 
 @dataclass(frozen=True)
@@ -97,8 +95,7 @@ def _placed(frames: Iterable[Frame], labels: DriveLabels | None) -> Iterator[Pla
 
 def _same_drive(before: Frame, frame: Frame) -> bool:
     ours, theirs = before.calibration(), frame.calibration()
-    same = ours is theirs or (ours is not None and theirs is not None and all(
-        np.array_equal(a, b) for a, b in zip(vars(ours).values(), vars(theirs).values())))
+    same = ours is theirs or (ours is not None and ours.equals(theirs))
     return (before.sequence == frame.sequence and same
             and 0 <= frame.stamp_ns - before.stamp_ns < GAP_NS // 2)
 
@@ -109,11 +106,7 @@ def _with_camera(frame: Frame, summary: Summary) -> tuple[Frame, Calibration]:
     if calibration is None:
         summary.remark("assumed: a camera at the LiDAR, looking ahead, as KITTI's labels need one")
         calibration = NO_CAMERA
-    return replace(frame, calibration=partial(_this, calibration)), calibration
-
-
-def _this(calibration: Calibration) -> Calibration:
-    return calibration
+    return replace(frame, calibration=lambda: calibration), calibration
 
 
 def _cloud(frame: Frame, summary: Summary) -> np.ndarray:
@@ -137,33 +130,29 @@ def _remark_losses(summary: Summary, placed: Placed, kept: str) -> None:
 
 
 def _kitti_object(folder: Path, frames: Iterator[Placed], summary: Summary) -> Iterator[Placed]:
-    root = folder / "training"
     for placed in frames:
         frame, calibration = _with_camera(placed.frame, summary)
-        name = f"{placed.number:06}"
-        write_velodyne(root / f"velodyne/{name}.bin", _cloud(frame, summary))
-        write_bytes(root / f"calib/{name}.txt", calibration_text(calibration).encode())
-        write_bytes(root / f"label_2/{name}.txt",
-                    kitti_object.text_of_frame(placed.labels, frame).encode())
+        write_object_text(folder, placed.number, _cloud(frame, summary),
+                          kitti_object.text_of_frame(placed.labels, frame), calibration)
         _remark_losses(summary, placed, "boxes")
         yield placed
 
 
 def _kitti_tracking(folder: Path, frames: Iterator[Placed], summary: Summary) -> Iterator[Placed]:
     root = folder / "training"
-    texts: dict[str, str] = {}
+    texts: dict[str, list[str]] = {}
     for placed in frames:
         frame, calibration = _with_camera(placed.frame, summary)
         name = f"{placed.drive:04}"
         write_velodyne(root / f"velodyne/{name}/{placed.index:06}.bin", _cloud(frame, summary))
         if name not in texts:
             write_bytes(root / f"calib/{name}.txt", calibration_text(calibration).encode())
-        texts[name] = texts.get(name, "") + kitti_tracking.text_of_frame(
-            placed.labels, frame, placed.index)
+        texts.setdefault(name, []).append(kitti_tracking.text_of_frame(
+            placed.labels, frame, placed.index))
         _remark_losses(summary, placed, "boxes, track ids")
         yield placed
-    for name, text in texts.items():
-        write_bytes(root / f"label_02/{name}.txt", text.encode())
+    for name, parts in texts.items():
+        write_bytes(root / f"label_02/{name}.txt", "".join(parts).encode())
 
 
 def _semantickitti(folder: Path, frames: Iterator[Placed], summary: Summary) -> Iterator[Placed]:

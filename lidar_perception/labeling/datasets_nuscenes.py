@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import struct
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from zlib import compress, crc32
@@ -30,7 +29,7 @@ from lidar_perception.data.nuscenes.boxes import (
 from lidar_perception.data.nuscenes.folder import CHANNEL, FULL_REFLECTION
 from lidar_perception.data.nuscenes.results import places
 from lidar_perception.geometry import points_in_boxes
-from lidar_perception.labeling.formats.nuscenes import LIKE, OURS, RIDDEN, THEIRS
+from lidar_perception.labeling.formats.nuscenes import OURS, RIDDEN, WRITTEN
 from lidar_perception.labeling.labels import NO_TRACK, FrameLabels
 from lidar_perception.runs.files import write_bytes, write_text
 
@@ -109,7 +108,7 @@ class NuscenesTables:
         for k, place in enumerate(placed):
             track, name, extra = labels.track_ids[k], labels.class_names[k], labels.extra[k]
             instance = token(scene, "track", track) if track != NO_TRACK else token(sample, k)
-            kind = {**THEIRS, **LIKE}.get(name, name)
+            kind = WRITTEN.get(name, name)
             category = extra.get("category")
             if CATEGORIES.get(str(category), category) != kind:
                 category = CATEGORY_OF.get(kind, name)
@@ -151,8 +150,8 @@ class NuscenesTables:
             write_text(self.folder / VERSION / f"{name}.json", json.dumps(rows, indent=0))
 
 
-def _quaternion(turn: Sequence[Sequence[float]] | np.ndarray) -> list[float]:
-    return [float(v) for v in quaternions(np.array(turn)[None])[0]]
+def _quaternion(turn: np.ndarray) -> list[float]:
+    return quaternions(turn[None])[0].tolist()
 
 
 def _png() -> bytes:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import wrap_angle
-from lidar_perception.types import CLASSES, GroundTruth, InputError
+from lidar_perception.types import CLASSES, GroundTruth, InputError, class_ids
 
 NO_TRACK = -1
 OTHER = "Misc"  # of CLASSES, for those that it does not have
@@ -125,8 +125,7 @@ def to_truth(labels: FrameLabels) -> GroundTruth:
     for k, (name, extra) in enumerate(zip(labels.class_names, labels.extra)):
         known = {} if name in CLASSES else {"class_name": name}
         extras.append({**extra, **known, **ids_and_score(labels, k)})
-    ids = [CLASSES.index(n if n in CLASSES else OTHER) for n in labels.class_names]
-    return GroundTruth.of(labels.boxes, ids, extras, labels.notes)
+    return GroundTruth.of(labels.boxes, class_ids(labels.class_names), extras, labels.notes)
 
 
 def ids_and_score(labels: FrameLabels, k: int) -> dict[str, Any]:

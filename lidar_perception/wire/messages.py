@@ -16,6 +16,7 @@ from lidar_perception.types import (
     GroundTruth,
     InputError,
     LidarFrame,
+    class_ids,
     usable_returns,
 )
 from lidar_perception.wire.topics import CAMERA_FRAME
@@ -185,12 +186,12 @@ def to_truth(objects: MarkedObjects) -> GroundTruth:
     class_name."""
     extras = [{"class_name": label, **extra} if label not in CLASSES else extra
               for label, extra in zip(objects.labels, objects.extras)]
-    return GroundTruth.of(objects.boxes, _class_ids(objects.labels), extras, objects.notes)
+    return GroundTruth.of(objects.boxes, class_ids(objects.labels), extras, objects.notes)
 
 
 def to_detections(objects: MarkedObjects) -> Detections:
     """Detections from markers; objects of unknown class are Misc."""
-    return Detections.of(objects.boxes, np.array(_class_ids(objects.labels), np.int32),
+    return Detections.of(objects.boxes, np.array(class_ids(objects.labels), np.int32),
                          objects.scores)
 
 
@@ -210,10 +211,6 @@ def detection_markers(detections: Detections, header: Any, make: Any, previous: 
         text["cluster_id"] = int(cluster)
     return to_marker_array(detections.boxes, labels, detections.scores, header=header, make=make,
                            extras=texts, previous=previous, lifetime_ns=lifetime_ns)
-
-
-def _class_ids(labels: list[str]) -> list[int]:
-    return [CLASSES.index(x if x in CLASSES else "Misc") for x in labels]
 
 
 def odometry(pose: np.ndarray, header: Any, moving_frame: str, make: Any) -> Any:

@@ -13,7 +13,7 @@ import numpy as np
 
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.runs.files import regular
-from lidar_perception.types import CLASSES, GroundTruth, InputError
+from lidar_perception.types import CLASSES, GroundTruth, InputError, class_ids
 
 # The label file's own names and numbers, in its order; they travel in GroundTruth.extras.
 COLUMNS = ("truncated", "occluded", "alpha", "bbox", "dimensions", "location", "rotation_y")
@@ -86,7 +86,7 @@ def to_ground_truth(labels: list[dict], lidar_to_camera: np.ndarray) -> GroundTr
     """Boxes in the LiDAR frame. Objects without a 3D box (DontCare) become notes; those of a class
     that is not in CLASSES are Misc, with its name as class_name."""
     to_lidar = np.linalg.inv(lidar_to_camera)
-    boxes, class_ids, extras, notes = [], [], [], []
+    boxes, names, extras, notes = [], [], [], []
     for label in labels:
         extra = {k: v for k, v in label.items() if k != "class"}
         box = lidar_box(label, to_lidar)
@@ -94,10 +94,9 @@ def to_ground_truth(labels: list[dict], lidar_to_camera: np.ndarray) -> GroundTr
             notes.append((label["class"], extra))
             continue
         boxes.append(box)
-        known = label["class"] in CLASSES
-        class_ids.append(CLASSES.index(label["class"] if known else "Misc"))
-        extras.append(extra if known else {**extra, "class_name": label["class"]})
-    return GroundTruth.of(boxes, class_ids, extras, notes)
+        names.append(label["class"])
+        extras.append(extra if names[-1] in CLASSES else {**extra, "class_name": names[-1]})
+    return GroundTruth.of(boxes, class_ids(names), extras, notes)
 
 
 def lidar_box(label: dict, to_lidar: np.ndarray) -> list[float] | None:

@@ -107,7 +107,13 @@ def write_velodyne(path: Path, cloud: np.ndarray) -> None:
 def write_object(root: Path, number: int, cloud: np.ndarray, truth: GroundTruth,
                  calibration: Calibration) -> None:
     """velodyne, calib and label_2 of one frame of an object data set at root/training."""
+    write_object_text(root, number, cloud, object_label_text(truth, calibration), calibration)
+
+
+def write_object_text(root: Path, number: int, cloud: np.ndarray, labels: str,
+                      calibration: Calibration) -> None:
+    """As write_object, with the text of the label_2 file."""
     folder, name = root / "training", f"{number:06}"
     write_velodyne(folder / f"velodyne/{name}.bin", cloud)
     write_bytes(folder / f"calib/{name}.txt", calibration_text(calibration).encode())
-    write_bytes(folder / f"label_2/{name}.txt", object_label_text(truth, calibration).encode())
+    write_bytes(folder / f"label_2/{name}.txt", labels.encode())

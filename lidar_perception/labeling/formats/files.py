@@ -11,7 +11,7 @@ from typing import Any
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.labeling.labels import NO_TRACK, FrameLabels
-from lidar_perception.runs.files import read_text, write_text
+from lidar_perception.runs.files import check_free, read_text, whole_folder, write_text
 from lidar_perception.types import InputError
 
 MAX_BYTES = 2**30  # of a file of labels
@@ -36,6 +36,30 @@ def drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[str, P
                              f"such as {names[0]!r}; give a folder, or choose a drive with --split")
         return {names[0]: path}
     return {name: path / f"{name or '0000'}{suffix}" for name in names}
+
+
+def known_drive_files(path: Path, frames: Sequence[Frame], suffix: str) -> dict[str, Path]:
+    """Of drive_files those that there are, and `path` itself. InputError as of check_all_known for
+    a folder."""
+    files = drive_files(path, frames, suffix)
+    if path not in files.values():
+        check_all_known(path, list(files.values()), suffix)
+    return {drive: file for drive, file in files.items() if file == path or file.exists()}
+
+
+def write_drives(out: Path, frames: Sequence[Frame], suffix: str, force: bool,
+                 write: Callable[[Path, str, list[int]], None]) -> None:
+    """Call write(file, drive, positions in frames) for each drive: `out` is the file of the only
+    one if it ends like one, else a folder that appears when all of them are complete."""
+    drives = sequences_of(frames)
+    if out.suffix == suffix:
+        ((drive, file),) = drive_files(out, frames, suffix).items()
+        check_free(out, force)
+        write(file, drive, drives[drive])
+        return
+    with whole_folder(out, force) as folder:
+        for drive, file in drive_files(folder, frames, suffix).items():
+            write(file, drive, drives[drive])
 
 
 def frame_files(folder: Path, frames: Sequence[Frame], suffix: str) -> list[Path]:

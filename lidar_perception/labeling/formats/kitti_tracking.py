@@ -10,10 +10,10 @@ from typing import Any
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import parsed_tracking_lines
 from lidar_perception.data.kitti.write import tracking_line
-from lidar_perception.labeling.formats.files import check_all_known, drive_files, sequences_of
+from lidar_perception.labeling.formats.files import known_drive_files, sequences_of, write_drives
 from lidar_perception.labeling.formats.kitti_lines import frame_labels, lines_of
 from lidar_perception.labeling.labels import NO_TRACK, DriveLabels, FrameLabels
-from lidar_perception.runs.files import check_free, whole_folder, write_bytes
+from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError
 
 
@@ -21,13 +21,11 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     """path: DRIVE.txt, a folder of them, or a folder of the tracking layout."""
     for inner in ("training/label_02", "label_02"):
         path = path / inner if (path / inner).is_dir() else path
-    files = drive_files(path, frames, ".txt")
-    if path not in files.values():
-        check_all_known(path, list(files.values()), ".txt")
+    files = known_drive_files(path, frames, ".txt")
     labels: list[FrameLabels] = []
     for drive, positions in sequences_of(frames).items():
         lines: dict[int, list[dict[str, Any]]] = {frames[i].index: [] for i in positions}
-        if files[drive].exists() or files[drive] == path:
+        if drive in files:
             for number, frame, line in parsed_tracking_lines(files[drive]):
                 if frame not in lines:
                     raise InputError(f"{files[drive]}:{number} is of frame {frame}, and the drive "
@@ -35,24 +33,17 @@ def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
                                      "give the drive that was labelled")
                 lines[frame].append({**line, "truncated": round(line["truncated"])})
         labels += [frame_labels(frames[i], lines[frames[i].index],
-                                f"{files[drive]}, frame {frames[i].index}") for i in positions]
+                                f"{files.get(drive)}, frame {frames[i].index}") for i in positions]
     return DriveLabels(labels)
 
 
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
     """out: DRIVE.txt, or a folder for a file of each drive. Numbers have six decimals."""
-    if out.suffix == ".txt":
-        (drive,) = drive_files(out, frames, ".txt")
-        check_free(out, force)
-        write_bytes(out, _text(labels, frames, sequences_of(frames)[drive]).encode())
-        return
-    with whole_folder(out, force) as folder:
-        for drive, file in drive_files(folder, frames, ".txt").items():
-            write_bytes(file, _text(labels, frames, sequences_of(frames)[drive]).encode())
+    def write_drive(file: Path, drive: str, positions: list[int]) -> None:
+        write_bytes(file, "".join(text_of_frame(labels.frames[i], frames[i], frames[i].index)
+                                  for i in positions).encode())
 
-
-def _text(labels: DriveLabels, frames: Sequence[Frame], positions: list[int]) -> str:
-    return "".join(text_of_frame(labels.frames[i], frames[i], frames[i].index) for i in positions)
+    write_drives(out, frames, ".txt", force, write_drive)
 
 
 def text_of_frame(labels: FrameLabels, frame: Frame, number: int) -> str:

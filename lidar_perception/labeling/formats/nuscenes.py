@@ -10,7 +10,7 @@ refuses them.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ OURS = {**CLASS_OF, **{theirs: ours for ours, theirs in DETECTED.items()}}
 THEIRS = {ours: theirs for theirs, ours in OURS.items()}
 # What is theirs under another name of ours, which stands beside it: vans are cars.
 LIKE = {row.name: THEIRS[row.looks_like] for row in TABLE if row.looks_like in THEIRS}
+WRITTEN = {**THEIRS, **LIKE}
 # What is ours with a rider, and theirs also without one.
 RIDDEN, NOT_RIDDEN = OURS.keys() - CLASS_OF.keys(), "cycle.without_rider"
 OWN = {"sample_token", "translation", "size", "rotation", "velocity", "tracking_id",
@@ -85,6 +86,7 @@ def _read(task: str, path: Path, frames: Sequence[Frame]) -> DriveLabels:
 
 def _rows(task: str, frame: Frame, boxes: list[dict[str, Any]], ids: dict[str, int]) -> list[Row]:
     rows: list[Row] = []
+    pose = _pose(frame) if boxes else np.eye(4)  # without a box there is no need of one
     for row in boxes:
         kind, attribute = str(row[f"{task}_name"]), row.get("attribute_name", "")
         rest = extra_of(row, OWN | {f"{task}_name", f"{task}_score"})
@@ -92,7 +94,7 @@ def _rows(task: str, frame: Frame, boxes: list[dict[str, Any]], ids: dict[str, i
             rest["attribute"] = attribute
         if (velocity := _finite(row.get("velocity"))) is not None:
             rest["velocity"] = velocity
-        box, leans = _in_frame(row, _pose(frame))
+        box, leans = _in_frame(row, pose)
         if leans:
             rest["rotation"] = row["rotation"]
         track = str(row.get("tracking_id", ""))
@@ -125,17 +127,18 @@ def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
     """out: one JSON file. Velocities that the labels do not have are those of the tracks, from
     frame to frame; NaN, which nuscenes-devkit reads, where there is none."""
     check_free(out, force)
-    speeds, names = _velocities(labels, frames), track_names(labels.frames, "tracking_id")
+    poses = {i: _pose(frame) for i, frame in enumerate(frames) if len(labels.frames[i])}
+    speeds, names = _velocities(labels, frames, poses), track_names(labels.frames, "tracking_id")
     results = {}
     for i, (each, frame) in enumerate(zip(labels.frames, frames)):
-        placed = places(_token(frame), *in_global(each.boxes, _pose(frame))) if len(each) else []
+        placed = places(_token(frame), *in_global(each.boxes, poses[i])) if len(each) else []
         results[_token(frame)] = [
-            {**place, **_columns(task, each, k, frame, speeds.get((i, k), [np.nan] * 2), names)}
+            {**place, **_columns(task, each, k, poses[i], speeds.get((i, k), [np.nan] * 2), names)}
             for k, place in enumerate(placed)]
     write_text(out, json.dumps({"meta": META, **labels.extra.get(ROOT, {}), "results": results}))
 
 
-def _columns(task: str, labels: FrameLabels, k: int, frame: Frame,
+def _columns(task: str, labels: FrameLabels, k: int, pose: np.ndarray,
              velocity: list[float], names: dict[int, str]) -> dict[str, Any]:
     """What else a box says, see _write."""
     kind, track = labels.class_names[k], int(labels.track_ids[k])
@@ -151,7 +154,7 @@ def _columns(task: str, labels: FrameLabels, k: int, frame: Frame,
     if isinstance(said := extra.pop("velocity", None), list) and len(said) == 2:
         velocity = said
     columns = {"velocity": velocity, "attribute_name": attribute,
-               f"{task}_name": {**THEIRS, **LIKE}.get(kind, kind),
+               f"{task}_name": WRITTEN.get(kind, kind),
                f"{task}_score": (float(labels.scores[k]) if np.isfinite(labels.scores[k])
                                  else NO_SCORE)}
     if task == "tracking" or track != NO_TRACK:
@@ -160,15 +163,17 @@ def _columns(task: str, labels: FrameLabels, k: int, frame: Frame,
     if isinstance(rotation, list) and len(rotation) == 4:
         del extra["rotation"]
         box = labels.boxes[k].tolist()
-        centre, size, _ = in_global(np.array([box]), _pose(frame))
+        centre, size, _ = in_global(np.array([box]), pose)
         place = {"translation": centre[0], "size": size[0][[1, 0, 2]], "rotation": rotation}
-        if unchanged(box, _in_frame(place, _pose(frame))[0]):
+        if unchanged(box, _in_frame(place, pose)[0]):
             columns["rotation"] = rotation
     return {**beside(extra, OWN | columns.keys()), **columns}
 
 
-def _velocities(labels: DriveLabels, frames: Sequence[Frame]) -> dict[tuple[int, int], list[float]]:
-    """By frame and box: m/s in the fixed frame, of a track from the frame before to that after."""
+def _velocities(labels: DriveLabels, frames: Sequence[Frame],
+                poses: dict[int, np.ndarray]) -> dict[tuple[int, int], list[float]]:
+    """By frame and box: m/s in the fixed frame, of a track from the frame before to that after.
+    poses: of the frames with boxes."""
     tracks: dict[tuple[str, int], list[tuple[int, int]]] = {}
     for i, (each, frame) in enumerate(zip(labels.frames, frames)):
         for k, track in enumerate(each.track_ids.tolist()):
@@ -176,7 +181,7 @@ def _velocities(labels: DriveLabels, frames: Sequence[Frame]) -> dict[tuple[int,
                 tracks.setdefault((frame.sequence, track), []).append((i, k))
     found = {}
     for places_ in tracks.values():
-        at = np.array([(_pose(frames[i]) @ [*labels.frames[i].boxes[k, :3], 1.0])[:2]
+        at = np.array([(poses[i] @ [*labels.frames[i].boxes[k, :3], 1.0])[:2]
                        for i, k in places_])
         seconds = np.array([frames[i].stamp_ns for i, _ in places_], np.int64)
         for n, place in enumerate(places_):
@@ -186,7 +191,5 @@ def _velocities(labels: DriveLabels, frames: Sequence[Frame]) -> dict[tuple[int,
     return found
 
 
-Read = Callable[[Path, Sequence[Frame]], DriveLabels]
-Write = Callable[..., None]
-detection: tuple[Read, Write] = (partial(_read, "detection"), partial(_write, "detection"))
-tracking: tuple[Read, Write] = (partial(_read, "tracking"), partial(_write, "tracking"))
+detection, tracking = ((partial(_read, task), partial(_write, task))
+                       for task in ("detection", "tracking"))

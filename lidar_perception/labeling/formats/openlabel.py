@@ -19,14 +19,14 @@ import numpy as np
 from lidar_perception.data.frame import Frame
 from lidar_perception.labeling.formats import openlabel_parts as parts
 from lidar_perception.labeling.formats.files import (
-    check_all_known,
-    drive_files,
     in_file,
     is_number,
+    known_drive_files,
     read_json,
     sequences_of,
     track_names,
     track_numbers,
+    write_drives,
     write_json,
 )
 from lidar_perception.labeling.labels import (
@@ -37,7 +37,6 @@ from lidar_perception.labeling.labels import (
     of_rows,
     unchanged,
 )
-from lidar_perception.runs.files import check_free, whole_folder
 from lidar_perception.types import InputError
 
 SUFFIX, ROOT = ".json", "openlabel"
@@ -50,16 +49,15 @@ KEPT, DATA, CUBOIDS = "openlabel_cuboid", "object_data", "cuboid"
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     """path: one JSON file, or a folder with DRIVE.json of each drive."""
-    files = drive_files(path, frames, SUFFIX)
-    if path not in files.values():
-        check_all_known(path, list(files.values()), SUFFIX)
+    files = known_drive_files(path, frames, SUFFIX)
     labels: list[FrameLabels] = []
     extra = {}
     for drive, positions in sequences_of(frames).items():
-        own, where = [frames[i] for i in positions], str(files[drive])
-        if not files[drive].exists() and files[drive] != path:
+        own = [frames[i] for i in positions]
+        if drive not in files:
             labels += [of_rows(frame, ()) for frame in own]
             continue
+        where = str(files[drive])
         found, extra[drive] = in_file(where, partial(_read_drive, files[drive], own, where))
         labels += found
     return DriveLabels(labels, {ROOT: extra})
@@ -125,15 +123,11 @@ def _rest(cuboid: dict[str, Any], box: list[float], plain: bool) -> dict[str, An
 def write(labels: DriveLabels, out: Path, frames: Sequence[Frame], force: bool = False) -> None:
     """out: FILE.json, or a folder for a file of each drive. Numbers are exact."""
     kept = labels.extra.get(ROOT, {})
-    if out.suffix == SUFFIX:
-        (drive,) = drive_files(out, frames, SUFFIX)
-        check_free(out, force)
-        write_json(out, _content(labels, frames, range(len(frames)), kept.get(drive, {})))
-        return
-    with whole_folder(out, force) as folder:
-        files = drive_files(folder, frames, SUFFIX)
-        for drive, positions in sequences_of(frames).items():
-            write_json(files[drive], _content(labels, frames, positions, kept.get(drive, {})))
+
+    def write_drive(file: Path, drive: str, positions: list[int]) -> None:
+        write_json(file, _content(labels, frames, positions, kept.get(drive, {})))
+
+    write_drives(out, frames, SUFFIX, force, write_drive)
 
 
 def _content(labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[int],

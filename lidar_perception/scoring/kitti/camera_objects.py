@@ -11,7 +11,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.kitti.labels import to_labels
 from lidar_perception.data.kitti.write import image_boxes
 from lidar_perception.geometry import wrap_angle
-from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
+from lidar_perception.types import Detections, GroundTruth, InputError, class_ids
 
 NO_ANGLE = -10.0          # KITTI's alpha where there is none
 # Truncation levels of the tracking layout: 0 inside, 1 across the border of the image, 2 ends of
@@ -97,8 +97,7 @@ def camera_objects(objects: GroundTruth, calibration: Calibration | None) -> Cam
     bearing = np.arctan2(location[:, 0], location[:, 2])
     computed = np.where(whole, wrap_angle(turn - bearing), np.nan)
     return CameraObjects(
-        class_ids=np.array([CLASSES.index(name if (name := label["class"]) in CLASSES else "Misc")
-                            for label in labels], np.int32),
+        class_ids=np.array(class_ids(label["class"] for label in labels), np.int32),
         boxes=np.column_stack([location[:, 2], -location[:, 0], sides[:, 0] / 2 - location[:, 1],
                                sides[:, [2, 1, 0]], -turn - np.pi / 2]),
         image_boxes=np.where(has_pixels, given, projected),
