@@ -21,22 +21,19 @@ ID, SCORE, REST = "track_id", "score", "rest"  # of Track.extra
 def from_labels(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str, Any]]:
     """Accepted tracks of key boxes, numbered from first_id; and what State.kept is to hold. Boxes
     of one track id and one class are a track; a box without an id is one of its own."""
-    found: dict[tuple[Any, ...], list[tuple[int, Box, dict[str, Any]]]] = {}
+    found: dict[tuple[Any, ...], tuple[str, dict[int, Box], dict[int, dict[str, Any]]]] = {}
     for f, frame in enumerate(labels.frames):
         for k, name in enumerate(frame.class_names):
             number, score = int(frame.track_ids[k]), float(frame.scores[k])
             said = {ID: number, REST: frame.extra[k],
                     **({} if math.isnan(score) else {SCORE: score})}
             key = (number, name) if number != NO_TRACK else (NO_TRACK, f, k)
-            known = found.setdefault(key, [])
-            if any(f == other for other, _, _ in known):  # an id twice in a frame: two tracks
-                known = found.setdefault((NO_TRACK, f, k), [])
-            known.append((f, Box.of(frame.boxes[k], KEY), {"class": name, **said}))
-    tracks = []
-    for number, rows in enumerate(found.values(), first_id):
-        extra = {f: {k: v for k, v in said.items() if k != "class"} for f, _, said in rows}
-        tracks.append(Track(number, rows[0][2]["class"], ACCEPTED, 1.0, IMPORTED,
-                            {f: box for f, box, _ in rows}, frozenset(), extra))
+            if key in found and f in found[key][1]:  # an id twice in a frame: two tracks
+                key = NO_TRACK, f, k
+            _, boxes, extra = found.setdefault(key, (name, {}, {}))
+            boxes[f], extra[f] = Box.of(frame.boxes[k], KEY), said
+    tracks = [Track(number, name, ACCEPTED, 1.0, IMPORTED, boxes, frozenset(), extra)
+              for number, (name, boxes, extra) in enumerate(found.values(), first_id)]
     notes = {str(f): [list(note) for note in frame.notes]
              for f, frame in enumerate(labels.frames) if frame.notes}
     return tracks, {"notes": notes, "extra": labels.extra}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,10 +23,17 @@ class Answered:
 def answered(path: Path, topic: str) -> list[Answered]:
     """The labelled frames that have an answer on a topic of a bag, in order of time; of equal
     stamps the last."""
-    by_stamp: dict[str, dict[int, MarkedObjects]] = {topic: {}, TRUTH: {}}
     with Bag(path) as bag:
-        for where, _, msg in bag.messages(by_stamp.keys() & bag.topics.keys()):
-            objects = from_marker_array(msg)
-            by_stamp[where][objects.stamp_ns] = objects
-    return [Answered(stamp, by_stamp[TRUTH][stamp], by_stamp[topic][stamp])
-            for stamp in sorted(by_stamp[topic].keys() & by_stamp[TRUTH].keys())]
+        found = by_stamp(bag, (topic, TRUTH))
+    return [Answered(stamp, found[TRUTH][stamp], found[topic][stamp])
+            for stamp in sorted(found[topic].keys() & found[TRUTH].keys())]
+
+
+def by_stamp(bag: Bag, topics: Iterable[str]) -> dict[str, dict[int, MarkedObjects]]:
+    """By topic and header.stamp what is marked on MarkerArray topics of a bag; of equal stamps the
+    last. Nothing on a topic that the bag does not have."""
+    found: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in topics}
+    for topic, _, message in bag.messages(found.keys()):
+        objects = from_marker_array(message)
+        found[topic][objects.stamp_ns] = objects
+    return found
