@@ -77,6 +77,11 @@ def _points_in_boxes(xyz, boxes, margin, begin, end, first):
     return inside[:count]
 
 
+def centre_distances(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """(K, M) metres from above between the centres of boxes (K, 7) and others (M, 7)."""
+    return np.hypot(*(boxes[:, None, :2] - others[None, :, :2]).transpose(2, 0, 1))
+
+
 def box_corners(boxes: np.ndarray) -> np.ndarray:
     """(K, 8, 3) corners of boxes (K, 7): four at the bottom, counter-clockwise from front left
     (seen from above), then the four above them."""

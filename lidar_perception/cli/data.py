@@ -48,6 +48,11 @@ weights_option = a_path("--weights", "Run the detector of this checkpoint, or on
                         "package.",
                         "FILE|NAME")
 
+port_option = click.option("--port", type=click.IntRange(0, 65535), default=0, show_default=True,
+                           help="Port on 127.0.0.1; 0: any that is free.")
+browser_option = click.option("--open/--no-open", "browser", default=True,
+                              help="Open the page in a browser.  [default: open]")
+
 
 @dataclass(frozen=True)
 class Walk:

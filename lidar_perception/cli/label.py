@@ -10,9 +10,11 @@ import click
 
 from lidar_perception.cli.data import (
     a_path,
+    browser_option,
     data_option,
     json_option,
     opened,
+    port_option,
     weights_option,
     write_json,
 )
@@ -31,10 +33,8 @@ if TYPE_CHECKING:
               "several.")
 @a_path("--out", "Folder of the journal; one that is there is continued. Default: "
         "out/label/NAME OF THE DRIVE.", "FOLDER")
-@click.option("--port", type=click.IntRange(0, 65535), default=0, show_default=True,
-              help="Port on 127.0.0.1; 0: any that is free.")
-@click.option("--open/--no-open", "browser", default=True, help="Open the page in a browser.  "
-              "[default: open]")
+@port_option
+@browser_option
 @weights_option
 @click.option("--propose/--no-propose", default=True, help="Look for proposals in the whole drive "
               "at once, unless the journal has some.  [default: propose]")
@@ -91,7 +91,7 @@ def _serve(drive: Drive, made: Session, port: int, browser: bool, propose: bool,
     import asyncio
     import webbrowser
 
-    from lidar_perception.labeling.exchange import FORMATS
+    from lidar_perception.labeling.results import Results
     from lidar_perception.labeling.server import Served, serve
 
     def started(url: str) -> None:
@@ -102,19 +102,8 @@ def _serve(drive: Drive, made: Session, port: int, browser: bool, propose: bool,
             made.do({"do": "propose"})
         if browser:
             webbrowser.open(url)
-    asyncio.run(serve(Served(drive, made, _labels(drive) if show_labels else None,
-                             can_export=tuple(FORMATS), export=made.export), port, started))
-
-
-def _labels(drive: Drive) -> Any:
-    """The labels of frame i, as the page has them."""
-    def layers(i: int, score: float) -> dict[str, Any]:
-        truth = drive.frames[i].truth()
-        labels = [] if truth is None else [
-            [*box.tolist(), name, extra.get("track_id")]
-            for box, name, extra in zip(truth.boxes, truth.labels, truth.extras)]
-        return {"labels": labels, "detections": {}, "matches": {}}
-    return layers
+    layers = Results().layers_of(drive) if show_labels else None
+    asyncio.run(serve(Served(drive, made, layers), port, started))
 
 
 def _simulated(recording: Recording, sequence: str | None, weights: str) -> dict[str, Any]:

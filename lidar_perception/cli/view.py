@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from lidar_perception.cli.data import device_option, opened
+from lidar_perception.cli.data import browser_option, device_option, opened, port_option
 from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
 
@@ -28,10 +27,8 @@ if TYPE_CHECKING:
 @click.option("--sequence", metavar="NAME", help="The drive of PATH to show, where it has "
               "several.")
 @device_option
-@click.option("--port", type=click.IntRange(0, 65535), default=0, show_default=True,
-              help="Port on 127.0.0.1; 0: any that is free.")
-@click.option("--open/--no-open", "browser", default=True, help="Open the page in a browser.  "
-              "[default: open]")
+@port_option
+@browser_option
 @click.option("--screenshot", type=click.Path(path_type=Path), metavar="PNG", help="Write a "
               "picture of the page and end; needs chromium.")
 @click.option("--frame", type=click.IntRange(0), default=0, show_default=True, metavar="N",
@@ -94,8 +91,4 @@ def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], poi
             for name in weights}
     more |= {folder.name: shown.by_files(folder) for folder in results}
     found = shown.Results({**found.sources, **more}, found.tracks)
-    return Served(drive, layers=partial(_layers, found, drive.frames), tracks=found.tracks)
-
-
-def _layers(found, frames, i: int, min_score: float) -> dict:
-    return found.layers(i, frames[i], min_score)
+    return Served(drive, layers=found.layers_of(drive), tracks=found.tracks)

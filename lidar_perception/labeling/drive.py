@@ -140,12 +140,12 @@ def one_drive(recording: Recording, sequence: str | None = None) -> Drive:
     several, or none of that name."""
     every = recording.frames[:]  # of a bag, without the clouds that iterating would keep
     names = list(dict.fromkeys(frame.sequence for frame in every))
+    listed = f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}"
     if sequence is None and len(names) > 1:
         raise InputError(f"{recording.path} has {len(names)} drives; name one with --sequence: "
-                         f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}")
+                         f"{listed}")
     if sequence is not None and sequence not in names:
-        raise InputError(f"{recording.path} has no drive {sequence}; it has "
-                         f"{', '.join(names[:10])}{', ...' if len(names) > 10 else ''}")
+        raise InputError(f"{recording.path} has no drive {sequence}; it has {listed}")
     chosen = names[0] if sequence is None else sequence
     frames = [frame for frame in every if frame.sequence == chosen]
     path = Path(recording.path).absolute()

@@ -21,22 +21,19 @@ ID, SCORE, REST = "track_id", "score", "rest"  # of Track.extra
 def from_labels(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[str, Any]]:
     """Accepted tracks of key boxes, numbered from first_id; and what State.kept is to hold. Boxes
     of one track id and one class are a track; a box without an id is one of its own."""
-    found: dict[tuple[Any, ...], list[tuple[int, str, Box, dict[str, Any]]]] = {}
+    found: dict[tuple[Any, ...], tuple[str, dict[int, Box], dict[int, dict[str, Any]]]] = {}
     for f, frame in enumerate(labels.frames):
         for k, name in enumerate(frame.class_names):
             number, score = int(frame.track_ids[k]), float(frame.scores[k])
             said = {ID: number, REST: frame.extra[k],
                     **({} if math.isnan(score) else {SCORE: score})}
             key = (number, name) if number != NO_TRACK else (NO_TRACK, f, k)
-            known = found.setdefault(key, [])
-            if known and known[-1][0] == f:  # an id twice in a frame: two tracks
-                known = found.setdefault((NO_TRACK, f, k), [])
-            known.append((f, name, Box.of(frame.boxes[k], KEY), said))
-    tracks = []
-    for number, rows in enumerate(found.values(), first_id):
-        tracks.append(Track(number, rows[0][1], ACCEPTED, 1.0, IMPORTED,
-                            {f: box for f, _, box, _ in rows}, frozenset(),
-                            {f: said for f, _, _, said in rows}))
+            if key in found and f in found[key][1]:  # an id twice in a frame: two tracks
+                key = NO_TRACK, f, k
+            _, boxes, extra = found.setdefault(key, (name, {}, {}))
+            boxes[f], extra[f] = Box.of(frame.boxes[k], KEY), said
+    tracks = [Track(number, name, ACCEPTED, 1.0, IMPORTED, boxes, frozenset(), extra)
+              for number, (name, boxes, extra) in enumerate(found.values(), first_id)]
     notes = {str(f): [list(note) for note in frame.notes]
              for f, frame in enumerate(labels.frames) if frame.notes}
     return tracks, {"notes": notes, "extra": labels.extra}

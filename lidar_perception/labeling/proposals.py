@@ -13,6 +13,7 @@ from lidar_perception.candidates.confidence import confidence
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.silhouette import similarity
 from lidar_perception.detectors.open import FUSED
+from lidar_perception.geometry import centre_distances
 from lidar_perception.labeling.interpolation import Motion, filled
 from lidar_perception.labeling.snap import completed
 from lidar_perception.labeling.state import PROPOSED, Box, Track
@@ -61,8 +62,7 @@ def found_in(look: Look, seeds: Sequence[SeedLook],
     if placed is None or placed[1] not in CLASSES:
         return detections, candidates
     box, name = placed
-    apart = np.hypot(detections.boxes[:, 0] - box[0], detections.boxes[:, 1] - box[1])
-    others = apart > max(SAME, box[3] / 3)
+    others = centre_distances(detections.boxes, box[None])[:, 0] > max(SAME, box[3] / 3)
     kept = detections[others]
     return Detections(np.concatenate([kept.boxes, box[None].astype(np.float32)]),
                       np.append(kept.class_ids, np.int32(CLASSES.index(name))),
@@ -77,8 +77,7 @@ def _seen_in(look: Look, seeds: Sequence[SeedLook]) -> tuple[Detections, Array]:
     people = found.boxes[np.isin(found.class_ids, ON_FOOT)]
     boxes = np.array([completed(b, CLASSES[PEDESTRIAN])
                       for b in look.boxes[chosen].astype(np.float64)]).reshape(-1, 7)
-    apart = np.hypot(*(boxes[:, None, :2] - people[None, :, :2]).transpose(2, 0, 1))
-    new = apart.min(axis=1, initial=np.inf) > SAME
+    new = centre_distances(boxes, people).min(axis=1, initial=np.inf) > SAME
     both = Detections(np.concatenate([found.boxes, boxes[new].astype(np.float32)]),
                       np.concatenate([found.class_ids, np.full(new.sum(), PEDESTRIAN, np.int32)]),
                       np.concatenate([found.scores, scores[chosen][new].astype(np.float32)]))
@@ -100,9 +99,10 @@ def proposed(looks: Sequence[Look], seeds: Sequence[SeedLook], stamps_ns: Sequen
         tracks = tracker(found, stamps_ns[i], pose)
         for k in np.flatnonzero(tracks.seen):
             box = tracks.detections.boxes[k].astype(np.float64)
-            apart = np.hypot(found.boxes[:, 0] - box[0], found.boxes[:, 1] - box[1])
-            if not len(apart) or (nearest := int(apart.argmin())) < 0 or apart[nearest] > NEAR:
+            apart = centre_distances(found.boxes, box[None])[:, 0]
+            if apart.min(initial=np.inf) > NEAR:
                 continue
+            nearest = int(apart.argmin())
             box[:3] = found.boxes[nearest, :3]
             hits.setdefault(int(tracks.ids[k]), []).append(
                 (i, box, int(tracks.detections.class_ids[k]), float(found.scores[nearest]),

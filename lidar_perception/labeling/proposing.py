@@ -15,7 +15,7 @@ from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.candidates.silhouette import similarity, to_pixels
 from lidar_perception.detectors.open import FUSED
-from lidar_perception.geometry import points_in_box
+from lidar_perception.geometry import centre_distances, points_in_box
 from lidar_perception.labeling.drive import Drive
 from lidar_perception.labeling.interpolation import Motion, corrected
 from lidar_perception.labeling.proposals import CANDIDATES, SAME, SeedLook, proposed
@@ -44,7 +44,7 @@ class Proposer:
         says whether to go on. Whether all were."""
         looks: list[Look] = []
         with closing(surveyed(self.drive, self.weights, here)) as survey:
-            for _, look in survey:
+            for look in survey:
                 looks.append(look)
                 if not done(len(looks)):
                     return False
@@ -113,7 +113,7 @@ class Proposer:
             return box
         found = self.looks[frame].detections
         found = found[found.class_ids == CLASSES.index(class_name)]
-        apart = np.hypot(found.boxes[:, 0] - box[0], found.boxes[:, 1] - box[1])
+        apart = centre_distances(found.boxes, box[None])[:, 0]
         if apart.min(initial=np.inf) > max(SAME, ALONG * box[3]):
             return box
         return found.boxes[int(apart.argmin())].astype(np.float64)

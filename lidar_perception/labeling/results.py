@@ -21,10 +21,11 @@ from lidar_perception.geometry import bev_iou
 from lidar_perception.groups import renumbered
 from lidar_perception.labeling.drive import Drive, Scan, scan_of, scanned
 from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_to_one
+from lidar_perception.scoring.recorded import by_stamp
 from lidar_perception.types import Detections, GroundTruth, InputError
 from lidar_perception.wire.messages import column, to_detections, to_frame
 from lidar_perception.wire.topics import POINTS, TRUTH
-from msg_utils.markers import MarkedObjects, from_marker_array
+from msg_utils.markers import MarkedObjects
 
 Array = np.ndarray[Any, Any]
 SIMILAR = {row.name: row.looks_like or row.name for row in TABLE}
@@ -57,7 +58,8 @@ class Results:
     def layers(self, i: int, frame: Frame, min_score: float) -> dict[str, Any]:
         """Labels and detections of frame i as /api/labels has them, and what of them is missed and
         false from this score on."""
-        truth, camera = frame.truth(), frame.camera()
+        truth = frame.truth()
+        camera = frame.camera() if self.sources and truth is not None else None
         found = {name: source.find(i, frame) for name, source in self.sources.items()}
         labels = [] if truth is None else [
             [*map(float, box), name, extra.get("track_id")]
@@ -68,6 +70,10 @@ class Results:
             name: compared(truth, d, min_score, camera, self.sources[name].classes)
             for name, d in found.items()}
         return {"labels": labels, "detections": rows, "matches": matches}
+
+    def layers_of(self, drive: Drive) -> Callable[[int, float], dict[str, Any]]:
+        """layers() of frame i of a drive, from a score on."""
+        return lambda i, min_score: self.layers(i, drive.frames[i], min_score)
 
 
 def compared(truth: GroundTruth, found: Detections, min_score: float, camera: Camera | None = None,
@@ -144,15 +150,12 @@ def recorded(path: Path, stamps: list[int]) -> Results:
     with Bag(path) as bag:
         wanted = {topic for topic, kind in bag.topics.items() if kind == MARKERS and topic != TRUTH
                   and topic.endswith((FOUND, TRACKS))}
-        found: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in sorted(wanted)}
-        for topic, _, message in bag.messages(wanted):
-            objects = from_marker_array(message)
-            found[topic][objects.stamp_ns] = objects
+        found = by_stamp(bag, sorted(wanted))
     numbers = {stamp: i for i, stamp in enumerate(stamps)}
     sources: dict[str, Source] = {}
     tracks: list[dict[str, Any]] = []
-    for topic, by_stamp in found.items():
-        frames = {numbers[stamp]: each for stamp, each in by_stamp.items() if stamp in numbers}
+    for topic, marked in found.items():
+        frames = {numbers[stamp]: each for stamp, each in marked.items() if stamp in numbers}
         if topic.endswith(TRACKS):
             tracks += _tracks(frames, topic, len(tracks))
         else:

@@ -20,6 +20,7 @@ from aiohttp import WSMsgType, web
 
 from lidar_perception.labeling.actions import track_of
 from lidar_perception.labeling.drive import Drive, classes
+from lidar_perception.labeling.exchange import FORMATS
 from lidar_perception.labeling.session import Session
 from lidar_perception.labeling.state import next_uncertain
 from lidar_perception.runs.files import short
@@ -42,17 +43,13 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 class Served:
     """What the page shows. session: the labels being made; None: results are only looked at.
     layers: of frame i from a score on, as /api/labels has it, None where there is nothing to show;
-    tracks: as the page has them, where results are looked at. has: what the page offers, beside
-    what the recording has."""
+    tracks: as the page has them, where results are looked at."""
 
     drive: Drive
     session: Session | None = None
     layers: Callable[[int, float], dict[str, Any]] | None = None
     tracks: tuple[dict[str, Any], ...] = ()
-    has: tuple[str, ...] = ()
     live: bool = False
-    can_export: tuple[str, ...] = ()
-    export: Callable[[str, str, bool], dict[str, Any]] | None = None
     token: str = field(default_factory=partial(secrets.token_urlsafe, 24))
 
 
@@ -122,8 +119,8 @@ class Server:
         return web.json_response({
             "name": drive.name, "path": str(drive.recording.path), "live": served.live,
             "mode": "label" if served.session else "view", "frames": frames, "classes": classes(),
-            "layout": drive.recording.layout, "has": [*sorted(drive.recording.has), *served.has],
-            "can_export": list(served.can_export)})
+            "layout": drive.recording.layout, "has": sorted(drive.recording.has),
+            "can_export": [*FORMATS] if served.session else []})
 
     def frame(self, text: str) -> int:
         """The number of a frame. InputError where there is none of it."""
@@ -228,13 +225,13 @@ class Server:
 
     async def export(self, request: web.Request) -> web.StreamResponse:
         """Write the labels in another format."""
-        asked, export = await _object(request), self.served.export
-        if export is None:
+        asked, made = await _object(request), self.served.session
+        if made is None:
             raise InputError("export is not available")
         if not isinstance(asked.get("format"), str) or not isinstance(asked.get("out"), str):
             raise InputError("an export needs a format and out, the name of a folder")
         return web.json_response(await self.in_thread(partial(
-            export, asked["format"], asked["out"], asked.get("force") is True)))
+            made.export, asked["format"], asked["out"], asked.get("force") is True)))
 
 
 def _number(text: str) -> int | None:

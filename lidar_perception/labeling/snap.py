@@ -10,7 +10,7 @@ from lidar_perception.candidates.params import SeedParams
 from lidar_perception.candidates.seeds import clicked_cluster
 from lidar_perception.classes import DETECTED, Size
 from lidar_perception.clustering.shapes import oriented_boxes
-from lidar_perception.geometry import points_in_box, wrap_angle
+from lidar_perception.geometry import points_in_box, to_box_frame, wrap_angle
 from lidar_perception.ground.surface import surface_under
 from lidar_perception.labeling.drive import Scan
 from lidar_perception.types import InputError
@@ -73,7 +73,7 @@ def to_size(box: Array, size: Array) -> Array:
     """(7,) the box with another length, width and height; the corner that is nearest to the sensor
     stays where it is, and so does the bottom."""
     cos, sin = np.cos(box[6]), np.sin(box[6])
-    seen = np.array([-(cos * box[0] + sin * box[1]), sin * box[0] - cos * box[1]])
+    seen = to_box_frame(np.zeros((1, 3)), box)[0, :2]
     away = -np.where(np.abs(seen) > box[3:5] / 2, np.sign(seen), 0.0)
     along, across = away * (size[:2] - box[3:5]) / 2
     return np.array([box[0] + cos * along - sin * across, box[1] + sin * along + cos * across,

@@ -72,28 +72,27 @@ def _described(xyz: Array, cluster_ids: Array, boxes: Array, numbers: Array,
 
 
 def surveyed(drive: Drive, weights: str,
-             here: bool = False) -> Generator[tuple[int, Look], None, None]:
-    """(number, look) of all frames, in their order, with the detector of these weights, "" for
-    none; in a process of its own, which ends with the iterator, or with `here` in this one.
-    InputError where a frame or the weights cannot be read."""
+             here: bool = False) -> Generator[Look, None, None]:
+    """The looks of all frames, in their order, with the detector of these weights, "" for none; in
+    a process of its own, which ends with the iterator, or with `here` in this one. InputError where
+    a frame or the weights cannot be read."""
     reopen, frames = drive.recording.reopen, list(range(len(drive.frames)))
     if here or reopen is None:
-        start: Callable[[], Callable[[int], tuple[int, Look]]] = partial(_here, drive, weights)
-        yield from map(start(), frames)
+        yield from map(_here(drive, weights), frames)
         return
     sequence = drive.frames[0].sequence
     yield from in_processes(partial(_elsewhere, reopen, weights, sequence), frames, 1,
                             "looked for proposals", apart=True)
 
 
-def _here(drive: Drive, weights: str) -> Callable[[int], tuple[int, Look]]:
+def _here(drive: Drive, weights: str) -> Callable[[int], Look]:
     detector = None if weights == "" else open_detector(
         weights, sensor_height=drive.frames[0].sensor_height, min_score=LEAST_SCORE)
     odometry = Odometry() if drive.motion.poses is None and has_odometry() else None
-    return lambda i: (i, look_at(drive.frames[i], detector, odometry))
+    return lambda i: look_at(drive.frames[i], detector, odometry)
 
 
 def _elsewhere(reopen: Callable[[], Recording], weights: str,
-               sequence: str) -> Callable[[int], tuple[int, Look]]:
+               sequence: str) -> Callable[[int], Look]:
     os.nice(10)  # the page comes first
     return _here(one_drive(reopen(), sequence), weights)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,11 +23,18 @@ class Answered:
 def answered(path: Path, *topics: str) -> list[list[Answered]]:
     """For each of these topics of a bag, the labelled frames that have an answer on it, in order of
     time; of equal stamps the last."""
-    by_stamp: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in (*topics, TRUTH)}
     with Bag(path) as bag:
-        for where, _, msg in bag.messages(by_stamp.keys() & bag.topics.keys()):
-            objects = from_marker_array(msg)
-            by_stamp[where][objects.stamp_ns] = objects
-    truth = by_stamp[TRUTH]
-    return [[Answered(stamp, truth[stamp], by_stamp[topic][stamp])
-             for stamp in sorted(by_stamp[topic].keys() & truth.keys())] for topic in topics]
+        found = by_stamp(bag, (*topics, TRUTH))
+    truth = found[TRUTH]
+    return [[Answered(stamp, truth[stamp], found[topic][stamp])
+             for stamp in sorted(found[topic].keys() & truth.keys())] for topic in topics]
+
+
+def by_stamp(bag: Bag, topics: Iterable[str]) -> dict[str, dict[int, MarkedObjects]]:
+    """By topic and header.stamp what is marked on MarkerArray topics of a bag; of equal stamps the
+    last. Nothing on a topic that the bag does not have."""
+    found: dict[str, dict[int, MarkedObjects]] = {topic: {} for topic in topics}
+    for topic, _, message in bag.messages(found.keys() & bag.topics.keys()):
+        objects = from_marker_array(message)
+        found[topic][objects.stamp_ns] = objects
+    return found

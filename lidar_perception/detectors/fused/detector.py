@@ -15,13 +15,7 @@ from lidar_perception.clustering.cluster import cluster
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.fused.boxes import on_ground, on_points
-from lidar_perception.detectors.fused.evidence import (
-    Evidence,
-    clipped_logit,
-    distances,
-    judged,
-    silhouette_at,
-)
+from lidar_perception.detectors.fused.evidence import Evidence, clipped_logit, judged, silhouette_at
 from lidar_perception.detectors.fused.model import at_most, probabilities, sources
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.nms import first_of_each, suppressed
@@ -37,6 +31,7 @@ from lidar_perception.detectors.view import (
     visible,
     with_intensity_scaled,
 )
+from lidar_perception.geometry import centre_distances
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.surface import surface_under
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, LidarFrame
@@ -159,7 +154,7 @@ def one_of_each(found: Detections, params: FusedParams) -> np.ndarray:
     order = suppressed(found.boxes, found.scores, found.class_ids, params.nms.iou,
                        params.nms.across_classes)
     boxes, class_ids = found.boxes[order], found.class_ids[order]
-    again = (distances(boxes, boxes) < params.same_place) & (class_ids[:, None] == class_ids)
+    again = (centre_distances(boxes, boxes) < params.same_place) & (class_ids[:, None] == class_ids)
     again[class_ids == CAR] = False
     return order[first_of_each(again)][:params.nms.max_boxes]
 

@@ -18,6 +18,7 @@ from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.detectors.pointnet.clusters import points_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.rescoring import known, rescored_by
+from lidar_perception.geometry import centre_distances
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.groups import group_points
 from lidar_perception.types import Detections, LidarFrame
@@ -41,7 +42,7 @@ def silhouette_at(boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray,
     found = snap_to_ground(oriented_boxes(xyz, cluster_ids, BEST.boxes.shape), fit_plane(ground))
     chosen = np.flatnonzero((found[:, 5] >= HEIGHTS[0]) & (found[:, 5] <= HEIGHTS[1])
                             & (found[:, 3:5].max(axis=1, initial=0.0) <= LENGTH))
-    near = distances(boxes, found[chosen]) <= SAME_PLACE
+    near = centre_distances(boxes, found[chosen]) <= SAME_PLACE
     asked = near.any(axis=0)
     chosen, near = chosen[asked], near[:, asked]
     own, start = group_points(xyz, cluster_ids, chosen + 1)
@@ -61,11 +62,6 @@ def judged(proposed: Detections, obstacles: LidarFrame, ground: np.ndarray,
     probabilities = np.full(len(proposed), np.nan)
     probabilities[asked] = rescored_by(classifier, proposed[asked], clusters, 1.0)[0].scores
     return probabilities
-
-
-def distances(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """(K, M) metres from above between the centres of boxes (K, 7) and others (M, 7)."""
-    return np.hypot(*(boxes[:, None, :2] - others[None, :, :2]).transpose(2, 0, 1))
 
 
 def clipped_logit(probabilities: np.ndarray) -> np.ndarray:
