@@ -66,11 +66,9 @@ def _ground_hits(ground, start, way, since, velocity, lift, max_range):
     return out
 
 
-def tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int, even: bool = True,
-           compensated: bool = False):
+def tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int, even: bool = True):
     """Returns of one turn of a sensor that leans against the road beneath it, degrees, at
-    sensor.height above it; even: streets slope and have curbs, and are smooth otherwise;
-    compensated: as in returns_of."""
+    sensor.height above it; even: streets slope and have curbs, and are smooth otherwise."""
     scene = drive._street(street, ANY)
     ground = scene.ground._replace(**EVEN) if even else scene.ground
     scene = replace(scene, ground=ground)
@@ -94,7 +92,7 @@ def tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int, 
     owner = np.where(nearer, 0, hits.owner)
     semantic = np.where(nearer, on_ground[..., 3], hits.semantic).astype(np.uint16)
     return returns_of(Hits(*merged, owner, semantic, hits.solid, hits.reached), sensor, motion,
-                      np.random.default_rng([street, number]), compensated)
+                      np.random.default_rng([street, number]), compensated=False)
 
 
 def cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str = "lidar"):
@@ -120,13 +118,11 @@ def cloud(returns, driver: dict, stamp_ns: int, rings: int, frame_id: str = "lid
     return from_array(points, header_message(stamp_ns, frame_id, bag_message), bag_message)
 
 
-def clouds_of(name: str, count: int = 4, even: bool = True, street: int = 40,
-              compensated: bool = False):
+def clouds_of(name: str, count: int = 4, even: bool = True, street: int = 40):
     """Clouds of the sensor of that name on its mount of MOUNTS, pairs on streets of their own."""
     driver, roll, pitch, height = MOUNTS[name]
     sensor = replace(sensor_named(name), height=height)
     for i in range(count):
-        found = tilted(sensor, roll, pitch, street + i // 2, 20 + i % 2, even,
-                       compensated)
+        found = tilted(sensor, roll, pitch, street + i // 2, 20 + i % 2, even)
         yield cloud(found, driver, round(1e9 * (10 * (i // 2) + (i % 2) / sensor.rate)),
                     sensor.rings)

@@ -8,6 +8,7 @@ from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.params import GroundParams, SensorPoseParams, ThresholdParams
 from lidar_perception.ground.patchwork import segment_by_patchwork
 from lidar_perception.ground.threshold import ransac_plane, segment_by_threshold
+from lidar_perception.robot.placing import tilted
 from lidar_perception.types import LidarFrame, usable_returns
 
 METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
@@ -47,11 +48,7 @@ def level(xyz: np.ndarray, pose: SensorPoseParams) -> np.ndarray:
     about x, then by pitch about y, as in a URDF's rpy. xyz itself where both are 0."""
     if pose.roll == pose.pitch == 0.0:
         return xyz
-    cos_r, sin_r = np.cos(pose.roll), np.sin(pose.roll)
-    cos_p, sin_p = np.cos(pose.pitch), np.sin(pose.pitch)
-    about_x = np.array([[1, 0, 0], [0, cos_r, -sin_r], [0, sin_r, cos_r]])
-    about_y = np.array([[cos_p, 0, sin_p], [0, 1, 0], [-sin_p, 0, cos_p]])
-    return xyz @ (about_y @ about_x).T.astype(np.float32)
+    return xyz @ tilted(pose.roll, pose.pitch)[:3, :3].T.astype(np.float32)
 
 
 def measured_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPoseParams()) -> float | None:

@@ -31,8 +31,7 @@ class Beams(NamedTuple):
     zeros where all start together; spread (B,) degrees: how far the points of one scatter, the
     median of their distances; error (B,) degrees: of the elevation, from its differences between
     scans (or within one); labels: of each scan (N,) int64, -1 of no beam; how: by what the beams
-    were told from each other: ring, order or elevation; rings_descend: of how == "ring": whether
-    ring 0 is the highest."""
+    were told from each other: ring, order or elevation."""
 
     elevations: np.ndarray
     lifts: np.ndarray
@@ -40,7 +39,6 @@ class Beams(NamedTuple):
     error: np.ndarray
     labels: list[np.ndarray]
     how: str
-    rings_descend: bool = False
 
 
 def beams_of(scans: Sequence[Scan]) -> Beams | None:
@@ -98,7 +96,7 @@ def _by_order(scans: Sequence[Scan]) -> list[np.ndarray] | None:
 
 def _by_elevation(scans: Sequence[Scan]) -> list[np.ndarray] | None:
     """Beams as peaks of the histogram of elevations."""
-    away = [scan.elevation[np.linalg.norm(scan.xyz, axis=1) > NEAR] for scan in scans]
+    away = [scan.elevation[scan.range > NEAR] for scan in scans]
     whole = [scan.elevation for scan in scans]
     points = np.concatenate(away if sum(map(len, away)) > 0.3 * sum(map(len, whole)) else whole)
     edges = np.arange(-90.0, 90.0 + BIN, BIN)
@@ -175,8 +173,7 @@ def _fitted(scans: Sequence[Scan], labels: list[np.ndarray], how: str) -> Beams 
     table = np.full(int(names.max()) + 2, -1)
     table[names[known]] = rank
     return Beams(elevations[keep], lifts[keep], spread[keep], error[keep],
-                 [table[label] for label in labels], how,
-                 how == "ring" and bool(elevations[0] > elevations[-1]))
+                 [table[label] for label in labels], how)
 
 
 def _lifts(beams: list[_Points]) -> tuple[np.ndarray, np.ndarray]:
@@ -213,10 +210,10 @@ def _mad(values: np.ndarray) -> float:
     return float(np.median(np.abs(values - np.median(values)))) if len(values) else np.inf
 
 
-def azimuth_steps(scans: Sequence[Scan], beams: Beams) -> tuple[float, float, float]:
-    """Degrees between neighbouring firings of a beam: the median over beams and scans, and its
-    error; and the share of points that stand where their neighbour does, as those of a second
-    return. NaN where no beam has enough points."""
+def azimuth_steps(scans: Sequence[Scan], beams: Beams) -> tuple[float, float]:
+    """Degrees between neighbouring firings of a beam, the median over beams and scans, and the
+    share of points that stand where their neighbour does, as those of a second return. NaN where no
+    beam has enough points."""
     steps, twice = [], []
     for scan, label in zip(scans, beams.labels):
         order = np.lexsort((scan.azimuth, label))
@@ -235,9 +232,8 @@ def azimuth_steps(scans: Sequence[Scan], beams: Beams) -> tuple[float, float, fl
             if len(apart) >= MIN_BEAM // 2:
                 steps.append(float(apart.mean()))
     if not steps:
-        return np.nan, np.nan, 0.0
-    return (float(np.median(steps)), float(1.4826 * _mad(np.array(steps)) / np.sqrt(len(steps))),
-            float(np.median(twice)))
+        return np.nan, 0.0
+    return float(np.median(steps)), float(np.median(twice))
 
 
 def range_noise(scans: Sequence[Scan], beams: Beams, step: float) -> tuple[float, int]:
@@ -249,13 +245,12 @@ def range_noise(scans: Sequence[Scan], beams: Beams, step: float) -> tuple[float
     basis, _ = np.linalg.qr(np.column_stack([np.ones(n), x, x * x]))
     found = []
     for scan, label in zip(scans, beams.labels):
-        reach = np.linalg.norm(scan.xyz, axis=1)
         order = np.lexsort((scan.azimuth, label))
         gaps = np.diff(scan.azimuth[order])
         follows = (np.diff(label[order]) == 0) & (label[order][1:] >= 0) & (gaps < 1.6 * step) & (
             gaps > 0.2 * step)
         runs = np.lib.stride_tricks.sliding_window_view(follows, n - 1)[::n].all(axis=1)
-        pieces = np.lib.stride_tricks.sliding_window_view(reach[order], n)[::n][runs]
+        pieces = np.lib.stride_tricks.sliding_window_view(scan.range[order], n)[::n][runs]
         rest = pieces - (pieces @ basis) @ basis.T
         found.append(np.sqrt((rest ** 2).sum(axis=1) / (n - 3)))
     scatter = np.concatenate(found) if found else np.zeros(0)

@@ -7,6 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidar_perception.robot.crop import kept_points
+from lidar_perception.robot.params import CropParams
 from lidar_perception.sensor_setup.beams import Beams
 from lidar_perception.sensor_setup.mount import Mount
 from lidar_perception.sensor_setup.scans import Scan
@@ -50,16 +52,15 @@ def coverage_of(scans: Sequence[Scan], beams: Beams | None, mount: Mount | None)
     rows, labels = _rows(scans, beams)
     near = np.full((len(scans), len(rows), SECTORS), np.inf, np.float32)
     for image, scan, label in zip(near, scans, labels):
-        cells = label, (scan.azimuth * (SECTORS / 360)).astype(int) % SECTORS
         known = label >= 0
-        np.minimum.at(image, (cells[0][known], cells[1][known]),
-                      np.linalg.norm(scan.xyz[known], axis=1).astype(np.float32))
+        np.minimum.at(image, (label[known], _sectors(scan)[known]),
+                      scan.range[known].astype(np.float32))
     there = np.isfinite(near)
     seen = there.mean(axis=0)
     still = _stands_still(near)
     body, middle = _body(near, rows, mount, still)
-    mine = [_at(scan, label, body, False) & (np.abs(np.linalg.norm(scan.xyz, axis=1)
-                                                    - _at(scan, label, middle, 0.0)) < 3 * STEADY)
+    mine = [_at(scan, label, body, False)
+            & (np.abs(scan.range - _at(scan, label, middle, 0.0)) < 3 * STEADY)
             for scan, label in zip(scans, labels)]
     points = np.concatenate([scan.xyz[m] for scan, m in zip(scans, mine)])
     total = sum(len(scan.xyz) for scan in scans)
@@ -68,7 +69,8 @@ def coverage_of(scans: Sequence[Scan], beams: Beams | None, mount: Mount | None)
         # A few returns from beside the body, such as people who stand there, do not widen the box.
         low, high = np.percentile(points, [0.5, 99.5], axis=0)
         box = np.concatenate([low - MARGIN, high + MARGIN])
-        inside = [((scan.xyz > box[:3]) & (scan.xyz < box[3:])).all(axis=1) for scan in scans]
+        crop = CropParams(body=tuple(box.tolist()))
+        inside = [~kept_points(scan.xyz, crop) for scan in scans]
         others = float(sum((i & ~m).sum() for i, m in zip(inside, mine))
                        / max(1, sum(i.sum() for i in inside)))
     blind = (seen == 0) | body
@@ -84,10 +86,13 @@ def _rows(scans: Sequence[Scan], beams: Beams | None) -> tuple[np.ndarray, list[
                   for scan in scans]
 
 
+def _sectors(scan: Scan) -> np.ndarray:
+    return (scan.azimuth * (SECTORS / 360)).astype(int) % SECTORS
+
+
 def _at(scan: Scan, labels: np.ndarray, cells: np.ndarray, otherwise: float) -> np.ndarray:
     """(N,) what cells (R, 360) hold where each point is; otherwise for those of no row."""
-    column = (scan.azimuth * (SECTORS / 360)).astype(int) % SECTORS
-    return np.where(labels >= 0, cells[labels, column], otherwise).astype(cells.dtype)
+    return np.where(labels >= 0, cells[labels, _sectors(scan)], otherwise).astype(cells.dtype)
 
 
 def _stands_still(near: np.ndarray) -> bool | None:

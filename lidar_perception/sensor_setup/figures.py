@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from io import BytesIO
 from typing import Any
 
@@ -13,9 +12,11 @@ from lidar_perception.clustering.cluster import cluster
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.param_fields import with_values
 from lidar_perception.robot.crop import cropped
+from lidar_perception.robot.placing import tilted
+from lidar_perception.robot.poses import moved_points
 from lidar_perception.sensor_setup.files import chosen_params
 from lidar_perception.sensor_setup.measure import Measured
-from lidar_perception.sensor_setup.mount import levelled
+from lidar_perception.sensor_setup.scans import RETROREFLECTOR
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.types import LidarFrame
 
@@ -78,7 +79,7 @@ def _ground(figure: Any, m: Measured) -> bool:
     i = next(k for k, plane in enumerate(m.mount.planes) if plane is not None)
     plane, scan = m.mount.planes[i], m.scans[i]
     assert plane is not None
-    xyz = levelled(scan.xyz, plane.roll, plane.pitch) + [0.0, 0.0, plane.height]
+    xyz = moved_points(scan.xyz, tilted(plane.roll, plane.pitch, plane.height))
     near = np.hypot(*xyz[:, :2].T) < 25.0
     above, side = figure.subplots(1, 2)
     some = _some(near)
@@ -132,7 +133,7 @@ def _intensities(figure: Any, m: Measured) -> bool:
     axis = figure.subplots()
     centres = (np.arange(len(i.histogram)) + 0.5) * i.full / len(i.histogram)
     axis.bar(centres, i.histogram, i.full / len(i.histogram) * 0.9, color=BLUE)
-    axis.axvline(0.9 * i.full, color=ORANGE, linewidth=0.8)
+    axis.axvline(RETROREFLECTOR * i.full, color=ORANGE, linewidth=0.8)
     axis.set(yscale="log", xlabel="intensity as in the cloud", ylabel="points",
              title=f"{100 * i.zeros:.1f} % are 0, {100 * i.bright:.2f} % beyond the line as bright "
                    "as retroreflectors")
@@ -154,7 +155,7 @@ def _scan(figure: Any, m: Measured) -> bool:
         ground = segment_ground(frame, params.ground)
     labels = np.zeros(len(frame), np.int64)
     upright = np.flatnonzero(~ground)
-    labels[upright] = cluster(frame.xyz[upright], replace(params.clustering))
+    labels[upright] = cluster(frame.xyz[upright], params.clustering)
     half = float(np.clip(np.percentile(np.abs(frame.xyz[:, :2]).max(axis=1), 95), 5.0, 45.0))
     near = (np.abs(frame.xyz[:, :2]) < half).all(axis=1)
     axis = figure.subplots()

@@ -27,10 +27,6 @@ NEAREST_GROUND = 0.9              # of the distance of the nearest ground: where
 def sensor_yaml(m: Measured) -> str:
     """sensor.yaml: see simulation.sensor.sensor_from_file."""
     sensor = sensor_of(m)
-    lines = [f"# Measured by 'lidar-perception setup' from {len(m.scans)} of {m.total} clouds of "
-             f"{m.source}.", "# Angles in degrees, lengths in metres; docs/own_lidar.md describes "
-             "every field."]
-    lines += [f"# Doubtful: {line}" for line in doubts(m)]
     model = f"that of {m.model}" if m.model else "a default"
     why = {
         "height": "not measured: no ground in sight" if m.mount is None else
@@ -53,7 +49,8 @@ def sensor_yaml(m: Measured) -> str:
         values["wander"] = round(float(np.degrees(sensor.wander)), 4)
     if sensor.fade != default.fade:
         values["fade"] = list(sensor.fade)
-    out = "\n".join(_commented(line) for line in lines) + "\n"
+    out = _head(m, _origin(m), "Angles in degrees, lengths in metres; docs/own_lidar.md describes "
+                "every field.") + "\n"
     out += "".join(f"{key}: {_plain(value)}" + (f"  # {why[key]}" if key in why else "") + "\n"
                    for key, value in values.items())
     out += _list("elevations", np.degrees(sensor.elevations), 4)
@@ -65,9 +62,16 @@ def sensor_yaml(m: Measured) -> str:
     return out
 
 
-def _commented(line: str) -> str:
-    text = line.removeprefix("# ")
-    return "\n".join(textwrap.wrap(text, WIDTH, initial_indent="# ", subsequent_indent="#   "))
+def _origin(m: Measured) -> str:
+    return (f"Measured by 'lidar-perception setup' from {len(m.scans)} of {m.total} clouds of "
+            f"{m.source}.")
+
+
+def _head(m: Measured, *about: str) -> str:
+    """Comments: what the file is about, and what is doubtful."""
+    return "\n".join(part for text in (*about, *(f"Doubtful: {line}" for line in doubts(m)))
+                     for part in textwrap.wrap(text, WIDTH, initial_indent="# ",
+                                               subsequent_indent="#   "))
 
 
 def _plain(value: Any) -> str:
@@ -140,10 +144,8 @@ def _of_resolution(m: Measured) -> dict[str, tuple[Any, str]]:
 def params_yaml(m: Measured) -> str:
     """robot.param.yaml: for every node, with what was chosen and why."""
     chosen = chosen_params(m)
-    lines = [_commented(f"# Measured by 'lidar-perception setup' from {len(m.scans)} of {m.total} "
-                        f"clouds of {m.source}. What is not here is as by default. Of a parameter "
-                        "that a node does not have it takes no notice.")]
-    lines += [_commented(f"# Doubtful: {line}") for line in doubts(m)]
+    lines = [_head(m, f"{_origin(m)} What is not here is as by default. Of a parameter that a node "
+                   "does not have it takes no notice."), "/**:"]
     tree: dict[str, Any] = {}
     for name, (value, why) in chosen.items():
         *path, last = name.split(".")
@@ -151,8 +153,8 @@ def params_yaml(m: Measured) -> str:
         for part in path:
             at = at.setdefault(part, {})
         at[last] = (value, why)
-    lines += ["/**:", "  ros__parameters:", *_tree(tree, 4)]
-    return "\n".join(lines if chosen else lines[:-2] + ["/**:", "  ros__parameters: {}"]) + "\n"
+    lines += ["  ros__parameters:", *_tree(tree, 4)] if chosen else ["  ros__parameters: {}"]
+    return "\n".join(lines) + "\n"
 
 
 def _tree(tree: Mapping[str, Any], indent: int) -> list[str]:

@@ -8,10 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.robot.crop import kept_points
+from lidar_perception.robot.params import CropParams
+from lidar_perception.robot.placing import tilted
+from lidar_perception.robot.poses import moved_points
 from lidar_perception.sensor_setup.beams import Beams, azimuth_steps, beams_of, range_noise
 from lidar_perception.sensor_setup.coverage import Coverage, coverage_of
 from lidar_perception.sensor_setup.motion import heading_of, shift_between
-from lidar_perception.sensor_setup.mount import Mount, levelled, mount_of
+from lidar_perception.sensor_setup.mount import Mount, mount_of
 from lidar_perception.sensor_setup.scans import Intensity, Scan, intensity_of
 from lidar_perception.sensor_setup.timing import Timing, timing_of
 from lidar_perception.simulation.sensor import NAMES, Sensor, sensor_named
@@ -27,21 +31,18 @@ AROUND = (-15.0, 5.0)  # degrees: where people are, in which the distance of bea
 
 @dataclass(frozen=True)
 class Measured:
-    """All of it. numbers: of the scans among those of the recording; beams None where there are
-    none, then step and noise are NaN; step, step_error: degrees; twice: share of second returns;
-    noise: m, of noise_pieces; least, greatest: m, of what is not the robot's own; heading: degrees
-    from x to where the robot drives, and how much scans agree, None where it is not known; model:
-    the sensor of config/sensors with such beams, "" for none; model_error: degrees, the median
-    over the beams."""
+    """All of it. beams None where there are none, then step and noise are NaN; step: degrees;
+    twice: share of second returns; noise: m, of noise_pieces; least, greatest: m, of what is not
+    the robot's own; heading: degrees from x to where the robot drives, and how much scans agree,
+    None where it is not known; model: the sensor of config/sensors with such beams, "" for none;
+    model_error: degrees, the median over the beams."""
 
     source: str
-    numbers: tuple[int, ...]
     scans: tuple[Scan, ...]
     total: int
     intensity: Intensity | None
     beams: Beams | None
     step: float
-    step_error: float
     twice: float
     noise: float
     noise_pieces: int
@@ -88,26 +89,20 @@ def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: 
         raise InputError(f"{source}: all points lie in one plane, as those of a 2D scanner; give "
                          "clouds of a 3D LiDAR")
     beams = beams_of(scans)
-    step, step_error, twice, noise, pieces = np.nan, np.nan, 0.0, np.nan, 0
+    step, twice, noise, pieces = np.nan, 0.0, np.nan, 0
     if beams is not None:
-        step, step_error, twice = azimuth_steps(scans, beams)
+        step, twice = azimuth_steps(scans, beams)
         noise, pieces = range_noise(scans, beams, step)
     mount = mount_of(scans)
     coverage = coverage_of(scans, beams, mount)
-    ranges = np.concatenate([np.linalg.norm(s.xyz, axis=1) for s in scans])
-    away = ranges[~_in_box(np.concatenate([s.xyz for s in scans]), coverage.box)]
+    ranges = np.concatenate([s.range for s in scans])
+    away = ranges[kept_points(np.concatenate([s.xyz for s in scans]), CropParams(
+        body=tuple(coverage.box.tolist())))]
     least, greatest = np.percentile(away if len(away) else ranges, [0.02, 99.995])
     model, error = model_of(beams)
-    return Measured(source, tuple(numbers), tuple(scans), total, intensity_of(scans), beams, step,
-                    step_error, twice, noise, pieces, coverage, mount,
-                    _heading(scans, numbers, mount), float(least), float(greatest),
-                    timing_of(scans, stamps_ns), model, error)
-
-
-def _in_box(xyz: np.ndarray, box: np.ndarray) -> Any:
-    if not len(box):
-        return np.zeros(len(xyz), bool)
-    return np.logical_and(xyz > box[:3], xyz < box[3:]).all(axis=1)
+    return Measured(source, tuple(scans), total, intensity_of(scans), beams, step, twice, noise,
+                    pieces, coverage, mount, _heading(scans, numbers, mount), float(least),
+                    float(greatest), timing_of(scans, stamps_ns), model, error)
 
 
 def _heading(scans: Sequence[Scan], numbers: Sequence[int],
@@ -115,11 +110,10 @@ def _heading(scans: Sequence[Scan], numbers: Sequence[int],
     """Of scans that follow each other; None without ground."""
     if mount is None:
         return None
-    shifts = []
+    shifts, pose = [], tilted(mount.roll, mount.pitch, mount.height)
     for i in range(len(scans) - 1):
         if numbers[i + 1] - numbers[i] == 1:
-            before, after = (levelled(scan.xyz, mount.roll, mount.pitch)
-                             + [0.0, 0.0, mount.height] for scan in scans[i:i + 2])
+            before, after = (moved_points(scan.xyz, pose) for scan in scans[i:i + 2])
             shift = shift_between(before, after)
             shifts += [shift] if shift is not None else []
     return heading_of(shifts)

@@ -26,13 +26,11 @@ MIN_EXTENT = 1.5            # metres that the plane reaches at least
 
 class Plane(NamedTuple):
     """The ground in the sensor's frame: normal (3,) unit vector that points up; height m of the
-    sensor above it; share of the points around on it; rough m, standard deviation about it; error
-    (3,): of height m, roll and pitch rad, from leaving out sectors; xyz[on] is on it."""
+    sensor above it; error (3,): of height m, roll and pitch rad, from leaving out sectors; xyz[on]
+    is on it."""
 
     normal: np.ndarray
     height: float
-    share: float
-    rough: float
     error: np.ndarray
     on: np.ndarray
 
@@ -50,8 +48,8 @@ class Plane(NamedTuple):
 class Mount(NamedTuple):
     """Over F scans: height m, roll and pitch rad; error (3,) of these, standard deviations of the
     medians; spread (3,) from scan to scan, robust standard deviations; planes: of each scan, None
-    where no ground was found; upside_down: whether the
-    ground is where the sensor's own z axis points."""
+    where no ground was found; upside_down: whether the ground is where the sensor's own z axis
+    points."""
 
     height: float
     roll: float
@@ -97,8 +95,7 @@ def ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:
         return None
     error = _error(xyz[on])
     normal = _normal(plane, below)
-    return Plane(normal, float(abs(plane[2]) * abs(normal[2])), float(share),
-                 float(off[on].std()), error, on)
+    return Plane(normal, float(abs(plane[2]) * abs(normal[2])), error, on)
 
 
 def _normal(plane: np.ndarray, below: bool) -> np.ndarray:
@@ -162,11 +159,3 @@ def mount_of(scans: Sequence[Scan]) -> Mount | None:
     roll = (middle[1] + np.pi) % (2 * np.pi) - np.pi
     return Mount(float(middle[0]), float(roll), float(middle[2]), error, spread, list(planes),
                  upside_down)
-
-
-def levelled(xyz: np.ndarray, roll: float, pitch: float) -> np.ndarray:
-    """Points (N, 3) as a level sensor at the same place would see them, float64."""
-    cos_r, sin_r, cos_p, sin_p = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
-    about_x = np.array([[1, 0, 0], [0, cos_r, -sin_r], [0, sin_r, cos_r]])
-    about_y = np.array([[cos_p, 0, sin_p], [0, 1, 0], [-sin_p, 0, cos_p]])
-    return xyz @ (about_y @ about_x).T

@@ -24,21 +24,21 @@ RETROREFLECTOR = 0.9  # of the full intensity, from which on returns count as a 
 class Scan(NamedTuple):
     """The N usable points of a cloud in the driver's order: xyz (N, 3) float64 m; azimuth (N,)
     degrees, 0 .. 360, counter-clockwise from x, elevation (N,) degrees above the sensor's own
-    horizon, ground_range (N,) m from its axis; intensity (N,) float64 as it is in the cloud, ring
-    (N,) int64 and seconds (N,) float64 after the stamp, each None where there is no such column;
-    lost: points that could not be used; columns: the names in the cloud; time_problem: why its
-    times cannot be read, "" where they can or are not there."""
+    horizon, range (N,) m from the sensor, ground_range (N,) m from its axis; intensity (N,) float64
+    as it is in the cloud, ring (N,) int64 and seconds (N,) float64 after the stamp, each None where
+    there is no such column; columns: the names in the cloud; time_problem: why its times cannot be
+    read, "" where they can or are not there."""
 
     xyz: np.ndarray
     azimuth: np.ndarray
     elevation: np.ndarray
+    range: np.ndarray
     ground_range: np.ndarray
     intensity: np.ndarray | None
     ring: np.ndarray | None
     seconds: np.ndarray | None
     stamp_ns: int
     frame_id: str
-    lost: int
     columns: tuple[str, ...]
     time_problem: str = ""
 
@@ -54,7 +54,8 @@ def scan_of(msg: Any, name: str = "the cloud") -> Scan:
         raise InputError(f"{name} has {len(frame)} usable points, which say nothing of the sensor; "
                          "record while it turns, in a place with walls or ground in sight")
     xyz = frame.xyz.astype(np.float64)
-    middle = float(np.median(np.linalg.norm(xyz, axis=1)))
+    ranges = np.linalg.norm(xyz, axis=1)
+    middle = float(np.median(ranges))
     if middle > FAR:
         raise InputError(f"{name}: half of its points are farther than {middle:.0f} m, so its "
                          "coordinates seem to be millimetres; divide x y z by 1000 in the driver")
@@ -68,10 +69,10 @@ def scan_of(msg: Any, name: str = "the cloud") -> Scan:
             problem = str(error)
     ground_range = np.hypot(xyz[:, 0], xyz[:, 1])
     return Scan(xyz, np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) % 360.0,
-                np.degrees(np.arctan2(xyz[:, 2], ground_range)), ground_range,
+                np.degrees(np.arctan2(xyz[:, 2], ground_range)), ranges, ground_range,
                 _column(points, indices, INTENSITY_FIELDS, float),
                 _column(points, indices, RINGS, np.int64), seconds, frame.stamp_ns, frame.frame_id,
-                len(points) - len(frame), columns, problem)
+                columns, problem)
 
 
 def _column(points: np.ndarray, indices: np.ndarray, names: Sequence[str],

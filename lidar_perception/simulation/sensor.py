@@ -4,6 +4,7 @@ file."""
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -227,7 +228,14 @@ def _key(name: str) -> str:
 
 READY = {_key(path.stem): path for path in sorted(
     (Path(__file__).parent / "sensors").glob("*.yaml"))}  # described by files of the package
-HDL64E = sensor_from_file(READY["hdl64e"])
+
+
+@cache
+def _ready(key: str) -> Sensor:
+    return sensor_from_file(READY[key])
+
+
+HDL64E = _ready("hdl64e")
 SENSORS: dict[str, Sensor] = {"hdl64e": HDL64E}  # and those of READY
 NAMES = tuple(path.stem for path in READY.values())
 GENERIC = "generic:BEAMS,LOWEST,HIGHEST,STEP,RATE (degrees, turns a second)"
@@ -262,4 +270,4 @@ def sensor_named(name: str) -> Sensor:
     if _key(name) not in READY:
         raise InputError(f"unknown sensor {name!r}: must be one of {', '.join(NAMES)}, a file "
                          f".yaml, or {GENERIC}")
-    return sensor_from_file(READY[_key(name)])
+    return _ready(_key(name))
