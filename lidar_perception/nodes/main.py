@@ -13,7 +13,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from lidar_perception.nodes import NODES
+from lidar_perception.nodes import NODES, require_rclpy
 from lidar_perception.runs.threads import one_thread_each
 
 if TYPE_CHECKING:
@@ -106,20 +106,21 @@ def run(name: str, arguments: list[str]) -> int:
     use_large_shared_memory(fed_by_a_driver(arguments))
     from lidar_perception.nodes.stopping import Stop
     stop = Stop(STOP_SIGNALS)
+    from lidar_perception.types import InputError
     try:
-        import rclpy
-    except ImportError:
-        print("rclpy is missing: install ROS 2 Jazzy, or pip install 'lidar_perception[ros]'",
-              file=sys.stderr)
+        require_rclpy()
+    except InputError as error:
+        print(error, file=sys.stderr)
         return 2
     module = importlib.import_module(f"lidar_perception.nodes.{name}")
     if hasattr(module, "warm_up"):
         with one_at_a_time():
             module.warm_up()
-    return _spin(getattr(module, NODES[name][0]), rclpy, arguments, perf_counter() - begin, stop)
+    return _spin(getattr(module, NODES[name][0]), arguments, perf_counter() - begin, stop)
 
 
-def _spin(node_class: type, rclpy, arguments: list[str], seconds: float, stop: Stop) -> int:
+def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) -> int:
+    import rclpy
     from rclpy.exceptions import ParameterException
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
