@@ -17,7 +17,7 @@ from lidar_perception.detectors.params import MIN_SCORE, ScoreParams
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, ego_of, observe
-from lidar_perception.tracking.ego import Odometry
+from lidar_perception.tracking.ego import recorded_poses
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, GroundTruth
@@ -46,15 +46,14 @@ def measure_recording(recording: Recording) -> dict:
     detector = open_detector("pointpillars", min_score=MIN_SCORE,
                              sensor_height=recording.frames[0].sensor_height)
     drives: dict[str, list[Seen]] = {}
-    by_scans = ego_of(recording) == "kiss_icp"
+    source = ego_of(recording)
     for frame in track(recording, "detecting", len(recording)):
         truth, scan = frame.truth(), frame.load()
         if truth is not None and all("track_id" in extra for extra in truth.extras):
             if frame.sequence not in drives:
-                motion = Odometry() if by_scans else None
+                pose_of = recorded_poses(source)
             drives.setdefault(frame.sequence, []).append(
-                Seen(detector(scan).detections, truth, frame.stamp_ns,
-                     motion(scan.xyz) if motion else frame.pose()))
+                Seen(detector(scan).detections, truth, frame.stamp_ns, pose_of(frame, scan.xyz)))
     return measure_tracking(drives, recording.frames[0].calibration()) if drives else {}
 
 

@@ -31,6 +31,7 @@ from lidar_perception.runs.terminal import console, errors, track
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.scoring.recorded import Answered, answered
+from lidar_perception.tracking.ego import NO_SOURCE
 from lidar_perception.types import CLASSES, PEDESTRIAN
 from lidar_perception.wire.messages import column, to_detections, to_frame, to_truth
 from lidar_perception.wire.track_markers import drawn_trails
@@ -134,12 +135,6 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     return path
 
 
-POSES = {"odometry": "poses of the recording",
-         "kiss_icp": "poses by KISS-ICP, as the recording has none",
-         None: "relative to the sensor, as the recording has no poses, and kiss-icp is not "
-               "installed: pip install 'lidar_perception[odometry]'"}
-
-
 def _print_detections(frames: Sequence[Answered], calibration: Any) -> dict:
     """Say what was found, by class, against the labels that the camera sees; the scores."""
     from lidar_perception.scoring.detections import Detected
@@ -163,9 +158,10 @@ def _print_pace(content: dict, rate: float, clouds: int) -> None:
                   f"{latency['p95']:.0f} ms; memory of the graph {content['memory_mb']:.0f} MB")
 
 
-def _print_tracks(frames: Sequence[Answered], calibration: Any, poses: str | None) -> dict:
+def _print_tracks(frames: Sequence[Answered], calibration: Any, poses: str) -> dict:
     """Say by class how many were tracked, how well, and with which poses; the scores."""
     from lidar_perception.scoring.tracking.from_bag import recorded_tracks
+    from lidar_perception.scoring.tracking.tables import EGO
     result = recorded_tracks(frames, calibration)
     for name in DETECTED:
         scores, count = result.scores.get(name), result.count.get(name, 0)
@@ -176,7 +172,8 @@ def _print_tracks(frames: Sequence[Answered], calibration: Any, poses: str | Non
                 f"(detection {100 * scores['DetA']:.1f}, association {100 * scores['AssA']:.1f})")
     if result.problem:
         console.print(f"tracks: {result.count}; HOTA is not known: {result.problem}")
-    console.print(f"tracks are with {POSES[poses]}" if poses else f"tracks are {POSES[poses]}")
+    remedy = "; pip install 'lidar_perception[odometry]' takes them from the scans"
+    console.print(f"tracks are with {EGO[poses]}{remedy * (poses == NO_SOURCE)}", markup=False)
     return {"found": result.count, "scores": result.scores}
 
 

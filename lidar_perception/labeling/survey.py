@@ -21,7 +21,7 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.groups import group_points
 from lidar_perception.labeling.drive import Drive, one_drive, settings
 from lidar_perception.runs.processes import in_processes
-from lidar_perception.tracking.ego import Odometry, has_odometry
+from lidar_perception.tracking.ego import Odometry, recorded_source
 from lidar_perception.types import Detections
 
 Array = np.ndarray[Any, Any]
@@ -88,7 +88,8 @@ def surveyed(drive: Drive, weights: str,
 def _here(drive: Drive, weights: str) -> Callable[[int], Look]:
     detector = None if weights == "" else open_detector(
         weights, sensor_height=drive.frames[0].sensor_height, min_score=LEAST_SCORE)
-    odometry = Odometry() if drive.motion.poses is None and has_odometry() else None
+    by_scans = recorded_source(drive.motion.poses is not None) == "kiss_icp"
+    odometry = Odometry() if by_scans else None
     return lambda i: look_at(drive.frames[i], detector, odometry)
 
 

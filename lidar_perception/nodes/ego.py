@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable
-from time import monotonic
+from time import monotonic, thread_time
 from typing import Any
 
 import numpy as np
@@ -11,20 +12,22 @@ from scipy.spatial.transform import Rotation
 
 from lidar_perception.nodes.runtime import CLOUD, LidarNode
 from lidar_perception.robot.tree import Missing, TransformTree
-from lidar_perception.tracking.ego import Odometry, has_odometry
+from lidar_perception.tracking.ego import NO_SOURCE, Odometry, best_source, has_odometry
 from lidar_perception.tracking.params import EgoParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_frame
 from msg_utils.stamps import SECOND, to_ns
 
 START, SCAN = "start", "scan"  # frames of KISS-ICP
+ICP_MS = "kiss_icp_cpu_ms_median"
 GRACE_NS = SECOND  # of frames without a pose; then ego.source auto takes the scans
+TIMED = 100        # scans
 
 
 class EgoInput:
     """Poses of the sensor in a fixed frame, by the stamps of its frames.
 
-    source: what they come from now, "" for nothing; carried: whether it is known where the sensor
+    source: what they come from now, of best_source; carried: whether it is known where the sensor
     is on what the odometry is of. clouds: whether the node itself takes the scans
     and hands them to pose(); then these wait for their poses, too. Otherwise they come from
     ~/input/points, for KISS-ICP alone.
@@ -33,10 +36,11 @@ class EgoInput:
     def __init__(self, node: LidarNode, params: Callable[[], EgoParams], clouds: bool):
         self.node, self.params, self.clouds = node, params, clouds
         self.transforms = node.transforms
-        self.source, self.carried = "", True
+        self.source, self.carried = NO_SOURCE, True
         self.icp: Odometry | None = None
         self.scans = TransformTree()
         self.scan_ns = 0  # of the last scan that KISS-ICP took
+        self.icp_ms: deque[float] = deque(maxlen=TIMED)  # of CPU time, for the last ones
         self.without_ns: int | None = None  # since when frames have had no pose, with auto
         self.waits: tuple[int, float] | None = None  # a frame for its pose: stamp, since when
         wanted = params().source
@@ -53,7 +57,7 @@ class EgoInput:
         """(4, 4) of the frame with this header; None where it is not known. xyz (N, 3) is its scan,
         where the node takes the clouds."""
         frame_id, stamp = header.frame_id, to_ns(header.stamp)
-        if self.icp is not None and self.clouds and xyz is not None:
+        if self.icp is not None and self.clouds and xyz is not None and self._by_scans():
             self._register(stamp, xyz)
         pose = None
         try:
@@ -70,7 +74,7 @@ class EgoInput:
         stamp = to_ns(header.stamp)
         try:
             source = self._source(header.frame_id, stamp)
-            if source and not (source == "kiss_icp" and self.clouds):
+            if source != NO_SOURCE and not (source == "kiss_icp" and self.clouds):
                 self._of(source, header.frame_id, stamp, None)
         except Missing as error:
             if error.late:
@@ -99,21 +103,34 @@ class EgoInput:
 
     def _source(self, frame_id: str, stamp: int) -> str:
         """Of what there is, the best that ego.source allows; it is kept in self.source."""
-        wanted = self.params().source
-        self.carried = True
-        if wanted in ("auto", "odometry") and self.transforms.odometry_ns is not None:
-            self.source, self.carried = "odometry", self.transforms.carries(frame_id)
+        wanted, there = self.params().source, {self.source}
+        if self.transforms.odometry_ns is not None:
+            there.add("odometry")
+        if self.scan_ns:
+            there.add("kiss_icp")
+        if best_source(wanted, {"tf", *there}) == "tf" != self.source and (
+                self._connected(frame_id, stamp)):
+            there.add("tf")
+        self.source, self.carried = best_source(wanted, there), True
+        if self.source == "odometry":
+            self.carried = self.transforms.carries(frame_id)
             if not self.carried:
                 self.transforms.listen()
-        elif self.icp is not None and self.scan_ns:
-            self.source = "kiss_icp"
-        elif wanted in ("auto", "tf") and self.source != "tf":
-            try:
-                self._of("tf", frame_id, stamp, self.params().max_gap)
-                self.source = "tf"
-            except Missing as error:
-                self.source = "tf" if error.late else self.source
+        if not self._by_scans():
+            self.icp = None  # with its map; scans are taken no longer
+            self.node.counts.pop(ICP_MS, None)
         return self.source
+
+    def _connected(self, frame_id: str, stamp: int) -> bool:
+        try:
+            self._of("tf", frame_id, stamp, self.params().max_gap)
+        except Missing as error:
+            return error.late
+        return True
+
+    def _by_scans(self) -> bool:
+        """Whether scans are of use: nothing better has come."""
+        return self.source in (NO_SOURCE, "kiss_icp")
 
     def _of(self, source: str, frame_id: str, stamp: int,
             max_gap: float | None) -> np.ndarray | None:
@@ -122,7 +139,9 @@ class EgoInput:
             return self.scans.lookup(START, SCAN, stamp, max_gap)
         if source == "odometry" and not self.carried:
             return self.transforms.odometry_poses(at, max_gap)[0]
-        return self.transforms.sensor_poses(source, frame_id, at, max_gap)[0] if source else None
+        if source == NO_SOURCE:
+            return None
+        return self.transforms.sensor_poses(source, frame_id, at, max_gap)[0]
 
     def _look_further(self, stamp: int, known: bool) -> None:
         """With auto: TF where no odometry comes, and KISS-ICP where TF says nothing either."""
@@ -141,7 +160,7 @@ class EgoInput:
             self.node.input("points", CLOUD, self._on_cloud)
 
     def _on_cloud(self, msg: Any) -> None:
-        if self.source in ("", "kiss_icp"):  # auto may have found something better
+        if self._by_scans():
             self._register(to_ns(msg.header.stamp), to_frame(msg)[0].xyz)
 
     def _register(self, stamp_ns: int, xyz: np.ndarray) -> None:
@@ -152,7 +171,10 @@ class EgoInput:
             self.icp, self.scans = Odometry(), TransformTree()
         self.scan_ns = stamp_ns
         assert self.icp is not None  # made by the first scan
+        begin = thread_time()
         pose = self.icp(xyz)
+        self.icp_ms.append((thread_time() - begin) * 1e3)
+        self.node.counts[ICP_MS] = f"{np.median(self.icp_ms):.1f}"
         self.scans.set(START, SCAN, stamp_ns, pose[:3, 3],
                        Rotation.from_matrix(pose[:3, :3]).as_quat())
         self.node.counts["last_pose_ns"] = stamp_ns

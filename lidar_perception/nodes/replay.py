@@ -25,7 +25,7 @@ from lidar_perception.nodes.graph import (
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors, progress
-from lidar_perception.tracking.ego import has_odometry
+from lidar_perception.tracking.ego import recorded_source
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, ODOMETRY, POINTS, TRUTH
 
@@ -40,8 +40,8 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
     """How the run of a detector of the graph, with its params, over a bag of `clouds` clouds went:
     results, latency_ms (from the cloud's arrival in this process to its detections'), memory_mb
     (proportional set size), slower (how many times slower than asked for it was), and poses:
-    whence the tracker had them, the bag's odometry, KISS-ICP where there is none, or None where
-    that is not installed either. With the candidates also the evaluator's scores.
+    whence the tracker had them, as recorded_source says. With the candidates also the evaluator's
+    scores.
 
     A cloud is sent when those before have their detections, so that none is lost on a slow
     machine; with real_time they come as from a sensor, whatever becomes of them.
@@ -56,12 +56,12 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
     topics = {**stages, "tracks": TRACKS}
     domain = private_domain()
     with Bag(drive) as bag:
-        poses = "odometry" if ODOMETRY in bag.topics else "kiss_icp" if has_odometry() else None
+        poses = recorded_source(ODOMETRY in bag.topics)
     scores = out / "logs" / "scores.json"
     nodes: dict[str, tuple[Mapping[str, str], dict[str, Any]]] = {
         node: (remap, {**flatten(params), "input.queue": AHEAD}) for node, remap in graph.items()}
     nodes[TRACKER] = graph[TRACKER], {
-        "ego.source": poses or "none",
+        "ego.source": "odometry" if poses == "recording" else poses,
         **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT})}
     if scored := detector == "candidates":
         nodes["evaluator"] = evaluation(scores.resolve(), single)
@@ -81,7 +81,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         clouds_heard = 2 + (poses == "kiss_icp") + (POINTS in recorded)
         rules = wait_for(single, clouds_heard, 1 + 2 * scored, detector)
         rules += [f"{relative(stages[FINAL])}:={3 + scored}"]  # watch, recorder, tracker, evaluator
-        rules += [relative(ODOMETRY)] if poses == "odometry" else []
+        rules += [relative(ODOMETRY)] if poses == "recording" else []
         processes.start("bag_player", {}, {"bag": str(drive.resolve()), "rate": rate,
                                            "wait_for": rules,
                                            "follow": [] if real_time else [stages[FINAL]],

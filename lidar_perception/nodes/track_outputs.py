@@ -12,6 +12,7 @@ import numpy as np
 from lidar_perception.nodes.ego import EgoInput
 from lidar_perception.nodes.runtime import MARKERS, RELIABLE, LidarNode
 from lidar_perception.params import DetectionNodeParams, TrackerNodeParams
+from lidar_perception.tracking.ego import NO_SOURCE
 from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import Trails
@@ -38,6 +39,7 @@ class TrackOutputs:
         self.node, self.params = node, params
         self.tracker = Tracker(params().tracking)
         self.ego = EgoInput(node, lambda: params().ego, clouds)
+        self.poses_from = NO_SOURCE, True  # of the last frame
         self.trails = Trails()
         self.frame_id: str | None = None
         self.shown: Any = ()
@@ -54,9 +56,10 @@ class TrackOutputs:
         A frame that is older than the last one, or has its stamp, is not answered: what is known
         is of another time."""
         stamp, tracker = to_ns(header.stamp), self.tracker
-        mixed, before = self._same_sensor(header.frame_id), (self.ego.source, self.ego.carried)
+        mixed, before = self._same_sensor(header.frame_id), self.poses_from
         pose = self.ego.pose(header, xyz)
-        if before[0] and before != (self.ego.source, self.ego.carried):
+        self.poses_from = self.ego.source, self.ego.carried
+        if before[0] != NO_SOURCE and before != self.poses_from:
             tracker.reset()  # another fixed frame
         problem = mixed or self.ego.problem(header.frame_id)
         tracker.params = self.params().tracking
@@ -99,8 +102,8 @@ class TrackOutputs:
         while now - self.counted[0][0] > RATE_OVER or len(self.counted) > 1000:
             self.counted.popleft()
         before, born, ended = self.counted[0]
-        self.node.counts.update(ego=self.ego.source or "none", tracks=reported,
-                                alive=tracker.alive, born=tracker.born, ended=tracker.ended)
+        self.node.counts.update(ego=self.ego.source, tracks=reported, alive=tracker.alive,
+                                born=tracker.born, ended=tracker.ended)
         if now > before:
             self.node.counts["born_per_s"] = f"{(tracker.born - born) / (now - before):.2f}"
             self.node.counts["ended_per_s"] = f"{(tracker.ended - ended) / (now - before):.2f}"

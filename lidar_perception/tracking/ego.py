@@ -7,16 +7,23 @@ sensor's own, and velocities are relative to it.
 from __future__ import annotations
 
 import importlib.util
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import InputError
 
 MAX_SPEED = 100.0   # m/s; a sensor that seems faster was put somewhere else
 NOT_RIGID = 1e-2    # how far a pose's rotation may be from one
+SOURCES = ("recording", "odometry", "tf", "kiss_icp")  # of poses, the best first
+NO_SOURCE = "none"
+MAPPED, FINE = 0.5, 1.5  # of a voxel of the map: one point in each goes there, is registered
+COARSE, ENOUGH = 3.0, 300
+CONVERGED = 1e-3    # m and rad, the step of KISS-ICP that is its last
 
 
 @dataclass(frozen=True)
@@ -85,6 +92,28 @@ def moved_boxes(boxes: np.ndarray, pose: np.ndarray) -> np.ndarray:
     return moved
 
 
+def best_source(wanted: str, there: Collection[str]) -> str:
+    """Whence the sensor's motion is known: of the SOURCES that are there the wanted one, and with
+    "auto" the best; NO_SOURCE where there is no such."""
+    return next((name for name in SOURCES if name in there and wanted in ("auto", name)),
+                NO_SOURCE)
+
+
+def recorded_source(poses: bool, wanted: str = "auto") -> str:
+    """best_source of recorded frames, which have poses or not. One that is wanted by name is taken
+    to be there, as it says itself where it is not."""
+    return best_source(wanted, {wanted, *["recording"] * poses, *["kiss_icp"] * has_odometry()})
+
+
+def recorded_poses(source: str) -> Callable[[Frame, np.ndarray], np.ndarray | None]:
+    """pose_of(frame, xyz (N, 3)) -> pose (4, 4) or None, for the frames of one drive in their
+    order; source as of recorded_source. InputError where KISS-ICP is not installed."""
+    if source == "kiss_icp":
+        odometry = Odometry()
+        return lambda frame, xyz: odometry(xyz)
+    return lambda frame, xyz: frame.pose() if source == "recording" else None
+
+
 def has_odometry() -> bool:
     """Whether Odometry can be made: the extra [odometry] is installed."""
     return importlib.util.find_spec("kiss_icp") is not None
@@ -92,18 +121,33 @@ def has_odometry() -> bool:
 
 class Odometry:
     """odometry(xyz (N, 3)) -> pose (4, 4) of the scan in the frame of the first, by KISS-ICP
-    (Vizzo et al., RA-L 2023). InputError where it is not installed."""
+    (Vizzo et al., RA-L 2023). InputError where it is not installed.
+
+    It runs in one thread, so that the same scans give the same poses, and registers one point in
+    each COARSE voxels, where that leaves ENOUGH: see docs/tracking.md for what both cost and save.
+    """
 
     def __init__(self, voxel: float = 1.0) -> None:
         try:
             from kiss_icp.config.parser import KISSConfig
             from kiss_icp.kiss_icp import KissICP
+            from kiss_icp.voxelization import voxel_down_sample
         except ImportError:
             raise InputError("ego motion from the scans needs kiss-icp; pip install "
                              "'lidar_perception[odometry]'") from None
         config = KISSConfig()
         config.mapping.voxel_size, config.data.deskew = voxel, False
+        config.registration.max_num_threads = 1
+        config.registration.convergence_criterion = CONVERGED
+
+        def voxelize(scan: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            """What is registered, and what goes into the map."""
+            mapped = voxel_down_sample(scan, MAPPED * voxel)
+            few = voxel_down_sample(mapped, COARSE * voxel)
+            return few if len(few) >= ENOUGH else voxel_down_sample(mapped, FINE * voxel), mapped
+
         self._icp = KissICP(config)
+        self._icp.voxelize = voxelize
 
     def __call__(self, xyz: np.ndarray) -> np.ndarray:
         """The pose of the next scan (N, 3)."""

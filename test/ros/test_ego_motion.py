@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter
 from test_robot_frames import message, mounted, odometry, transforms, walker
 from tracking_samples import START, TENTH, crowd, pose
 
+from lidar_perception.nodes.ego import ICP_MS
 from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.runtime import MARKERS
 from lidar_perception.nodes.tracker import TrackerNode
@@ -96,18 +97,21 @@ def test_what_tf_lacks_is_named(start):
     assert "TF does not connect 'lidar' with 'map'" in node.state[1]
 
 
-def test_auto_takes_the_scans_after_a_second_without_poses_and_odometry_when_it_comes(start):
+@pytest.mark.parametrize("better", ["odometry", "tf"])
+def test_auto_takes_the_scans_after_a_second_without_poses_and_what_is_better_when_it_comes(
+        start, better):
     if not has_odometry():
         pytest.skip("needs kiss-icp, the extra [odometry]")
     node = start(TrackerNode)
+    found = node._receptions()[0]
     xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
 
     def frames(first, count):
         for i in range(first, first + count):
             if len(node._receptions()) > node_inputs:
                 give_to_points(message(xyz, START + i * TENTH))
-            node.on_markers(detection_markers(next(crowd()), header(START + i * TENTH),
-                                              bag_message))
+            found.deliver(encode(detection_markers(next(crowd()), header(START + i * TENTH),
+                                                   bag_message)), False)
 
     def give_to_points(cloud):
         points = next(r for r in node._receptions() if r.topic.endswith("/points"))
@@ -117,12 +121,17 @@ def test_auto_takes_the_scans_after_a_second_without_poses_and_odometry_when_it_
     frames(0, 10)
     assert node.counts["ego"] == "none" and len(node._receptions()) == node_inputs
     frames(10, 4)
-    assert node.counts["ego"] == "kiss_icp"
+    assert node.counts["ego"] == "kiss_icp" and float(node.counts[ICP_MS]) > 0
     before = max(tracked(node).ids)
     for i in (13, 14, 15):
-        node.transforms.on_odometry(odometry(base_at(i), START + i * TENTH, "lidar"))
+        stamp = START + i * TENTH
+        if better == "odometry":
+            node.transforms.on_odometry(odometry(base_at(i), stamp, "lidar"))
+        else:
+            node.transforms.on_tf(transforms(("odom", "lidar", base_at(i), stamp)), static=False)
     frames(14, 2)
-    assert node.counts["ego"] == "odometry" and min(tracked(node).ids) > before
+    assert node.counts["ego"] == better and min(tracked(node).ids) > before
+    assert ICP_MS not in node.counts  # it costs nothing any more
 
 
 def test_in_a_detectors_process_a_cloud_waits_for_its_pose_and_not_for_ever(start):

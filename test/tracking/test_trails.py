@@ -9,7 +9,10 @@ from tracking_samples import START, TENTH, crowd, pose
 from lidar_perception.tracking.ego import moved_boxes
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import TRAIL_POINTS, Trails
-from lidar_perception.types import Detections
+from lidar_perception.types import CLASSES, Detections
+from lidar_perception.wire.codec import bag_message, decode, encode
+from msg_utils.detections import to_detection_array
+from msg_utils.stamps import header_message
 
 
 @pytest.mark.parametrize("seconds", [0.0, 0.55, 60.0])
@@ -29,9 +32,13 @@ def test_trails_end_at_the_tracks_and_lie_where_they_were(seconds):
     assert len(trails(tracks, tracker.pose, stamp, seconds)) == len(tracks)
 
 
-def test_pose_covariances_are_those_of_x_y_z_and_the_heading():
-    for i, found in enumerate(crowd()):
-        tracks = Tracker()(found, START + i * TENTH)
+@pytest.fixture(scope="module")
+def tracks():
+    tracker = Tracker()
+    return [tracker(found, START + i * TENTH) for i, found in enumerate(crowd())][-1]
+
+
+def test_pose_covariances_are_those_of_x_y_z_and_the_heading(tracks):
     square = tracks.pose_covariances()
     assert square.shape == (len(tracks), 6, 6)
     np.testing.assert_array_equal(square, square.transpose(0, 2, 1))
@@ -40,3 +47,15 @@ def test_pose_covariances_are_those_of_x_y_z_and_the_heading():
         assert np.diag(square[k]).tolist() == [own[0, 0], own[1, 1], tracks.height_variances[k],
                                                0, 0, own[4, 4]]
         assert square[k, 0, 5] == own[0, 4] and square[k, 1, 5] == own[1, 4]
+
+
+def test_a_detection_array_has_the_ids_and_covariances_of_the_tracks(tracks):
+    found = tracks.detections
+    array = to_detection_array(
+        found.boxes, [CLASSES[i] for i in found.class_ids], found.scores, ids=tracks.ids + 40,
+        covariances=tracks.pose_covariances(), make=bag_message,
+        header=header_message(START, "lidar", bag_message))
+    read = decode(encode(array), "vision_msgs/msg/Detection3DArray")
+    assert [d.id for d in read.detections] == [str(i + 40) for i in tracks.ids.tolist()]
+    for detection, square in zip(read.detections, tracks.pose_covariances(), strict=True):
+        np.testing.assert_array_equal(detection.results[0].pose.covariance, square.ravel())

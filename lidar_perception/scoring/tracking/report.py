@@ -15,7 +15,7 @@ from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
 from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
 from lidar_perception.scoring.tracking.over_recall import over_recall
 from lidar_perception.scoring.tracking.pairs import Pairs, pairs_of, tracked_labels, without_ignored
-from lidar_perception.tracking.ego import Odometry, has_odometry
+from lidar_perception.tracking.ego import recorded_poses, recorded_source
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import GroundTruth, InputError
@@ -42,11 +42,7 @@ def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
 def ego_of(recording: Recording, wanted: str = "auto") -> str:
     """Whence the sensor's motion comes, of RECORDED_EGO all but auto, which is: the poses of the
     recording, where it has any, else KISS-ICP, where that is installed, else none."""
-    if wanted != "auto":
-        return wanted
-    if POSES in recording.has:
-        return "recording"
-    return "kiss_icp" if has_odometry() else "none"
+    return recorded_source(POSES in recording.has, wanted)
 
 
 def by_tracker(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
@@ -60,16 +56,14 @@ def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, ego: str,
                 recording: Recording) -> Callable[[Frame], Observation | None]:
     ego = ego_of(recording, ego)
     detector = open_()
-    last, tracker, motion = None, Tracker(params), None
+    last, tracker, pose_of = None, Tracker(params), recorded_poses(ego)
 
     def measure(frame: Frame) -> Observation | None:
-        nonlocal last, tracker, motion
+        nonlocal last, tracker, pose_of
         if frame.sequence != last:
-            last, tracker = frame.sequence, Tracker(params)
-            motion = Odometry() if ego == "kiss_icp" else None
+            last, tracker, pose_of = frame.sequence, Tracker(params), recorded_poses(ego)
         scan = frame.load()
-        pose = motion(scan.xyz) if motion else frame.pose() if ego == "recording" else None
-        tracks = tracker(detector(scan).detections, frame.stamp_ns, pose)
+        tracks = tracker(detector(scan).detections, frame.stamp_ns, pose_of(frame, scan.xyz))
         truth = frame.truth()
         if truth is None:
             return None
