@@ -19,7 +19,7 @@ import numpy as np
 from rich.table import Table
 
 from benchmark.plain_ab3dmot import PlainAb3dmot
-from benchmark.precision import Curve, curve_of, precision_at
+from benchmark.precision import Curve, curve_of, precisions
 from benchmark.tracking import Seen, Step, peer, tracker
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.seed_sources import automatic_seed
@@ -134,22 +134,24 @@ def _scores(peers: list[tuple], ours: list[tuple]) -> dict:
 
 
 def _precision(single: list[Curve], tracked: list[Curve]) -> dict:
-    rows = {}
-    for recall in RECALLS:
-        values = [resampled(curves, lambda chosen, r=recall: precision_at(chosen, r))
-                  for curves in (single, tracked)]
-        rows[str(recall)] = {
-            "single": precision_at(single, recall), "tracked": precision_at(tracked, recall),
-            "gain_interval": _interval(np.subtract(values[1], values[0]))}
-    return rows
+    each_once = np.ones((1, len(single)), int)
+    times = np.array([np.bincount(draw, minlength=len(single)) for draw in draws(len(single))])
+    values = [precisions(curves, RECALLS, np.concatenate([each_once, times]))
+              for curves in (single, tracked)]
+    return {str(recall): {"single": float(one[0]), "tracked": float(many[0]),
+                          "gain_interval": _interval(many[1:] - one[1:])}
+            for recall, one, many in zip(RECALLS, *(v.T for v in values))}
 
 
-def resampled(drives: list, value: Callable[[list], float], seed: int = 0) -> np.ndarray:
+def resampled(drives: list, value: Callable[[list], float]) -> np.ndarray:
     """(RESAMPLED,) values of drives drawn with replacement, the same draws for the same number of
     drives, so that differences are paired."""
-    rng = np.random.default_rng(seed)
-    draws = rng.integers(0, len(drives), (RESAMPLED, len(drives)))
-    return np.array([value([drives[i] for i in draw]) for draw in draws])
+    return np.array([value([drives[i] for i in draw]) for draw in draws(len(drives))])
+
+
+def draws(count: int) -> np.ndarray:
+    """(RESAMPLED, count) indices of so many drives, always the same."""
+    return np.random.default_rng(0).integers(0, count, (RESAMPLED, count))
 
 
 def _interval(values: np.ndarray) -> list[float]:

@@ -51,11 +51,18 @@ def _of_frame(pairs: Pairs) -> Curve:
     return Curve(pairs.scores[counts], hits[counts], int((~pairs.ignored).sum()))
 
 
-def precision_at(curves: Sequence[Curve], recall: float) -> float:
-    """The best precision of these drives at a recall or beyond; 0 where it is not reached."""
-    labels = sum(c.labels for c in curves)
+def precisions(curves: Sequence[Curve], recalls: Sequence[float], draws: np.ndarray) -> np.ndarray:
+    """(D, R) the best precision at each of R recalls or beyond, 0 where it is not reached, in D
+    draws (D, N) of the N drives: how often each is in it."""
     order = np.argsort(-np.concatenate([c.scores for c in curves]), kind="stable")
-    hits = np.cumsum(np.concatenate([c.hits for c in curves])[order])
-    reached = hits >= recall * max(labels, 1)
-    precision = hits / np.arange(1, len(hits) + 1)
-    return float(precision[reached].max(initial=0.0))
+    hit = np.concatenate([c.hits for c in curves])[order]
+    drive = np.repeat(np.arange(len(curves)), [len(c.scores) for c in curves])[order]
+    labels = draws @ np.array([c.labels for c in curves])
+    result = np.zeros((len(draws), len(recalls)))
+    for row, times, needed in zip(result, draws, np.outer(labels, recalls)):
+        weight = times[drive]
+        hits, boxes = np.cumsum(weight * hit), np.cumsum(weight)
+        best = np.maximum.accumulate((hits / np.maximum(boxes, 1))[::-1])[::-1]  # from there on
+        first = np.searchsorted(hits, np.maximum(needed, 1e-9))
+        row[first < len(hits)] = best[first[first < len(hits)]]
+    return result

@@ -27,8 +27,8 @@ class MotionParams(Params):
                         low=0.01, high=100.0)
     position: float = param(0.25, "Standard deviation of a measured centre.", unit="m", low=0.001,
                             high=10.0)
-    heading: float = param(0.2, "Standard deviation of a measured heading.", unit="rad", low=0.001,
-                           high=10.0)
+    heading: float = param(0.2, "Standard deviation of a measured heading, as one look in many "
+                           "whose errors are alike.", unit="rad", low=0.001, high=10.0)
     reach: float = param(1.5, "Centres so near to the predicted one can belong to a track, however "
                          "sure it is.", unit="m", low=0.0, high=20.0)
 
@@ -82,8 +82,8 @@ class TrackingParams(Params):
     """Tracks from detections."""
 
     vehicle: MotionParams = MotionParams(position=0.4)
-    pedestrian: MotionParams = MotionParams(1.0, 0.0, 1.0, 1.0, 0.7, 0.15, 0.7, 0.7)
-    cyclist: MotionParams = MotionParams(2.0, 0.3, 0.2, 4.0, 0.4, 0.2, 0.3, 1.2)
+    pedestrian: MotionParams = MotionParams(1.0, 0.0, 1.0, 1.0, 0.7, 0.15, 3.0, 0.7)
+    cyclist: MotionParams = MotionParams(2.0, 0.3, 0.2, 4.0, 0.4, 0.1, 1.0, 1.2)
     association: AssociationParams = AssociationParams()
     existence: ExistenceParams = ExistenceParams()
     report: float = param(0.5, "Tracks that exist with at least this probability come out.",
