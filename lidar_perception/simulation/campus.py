@@ -56,7 +56,7 @@ KINDS = {
         "facade": 0.4, "square": 0.3, "entrance": 0.3}, 0.7, things=0.7, across=0.8,
         standers=22.0),
     "path": Kind(0.35, (1.0, 2.6), (1.0, 2.6), {
-        "verge": 0.55, "garden": 0.15, "hedge": 0.3}, 0.15, path=True, things=0.0, along=16.0,
+        "verge": 0.55, "garden": 0.15, "hedge": 0.3}, 0.15, path=True, things=0.0, along=26.0,
         standers=5.0, riders=4.0, seats=3.0, edge=6.0),
 }
 

@@ -14,6 +14,7 @@ from lidar_perception.simulation.shapes.thing import Thing
 from lidar_perception.simulation.shapes.wheelchairs import wheelchair
 
 STANDING, WALKING = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)  # chances of groups of 1, 2, ..
+HOURS = 0.3, 1.0, 1.0, 2.5  # how busy a place is
 WHEELCHAIRS = 0.06  # for each group that walks or stands
 
 
@@ -74,7 +75,8 @@ def _pace(rng) -> float:
 def fill(rng, room: Room, court: Court, people: float, along: float, across: float,
          standers: float) -> None:
     """Who is on foot in a court: groups who walk along x and groups who stand on each 100 m of it,
-    groups who walk anywhere on each 100 square metres, each times people."""
+    groups who walk anywhere on each 100 square metres, each times people and by the hour."""
+    people *= rng.choice(HOURS)
     for groups in (standing(rng, court.floor, standers * people),
                    walking(rng, court.floor, along * people, roam=False),
                    wheeling(rng, court.floor, WHEELCHAIRS * (along + standers) * people),

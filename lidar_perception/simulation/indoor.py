@@ -44,17 +44,17 @@ class Kind:
 
 KINDS = {
     "corridor": Kind(0.35, (0.7, 1.7), (8.0, 35.0), (2.4, 3.2), {
-        "wall": 0.42, "door": 0.38, "glazing": 0.1, "passage": 0.1}, (), 0.25, along=22.0,
-        things=0.6, at_walls=22.0),
+        "wall": 0.42, "door": 0.38, "glazing": 0.1, "passage": 0.1}, (), 0.25, along=45.0,
+        standers=8.0, things=0.6, at_walls=22.0),
     "hall": Kind(0.3, (5.0, 14.0), (6.0, 20.0), (3.5, 8.0), {
         "wall": 0.4, "door": 0.2, "glazing": 0.2, "passage": 0.2}, ("columns", "benches", "tables"),
         0.7, outer=0.4, across=2.2, standers=16.0),
     "canteen": Kind(0.2, (3.0, 9.0), (6.0, 14.0), (2.7, 4.5), {
         "wall": 0.6, "door": 0.15, "glazing": 0.15, "passage": 0.1}, ("columns", "many tables"),
-        0.3, outer=0.35, across=1.2, standers=10.0, along=6.0),
+        0.3, outer=0.35, across=2.0, standers=14.0, along=12.0),
     "store": Kind(0.15, (4.0, 10.0), (6.0, 14.0), (2.8, 5.5), {
-        "wall": 0.8, "door": 0.15, "glazing": 0.05}, ("shelves",), 0.1, across=1.0, along=10.0,
-        standers=14.0, things=0.5),
+        "wall": 0.8, "door": 0.15, "glazing": 0.05}, ("shelves",), 0.1, across=2.0, along=18.0,
+        standers=16.0, things=0.5),
 }
 WALLS = {  # what is made, and lengths
     "wall": (interiors.wall, 1.0, 7.0), "door": (interiors.door, 1.2, 1.7),
@@ -110,7 +110,7 @@ def _walls(rng, side: Side, kind: Kind, height: float) -> Iterator[Actor]:
 def _columns(rng, court: Court, height: float, people: float) -> Iterator[list[Actor]]:
     """Alike, in rows."""
     made = prop(interiors.column(rng, height))
-    (dx, dy), (x, y) = rng.uniform(4.0, 8.0, 2), rng.uniform(1.0, 4.0, 2)
+    (dx, dy), (x, y) = rng.uniform(5.0, 10.0, 2), rng.uniform(1.0, 5.0, 2)
     for at_x in np.arange(court.x0 + x, court.x1 - 1, dx):
         for at_y in np.arange(court.y0 + y, court.y1 - 1, dy):
             yield [Actor(made, at_x, at_y)]

@@ -81,7 +81,7 @@ def against(rng: np.random.Generator, side: Side, makers: Sequence[Callable],
             rate: float) -> Iterator[Actor]:
     """Things within a side with their backs to it, rate of them on 100 m, each by one of makers."""
     for along in scattered(rng, side.length, rate):
-        made = makers[rng.integers(len(makers))](rng)
+        made = makers[int(rng.integers(len(makers)))](rng)
         low, _ = extents(made)
         yield side.put(made, along, low[:, 0].min() - 0.05, -np.pi / 2 + rng.normal(0, 0.02))
 

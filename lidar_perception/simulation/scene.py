@@ -36,10 +36,21 @@ class Streets(NamedTuple):
     people: float = 1.0
     scene: str = "street"
 
+    def sorts(self) -> list[Sort]:
+        """In the order of their turns. InputError for an unknown scene or kind."""
+        names = self.scene.split(",")
+        if unknown := [name for name in names if name not in SCENES]:
+            raise InputError(f"unknown scene {unknown[0]!r}: must be one of {', '.join(SCENES)}, "
+                             "or several with commas between")
+        kinds = dict.fromkeys(kind for name in names for kind in SCENES[name].kinds)
+        if self.kind is not None and any(self.kind not in SCENES[name].kinds for name in names):
+            raise InputError(f"kind = {self.kind!r} must be one of {', '.join(kinds)}")
+        return [SCENES[name] for name in names]
+
     @property
     def camera(self) -> bool:
         """Whether all have a camera that looks ahead, beyond whose image nothing is labelled."""
-        return all(scene_named(name).camera for name in self.scene.split(","))
+        return all(sort.camera for sort in self.sorts())
 
 
 ANY = Streets()
@@ -173,11 +184,8 @@ def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0,
         raise InputError(f"seed = {seed} must not be negative")
     if not 0 <= people < np.inf:
         raise InputError(f"people = {people} must be 0 or more, such as 1")
-    found = [scene_named(name) for name in scene.split(",")]
-    if kind is not None and any(kind not in one.kinds for one in found):
-        known = dict.fromkeys(name for one in found for name in one.kinds)
-        raise InputError(f"kind = {kind!r} must be one of {', '.join(known)}")
-    chosen = found[seed % len(found)]
+    sorts = Streets(kind, people, scene).sorts()
+    chosen = sorts[seed % len(sorts)]
     rng = np.random.default_rng(seed)
     drawn = str(rng.choice(list(chosen.kinds), p=[k.share for k in chosen.kinds.values()]))
     kind = kind or drawn
@@ -207,10 +215,3 @@ class Sort(NamedTuple):
 SCENES = {"street": Sort(KINDS, _street, camera=True), "campus": Sort(campus.KINDS, campus.make),
           "indoor": Sort(indoor.KINDS, indoor.make)}
 
-
-def scene_named(name: str) -> Sort:
-    """One of SCENES. InputError for another name."""
-    if name not in SCENES:
-        raise InputError(f"unknown scene {name!r}: must be one of {', '.join(SCENES)}, or several "
-                         "with commas between")
-    return SCENES[name]
