@@ -107,6 +107,8 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
     \b
     Examples:
       lidar-perception train pointnet --data sim --out pointnet
+      lidar-perception train pointnet --data sim --scene campus,indoor --sensor vlp16 \\
+          --mount-height 0.6 --init package --out robot
       lidar-perception train pointnet --data /data/kitti/object --split train.txt \\
           --val-split val.txt --epochs 20 --out pointnet --resume
       lidar-perception train pointnet --ablation --data sim --steps 1000 --out ablation
