@@ -83,7 +83,7 @@ class TrackingParams(Params):
 
     vehicle: MotionParams = MotionParams(position=0.4)
     pedestrian: MotionParams = MotionParams(1.0, 0.0, 1.0, 1.0, 0.7, 0.15, 3.0, 0.7)
-    cyclist: MotionParams = MotionParams(2.0, 0.3, 0.2, 4.0, 0.4, 0.1, 1.0, 1.2)
+    cyclist: MotionParams = MotionParams(2.0, 0.3, 0.2, 4.0, 0.4, 0.2, 1.0, 1.2)
     association: AssociationParams = AssociationParams()
     existence: ExistenceParams = ExistenceParams()
     report: float = param(0.5, "Tracks that exist with at least this probability come out.",
