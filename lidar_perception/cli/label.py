@@ -92,7 +92,8 @@ def _serve(drive: Drive, made: Session, port: int, browser: bool, propose: bool,
     import webbrowser
 
     from lidar_perception.labeling.results import Results
-    from lidar_perception.labeling.server import Served, serve
+    from lidar_perception.labeling.served import Served
+    from lidar_perception.labeling.server import serve
 
     def started(url: str) -> None:
         console.print(url, soft_wrap=True, markup=False)

@@ -222,6 +222,15 @@ def _class(state: State, action: Action, motion: Motion) -> Made:
     return _only(state, replace(track_of(state, action.get("track")), class_name=class_of(action)))
 
 
+def _reject_rest(state: State, action: Action, motion: Motion) -> Made:
+    only = class_of(action) if "class" in action else None
+    left = [t for t in state.tracks.values() if t.state == PROPOSED
+            and only in (None, t.class_name)]
+    if not left:
+        raise InputError(f"no track{f' of class {only}' if only else ''} is left to reject")
+    return _only(state, *(replace(t, state=REJECTED) for t in left))
+
+
 def _accept(state: State, action: Action, motion: Motion) -> Made:
     track, seeds = track_of(state, action.get("track")), state.seeds
     if action.get("seed") is not None:  # the frame in which it is the best one
@@ -280,7 +289,7 @@ def _check(state: State, action: Action, motion: Motion) -> Made:
 DO: dict[str, Callable[[State, Action, Motion], Made]] = {
     "seed": _seed, "add": _add, "box": _box, "size": _size, "remove_box": _remove_box,
     "interpolate": _interpolate, "copy": _copy, "class": _class, "accept": _accept,
-    "reject": _reject, "reopen": _reopen, "merge": _merge, "split": _split, "check": _check,
+    "reject": _reject, "reject_rest": _reject_rest, "reopen": _reopen, "merge": _merge, "split": _split, "check": _check,
     "snap": _box, "propose": _results, "import": _results,
 }
 
