@@ -53,7 +53,10 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
                     (state.seeds, seeds), (state.checked, checked),
                     (state.kept, action.get("kept", state.kept) if name == "import"
                      else state.kept))
-    after = replace(state.after(change), seq=state.seq + 1, done=(change, state.done), undone=None)
+    done = change, state.done
+    if action.get("joins") and state.done is not None:  # the rest of what the last action began
+        done = state.done[0].then(change), state.done[1]
+    after = replace(state.after(change), seq=state.seq + 1, done=done, undone=None)
     return after, change
 
 
@@ -289,8 +292,8 @@ def _check(state: State, action: Action, motion: Motion) -> Made:
 DO: dict[str, Callable[[State, Action, Motion], Made]] = {
     "seed": _seed, "add": _add, "box": _box, "size": _size, "remove_box": _remove_box,
     "interpolate": _interpolate, "copy": _copy, "class": _class, "accept": _accept,
-    "reject": _reject, "reject_rest": _reject_rest, "reopen": _reopen, "merge": _merge, "split": _split, "check": _check,
-    "snap": _box, "propose": _results, "import": _results,
+    "reject": _reject, "reject_rest": _reject_rest, "reopen": _reopen, "merge": _merge,
+    "split": _split, "check": _check, "snap": _box, "propose": _results, "import": _results,
 }
 
 

@@ -150,7 +150,8 @@ class Live:
             self._add(frame, topic, objects, message)
             heard.delays.append(1e3 * (monotonic() - frame.came))
             if frame.shown:
-                heard.late += heard.kind != LABELS  # these come when they like
+                # Labels come when they like; nobody knew that the first of a topic was to come.
+                heard.late += heard.kind != LABELS and heard.came > 1
                 self._tell(self._event(frame))
         self.tick()
 

@@ -36,7 +36,7 @@ def around_click(scan: Scan, click: Array, class_name: str) -> Array:
         inside, whole = (np.bincount(scan.cluster_ids[mask], minlength=scan.cluster_ids.max() + 1)
                          for mask in (near, slice(None)))
         members |= ((inside > MOST * whole) & (np.arange(len(whole)) > 0))[scan.cluster_ids]
-    return completed(_around(scan, members), class_name)
+    return completed(_around(scan, members), usual)
 
 
 def to_cluster(scan: Scan, box: Array) -> Array:
@@ -92,11 +92,10 @@ def usual_size(class_name: str) -> Size | None:
     return DETECTED[class_name].mean_size if class_name in DETECTED else None
 
 
-def completed(box: Array, class_name: str) -> Array:
-    """(7,) the box of what is seen, made as long and wide as the class usually is. People are seen
+def completed(box: Array, usual: Size | None) -> Array:
+    """(7,) the box of what is seen, made as long and wide as its class usually is. People are seen
     through and through, so theirs grows evenly; others grow away from the sensor, and a side that
     is hardly longer than the width is taken for the width."""
-    usual = usual_size(class_name)
     if usual is None:
         return box
     length, width, height = usual
