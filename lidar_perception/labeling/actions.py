@@ -282,6 +282,20 @@ def _split(state: State, action: Action, motion: Motion) -> Made:
             state.checked)
 
 
+def _trim(state: State, action: Action, motion: Motion) -> Made:
+    track, frame = track_of(state, action.get("track")), frame_of(action, motion)
+    side = action.get("side")
+    if side not in ("before", "after"):
+        raise InputError("a track is trimmed before or after a frame")
+    cut = {f for f in track.boxes if (f < frame if side == "before" else f > frame)}
+    kept = {f: b for f, b in track.boxes.items() if f not in cut}
+    if not cut or not kept:
+        raise InputError(f"track {track.id} has {'no' if kept else 'only'} boxes {side} frame "
+                         f"{frame}")
+    seeds = tuple(s for s in state.seeds if s[1] != track.id or s[0] not in cut)
+    return ({track.id: replace(track, boxes=kept, gone=track.gone | cut)}, seeds, state.checked)
+
+
 def _check(state: State, action: Action, motion: Motion) -> Made:
     frame, checked = frame_of(action, motion), action.get("checked", True)
     if not isinstance(checked, bool):
@@ -293,7 +307,7 @@ DO: dict[str, Callable[[State, Action, Motion], Made]] = {
     "seed": _seed, "add": _add, "box": _box, "size": _size, "remove_box": _remove_box,
     "interpolate": _interpolate, "copy": _copy, "class": _class, "accept": _accept,
     "reject": _reject, "reject_rest": _reject_rest, "reopen": _reopen, "merge": _merge,
-    "split": _split, "check": _check, "snap": _box, "propose": _results, "import": _results,
+    "split": _split, "trim": _trim, "check": _check, "snap": _box, "propose": _results, "import": _results,
 }
 
 

@@ -203,8 +203,7 @@ class Annotator:
         self._do("drag", do="box", track=track.id, frame=frame, box=box.tolist())
 
     def _trim(self, person: int) -> None:
-        """Before its first frame and after its last, split off what is too much and reject it; in
-        between, remove boxes one by one."""
+        """Let it begin and end where the person does; in between, remove boxes one by one."""
         boxes = self.truth.people[person]
         for late in (True, False):
             track = self._track_of(person)
@@ -213,12 +212,8 @@ class Annotator:
             outside = [f for f in extra if (f > max(boxes) if late else f < min(boxes))]
             if not outside:
                 continue
-            cut = max(boxes) + 1 if late else min(boxes)
-            before = set(self.session.state.tracks)
-            self._do("key: split", do="split", track=track.id, frame=cut)
-            new, = set(self.session.state.tracks) - before
-            self._do("key: reject", do="reject", track=new if late else track.id)
-            self._own[person] = track.id if late else new
+            self._do("key: ends here" if late else "key: begins here", do="trim", track=track.id,
+                     frame=max(boxes) if late else min(boxes), side="after" if late else "before")
         track = self._track_of(person)
         for f in sorted(track.boxes):
             if f not in boxes and self.truth.seen(f, np.array(track.boxes[f].values)):

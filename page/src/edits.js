@@ -109,6 +109,8 @@ export const classToAdd = () => store.newClass
 
 export const snap = (to) => onTrack({ do: "snap", frame: store.frame, to });
 export const removeBox = () => onTrack({ do: "remove_box", frame: store.frame });
+/** No boxes "before" or "after" this frame. */
+export const trim = (side) => onTrack({ do: "trim", frame: store.frame, side });
 export const split = () => onTrack({ do: "split", frame: store.frame });
 
 /** This frame's box of the selected track also in the next frame; then go there. */

@@ -3,7 +3,7 @@
 import { getJson } from "./api.js";
 import { colourOfClass } from "./colours.js";
 import { element } from "./dom.js";
-import { copyOn, decide, interpolate, merge, removeBox, setClass, setNumbers, snap, split }
+import { copyOn, decide, interpolate, merge, removeBox, setClass, setNumbers, snap, split, trim }
   from "./edits.js";
 import { on, selectedBox, selectedTrack, store } from "./store.js";
 
@@ -22,7 +22,9 @@ const BUTTONS = [
            ["interpolate", "I", "Between the boxes set by hand before and after", interpolate],
            ["remove", "Del", "Remove the box of this frame", removeBox]]],
   ["Track", [["merge", "M", "Merge with the tracks selected by Ctrl and a click", merge],
-             ["split", "X", "This frame and those after it become a new track", split]]],
+             ["split", "X", "This frame and those after it become a new track", split],
+             ["begin", "Q", "Begins here: no boxes before this frame", () => trim("before")],
+             ["end", "E", "Ends here: no boxes after this frame", () => trim("after")]]],
 ];
 
 export function openInspector() {

@@ -2,7 +2,8 @@
 
 import { element } from "./dom.js";
 import { checkFrame, commit, copyOn, decide, dropDraft, interpolate, merge, next, nudge, propose,
-         redo, rejectRest, removeBox, setClass, snap, split, toKey, undo } from "./edits.js";
+         redo, rejectRest, removeBox, setClass, snap, split, toKey, trim,
+         undo } from "./edits.js";
 import { step, to, togglePlay } from "./playback.js";
 import { setTool, useCentre } from "./pointer.js";
 import { nextWrong } from "./results.js";
@@ -60,6 +61,8 @@ const TABLE = [
   ["Track", "Delete", "Del", "Remove the box of this frame", removeBox, LABEL],
   ["Track", "m", "M", "Merge the selected tracks", merge, LABEL],
   ["Track", "x", "X", "Split here", split, LABEL],
+  ["Track", "q", "Q", "Begins here: no boxes before", () => trim("before"), LABEL],
+  ["Track", "e", "E", "Ends here: no boxes after", () => trim("after"), LABEL],
   ["Track", "[", "[", "Box set by hand before this frame", () => toKey(-1), LABEL],
   ["Track", "]", "]", "Box set by hand after this frame", () => toKey(1), LABEL],
   ["Frames", ", PageUp", ",", "Previous frame", () => step(-1), BOTH],

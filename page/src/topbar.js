@@ -54,6 +54,10 @@ export function openTopbar() {
   by("import-form").onsubmit = sendImport;
   on("drive", showDrive);
   on("progress drive", showProgress);
+  on("tracks drive", () => { // where none can come, there is nothing to be seen over time
+    document.documentElement.dataset.tracks = store.drive && store.mode === "view"
+      && !store.drive.live && store.tracks.size === 0 ? "none" : "some";
+  });
   on("selection drive", () => {
     document.documentElement.dataset.chosen = String(store.selected !== null || store.found !== null);
   });
