@@ -307,7 +307,8 @@ DO: dict[str, Callable[[State, Action, Motion], Made]] = {
     "seed": _seed, "add": _add, "box": _box, "size": _size, "remove_box": _remove_box,
     "interpolate": _interpolate, "copy": _copy, "class": _class, "accept": _accept,
     "reject": _reject, "reject_rest": _reject_rest, "reopen": _reopen, "merge": _merge,
-    "split": _split, "trim": _trim, "check": _check, "snap": _box, "propose": _results, "import": _results,
+    "split": _split, "trim": _trim, "check": _check, "snap": _box, "propose": _results,
+    "import": _results,
 }
 
 

@@ -133,7 +133,7 @@ class Annotator:
     def _reject_rest(self) -> None:
         """What was not accepted, at once: only pedestrians are listed, and the rest of them is
         rejected."""
-        if any(t.state == PROPOSED and t.class_name == PERSON
+        if any(t.state == PROPOSED and t.id in self.looked_at
                for t in self.session.state.tracks.values()):
             self.counts["click: only pedestrians"] += 1
             self._do("key: reject the rest", do="reject_rest", **{"class": PERSON})

@@ -141,7 +141,7 @@ class Live:
             heard.came += 1
             objects = _usable(objects)
             frame = self._by_stamp.get(objects.stamp_ns)
-            if frame is None:
+            if frame is None or topic in frame.objects:  # then a bag began again, and it is early
                 heard.early[objects.stamp_ns] = objects, message
                 while len(heard.early) > EARLY:
                     heard.early.popitem(last=False)

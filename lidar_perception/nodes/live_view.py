@@ -25,6 +25,7 @@ from msg_utils.messages import message_class
 LOOK = 1.0    # seconds between looks at what there is
 ENDING = 5.0  # seconds for the message in hand
 RECEIVED = ReceptionParams(queue=5)
+SAID = "publishers", "silent", "stale", "lost", "dropped"  # of what a Reception finds wrong
 
 
 class LiveView(Outside):
@@ -105,10 +106,11 @@ class LiveView(Outside):
         clouds = self.receptions.get(self.clouds)
         lines = [self.problem] if self.problem else []
         if clouds is not None:
-            lines += [text for _, _, text in clouds.problems()]
             self.live.values = {"topic": self.clouds, **clouds.values()}
-            if not self.problem and clouds.last_time is None:
-                lines.append(f"no cloud has come on {self.clouds} yet")
+            if not self.problem:
+                lines += [text for kind, _, text in clouds.problems() if kind in SAID]
+                if clouds.last_time is None:
+                    lines.append(f"no cloud has come on {self.clouds} yet")
         for topic, reception in self.receptions.items():
             lost = reception.arrivals.lost + reception.arrivals.dropped
             if topic != self.clouds and lost:

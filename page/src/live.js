@@ -75,21 +75,21 @@ function showLines() {
   lines.replaceChildren(...found.map((line) => element("span", {}, line)));
 }
 
-/** Of the clouds and of each topic of boxes: [title, value, what it means, whether it is wrong]. */
+/** Of the clouds and of each topic of boxes: [title, value, what it means, what is wrong]. */
 export function liveRows() {
   const { clouds = {}, topics = [] } = store.status ?? {};
   const rows = [["clouds a second", clouds.rate_hz ?? "–", clouds.topic ?? ""],
     ["lost · dropped", `${clouds.lost ?? 0} · ${clouds.dropped ?? 0}`,
-     "lost on the way; dropped, as newer ones had come", (clouds.lost ?? 0) > 0]];
+     "Lost on the way; dropped, as newer ones had come"]];
+  if (clouds.passed) rows.push(["passed over", `${clouds.passed}`, "Clouds that came while a page had paused"]);
   for (const { topic, kind, came, late, alone, ms } of topics) {
-    const parts = [came ? `${came}` : "none yet", ms === null ? null : `${ms} ms`,
-                   late ? `${late} late` : null, alone ? `${alone} alone` : null];
-    rows.push([topic.replace(/^\/|\/output\/\w+$/g, "") + (kind === "tracks" ? " (tracks)" : ""),
-      parts.filter(Boolean).join(" · "),
-      `${topic}: arrays, how long behind their cloud; late: after it was shown; alone: their cloud never came`,
-      late + alone > 0]);
+    const name = kind === "labels" ? "labels" : topic.replace(/^\/|\/output\/\w+$/g, "");
+    const wrong = [late ? `${late} late` : null, alone ? `${alone} without a cloud` : null];
+    rows.push([kind === "tracks" ? `${name}: tracks` : name,
+      !came ? "none yet" : ms === null || kind === "labels" ? `${came}` : `${came} · ${ms} ms`,
+      `${topic}: arrays, and how long behind their cloud. Late: after it was shown`,
+      wrong.filter(Boolean).join(" · ")]);
   }
-  if (clouds.passed) rows.push(["not kept, paused", String(clouds.passed), "clouds that came meanwhile"]);
   return rows;
 }
 

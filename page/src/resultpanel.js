@@ -44,8 +44,9 @@ const rowOf = (title, value, colour, what) => element("div", { class: "count-row
     value === null ? "–" : String(value)));
 
 function showComing() {
-  document.getElementById("comes")?.replaceChildren(...liveRows().map(([title, value, what, wrong]) =>
-    rowOf(title, value, wrong ? FALSE : "", what)));
+  document.getElementById("comes")?.replaceChildren(...liveRows().flatMap(
+    ([title, value, what, wrong]) => [rowOf(title, value, "", what),
+      ...(wrong ? [rowOf("", wrong, FALSE, what)] : [])]));
 }
 
 function count() {

@@ -18,7 +18,8 @@ function listed() {
   return [...store.tracks.values()]
     .filter((track) => track.id === store.selected || ((wanted === undefined || track.state === wanted)
       && (!store.only || track.class === store.only)))
-    .sort((a, b) => (b.uncertainty ?? 0) - (a.uncertainty ?? 0) || a.id - b.id);
+    .sort((a, b) => store.drive?.live ? b.last - a.last || b.id - a.id // the newest first
+      : (b.uncertainty ?? 0) - (a.uncertainty ?? 0) || a.id - b.id);
 }
 
 function counts() {

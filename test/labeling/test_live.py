@@ -117,6 +117,15 @@ def test_a_bag_that_begins_again_is_shown_again(live):
     assert all(live.layers(i, 0.0)["detections"] for i in range(4))
 
 
+def test_labels_that_come_before_their_cloud_do_so_when_a_bag_begins_again_too(live):
+    live.hear("/ground_truth/detections", LABELS)
+    for stamp in (1, 2, 1, 2):
+        live.boxes("/ground_truth/detections", boxes(stamp), None)
+        live.cloud(cloud(stamp))
+    assert all(len(live.layers(i, 0.0)["labels"]) == 1 for i in range(4))
+    assert live.status()["topics"][1]["alone"] == 0
+
+
 def test_boxes_in_another_frame_are_said_and_broken_ones_left_out(live):
     live.cloud(cloud(1))
     live.boxes(FOUND, boxes(1, "base_link"), None)
