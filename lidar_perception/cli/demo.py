@@ -24,6 +24,7 @@ from lidar_perception.data.frame import BOXES, Recording
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.groups import renumbered
+from lidar_perception.nodes import require_rclpy
 from lidar_perception.nodes.graph import ALONE, FINAL, cloud_topic, result_topics
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console, errors, track
@@ -75,6 +76,7 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
     detector = detector or ("fused" if params == PAPER else CANDIDATES)
     if detector != CANDIDATES and params != PAPER:
         raise click.UsageError(f"--config and the parameters are those of --detector {CANDIDATES}")
+    require_rclpy()  # before the drive is made
     recording = None if data is None else opened(data)
     for old in ("drive", "result", "logs"):
         shutil.rmtree(out / old, ignore_errors=True)
