@@ -29,6 +29,7 @@ Placed = tuple[Array, str]  # a box (7,) and its class
 SAME = 0.6             # metres between the centres of a candidate and a detection of one person
 NEAR = 1.0             # metres between a track and the detection that it was hit by
 LEAST_CONFIDENCE = 0.3  # of a candidate
+UNDETECTED = 0.5       # share of a likeness that counts where a detector found nothing
 FEWEST_HITS = 2        # of a track that is proposed, in a drive of several frames
 LEAST_SCORE = 0.3      # of one
 SURE = 0.95            # score of a box that a person placed
@@ -53,6 +54,17 @@ class SeedSize:
     size: Size
 
 
+@dataclass(frozen=True)
+class Wanted:
+    """What is looked for: what is like these seeds; and by frame, what a person put there.
+    detected: a detector looks too, so that what is as large as a seed but not found counts less."""
+
+    seeds: Sequence[SeedLook] = ()
+    sizes: Sequence[SeedSize] = ()
+    placed: Mapping[int, Placed] = field(default_factory=dict)
+    detected: bool = False
+
+
 def likeness(look: Look, seeds: Sequence[SeedLook]) -> Array:
     """(C,) float64: the probability that each cluster is a person, by the seed it is most like; 0
     without seeds."""
@@ -64,11 +76,11 @@ def likeness(look: Look, seeds: Sequence[SeedLook]) -> Array:
     return best
 
 
-def found_in(look: Look, seeds: Sequence[SeedLook], sizes: Sequence[SeedSize] = (),
+def found_in(look: Look, wanted: Wanted,
              placed: Placed | None = None) -> tuple[Detections, Array]:
     """What there is in a frame: detections, and candidates where none is; and which (K,) bool are
     these. What a person placed is there for sure."""
-    detections, candidates = _with_things(look, sizes, *_seen_in(look, seeds))
+    detections, candidates = _with_things(look, wanted, *_seen_in(look, wanted.seeds))
     if placed is None or placed[1] not in CLASSES:
         return detections, candidates
     box, name = placed
@@ -92,13 +104,15 @@ def _seen_in(look: Look, seeds: Sequence[SeedLook]) -> tuple[Detections, Array]:
     return both, np.arange(len(both)) >= len(found)
 
 
-def _with_things(look: Look, sizes: Sequence[SeedSize], found: Detections,
+def _with_things(look: Look, wanted: Wanted, found: Detections,
                  candidates: Array) -> tuple[Detections, Array]:
     """Clusters too that are as large as the seeds that are no pedestrians, each like one of them,
     where nothing is found."""
+    sizes = wanted.sizes
     if not sizes or not len(look.things):
         return found, candidates
     scores = np.array([alike(look.things, seed.size) for seed in sizes])
+    scores *= UNDETECTED if wanted.detected else 1.0
     best = scores.argmax(axis=0)
     chosen = np.flatnonzero(scores.max(axis=0) >= LEAST_CONFIDENCE)
     shapes = look.things[chosen].astype(np.float64)
@@ -120,15 +134,6 @@ def _and(found: Detections, boxes: Array, class_ids: Array, scores: Array) -> De
 ON_FOOT = [i for i, kind in enumerate(KIND_OF_CLASS) if kind != KIND_OF_CLASS[0]]
 
 
-@dataclass(frozen=True)
-class Wanted:
-    """What is looked for: what is like these seeds; and by frame, what a person put there."""
-
-    seeds: Sequence[SeedLook] = ()
-    sizes: Sequence[SeedSize] = ()
-    placed: Mapping[int, Placed] = field(default_factory=dict)
-
-
 def proposed(looks: Sequence[Look], wanted: Wanted, stamps_ns: Sequence[int], motion: Motion,
              frames: range, told: Callable[[int], bool] = lambda count: True) -> list[Track] | None:
     """The tracks in some frames, one after the other, of a drive of which looks (F) are known, the
@@ -138,7 +143,7 @@ def proposed(looks: Sequence[Look], wanted: Wanted, stamps_ns: Sequence[int], mo
     for i in frames:
         if not told(i - frames.start):
             return None
-        found, candidates = found_in(looks[i], wanted.seeds, wanted.sizes, wanted.placed.get(i))
+        found, candidates = found_in(looks[i], wanted, wanted.placed.get(i))
         pose = None if motion.poses is None else motion.poses[i]
         tracks = tracker(found, stamps_ns[i], pose)
         for k in np.flatnonzero(tracks.seen):

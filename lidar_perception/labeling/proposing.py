@@ -97,7 +97,8 @@ class Proposer:
         placed = {f: (np.array(b.values), t.class_name) for t in state.tracks.values()
                   if is_placed(t) for f, b in t.boxes.items()}
         stamps = [frame.stamp_ns for frame in self.drive.frames]
-        return proposed(self.looks or [], Wanted(seeds, sizes, placed), stamps, motion,
+        wanted = Wanted(seeds, sizes, placed, self.weights != "")
+        return proposed(self.looks or [], wanted, stamps, motion,
                         range(len(self.looks or [])) if frames is None else frames, told)
 
     def _things(self, state: State) -> list[tuple[int, Track]]:
