@@ -33,6 +33,7 @@ from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.scoring.recorded import Answered, answered
 from lidar_perception.types import CLASSES, PEDESTRIAN
 from lidar_perception.wire.messages import column, to_detections, to_frame, to_truth
+from lidar_perception.wire.topics import POINTS
 from lidar_perception.wire.track_markers import drawn_trails
 from msg_utils.stamps import to_ns
 
@@ -121,7 +122,8 @@ def _params_of(detector: str, played: Recording, params: PipelineParams) -> Any:
 
 def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     """The bag to replay: the one that was given, or one made of it, or of a simulated drive."""
-    if recording is not None and isinstance(recording.frames, BagFrames):
+    if recording is not None and isinstance(recording.frames, BagFrames) and (
+            recording.frames.points == POINTS):
         return recording.path
     if recording is not None:
         found = track(recording, f"converting {recording.path}", len(recording))

@@ -6,12 +6,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from lidar_perception.labeling.live import BOXES, LABELS, TRACKS
-from lidar_perception.labeling.results import CLOUD, FOUND, MARKERS
+from lidar_perception.labeling.results import FOUND, MARKERS
 from lidar_perception.labeling.results import TRACKS as TRACKED
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS, TRUTH
 
-ARRAY = "vision_msgs/msg/Detection3DArray"
+CLOUD, ARRAY = "sensor_msgs/msg/PointCloud2", "vision_msgs/msg/Detection3DArray"
 # The ends of topics of clouds, those with the most columns first.
 CLOUDS = ("clustering/output/points", "perception/output/points",
           "ground_segmentation/output/points", POINTS.lstrip("/"))
