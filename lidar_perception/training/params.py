@@ -182,6 +182,8 @@ class ClusterAugmentParams(ThingParams):
                                    "standard deviation.", unit="m", low=0.0, high=2.0)
     farther: float = param(1.5, "Some clusters are moved away, up to (1 + this) times their "
                                 "range, and thinned accordingly.", low=0.0, high=10.0)
+    thin: float = param(0.0, "Share of the scenes that are thinned as a whole before they are cut "
+                        "into clusters, to a tenth of their points at least.", low=0.0, high=1.0)
     dropout: float = param(0.9, "Half of the clusters lose up to this share of their points.",
                            low=0.0, high=0.99)
     scale: float = param(0.05, "Clusters are scaled by up to this share.", low=0.0, high=0.5)
