@@ -34,11 +34,13 @@ def _clustered(xyz: np.ndarray, given: ClusteringParams, seen: float) -> np.ndar
 
 
 def cluster_obstacles(xyz: np.ndarray, ground: np.ndarray,
-                      params: ClusteringParams = ClusteringParams()) -> np.ndarray:
+                      params: ClusteringParams = ClusteringParams(),
+                      sensed: np.ndarray | None = None) -> np.ndarray:
     """(M,) int32 cluster ids of the points (M, 3) that are not ground (M,) bool; ground has 0.
-    Where params are made for some density, that of all points is measured."""
+    Where params are made for some density, that of all points is measured, or of sensed (N, 3), the
+    cloud as the sensor sees it, where xyz has been moved to another height."""
     labels = np.zeros(len(xyz), np.int32)
     obstacles = np.flatnonzero(~ground)
-    seen = density(xyz) if params.density else 0.0
+    seen = density(xyz if sensed is None else sensed) if params.density else 0.0
     labels[obstacles] = cluster(xyz.take(obstacles, axis=0), params, seen)
     return labels

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidar_perception.clustering.params import ClusteringParams
+from lidar_perception.geometry import horizontal_range
 from lidar_perception.types import usable_returns
 
 CELL = 2.0       # degrees: the gap between the beams of a VLP-16
@@ -68,7 +69,7 @@ def _fewer(count: int, thinner: float, least: int) -> int:
 
 
 def radii(xyz: np.ndarray, seen: float, least: float, most: float) -> np.ndarray:
-    """(N,) float64 m: at each of points (N, 3) the radius of the local threshold that its range
-    asks for in a cloud of `seen` points a square degree, between least and most."""
-    away = np.sqrt(np.einsum("ij,ij->i", xyz, xyz, dtype=np.float64))
-    return np.clip(IN_RADIUS * spacing(seen) * away, least, most)
+    """(N,) float64 m: the radius of the local threshold that the horizontal range of each of points
+    (N, 3) asks for in a cloud of `seen` points a square degree, between least and most."""
+    return np.clip(IN_RADIUS * spacing(seen) * horizontal_range(xyz).astype(np.float64), least,
+                   most)

@@ -97,7 +97,7 @@ class FusedDetector(NetworkDetector):
         times.append(perf_counter())
         proposed = self._proposer()(seen, ground=ground, cluster_ids=cluster_ids)
         times.append(perf_counter())
-        people = cluster_obstacles(seen.xyz, ground, self.params.people)[~ground]
+        people = cluster_obstacles(seen.xyz, ground, self.params.people, frame.xyz)[~ground]
         times.append(perf_counter())
         found = proposed.detections
         evidence = {"network": clipped_logit(found.scores), "silhouette": clipped_logit(
