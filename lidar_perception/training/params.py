@@ -139,8 +139,10 @@ class DataParams(Params):
 
 @dataclass(frozen=True)
 class SceneTraining(LoopParams):
-    """How long, and by which sensor."""
+    """How long, where, and by which sensor."""
 
+    scene: str = param("street", "Where the simulated scans are taken: street, campus or indoor, "
+                       "or several in turn, such as street,campus.")
     sensor: str = param("hdl64e", "Sensor of the simulated scans: a sensor.yaml, the name of a "
                         "preset, or generic:BEAMS,LOWEST,HIGHEST,STEP,RATE.")
     mount_height: float = param(0.0, "Its height above the ground. 0: what its file or preset "
@@ -182,8 +184,6 @@ class ClusterAugmentParams(ThingParams):
                                    "standard deviation.", unit="m", low=0.0, high=2.0)
     farther: float = param(1.5, "Some clusters are moved away, up to (1 + this) times their "
                                 "range, and thinned accordingly.", low=0.0, high=10.0)
-    thin: float = param(0.0, "Share of the scenes that are thinned as a whole before they are cut "
-                        "into clusters, to a tenth of their points at least.", low=0.0, high=1.0)
     dropout: float = param(0.9, "Half of the clusters lose up to this share of their points.",
                            low=0.0, high=0.99)
     scale: float = param(0.05, "Clusters are scaled by up to this share.", low=0.0, high=0.5)

@@ -18,13 +18,12 @@ from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.points.clusters import labelled
-from lidar_perception.training.augment import TrainingScene, raised, thinned
+from lidar_perception.training.augment import TrainingScene, raised
 from lidar_perception.training.cache import kept, path_in
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, LidarFrame
 
 AROUND = 0.3  # m: points so near to an object are looked at, too
 DECOYS = 24   # in a scene
-LEAST = 0.1   # of its points
 
 
 @dataclass(frozen=True)
@@ -42,14 +41,12 @@ class CutScene:
 @dataclass(frozen=True)
 class CutScenes:
     """scene(i): the clusters of a scene of `scenes`, as a network of the config is to see them, of
-    min_points or more. cache: folder for them, or None. thin: this share of the scenes, 0..1, is
-    thinned as a whole before, to between LEAST and all of the points, always in the same way."""
+    min_points or more. cache: folder for them, or None."""
 
     scenes: Any
     config: PointNetConfig
     min_points: int = 5
     cache: Path | None = None
-    thin: float = 0.0
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -61,7 +58,7 @@ class CutScenes:
     def path(self, i: int) -> Path | None:
         """The file that keeps the clusters of scene i."""
         return path_in(self.cache, self.scenes.key(i), self.config.ground, self.config.clustering,
-                       self.config.classes, self.min_points, self.thin)
+                       self.config.classes, self.min_points)
 
     def keep(self, i: int) -> None:
         """Put it into the cache."""
@@ -70,13 +67,7 @@ class CutScenes:
     def scene(self, i: int) -> CutScene:
         """InputError naming the file that cannot be used."""
         return kept(self.path(i),
-                    lambda: cut(self._scene(i), self.config, self.min_points), _read, _arrays)
-
-    def _scene(self, i: int) -> TrainingScene:
-        scene, rng = self.scenes.scene(i), np.random.default_rng(i)
-        if rng.random() >= self.thin:
-            return scene
-        return thinned(scene, 1 - LEAST ** rng.random(), rng)
+                    lambda: cut(self.scenes.scene(i), self.config, self.min_points), _read, _arrays)
 
 
 def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutScene:

@@ -76,9 +76,8 @@ class PointNetStart:
     def cut(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any],
             cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
         """The clusters of all scenes."""
-        cuts = [CutScenes(source, self.config, params.data.min_points, cache / "clusters", thin)
-                for part, thin in ((sources, params.augment.thin), (held_out, 0.0))
-                for source in part]
+        cuts = [CutScenes(source, self.config, params.data.min_points, cache / "clusters")
+                for source in (*sources, *held_out)]
         return cuts, [range(len(source)) for source in cuts]
 
     def gather(self, params: PointNetTraining, cut: tuple[list[Any], list], out: Path) -> None:
