@@ -41,10 +41,11 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.runs.files import make_folder, read_text, write_bytes, write_text
 from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import duration, errors, track
+from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.tracking.ego import has_odometry
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.cache import kept as made_once
-from lidar_perception.training.sources import SIM, sensor_of
+from lidar_perception.training.sources import SIM
 from lidar_perception.training.start import start
 from lidar_perception.types import InputError
 
@@ -98,7 +99,7 @@ class Adapting:
         known = self.header.training.get("sensor")
         known = known.get("name") if isinstance(known, dict) else None
         self.sensor_name = params.sensor or known or "hdl64e"
-        self.sensor = sensor_of(self.sensor_name, self.height)
+        self.sensor = sensor_named(self.sensor_name, self.height)
         if self.frames[0].pose() is None and not has_odometry():
             raise InputError(f"{data} has no poses, and to find them by the scans needs kiss-icp; "
                              "pip install 'lidar_perception[odometry]'")
