@@ -99,14 +99,12 @@ def _listening(namespace: str, points: str, detections: tuple[str, ...]) -> Iter
     """What the page shows of the running graph, while the block lasts."""
     from lidar_perception.labeling.live import Live
     from lidar_perception.labeling.served import Served
-    from lidar_perception.nodes.main import use_large_shared_memory
+    from lidar_perception.nodes import require_rclpy
+    from lidar_perception.nodes.shared_memory import use_large_shared_memory
 
+    require_rclpy()
     use_large_shared_memory(from_driver=points != "" and not points.endswith("/output/points"))
-    try:
-        from lidar_perception.nodes.live_view import listening
-    except ImportError as error:
-        raise InputError(f"--live needs ROS 2 ({error}): source it, or pip install "
-                         "'lidar_perception[ros]'") from None
+    from lidar_perception.nodes.live_view import listening  # with the profile already set
     name = "/".join(filter(None, (f"ROS domain {os.environ.get('ROS_DOMAIN_ID') or 0}",
                                   namespace.strip("/"))))
     live = Live(name)

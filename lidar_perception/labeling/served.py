@@ -8,10 +8,12 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.labeling.drive import Drive, classes
 from lidar_perception.labeling.exchange import FORMATS
 from lidar_perception.labeling.live import Live
 from lidar_perception.labeling.session import Session
+from lidar_perception.types import CLASSES, PEDESTRIAN
 
 
 @dataclass(eq=False)
@@ -35,6 +37,7 @@ class Served:
         """As /api/drive has it."""
         common = {"name": self.drive.name, "mode": "label" if self.session else "view",
                   "classes": classes(), "live": self.live is not None,
+                  "min_score": ScoreParams().of_class(CLASSES[PEDESTRIAN]),
                   "can_export": [*FORMATS] if self.session else []}
         if isinstance(self.drive, Live):
             return {**common, "path": "", "layout": "live", "has": [],

@@ -30,6 +30,7 @@ async function open() {
   try {
     takeDrive(await getJson("/api/drive"));
     store.mode = store.drive.mode;
+    store.minScore = store.drive.min_score;
     if (store.mode === "view") store.filter = "all";
     listKeys();
     changed("drive", "tool", "colour", "playing");

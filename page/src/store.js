@@ -18,7 +18,7 @@ export const store = {
   draft: null, // {track, frame, box}: only while something is dragged, or a key held
   colour: "height", names: true, online: true, playing: false, advance: true,
   filter: "left", only: null, shownTracks: [],
-  results: { labels: [], detections: {}, matches: {} }, sources: new Map(), minScore: 0.3,
+  results: { labels: [], detections: {}, matches: {} }, sources: new Map(), minScore: 0,
   layers: { labels: true, errors: true, tracks: true, trails: true },
 };
 
