@@ -41,8 +41,8 @@ setup(
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "msg_utils*"]),
     package_data={NAME: ["nodes/*.xml", "candidates/*.json", "reproduction/*.html",
-                         "simulation/sensors/*.yaml", "sensor_setup/*.html", "labeling/page/*",
-                         "detectors/*/weights/*", "detectors/fused/*.json"]},
+                         "simulation/sensors/*.yaml", "sensor_setup/*.html", "adapting/*.html",
+                         "labeling/page/*", "detectors/*/weights/*", "detectors/fused/*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -65,4 +65,5 @@ MAX_DIAGONAL = 6.40  # metres, of the largest class: paper B, Table 2
 CLASSES = tuple(row.name for row in TABLE)
 DETECTED = {row.name: row.numbers for row in TABLE if row.numbers is not None}
 BY_SIZE = sorted(DETECTED, key=lambda name: -DETECTED[name].min_diagonal)  # the largest first
-CAR, PEDESTRIAN, CYCLIST = map(CLASSES.index, ("Car", "Pedestrian", "Cyclist"))
+CAR, PEDESTRIAN, CYCLIST, DONT_CARE = map(CLASSES.index, ("Car", "Pedestrian", "Cyclist",
+                                                          "DontCare"))

@@ -103,16 +103,18 @@ def check(asked: Asked, init: Path | None) -> None:
         may_begin(asked.out, asked.resume, name)
 
 
-def scenes_of(asked: Asked, params: Any, sensor: Sensor) -> tuple[tuple, tuple]:
-    """Sources to train on and to validate on."""
+def scenes_of(asked: Asked, params: Any, sensor: Sensor, own: tuple = ()) -> tuple[tuple, tuple]:
+    """Sources to train on, those of one's own last, and to validate on."""
     around = getattr(params, "range", "") == "around"
-    return training_scenes(asked.data, asked.val, asked.split, asked.val_split, params.data,
-                           params.seed, sensor, around, params.scene)
+    sources, held_out = training_scenes(asked.data, asked.val, asked.split, asked.val_split,
+                                        params.data, params.seed, sensor, around, params.scene)
+    return (*sources, *own), held_out
 
 
-def start(network: Network, asked: Asked, params: Any,
-          commit: str = "") -> Ended | None:
-    """Train a network; how it ended, None in all but the first of several processes.
+def start(network: Network, asked: Asked, params: Any, commit: str = "",
+          own: tuple = ()) -> Ended | None:
+    """Train a network; how it ended, None in all but the first of several processes. own: sources
+    of scenes, see training/scenes.py, besides those that are asked for.
 
     The first start measures this machine, plans and writes the plan to RUN; a resumed run keeps
     it. All that is prepared is kept in the cache, so that a run may be killed at any time.
@@ -129,10 +131,10 @@ def start(network: Network, asked: Asked, params: Any,
         sensor = sensor_named(params.sensor, params.mount_height)
         if rank() == 0:
             make_folder(Path(params.data.cache))
-            _settle(network, asked, params, sensor, device)
+            _settle(network, asked, params, sensor, device, own)
         wait()
-        given, params = params, _settled(network, asked, params, sensor)
-        sources, held_out = scenes_of(asked, params, sensor)
+        given, params = params, _settled(network, asked, params, sensor, own)
+        sources, held_out = scenes_of(asked, params, sensor, own)
         cut = network.cut(params, sources, held_out, Path(params.data.cache))
         if rank() == 0:
             try:
@@ -144,7 +146,7 @@ def start(network: Network, asked: Asked, params: Any,
                 errors.print("stopped; what is prepared is kept, --resume goes on")
                 raise
         wait()
-        params = _settled(network, asked, given, sensor)
+        params = _settled(network, asked, given, sensor, own)
         stream, to_validate = network.scenes(params, sources, held_out, cut, asked.out)
         batches = Batches(stream, params.batch, asked.jobs, rank(), world())
         about = {**about_data(asked.data, asked.val, stream, held_out, asked.init),
@@ -157,7 +159,7 @@ def start(network: Network, asked: Asked, params: Any,
 
 
 def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
-            device: torch.device) -> None:
+            device: torch.device, own: tuple) -> None:
     """Plan, say so and write it, unless that was done by an earlier start."""
     path = asked.out / RUN
     if path.is_file():
@@ -165,7 +167,7 @@ def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
         return
     errors.print("measuring this machine with a few scenes ...")
     few = with_values(params, {"data.scans": 8, "data.val_scans": 1, "data.cache": ""})
-    sources, held_out = scenes_of(asked, few, sensor)
+    sources, held_out = scenes_of(asked, few, sensor, own)
     scenes, scan = _some_scenes((*sources, *held_out))
     cut, step, whole, frame = network.measured(few, scenes, held_out[0], device)
     speed = Speed(scan, cut, step, whole, frame, scenes[0].points.nbytes * 1.02e-6)
@@ -179,7 +181,8 @@ def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
         chosen = replace(chosen, validate_steps=params.validation_steps(epoch))
     _require_room(Path(params.data.cache), params.data.cache_gb, chosen, speed)
     _say(network, params, sensor, chosen, speed, data)
-    write_text(path, json.dumps({"asked": _decisive(asked, params, sensor), "plan": asdict(chosen),
+    write_text(path, json.dumps({"asked": _decisive(asked, params, sensor, own),
+                                 "plan": asdict(chosen),
                                  "speed": asdict(speed), "data": asdict(data)}, indent=1))
 
 
@@ -198,7 +201,7 @@ def _refit(out: Path, begun: float, hours: float) -> None:
         write_text(out / RUN, json.dumps({**known, "plan": asdict(refit)}, indent=1))
 
 
-def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor) -> Any:
+def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor, own: tuple) -> Any:
     """params with the plan of the first start. InputError where something else was asked for."""
     path = asked.out / RUN
     try:
@@ -206,7 +209,7 @@ def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor) -> Any
         before, chosen = known["asked"], Plan(**known["plan"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"cannot read {path}: {error}; give another --out") from None
-    now = json.loads(json.dumps(_decisive(asked, params, sensor)))
+    now = json.loads(json.dumps(_decisive(asked, params, sensor, own)))
     if different := differences(before, now):
         raise InputError(f"{asked.out} holds a run with {'; '.join(different[:3])}; resume it with "
                          "the same settings, or give another --out")
@@ -216,8 +219,9 @@ def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor) -> Any
     return with_values(params, values)
 
 
-def _decisive(asked: Asked, params: Any, sensor: Sensor) -> dict[str, Any]:
-    return {**params.decisive(), "data": list(asked.data), "val": list(asked.val),
+def _decisive(asked: Asked, params: Any, sensor: Sensor, own: tuple) -> dict[str, Any]:
+    others = {"own": [[source.key(0), len(source)] for source in own]} if own else {}
+    return {**others, **params.decisive(), "data": list(asked.data), "val": list(asked.val),
             "split": str(asked.split or ""), "val_split": str(asked.val_split or ""),
             "init": str(asked.init or ""), "sensor": asdict(sensor)}
 

@@ -73,7 +73,7 @@ class FusedDetector(NetworkDetector):
         """Ground and PointPillars' clusters are computed where they are None."""
         look = self.look(frame, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
-        detections, best = self._fused(look)
+        detections, best = self.weighed(look)
         detections = in_sensor_frame(detections, self.params.ground.sensor_pose)
         ms = {**look.ms, STEPS[-1]: (perf_counter() - begin) * 1e3}
         return Found(detections, ms, look.problem or self.fallback or self.classifier.fallback,
@@ -121,8 +121,9 @@ class FusedDetector(NetworkDetector):
                                             nms=settings.nms, cpu_fallback=settings.cpu_fallback))
         return self.proposer
 
-    def _fused(self, look: Look) -> tuple[Detections, dict[str, float]]:
-        """The detections, best first, and where there are none the highest score of each class."""
+    def weighed(self, look: Look) -> tuple[Detections, dict[str, float]]:
+        """The detections, best first, as from a level sensor at SENSOR_HEIGHT, and where there are
+        none the highest score of each class."""
         settings, class_ids = self.settings, look.proposed.class_ids
         every = replace(look.proposed, scores=probabilities(class_ids, look.evidence),
                         sources=sources(class_ids, look.evidence))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.camera import Camera
-from lidar_perception.classes import TABLE
+from lidar_perception.classes import DONT_CARE, TABLE
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of
@@ -25,8 +25,9 @@ UNKNOWN = -1              # a label of which nothing is said
 SURE, UNSURE = 0.5, 0.15  # a cluster with this share of its points in a box is that object, with
                           # less than the second it is background
 BORDER = 0.05             # m: points so near to a box are taken for its own, as labels are rounded
-# These look like a class, and are none of it.
+# These look like a class, and are none of it; or nobody knows what they are.
 NEITHER = [row.name for row in TABLE if row.numbers is None and (row.looks_like or row.vehicle)]
+NEITHER.append(CLASSES[DONT_CARE])
 MIN_POINTS = 10         # clusters with fewer do not count
 
 

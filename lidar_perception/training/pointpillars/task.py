@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from lidar_perception.classes import DONT_CARE
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Detector
@@ -52,13 +53,15 @@ from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError, LidarFram
 VALIDATED = DetectorParams(pointpillars=PointPillarsParams(scores=ScoreParams.all_alike(0.1),
                                                            warm_up=False))
 LIKE = {other: name for name, other in NEIGHBOURS.items()}  # Van: Car, Person_sitting: Pedestrian
+TOUCHED = 1e-6  # overlap of an anchor that touches
+REGION = -2  # label of a box of the class DontCare
 
 
 @dataclass(frozen=True)
 class Sample:
     """One scene for the network: points and cluster_map as in expert.NetworkInput; boxes (M, 7)
-    float32, labels (M,) int64 into the config's classes; counted (M,) bool: to be found, the others
-    may be found or not."""
+    float32, labels (M,) int64 into the config's classes, REGION for a region of which nothing is
+    learned; counted (M,) bool: to be found, the others may be found or not."""
 
     points: np.ndarray
     cluster_map: np.ndarray | None
@@ -105,13 +108,15 @@ class Preparation:
         names = [CLASSES[i] for i in scene.class_ids]
         labels = np.array([self._label(LIKE.get(name, name)) for name in names], np.int64)
         within = ((scene.boxes[:, :2] >= low[:2]) & (scene.boxes[:, :2] < high[:2])).all(axis=1)
-        kept = np.flatnonzero(within & (labels >= 0))
-        counted = [bool(scene.wanted[i]) and names[i] not in LIKE
+        kept = np.flatnonzero(within & (labels != -1))
+        counted = [bool(scene.wanted[i]) and names[i] not in LIKE and labels[i] != REGION
                    and len(inside(xyz, scene.boxes[i], 0.0)) >= self.min_points
                    for i in kept]
         return scene.boxes[kept].astype(np.float32), labels[kept], np.array(counted, bool)
 
     def _label(self, name: str) -> int:
+        if name == CLASSES[DONT_CARE]:
+            return REGION
         return self.config.classes.index(name) if name in self.config.classes else -1
 
 
@@ -135,20 +140,21 @@ def narrowed(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig
 
 
 def targets_of(sample: Sample, anchors: Tensor, config: NetworkConfig) -> Targets:
-    """The targets of one sample. Anchors on objects that are not counted are neither object nor
-    background."""
+    """The targets of one sample. Anchors on objects that are not counted, and those of any class
+    that touch a region, are neither object nor background."""
     boxes = torch.from_numpy(sample.boxes).to(anchors.device)
     labels = torch.from_numpy(sample.labels).to(anchors.device)
     counted = torch.from_numpy(sample.counted).to(anchors.device)
     targets = assign(anchors, config, boxes[counted], labels[counted])
     found = targets.labels[0]
     for index, spec in enumerate(config.anchors):
-        others = boxes[~counted & (labels == index)]
-        mine = anchors_near(anchors, config, others, index)
-        if len(mine):
-            near = nearest_axis_iou(anchors[mine], others).max(dim=1).values >= spec.unmatched
-            near &= found[mine] == BACKGROUND
-            found[mine[near]] = IGNORED
+        for others, least in ((boxes[~counted & (labels == index)], spec.unmatched),
+                              (boxes[labels == REGION], TOUCHED)):
+            mine = anchors_near(anchors, config, others, index)
+            if len(mine):
+                near = nearest_axis_iou(anchors[mine], others).max(dim=1).values >= least
+                near &= found[mine] == BACKGROUND
+                found[mine[near]] = IGNORED
     return targets
 
 

@@ -1,0 +1,36 @@
+"""Parameters of adapting: flags and docs are made from these fields."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lidar_perception.param_fields import Params, param
+
+
+@dataclass(frozen=True)
+class AdaptParams(Params):
+    """How often, how fast, and with what."""
+
+    rounds: int = param(2, "Rounds of looking and learning; each begins with the weights of the "
+                        "one before.", low=1, high=10)
+    steps: int = param(0, "Steps of the optimizer in a round. 0: the budget decides.", low=0,
+                       high=10**7)
+    lr: float = param(0.0005, "Highest learning rate.", low=1e-9, high=1.0)
+    batch: int = param(4, "Scenes in a step.", low=1, high=1024)
+    seed: int = param(0, "Seed of the order of the scenes, their augmentation and the simulated "
+                      "streets.", low=0, high=2**31 - 1)
+    frames: int = param(0, "Frames that are looked at, in pieces of consecutive ones. 0: the "
+                        "budget decides.", low=0, high=10**6)
+    scans: int = param(0, "Simulated scans that are mixed in, which also give objects to be pasted "
+                       "into real ones. 0: as many as there are frames.", low=0, high=10**6)
+    val_scans: int = param(24, "Simulated scans by which a round is judged.", low=1, high=10**5)
+    scene: str = param("street", "Where the simulated scans are taken: street, campus or indoor, "
+                       "or several in turn, such as street,campus.")
+    sensor: str = param("", "Sensor of the simulated scans: a sensor.yaml, or the name of a "
+                        "preset. Empty: the one that the weights were trained for.")
+    mount_height: float = param(0.0, "Its height above the ground. 0: as the recording says, or "
+                                "else KITTI's.", unit="m", low=0.0, high=10.0)
+    worse_simulated: float = param(2.0, "A round is not taken if the AP on simulated scans falls "
+                                   "by more than this.", low=0.0, high=100.0)
+    worse_agreement: float = param(0.02, "Nor if the agreement falls by more than this.", low=0.0,
+                                   high=1.0)

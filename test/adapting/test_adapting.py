@@ -1,0 +1,265 @@
+"""Laws of adapting: what is learned from, what a kill changes, and when a round is not taken."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from adapting_samples import drive
+from click.testing import CliRunner
+from detection_samples import BOXES, lively, tiny, two_objects
+from samples import write
+
+from lidar_perception.adapting import adapt as adapt_module
+from lidar_perception.adapting.adapt import BEST, LAST, Adapting
+from lidar_perception.adapting.judging import IGNORED, KEPT, REJECTED, STATES
+from lidar_perception.adapting.labels import FrameLabels
+from lidar_perception.adapting.looking import SOURCES, FrameLook
+from lidar_perception.adapting.params import AdaptParams
+from lidar_perception.adapting.scenes import AdaptedScenes, save_labels
+from lidar_perception.classes import CAR, DONT_CARE
+from lidar_perception.cli.main import cli
+from lidar_perception.data.frame import Frame
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.pointnet.weights_file import weights_file
+from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
+from lidar_perception.detectors.pointpillars.losses import detection_loss
+from lidar_perception.detectors.pointpillars.network import Outputs
+from lidar_perception.detectors.pointpillars.targets import stacked
+from lidar_perception.labeling.exchange import import_labels
+from lidar_perception.training.augment import TrainingScene
+from lidar_perception.training.cache import write_arrays
+from lidar_perception.training.params import AugmentParams
+from lidar_perception.training.pointpillars.task import Preparation, targets_of
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
+
+SENSOR = "generic:16,-14,3,2,10"
+SMALL = AdaptParams(rounds=1, steps=3, batch=1, frames=100, scans=2, val_scans=1, sensor=SENSOR)
+STILL = AugmentParams(crowded=0.0, object_turn=0.0, object_shift=0.0, flip=0.0, turn=0.0, scale=0.0,
+                      dropout=0.0, intensity=0.0, height=0.0, tilt=0.0, beam_noise=0.0,
+                      range_noise=0.0)
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory) -> Path:
+    """A simulated drive of 12 frames, with poses."""
+    path = tmp_path_factory.mktemp("drive") / "bag"
+    made = CliRunner().invoke(cli, ["simulate", "--out", str(path), "--frames", "12", "--seed", "3",
+                                    "--sensor", SENSOR, "--people", "3"])
+    assert made.exit_code == 0, made.exception
+    return path
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory) -> Path:
+    """Of a small network that has learned nothing."""
+    path = tmp_path_factory.mktemp("weights") / "old.safetensors"
+    save_checkpoint(path, lively(tiny()), Header(tiny()))
+    return path
+
+
+def perfect_looks(bag: Path, out: Path) -> None:
+    """Put into out, as the first looks, what a perfect detector would have seen."""
+    for n, frame in enumerate(open_recording(bag)):
+        truth = frame.truth()
+        own = np.isin(truth.class_ids, [CAR, PEDESTRIAN, CLASSES.index("Cyclist")])
+        found = Detections.of(truth.boxes[own], truth.class_ids[own], 0.95)
+        found = Detections(found.boxes, found.class_ids, found.scores,
+                           dict.fromkeys(SOURCES, found.scores))
+        look = FrameLook(found, np.full(len(found), 50), np.full(len(found), 1.7), frame.pose())
+        write_arrays(out / "round1" / "looks" / f"{n:06}.npz", look.arrays())
+
+
+def adapted(bag: Path, weights: Path, out: Path, params: AdaptParams = SMALL) -> Adapting:
+    run = Adapting(bag, weights, out, 1.0, params, "cpu", 0)
+    run.run()
+    return run
+
+
+def tensors(path: Path) -> bytes:
+    """All but the header, which says how long it took."""
+    content = path.read_bytes()
+    return content[8 + int.from_bytes(content[:8], "little"):]
+
+
+@pytest.fixture(scope="module")
+def whole(bag, weights, tmp_path_factory) -> Path:
+    """The folder of a run that nothing has stopped."""
+    out = tmp_path_factory.mktemp("whole") / "out"
+    perfect_looks(bag, out)
+    adapted(bag, weights, out)
+    return out
+
+
+def test_a_killed_run_ends_as_if_it_had_not_been(bag, weights, whole, tmp_path):
+    out = tmp_path / "out"
+    perfect_looks(bag, out)
+    code = ("import sys; from pathlib import Path; sys.path.insert(0, 'test');"
+            "sys.path.insert(0, 'test/adapting'); from test_adapting import adapted;"
+            "adapted(*map(Path, sys.argv[1:]))")
+    process = subprocess.Popen([sys.executable, "-c", code, str(bag), str(weights), str(out)],
+                               env={**os.environ, "OMP_NUM_THREADS": "1"},
+                               cwd=Path(__file__).parents[2], text=True,
+                               stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    end = time.monotonic() + 240
+    while not (out / "round1" / "objects.npz").exists():
+        assert process.poll() is None, process.stderr.read()
+        assert time.monotonic() < end
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not (out / BEST).exists()
+    before = weights.read_bytes()
+    run = adapted(bag, weights, out)
+    assert weights.read_bytes() == before
+    assert tensors(out / "round1" / LAST) == tensors(whole / "round1" / LAST)
+    for name in ("round1/labels.npz", "round1/judged.json", "judged.json"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
+    assert (out / BEST).read_bytes() == run.best.read_bytes()
+
+
+def test_other_settings_are_no_resumed_run(bag, weights, whole):
+    with pytest.raises(InputError, match="seed 0, not 1"):
+        adapted(bag, weights, whole, replace(SMALL, seed=1))
+
+
+def test_a_round_that_makes_simulated_validation_worse_is_not_taken(bag, weights, whole, tmp_path,
+                                                                    monkeypatch):
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    for name in ("judged.json", "round1/judged.json"):
+        (out / name).unlink()
+    scores = iter([{"score": 50.0}, {"score": 40.0}])
+    monkeypatch.setattr(adapt_module, "simulated_score", lambda *_: next(scores))
+    run = adapted(bag, weights, out)
+    assert "simulated AP fell from 50.0 to 40.0" in run.rounds[0].refused
+    assert (out / BEST).read_bytes() == weights.read_bytes()
+    assert json.loads((out / "adapt.json").read_text())["rounds"][0]["refused"]
+
+
+def test_the_cluster_network_is_adapted_in_the_same_way(bag, tmp_path):
+    old, out = weights_file(PointNetParams()), tmp_path / "out"
+    perfect_looks(bag, out)
+    run = adapted(bag, old, out, replace(SMALL, steps=1, worse_simulated=100.0,
+                                         worse_agreement=1.0))
+    assert isinstance(open_detector(out / BEST, "cpu"), PointNetDetector)
+    assert run.best != old and tensors(out / BEST) != tensors(old)
+
+
+def test_report_and_labels_say_what_was_kept(bag, weights, whole):
+    from lidar_perception.adapting.report import LABELS, REPORT, write_report
+    run = adapted(bag, weights, whole)
+    write_report(run)
+    frames = list(open_recording(bag))
+    labels = import_labels(whole / LABELS, "openlabel", frames)
+    assert labels.boxes == sum(own.of(KEPT).sum() for own in run.seen[0].labels) > 0
+    page = (whole / REPORT).read_text()
+    assert page.count("<img") == 6 and all(v.reason in page.replace("&#39;", "'")
+                                           for v in run.seen[0].verdicts)
+
+
+# what is learned from
+
+def labelled(states: list[str]) -> FrameLabels:
+    return FrameLabels(BOXES.numpy().astype(np.float64), np.array([CAR, PEDESTRIAN]),
+                       np.array([STATES.index(s) for s in states]), np.arange(2), np.ones(2),
+                       np.ones(2, bool))
+
+
+def test_scenes_are_the_clouds_with_kept_boxes_and_regions(bag, tmp_path):
+    path = tmp_path / "labels.npz"
+    save_labels(path, [4, 2], [labelled([KEPT, IGNORED]), labelled([REJECTED, KEPT])])
+    scenes = AdaptedScenes(bag, path, (0.0, -20.0), (30.0, 20.0), 1.5)
+    assert len(scenes) == 2 and scenes.key(0) != scenes.key(1)
+    first, second = scenes.scene(0), scenes.scene(1)
+    assert first.class_ids.tolist() == [CAR, DONT_CARE] and first.wanted.tolist() == [True, False]
+    assert second.class_ids.tolist() == [PEDESTRIAN] and second.height == 1.5
+    cloud = list(open_recording(bag))[4].load()
+    inside = ((cloud.xyz[:, :2] >= [0, -20]) & (cloud.xyz[:, :2] < [30, 20])).all(axis=1)
+    np.testing.assert_array_equal(first.points[:, :3], cloud.xyz[inside])
+
+
+def test_regions_give_no_gradient_and_change_none_elsewhere():
+    config = tiny()
+    anchors, kinds = make_anchors(config), anchor_classes(config)
+    boxes = BOXES.numpy().astype(np.float64)
+
+    def gradient(class_ids: list[int]) -> torch.Tensor:
+        scene = TrainingScene(two_objects(), boxes, np.array(class_ids), np.ones(2, bool))
+        sample = Preparation(config, STILL)(scene, np.random.default_rng(0))
+        torch.manual_seed(1)
+        outputs = Outputs(*(torch.randn(1, len(anchors), n, requires_grad=True)
+                            for n in (len(config.classes), 7, 2)))
+        detection_loss(outputs, stacked([targets_of(sample, anchors, config)]), kinds
+                       ).total.backward()
+        return torch.cat([part.grad.flatten(2) for part in outputs], dim=2)[0].abs().sum(dim=1)
+
+    region, background = gradient([DONT_CARE, PEDESTRIAN]), gradient([CLASSES.index("Misc"),
+                                                                      PEDESTRIAN])
+    touching = (anchors[:, :2] - BOXES[0, :2]).abs().amax(dim=1) < 0.3
+    assert {int(k) for k in kinds[touching]} == set(range(len(config.classes)))
+    assert (region[touching] == 0).all() and (background[touching] > 0).all()
+    assert ((region == background) | (region == 0)).all()
+
+
+# bad input: one line, and nothing is made or replaced
+
+def standing(path: Path) -> Path:
+    looks, stamps, _ = drive()
+    frames = [Frame.of(str(i), LidarFrame(np.ones((50, 3), np.float32), np.ones(50, np.float32),
+                                          stamps[i], "velodyne"),
+                       pose=partial(np.eye, 4)) for i in range(len(looks))]
+    write_bag(path, frames)
+    return path
+
+
+def refused(out: Path, *words: str) -> str:
+    said = CliRunner().invoke(cli, ["adapt", "--out", str(out), "--device", "cpu", "--jobs", "0",
+                                    "--frames", "100", "--sensor", SENSOR, *map(str, words)])
+    assert isinstance(said.exception, InputError), said.exception
+    assert "\n" not in str(said.exception)
+    return str(said.exception)
+
+
+def test_bad_input_is_refused_in_one_line(bag, weights, made, tmp_path):
+    out = tmp_path / "out"
+    assert "5 frames" in refused(out, "--data", made / "kitti-tracking", "--weights", weights)
+    assert "stands still" in refused(tmp_path / "still", "--data", standing(tmp_path / "bag"),
+                                     "--weights", weights)
+    assert "--budget" in refused(out, "--data", bag, "--weights", weights, "--budget", "0")
+    other = write(tmp_path / "other.onnx", "no weights")
+    assert "other.onnx" in refused(out, "--data", bag, "--weights", other)
+    assert not out.exists()
+
+
+def test_a_folder_of_somebody_else_stays_as_it_is(bag, weights, tmp_path):
+    file = write(tmp_path / "out" / "thesis.txt", "mine")
+    for more in ((), ("--force",), ("--resume",)):
+        assert "no run of adapt" in refused(tmp_path / "out", "--data", bag, "--weights", weights,
+                                            *more)
+    assert [p.name for p in file.parent.iterdir()] == ["thesis.txt"]
+
+
+def test_too_little_agreement_is_said_with_a_report(bag, weights, tmp_path):
+    out = tmp_path / "out"
+    line = refused(out, "--data", bag, "--weights", weights)
+    assert "agree on" in line and "train --sensor" in line
+    assert (out / "report.html").is_file() and not (out / BEST).exists()
+    assert "--resume or --force" in refused(out, "--data", bag, "--weights", weights)
