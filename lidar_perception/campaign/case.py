@@ -21,7 +21,7 @@ MAX_BYTES = 2**30  # of a file that holds a case
 @dataclass(frozen=True)
 class Case:
     """What is tried: number `number` of a part under a seed. settings (values of JSON) and data are
-    all that the part needs to try it again."""
+    all that the part needs to try it again. seconds: how long it lasts at least; 0: not long."""
 
     part: str
     name: str
@@ -29,13 +29,14 @@ class Case:
     number: int
     settings: dict[str, Any] = field(default_factory=dict)
     data: bytes = b""
+    seconds: float = 0.0
 
     def save(self, path: Path, outcome: Outcome) -> None:
         """Write a file that `campaign --replay` takes."""
         write_text(path, json.dumps({
             "part": self.part, "name": self.name, "seed": self.seed, "number": self.number,
             "settings": self.settings, "data": base64.b64encode(self.data).decode(),
-            "reason": outcome.reason}, indent=1))
+            "seconds": self.seconds, "reason": outcome.reason}, indent=1))
 
     @staticmethod
     def load(path: Path) -> Case:
@@ -44,7 +45,7 @@ class Case:
             content = json.loads(read_text(path, MAX_BYTES))
             return Case(str(content["part"]), str(content["name"]), int(content["seed"]),
                         int(content["number"]), dict(content["settings"]),
-                        base64.b64decode(content["data"]))
+                        base64.b64decode(content["data"]), float(content["seconds"]))
         except (ValueError, KeyError, TypeError, RecursionError) as error:
             if isinstance(error, InputError):
                 raise

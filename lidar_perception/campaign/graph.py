@@ -20,8 +20,8 @@ from lidar_perception.nodes.graph import (
     evaluation,
     private_domain,
 )
-from lidar_perception.nodes.main import use_large_shared_memory
 from lidar_perception.nodes.runtime import CLOUD, LATCHED, MARKERS, RELIABLE
+from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.nodes.watch import Outside
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import CLICK, POINTS, TRUTH

@@ -19,21 +19,23 @@ from lidar_perception.wire.topics import POINTS
 from msg_utils.markers import from_marker_array
 from msg_utils.point_cloud2 import from_array
 
-COUNT, SECONDS = 120_000, 20.0
-RATES = (10, 20, 40)
+COUNT = 120_000
 FIRST = 1_750_000_000_000_000_000  # ns; stamps are counted on from here, one a cloud
 RECOVERY_SECONDS = 60.0
 GROWTH_MB = 100.0
-CASES = [(single, rate) for rate in RATES for single in (True, False)]
+# In one process or one a stage, Hz, seconds.
+CASES = [*((single, rate, 20.0) for rate in (10, 20, 40) for single in (True, False)),
+         (True, 20, 1800.0)]
 
 
 def case_of(seed: int, number: int) -> Case | None:
-    """The graph in one process, and in one a stage, at each rate."""
+    """The graph in one process, and in one a stage, at each rate; last for half an hour."""
     if number >= len(CASES):
         return None
-    single, rate = CASES[number]
-    return Case("load", f"{'one process' if single else 'a process a stage'}, {rate} Hz", seed,
-                number, {"single": single, "rate": rate})
+    single, rate, seconds = CASES[number]
+    name = (f"{'one process' if single else 'a process a stage'}, {rate} Hz"
+            + (f", {seconds / 60:.0f} minutes" if seconds > 60 else ""))
+    return Case("load", name, seed, number, {"single": single, "rate": rate}, seconds=seconds)
 
 
 class Attempt:
@@ -56,10 +58,12 @@ class Attempt:
     def __call__(self, case: Case) -> Outcome:
         single, rate = case.settings["single"], case.settings["rate"]
         with Graph(self.folder / str(case.number), tuple(SINGLE if single else STAGES)) as graph:
-            return _under_load(graph, case.name, self.cloud, result_topics(single)["final"], rate)
+            return _under_load(graph, case.name, self.cloud, result_topics(single)["final"], rate,
+                               case.seconds)
 
 
-def _under_load(graph: Graph, what: str, cloud: bytes, results: str, rate: int) -> Outcome:
+def _under_load(graph: Graph, what: str, cloud: bytes, results: str, rate: int,
+                seconds: float) -> Outcome:
     sent: dict[int, float] = {}
     answers: list[tuple[int, float]] = []
 
@@ -74,12 +78,12 @@ def _under_load(graph: Graph, what: str, cloud: bytes, results: str, rate: int) 
     graph.spin(2.0)
     before = {key: graph.count(first, key) for key in ("frames", "dropped", "lost")}
     memory, begin, number = 0.0, monotonic(), 0
-    while monotonic() - begin < SECONDS:
+    while monotonic() - begin < seconds:
         stamp = FIRST + number * 10**9 // rate
         sent[stamp] = monotonic()
         graph.send(POINTS, stamped(cloud, stamp))
         number += 1
-        if not memory and monotonic() - begin > SECONDS / 4:
+        if not memory and monotonic() - begin > seconds / 4:
             memory = sum(graph.processes.memory_mb().values())
         graph.spin(max(0.0, begin + number / rate - monotonic()))
     took = monotonic() - begin
@@ -95,7 +99,7 @@ def _under_load(graph: Graph, what: str, cloud: bytes, results: str, rate: int) 
                "dropped": counts["dropped"], "lost": counts["lost"], "answered": len(answers),
                "recovery_s": round(recovery, 2), "memory_mb": round(memory),
                "growth_mb": round(growth, 1), **{f"latency_p{p}_ms": round(float(np.percentile(
-                   [1e3 * seconds for _, seconds in answers], p))) for p in (50, 95, 99)}}
+                   [1e3 * late for _, late in answers], p))) for p in (50, 95, 99)}}
     stamps = [stamp for stamp, _ in answers]
     if stamps != sorted(stamps):
         return Outcome(FAILED, f"{what}: an older cloud was answered after a newer one", figures)

@@ -161,8 +161,8 @@ def _serve(part: str, limits: Limits, folder: Path, quiet: bool, connection: Con
             else:
                 seed, first, last, deadline = order
                 for number in range(first, last):
-                    case = module.case_of(seed, number) if monotonic() < deadline else None
-                    if case is None:
+                    case = module.case_of(seed, number)
+                    if case is None or monotonic() + case.seconds >= deadline:
                         break
                     outcome = _measured(attempt, case, limits)
                     connection.send(("outcome", number, outcome,

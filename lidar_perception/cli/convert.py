@@ -11,7 +11,6 @@ from rich.markup import escape
 
 from lidar_perception.cli.data import a_path, limit_option, opened, split_option
 from lidar_perception.runs.terminal import console, track
-from lidar_perception.wire.topics import POINTS
 
 BAG = "bag"
 DATASETS = ("kitti_object", "kitti_tracking", "nuscenes", "semantickitti")
@@ -30,8 +29,8 @@ LABELS = ("kitti_object", "kitti_tracking", "nuscenes_detection", "nuscenes_trac
               "Default: recognised.")
 @click.option("--detections", metavar="TOPIC", help="Take the boxes on this topic of the bag at "
               "PATH (MarkerArray or Detection3DArray), instead of its labels.")
-@click.option("--points", default=POINTS, show_default=True, metavar="TOPIC",
-              help="Clouds of a bag.")
+@click.option("--points", default="", metavar="TOPIC",
+              help="Clouds of a bag.  [default: /points, else the only ones]")
 @click.option("--images", is_flag=True, help="To a bag: include the left colour images, as PNG.")
 @split_option
 @limit_option

@@ -24,6 +24,7 @@ from lidar_perception.data.frame import BOXES, Recording
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.groups import renumbered
+from lidar_perception.nodes import require_rclpy
 from lidar_perception.nodes.graph import ALONE, FINAL, cloud_topic, result_topics
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console, errors, track
@@ -32,6 +33,7 @@ from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.scoring.recorded import Answered, answered
 from lidar_perception.types import CLASSES, PEDESTRIAN
 from lidar_perception.wire.messages import column, to_detections, to_frame, to_truth
+from lidar_perception.wire.topics import POINTS
 from lidar_perception.wire.track_markers import drawn_trails
 from msg_utils.stamps import to_ns
 
@@ -75,6 +77,7 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
     detector = detector or ("fused" if params == PAPER else CANDIDATES)
     if detector != CANDIDATES and params != PAPER:
         raise click.UsageError(f"--config and the parameters are those of --detector {CANDIDATES}")
+    require_rclpy()  # before the drive is made
     recording = None if data is None else opened(data)
     for old in ("drive", "result", "logs"):
         shutil.rmtree(out / old, ignore_errors=True)
@@ -119,7 +122,8 @@ def _params_of(detector: str, played: Recording, params: PipelineParams) -> Any:
 
 def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     """The bag to replay: the one that was given, or one made of it, or of a simulated drive."""
-    if recording is not None and isinstance(recording.frames, BagFrames):
+    if recording is not None and isinstance(recording.frames, BagFrames) and (
+            recording.frames.points == POINTS):
         return recording.path
     if recording is not None:
         found = track(recording, f"converting {recording.path}", len(recording))

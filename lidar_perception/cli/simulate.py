@@ -16,7 +16,7 @@ from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.simulation.dataset import LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import longest_drive
-from lidar_perception.simulation.scene import KINDS, Streets
+from lidar_perception.simulation.scene import SCENES, Streets
 from lidar_perception.simulation.sensor import GENERIC, NAMES, sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.types import InputError
@@ -28,14 +28,19 @@ from lidar_perception.types import InputError
               show_default=True, help="A rosbag2 bag, or the folders of one of these data sets.")
 @click.option("--sensor", "sensor_name", default="hdl64e", show_default=True,
               help=f"One of {', '.join(NAMES)}, a .yaml file (`setup` writes one), or {GENERIC}.")
+@click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
+              help="Height of the sensor above the ground. Default: what its file or preset says.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
               help="Number of scans; with --compare, one scan of each of that many streets.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
               help="Seed of the first street; the same seed gives the same bytes.")
-@click.option("--street", "kind", type=click.Choice(list(KINDS)), help="Streets of this kind only. "
-              "Default: all, as often as in KITTI.")
+@click.option("--scene", default="street", show_default=True, metavar="NAME",
+              help=f"One of {', '.join(SCENES)}, or several in turn, such as street,campus.")
+@click.option("--kind", "--street", "kind", metavar="KIND", help="Scenes of this kind only: "
+              + "; ".join(f"{name} {', '.join(one.kinds)}" for name, one in SCENES.items())
+              + ". Default: all.")
 @click.option("--people", type=click.FloatRange(0), default=1.0, show_default=True,
-              help="Pedestrians and cyclists, as a multiple of KITTI's.")
+              help="Pedestrians and cyclists, as a multiple of the usual; on streets of KITTI's.")
 @click.option("--streets-of", type=click.IntRange(1), metavar="N",
               help="Scans of each street. Default: 1 for kitti, a drive of 20 s for the others.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes that write the folders of a data "
@@ -48,11 +53,11 @@ from lidar_perception.types import InputError
 @a_path("--json", "With --compare: write every curve to this file.")
 @a_path("--png", "With --compare: draw every curve.")
 def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed: int,
-             kind: str | None, people: float, streets_of: int | None, jobs: int | None,
-             resume: bool, force: bool, compare: Path | None, json: Path | None,
-             png: Path | None) -> None:
-    """Write labelled scans of simulated streets as a bag or data set, or measure how realistic they
-    are.
+             scene: str, kind: str | None, people: float, mount_height: float,
+             streets_of: int | None, jobs: int | None, resume: bool, force: bool,
+             compare: Path | None, json: Path | None, png: Path | None) -> None:
+    """Write labelled scans of simulated streets, campuses or interiors as a bag or data set, or
+    measure how realistic those of streets are.
 
     A file INCOMPLETE marks an unfinished data set; --resume resumes it.
 
@@ -60,19 +65,22 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
     Examples:
       lidar-perception simulate --frames 100 --seed 7 --out drive
       lidar-perception simulate --format kitti --frames 1000 --out training_data
+      lidar-perception simulate --scene campus --sensor vlp-16 --mount-height 0.6 --out robot
       lidar-perception simulate --compare /data/kitti/object --png realism.png
     """
     if (out is None) == (compare is None):
         raise click.UsageError("give either --out FOLDER or --compare PATH")
-    streets = Streets(kind, people)
+    streets = Streets(kind, people, scene)
     if compare is not None:
+        if scene != "street":
+            raise click.UsageError("--compare compares streets, as all real data here does")
         _compare(compare, frames, seed, streets, json, png)
         return
     if json or png:
         raise click.UsageError("--json and --png go with --compare")
     if resume and force:
         raise click.UsageError("--resume resumes, --force starts over: give one of them")
-    sensor = sensor_named(sensor_name)
+    sensor = sensor_named(sensor_name, mount_height)
     plan = Plan(layout, sensor, seed, frames,
                 streets_of or (1 if layout == "kitti" else longest_drive(sensor)), streets)
     if layout == "mcap":
@@ -96,13 +104,16 @@ def _bag(out: Path, plan: Plan, force: bool) -> None:
 
 def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
               force: bool) -> None:
-    asked = {"format": plan.layout, "sensor": sensor_name, "seed": plan.seed,
-             "frames": plan.frames, "street": plan.streets.kind, "people": plan.streets.people,
-             "streets_of": plan.streets_of, "version": __version__}
+    streets = plan.streets
+    asked = {"format": plan.layout, "sensor": sensor_name, "height": plan.sensor.height,
+             "seed": plan.seed, "frames": plan.frames, "scene": streets.scene,
+             "street": streets.kind, "people": streets.people, "streets_of": plan.streets_of,
+             "version": __version__}
     asked["command"] = (f"lidar-perception simulate --format {plan.layout} --sensor {sensor_name} "
-                        f"--seed {plan.seed} --frames {plan.frames} "
-                        f"--people {plan.streets.people:g} --streets-of {plan.streets_of}"
-                        + (f" --street {plan.streets.kind}" if plan.streets.kind else ""))
+                        f"--mount-height {plan.sensor.height:g} --seed {plan.seed} "
+                        f"--frames {plan.frames} --scene {streets.scene} "
+                        f"--people {streets.people:g} --streets-of {plan.streets_of}"
+                        + (f" --street {streets.kind}" if streets.kind else ""))
     complete, begun = resume and is_finished(out), False
     try:
         with unfinished(out, asked, resume=resume, force=force) as missing:

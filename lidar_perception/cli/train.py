@@ -25,7 +25,7 @@ PAPER_ABLATION = (75.52, 80.15, 81.33, 83.44, 85.10, 86.33, 86.89, 88.96)  # pap
 
 OPTIONS = (
     click.option("--data", multiple=True, required=True, metavar="PATH|sim",
-                 help="What to train on: a data set or bag, or `sim` for simulated streets; may be "
+                 help="What to train on: a data set or bag, or `sim` for simulated scenes; may be "
                  "repeated to mix them."),
     click.option("--val", multiple=True, metavar="PATH|sim",
                  help="What to validate on. Default: frames held out of --data, and other "
@@ -107,6 +107,8 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
     \b
     Examples:
       lidar-perception train pointnet --data sim --out pointnet
+      lidar-perception train pointnet --data sim --scene campus,indoor --sensor vlp16 \\
+          --mount-height 0.6 --init package --out robot
       lidar-perception train pointnet --data /data/kitti/object --split train.txt \\
           --val-split val.txt --epochs 20 --out pointnet --resume
       lidar-perception train pointnet --ablation --data sim --steps 1000 --out ablation

@@ -15,6 +15,7 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import Bag
+from lidar_perception.data.cloud_files import SUFFIXES
 from lidar_perception.data.frame import (
     BOXES,
     CAMERA,
@@ -39,6 +40,7 @@ from lidar_perception.wire.topics import (
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import SECOND, to_ns
 
+CLOUD = "sensor_msgs/msg/PointCloud2"
 # What is known by these topics
 BESIDE = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}, POSES: {ODOMETRY}}
 
@@ -46,14 +48,30 @@ BESIDE = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}, POSES: {ODOMETRY}}
 def recognises(path: Path) -> bool:
     """Whether a bag lies there: a file, or a folder with one."""
     if path.is_file():
-        return True  # nothing else is one file
+        return path.suffix not in SUFFIXES  # nothing else is one file
     return (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
 
 
-def open_recording(path: Path, *, points: str = POINTS, scans: bool = True) -> Recording:
-    """Frames of the clouds on the topic `points`. InputError if there is none."""
+def cloud_topic(bag: Bag, points: str = "") -> str:
+    """The topic of a bag to take the clouds from: points, where one is named, else /points, else
+    the only one with clouds. InputError where there is none, or several."""
+    clouds = sorted(topic for topic, kind in bag.topics.items()
+                    if kind == CLOUD and bag.counts[topic])
+    if not points and POINTS not in clouds and len(clouds) > 1:
+        raise InputError(f"{bag.path} has clouds on {', '.join(clouds)}; name the topic of one, as "
+                         f"in {bag.path}:{clouds[0]}")
+    chosen = points or (clouds[0] if clouds and POINTS not in clouds else POINTS)
+    bag.require(chosen)
+    if bag.topics[chosen] != CLOUD:
+        raise InputError(f"{bag.path} has {bag.topics[chosen]} on {chosen}, no clouds; name "
+                         f"another topic, as in {bag.path}:/points")
+    return chosen
+
+
+def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
+    """Frames of the clouds on a topic, see cloud_topic."""
     with Bag(path) as bag:
-        bag.require(points)
+        points = cloud_topic(bag, points)
         topics = {topic for topic, count in bag.counts.items() if count}
         frames = BagFrames(path, points, bag.topics[points], bag.counts[points])
         labelled = False

@@ -14,6 +14,7 @@ import numpy as np
 from lidar_perception.camera import Camera
 from lidar_perception.classes import CLASSES, DETECTED, PEDESTRIAN, TABLE
 from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag_frames import cloud_topic
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.results import read_results
 from lidar_perception.detectors.contract import Detector
@@ -24,14 +25,14 @@ from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_t
 from lidar_perception.scoring.recorded import by_stamp
 from lidar_perception.types import Detections, GroundTruth, InputError
 from lidar_perception.wire.messages import column, to_detections, to_frame
-from lidar_perception.wire.topics import POINTS, TRUTH
+from lidar_perception.wire.topics import TRUTH
 from msg_utils.markers import MarkedObjects
 
 Array = np.ndarray[Any, Any]
 SIMILAR = {row.name: row.looks_like or row.name for row in TABLE}
-MARKERS, CLOUD = "visualization_msgs/msg/MarkerArray", "sensor_msgs/msg/PointCloud2"
+MARKERS = "visualization_msgs/msg/MarkerArray"
 FOUND, TRACKS = "/output/detections", "/output/tracks"  # the end of a topic, of whatever node
-CLUSTERED = ("/clustering/output/points", "/perception/output/points", POINTS)
+CLUSTERED = ("/clustering/output/points", "/perception/output/points")
 KEPT = 2000                                  # frames whose detections are kept
 
 
@@ -132,16 +133,11 @@ def by_files(folder: Path) -> Source:
 
 
 def points_topic(path: Path) -> str:
-    """The topic of a bag with the clouds that say most: clustered ones, else /points, else the only
-    one there. InputError where that is not clear."""
+    """The topic of a bag with the clouds that say most: clustered ones, else those of
+    bag_frames.cloud_topic. InputError where that is not clear."""
     with Bag(path) as bag:
-        clouds = sorted(topic for topic, kind in bag.topics.items()
-                        if kind == CLOUD and bag.counts[topic])
-    known = [topic for topic in CLUSTERED if topic in clouds]
-    if not known and len(clouds) != 1:
-        raise InputError(f"{path} has clouds on {', '.join(clouds) or 'no topic'}; name one with "
-                         "--points")
-    return (known or clouds)[0]
+        known = [topic for topic in CLUSTERED if bag.counts.get(topic)]
+        return known[0] if known else cloud_topic(bag)
 
 
 def recorded(path: Path, stamps: list[int]) -> Results:

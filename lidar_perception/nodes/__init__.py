@@ -21,3 +21,14 @@ NODES = {
     "fused_detector": ("FusedNode", "detectors.fused.params.FusedDetectorParams", _DETECTIONS),
     "tracker": ("TrackerNode", "params.TrackerNodeParams", "params.TrackInputParams"),
 }
+
+
+def require_rclpy() -> None:
+    """InputError where rclpy is not installed, or cannot be loaded."""
+    from lidar_perception.types import InputError
+    try:
+        import rclpy  # noqa: F401
+    except ImportError as error:
+        reason = str(error).splitlines()[0]
+        raise InputError(f"cannot load rclpy ({reason}): source ROS 2 Jazzy, or pip install "
+                         "'lidar_perception[ros]'") from None

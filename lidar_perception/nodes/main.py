@@ -13,7 +13,8 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from lidar_perception.nodes import NODES
+from lidar_perception.nodes import NODES, require_rclpy
+from lidar_perception.nodes.shared_memory import fed_by_a_driver, use_large_shared_memory
 from lidar_perception.runs.threads import one_thread_each
 
 if TYPE_CHECKING:
@@ -43,45 +44,6 @@ def help_text(name: str) -> str:
 
 
 STOP_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
-PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-PROFILES = {256 * 2**20: "fastdds.xml", 40 * 2**20: "fastdds_small.xml"}  # free bytes needed
-DRIVER_PROFILE, SOCKET_BUFFER = "fastdds_driver.xml", 2 * 2**20  # bytes of net.core.rmem_max needed
-
-
-def use_large_shared_memory(from_driver: bool = False) -> None:
-    """Let Fast DDS pass whole clouds through shared memory, see fastdds.xml; less of it where
-    /dev/shm is small, as the 64 MB of a container are. With from_driver, clouds come by UDP where
-    the socket's buffer can hold one, see fastdds_driver.xml. A profile of the user's own stays."""
-    if any(os.environ.get(name) for name in PROFILE_VARIABLES):
-        return
-    try:
-        memory = os.statvfs("/dev/shm")
-    except OSError:
-        return
-    free = memory.f_bavail * memory.f_frsize
-    profile = next((name for needed, name in PROFILES.items() if free >= needed), None)
-    if profile != "fastdds.xml":
-        print(f"/dev/shm has only {free / 2**20:.0f} MB free, so clouds above "
-              f"{3 if profile else 0} MB may get lost between processes; start the container with "
-              "--shm-size=1g", file=sys.stderr)
-    if from_driver and profile == "fastdds.xml" and socket_buffer() >= SOCKET_BUFFER:
-        profile = DRIVER_PROFILE
-    if profile:
-        for name in PROFILE_VARIABLES:
-            os.environ[name] = str(Path(__file__).with_name(profile))
-
-
-def socket_buffer() -> int:
-    """net.core.rmem_max, bytes that a socket may hold; 0 where it is not known."""
-    try:
-        return int(Path("/proc/sys/net/core/rmem_max").read_text())
-    except (OSError, ValueError):
-        return 0
-
-
-def fed_by_a_driver(arguments: list[str]) -> bool:
-    """Whether a node's clouds come from outside: those of our nodes are NODE/output/points."""
-    return not any(word.endswith("/output/points") for word in arguments)
 
 
 @contextmanager
@@ -106,20 +68,21 @@ def run(name: str, arguments: list[str]) -> int:
     use_large_shared_memory(fed_by_a_driver(arguments))
     from lidar_perception.nodes.stopping import Stop
     stop = Stop(STOP_SIGNALS)
+    from lidar_perception.types import InputError
     try:
-        import rclpy
-    except ImportError:
-        print("rclpy is missing: install ROS 2 Jazzy, or pip install 'lidar_perception[ros]'",
-              file=sys.stderr)
+        require_rclpy()
+    except InputError as error:
+        print(error, file=sys.stderr)
         return 2
     module = importlib.import_module(f"lidar_perception.nodes.{name}")
     if hasattr(module, "warm_up"):
         with one_at_a_time():
             module.warm_up()
-    return _spin(getattr(module, NODES[name][0]), rclpy, arguments, perf_counter() - begin, stop)
+    return _spin(getattr(module, NODES[name][0]), arguments, perf_counter() - begin, stop)
 
 
-def _spin(node_class: type, rclpy, arguments: list[str], seconds: float, stop: Stop) -> int:
+def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) -> int:
+    import rclpy
     from rclpy.exceptions import ParameterException
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions

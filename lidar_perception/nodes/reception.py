@@ -15,7 +15,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from lidar_perception.nodes.main import SOCKET_BUFFER, socket_buffer
+from lidar_perception.nodes.shared_memory import SOCKET_BUFFER, socket_buffer
 from lidar_perception.params import ReceptionParams
 
 WARN, ERROR, STALE = DiagnosticStatus.WARN, DiagnosticStatus.ERROR, DiagnosticStatus.STALE

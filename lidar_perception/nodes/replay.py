@@ -22,7 +22,7 @@ from lidar_perception.nodes.graph import (
     result_topics,
     wait_for,
 )
-from lidar_perception.nodes.main import use_large_shared_memory
+from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors, progress
 from lidar_perception.tracking.ego import has_odometry

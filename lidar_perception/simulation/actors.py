@@ -12,9 +12,11 @@ from numba import njit
 
 from lidar_perception.simulation.shapes.thing import Thing, rigid
 from lidar_perception.simulation.solids import hull
+from lidar_perception.simulation.way import Way
 
 HEAD_ROOM = 2.2  # metres; what hangs higher is in nobody's way
 SIGHT, FAR_SIGHT = 80.0, 120.0  # metres from the sensor; what is farther is left out of a moment;
+STEP = 0.1                      # s between the places of a robot that others keep clear of
 LARGE = 5.0                     # FAR_SIGHT is for what is so large, m
 
 
@@ -125,24 +127,46 @@ def _apart(one, other, t):
             - one[Y] - math.sin(one[HEADING]) * way)
 
 
+@njit(cache=True, nogil=True)
+def _meets_way(one, way, radius):
+    """Whether a footprint (8,) comes within radius of a way (T, 3), [t x y]; as both move between
+    the times of the way, half of what they cover in a step is added."""
+    cos, sin = math.cos(one[HEADING]), math.sin(one[HEADING])
+    for k in range(len(way)):
+        t, last = way[k, 0], way[max(k - 1, 0)]
+        moved = one[SPEED] * min(max(t - one[START], 0.0), one[STOP] - one[START])
+        x, y = way[k, 1] - one[X] - cos * moved, way[k, 2] - one[Y] - sin * moved
+        outside = math.hypot(max(abs(cos * x + sin * y) - one[LENGTH], 0.0),
+                             max(abs(cos * y - sin * x) - one[WIDTH], 0.0))
+        covered = one[SPEED] * (t - last[0]) + math.hypot(way[k, 1] - last[1], way[k, 2] - last[2])
+        if outside < radius + covered / 2:
+            return True
+    return False
+
+
 class Room:
     """The actors of a street so far; a newcomer must keep clear of all of them all the time."""
 
-    def __init__(self, seconds: float, keep_clear: np.ndarray):
-        """keep_clear (M, 8): footprints that are taken from the start."""
+    def __init__(self, seconds: float, keep_clear: np.ndarray | None = None,
+                 way: Way | None = None, radius: float = 0.0):
+        """keep_clear (M, 8): footprints that are taken from the start; way: of a round robot of
+        that radius, m."""
         self.seconds = seconds
+        self._way = np.empty((0, 3)) if way is None else way.sampled(seconds, STEP)
+        self._radius = radius
         self.actors: list[Actor] = []
         self._taken, self._reach, self._used = np.empty((64, 8)), np.empty(64), 0
-        for row in keep_clear:
+        for row in () if keep_clear is None else keep_clear:
             self._take(row)
 
     def admit(self, *group: Actor, gap: float = 0.1) -> bool:
-        """Adds the group if none of it ever comes within gap of anyone else, nor meets another of
-        its own."""
+        """Adds the group if none of it ever comes within gap of anyone else, the robot too, nor
+        meets another of its own."""
         before = self._used
         for actor in group:
             row, own = actor.footprint, slice(before, self._used)
-            if (_meet_any(row, self._taken[:before], self._reach, self.seconds, gap)
+            if (_meets_way(row, self._way, self._radius + gap)
+                    or _meet_any(row, self._taken[:before], self._reach, self.seconds, gap)
                     or _meet_any(row, self._taken[own], self._reach[own], self.seconds, 0.0)):
                 self._used = before
                 return False

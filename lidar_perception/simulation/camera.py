@@ -42,6 +42,11 @@ def labels_in_view(truth: GroundTruth) -> GroundTruth:
     return _part(truth, seen)
 
 
+def labels_around(truth: GroundTruth) -> GroundTruth:
+    """The labelled objects all around, where no camera says what is labelled."""
+    return _part(truth, worth_a_label(truth))
+
+
 def kitti_labels(truth: GroundTruth, camera: Calibration = FORWARD_CAMERA) -> GroundTruth:
     """What a KITTI label file has: the labelled objects of which a part is in the image, and as
     notes the regions of the others, DontCare."""

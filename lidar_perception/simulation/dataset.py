@@ -40,6 +40,7 @@ class Plan:
 
     def __post_init__(self) -> None:
         most = longest_drive(self.sensor)
+        self.streets.sorts()
         for wrong, what in (
                 (self.layout not in ("mcap", *LAYOUTS), f"layout = {self.layout!r} must be one of "
                                              f"{', '.join(LAYOUTS)}"),

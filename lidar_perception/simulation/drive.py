@@ -69,11 +69,12 @@ def scan_at(seed: int, i: int, sensor: Sensor, streets: Streets = ANY) -> Simula
     scene, sensor = _street(seed, streets), sensor.at_turn(i)
     moment = scene.at(i / sensor.rate, sensor.height)
     hits = cast(moment.solids, scene.ground, moment.position, sensor, moment.motion,
-                (seed << 20) + i)
+                (seed << 20) + i, moment.heading)
     got = returns_of(hits, sensor, moment.motion, np.random.default_rng([seed, i]))
     stamp = START_NS + round(i * 10**9 / sensor.rate)
-    pose = np.eye(4)
-    pose[:3, 3] = moment.position - scene.sensor_position(0.0, sensor.height)
+    first, pose = (scene.sensor_pose(t, sensor.height) for t in (0.0, i / sensor.rate))
+    pose[:3, 3] -= first[:3, 3]
+    pose[:3] = first[:3, :3].T @ pose[:3]
     return SimulatedScan(
         LidarFrame(got.xyz, got.intensity, stamp, LIDAR_FRAME), truth(moment, hits, got.owner),
         _moving(moment, got.owner, got.semantic), got.owner.astype(np.uint16), got.ring, got.time,

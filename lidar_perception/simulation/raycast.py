@@ -5,11 +5,13 @@ window (windows.py) of a depth buffer. Those that nobody labels come last and fr
 that most of their rays are found hidden with one comparison; then the ground, which takes longest,
 where it may be nearer.
 Beams at the edges of things are cast once more, into their footprint: see edges.py.
-Solids are in the sensor's frame at the stamp; the ground is in the world, whose axes are parallel.
+Solids are in the sensor's frame at the stamp; the ground is in the world, against which that frame
+is turned about z alone.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -51,10 +53,10 @@ class Turn(NamedTuple):
 
 
 def cast(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sensor,
-         motion: Motion = STILL, seed: int = 0) -> Hits:
+         motion: Motion = STILL, seed: int = 0, heading: float = 0.0) -> Hits:
     """Cast all rays of one turn of a sensor at position (3,) m in the world at the stamp, over the
-    road; motion: of the sensor; seed, a whole number (its lowest 64 bits count): of what is left to
-    chance."""
+    ground, that looks along heading; motion: of the sensor, in its own frame; seed, a whole number
+    (its lowest 64 bits count): of what is left to chance."""
     salt = np.uint64(mixed(np.uint64(seed % (1 << 64))))
     made = rays(sensor, motion)
     turn = Turn(made.direction, made.since, sensor.origins()[:, 2].copy())
@@ -62,6 +64,7 @@ def cast(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sensor,
     scene = (shapes_of(solids, motion, salt), seen,
              np.lexsort((seen.near, solids.owner, solids.owner == 0)), compiled(ground),
              np.array(position, np.float64), np.array(motion.velocity, np.float64),
+             (math.cos(heading), math.sin(heading)),
              float(sensor.max_range), foliage.FILLED)
     shape = (sensor.columns, sensor.rings)
     hits = Hits(np.empty(shape), np.empty(shape), np.empty(shape), np.empty(shape, np.int32),
@@ -77,8 +80,8 @@ def cast(solids: Solids, ground: Ground, position: np.ndarray, sensor: Sensor,
 
 
 @njit(cache=True, nogil=True)
-def _first(hits, turn, only, shapes, seen, order, ground, position, velocity, max_range, filled,
-           counting):
+def _first(hits, turn, only, shapes, seen, order, ground, position, velocity, facing, max_range,
+           filled, counting):
     """Fills the hits of only those rays, (columns, rings) bool; reached only where counting.
     order: owner by owner, then from near to far what has none."""
     hits.range[:] = np.inf
@@ -87,14 +90,15 @@ def _first(hits, turn, only, shapes, seen, order, ground, position, velocity, ma
     columns, rings = only.shape
     for column in range(columns):
         since = turn.since[column]
-        x, y, z = (position[0] + velocity[0] * since, position[1] + velocity[1] * since,
-                   position[2] + velocity[2] * since)
+        along, aside, up = _turned(velocity, facing)
+        x, y, z = position[0] + along * since, position[1] + aside * since, position[2] + up * since
         for ring in range(rings):
             if only[column, ring]:
-                start, way = (x, y, z + turn.lift[ring]), _way(turn, column, ring)
+                way = _way(turn, column, ring)
+                start, down = (x, y, z + turn.lift[ring]), _turned(way, facing)
                 far, s = hits.range[column, ring], hits.solid[column, ring]
-                if not far < not_before(ground, start, way):
-                    met = cast_ground(ground, start, way, max_range)
+                if not far < not_before(ground, start, down):
+                    met = cast_ground(ground, start, down, max_range)
                     if s < 0 or np.float32(met.range) < np.float32(far):
                         _write(hits, column, ring, Met(met.range, met.brightness, met.cosine, 0,
                                                        met.semantic, -1))
@@ -106,6 +110,14 @@ def _first(hits, turn, only, shapes, seen, order, ground, position, velocity, ma
                                                    shapes.semantic[s], s))
                 else:
                     _write(hits, column, ring, Met(np.inf, 0.0, 0.0, 0, 0, -1))
+
+
+@njit(cache=True, nogil=True)
+def _turned(vector, facing):
+    """A vector (x, y, z) of the sensor's frame in the world; facing: cosine and sine of the
+    heading."""
+    cos, sin = facing
+    return cos * vector[0] - sin * vector[1], sin * vector[0] + cos * vector[1], vector[2]
 
 
 @njit(cache=True, nogil=True)

@@ -7,10 +7,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from lidar_perception.simulation.actors import Actor, Room, prop
+from lidar_perception.simulation.places import Side, evenly_spaced, scattered
 from lidar_perception.simulation.shapes import furniture, vegetation
 from lidar_perception.simulation.shapes.buildings import building
 from lidar_perception.simulation.solids import extents
-from lidar_perception.simulation.street import CORNER, Kind, Side, Street, evenly_spaced, scattered
+from lidar_perception.simulation.street import CORNER, Kind, Street
 
 PLANTS = {70, 71}  # of SemanticKITTI
 BORDERS = (*[vegetation.hedge] * 3, *[furniture.fence] * 2, furniture.wall)

@@ -1,33 +1,56 @@
-"""A drive along a street: what that is in the LiDAR frame at any time."""
+"""A drive through a scene: what that is in the LiDAR frame at any time.
+
+A scene is a ground, things that stand or move on it, and the way of the sensor. Places make them: a
+street for a car, or where robots are that drive on no road.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidar_perception.simulation import campus, indoor
 from lidar_perception.simulation.actors import FAR_SIGHT, LARGE, SIGHT, Actor, Room
 from lidar_perception.simulation.roadside import furnish
 from lidar_perception.simulation.sensor import Motion
 from lidar_perception.simulation.solids import PART, Solids, hull, place
-from lidar_perception.simulation.street import KINDS, lay_out
+from lidar_perception.simulation.street import KINDS, Kind, lay_out
 from lidar_perception.simulation.terrain import Ground, surface_height
 from lidar_perception.simulation.traffic import populate
+from lidar_perception.simulation.way import SECONDS, Way
 from lidar_perception.types import CLASSES, InputError
 
-SECONDS = 20.0  # for so long nobody walks or drives into anything
 EGO = (3.0, 1.1)  # half length and width that the ego vehicle keeps clear, m
 
 
 class Streets(NamedTuple):
-    """Which streets, see make_scene: all kinds, or one; how many times as many people as in
-    KITTI."""
+    """Which scenes, see make_scene: all kinds, or one; how many times as many people as usual;
+    scene: one of SCENES, or several with commas between, in turn from seed to seed."""
 
     kind: str | None = None
     people: float = 1.0
+    scene: str = "street"
+
+    def sorts(self) -> list[Sort]:
+        """In the order of their turns. InputError for an unknown scene or kind."""
+        names = self.scene.split(",")
+        if unknown := [name for name in names if name not in SCENES]:
+            raise InputError(f"unknown scene {unknown[0]!r}: must be one of {', '.join(SCENES)}, "
+                             "or several with commas between")
+        kinds = dict.fromkeys(kind for name in names for kind in SCENES[name].kinds)
+        if self.kind is not None and any(self.kind not in SCENES[name].kinds for name in names):
+            raise InputError(f"kind = {self.kind!r} must be one of {', '.join(kinds)}")
+        return [SCENES[name] for name in names]
+
+    @property
+    def camera(self) -> bool:
+        """Whether all have a camera that looks ahead, beyond whose image nothing is labelled."""
+        return all(sort.camera for sort in self.sorts())
 
 
 ANY = Streets()
@@ -35,12 +58,14 @@ CROWDED = Streets("zone", 3.0)  # for demos and tests of pedestrian detectors
 
 
 class Moment(NamedTuple):
-    """The scene at one time, as the sensor at position (3,) in the world finds it. boxes (K, 7)
-    as in GroundTruth, class_ids (K,) int32, track_ids (K,) int32 in 1.., which are also the
-    solids' owners, speeds (K,) m/s over the ground, motion of the sensor."""
+    """The scene at one time, as the sensor at position (3,) in the world, which looks along
+    heading, finds it. boxes (K, 7) as in GroundTruth, class_ids (K,) int32, track_ids (K,) int32
+    in 1.., which are also the solids' owners, speeds (K,) m/s over the ground, motion of the
+    sensor."""
 
     solids: Solids
     position: np.ndarray
+    heading: float
     boxes: np.ndarray
     class_ids: np.ndarray
     track_ids: np.ndarray
@@ -50,24 +75,29 @@ class Moment(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """A street along x. The ego vehicle drives at y = 0 from x = 0 at speed m/s; all vehicles stay
-    upright, so that the ground has its slope in the LiDAR frame too. The labelled actors have the
-    track ids 1.. in their order. seconds: how long the drive may be."""
+    """Things on a ground, and a sensor that goes its way. Robots and all vehicles stay upright, so
+    that the ground has its slope in the LiDAR frame too. The labelled actors have the track ids
+    1.. in their order. seconds: how long the drive may be."""
 
     ground: Ground
     actors: tuple[Actor, ...]
-    speed: float
+    way: Way = Way()
     kind: str = ""
     seconds: float = SECONDS
 
-    def sensor_position(self, t: float, sensor_height: float) -> np.ndarray:
-        """(3,) float64 in the world after t seconds."""
-        ego = np.array([self.speed * t, 0.0])
-        return np.array([*ego, surface_height(self.ground, *ego) + sensor_height])
+    def sensor_pose(self, t: float, sensor_height: float) -> np.ndarray:
+        """(4, 4) float64 from the sensor's frame after t seconds to the world."""
+        along, pose = self.way.at(t), np.eye(4)
+        cos, sin = math.cos(along.heading), math.sin(along.heading)
+        pose[:2, :2] = (cos, -sin), (sin, cos)
+        pose[:3, 3] = (along.x, along.y,
+                       surface_height(self.ground, along.x, along.y) + sensor_height)
+        return pose
 
     def at(self, t: float, sensor_height: float) -> Moment:
-        """The scene after t seconds, relative to a sensor so high above the road."""
-        sensor = self.sensor_position(t, sensor_height)
+        """The scene after t seconds, relative to a sensor so high above the ground."""
+        along, pose = self.way.at(t), self.sensor_pose(t, sensor_height)
+        sensor, turned = pose[:3, 3].copy(), pose[:3, :3]
         ego = sensor[:2]
         a = self._table
         way = a["speed"] * np.clip(t - a["start"], 0.0, a["stop"] - a["start"])
@@ -75,21 +105,23 @@ class Scene:
         near = np.flatnonzero(np.hypot(*(flat - ego).T) <= a["sight"])
         a, way, flat = a[near], way[near], flat[near]
         feet = np.where(np.isnan(a["feet"]), surface_height(self.ground, *flat.T), a["feet"])
-        base = np.column_stack([flat, feet]) - sensor
+        base = (np.column_stack([flat, feet]) - sensor) @ turned
+        heading = a["heading"] - along.heading
         speed = np.where((a["start"] <= t) & (t < a["stop"]), a["speed"], 0.0)
-        velocity = self._climbing(a["forward"] * speed[:, None])
+        velocity = self._climbing(a["forward"] * speed[:, None]) @ turned
 
         made = [self.actors[i].thing.parts(s) for i, s in zip(near.tolist(), way.tolist())]
         whose = np.repeat(np.arange(len(made)), [len(m) for m in made])
-        solids = place(_joined(made), base[whose],
-                       a["heading"][whose], a["track"][whose], velocity[whose])
+        solids = place(_joined(made), base[whose], heading[whose], a["track"][whose],
+                       velocity[whose])
 
         known = np.flatnonzero(a["track"])
-        boxes = np.column_stack([base, a["size"], a["heading"]])[known]
+        boxes = np.column_stack([base, a["size"], heading])[known]
         boxes[:, 2] += boxes[:, 5] / 2
-        motion = Motion(tuple(self._climbing(np.array([[self.speed, 0.0]]))[0].tolist()))
-        return Moment(solids, sensor, boxes, a["class"][known], a["track"][known], speed[known],
-                      motion)
+        moved = (self._climbing(np.array([along.velocity])) @ turned)[0]
+        motion = Motion(tuple(moved.tolist()), along.yaw_rate)
+        return Moment(solids, sensor, along.heading, boxes, a["class"][known], a["track"][known],
+                      speed[known], motion)
 
     @cached_property
     def _table(self) -> np.ndarray:
@@ -139,26 +171,47 @@ def _corners(f: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             y + np.sin(heading) * ahead + np.cos(heading) * aside)
 
 
-def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0) -> Scene:
-    """A street of its own for every seed. kind: one of KINDS; None draws it by their
-    shares. people: multiplies how many pedestrians, sitting people and cyclists are tried; 1 comes
-    near KITTI's labels, 0 is none.
+def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0,
+               scene: str = "street") -> Scene:
+    """A scene of its own for every seed. kind: one of those of the scene; None draws it by their
+    shares. people: multiplies how many pedestrians, sitting people and cyclists are tried; on
+    streets 1 comes near KITTI's labels, 0 is none. scene: see Streets.
 
     What is placed later is dropped where it would ever touch what is there already. InputError
-    for a negative seed or people and an unknown kind.
+    for a negative seed or people and an unknown scene or kind.
     """
     if seed < 0:
         raise InputError(f"seed = {seed} must not be negative")
     if not 0 <= people < np.inf:
         raise InputError(f"people = {people} must be 0 or more, such as 1")
-    if kind is not None and kind not in KINDS:
-        raise InputError(f"kind = {kind!r} must be one of {', '.join(KINDS)}")
+    sorts = Streets(kind, people, scene).sorts()
+    chosen = sorts[seed % len(sorts)]
     rng = np.random.default_rng(seed)
-    drawn = str(rng.choice(list(KINDS), p=[k.share for k in KINDS.values()]))
+    drawn = str(rng.choice(list(chosen.kinds), p=[k.share for k in chosen.kinds.values()]))
     kind = kind or drawn
-    street = lay_out(rng, KINDS[kind], SECONDS)
+    return Scene(*chosen.make(rng, chosen.kinds[kind], people), kind)
+
+
+def _street(rng: np.random.Generator, kind: Kind,
+            people: float) -> tuple[Ground, tuple[Actor, ...], Way]:
+    """A street along x, and a car that drives at y = 0."""
+    street = lay_out(rng, kind, SECONDS)
     ego = [0.0, 0.0, 0.0, *EGO, street.speed, 0.0, np.inf]
     room = Room(SECONDS, np.array([ego]))
     furnish(rng, street, room)
     populate(rng, street, room, people)
-    return Scene(street.ground, tuple(room.actors), street.speed, kind)
+    return street.ground, tuple(room.actors), Way(street.speed)
+
+
+class Sort(NamedTuple):
+    """A sort of scene: its kinds by name, each with the share that it is drawn with; make(rng,
+    kind, people): ground, actors and way; camera: see Streets."""
+
+    kinds: dict[str, Any]
+    make: Callable[[np.random.Generator, Any, float], tuple[Ground, tuple[Actor, ...], Way]]
+    camera: bool = False
+
+
+SCENES = {"street": Sort(KINDS, _street, camera=True), "campus": Sort(campus.KINDS, campus.make),
+          "indoor": Sort(indoor.KINDS, indoor.make)}
+

@@ -250,10 +250,15 @@ def hdl64e(rate: float = 10.0) -> Sensor:
     return replace(HDL64E, azimuth_step=2 * np.pi / columns, rate=rate)
 
 
-def sensor_named(name: str) -> Sensor:
+def sensor_named(name: str, height: float = 0.0) -> Sensor:
     """The sensor of a YAML file (see sensor_from_file), the one of that name, however it is
-    written (vlp-16, VLP16), or a generic one as GENERIC says. InputError, which names them all, for
-    anything else."""
+    written (vlp-16, VLP16), or a generic one as GENERIC says; at another height above the ground if
+    that is not 0, metres. InputError, which names them all, for anything else."""
+    sensor = _named(name)
+    return replace(sensor, height=height) if height else sensor
+
+
+def _named(name: str) -> Sensor:
     if name.startswith("generic:"):
         try:
             beams, *numbers = map(float, name.removeprefix("generic:").split(","))

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from lidar_perception.simulation.actors import Actor, prop
-from lidar_perception.simulation.shapes.thing import Thing
+from lidar_perception.simulation.places import Side
 from lidar_perception.simulation.terrain import Ground
 
 BEHIND, AHEAD = 100.0, 130.0  # metres of street behind the start and beyond the end of a drive
@@ -76,28 +74,6 @@ class Lane(NamedTuple):
     direction: int
     speed: float
     use: str = "road"
-
-
-class Side(NamedTuple):
-    """The line of a curb from x, y along heading. What is beyond it lies to its left: walk metres
-    of sidewalk, then the front. parking: width of the strip on this side of the curb."""
-
-    x: float
-    y: float
-    heading: float
-    length: float
-    walk: float
-    front: str
-    parking: float = 0.0
-
-    def put(self, thing: Thing | np.ndarray, along: float, out: float, turn: float = 0.0,
-            **moves) -> Actor:
-        """An actor so far along the curb and out from it, turned against its line; parts (P,) PART
-        are a thing without a label."""
-        thing = prop(thing) if isinstance(thing, np.ndarray) else thing
-        cos, sin = math.cos(self.heading), math.sin(self.heading)
-        return Actor(thing, self.x + cos * along - sin * out, self.y + sin * along + cos * out,
-                     self.heading + turn, **moves)
 
 
 class Street(NamedTuple):
@@ -198,14 +174,3 @@ def _arm(front: str, x: float, land: int, curb: float, up: int, walk: float,
 def parked_width(crossing: tuple[float, float]) -> float:
     """The width of the parking strips on both sides of a side street."""
     return PARALLEL if crossing[1] - crossing[0] > 8.0 else 0.0
-
-
-def evenly_spaced(rng, length: float, spacing: float) -> np.ndarray:
-    """Places along a length, spacing apart in the mean."""
-    places = np.arange(rng.uniform(0, spacing), length, spacing)
-    return np.clip(places + rng.uniform(-0.2, 0.2, len(places)) * spacing, 0, length)
-
-
-def scattered(rng, length: float, rate: float) -> np.ndarray:
-    """Places along a length, rate of them on 100 m in the mean, each on its own."""
-    return rng.uniform(0, length, rng.poisson(max(length, 0.0) * rate / 100))

@@ -48,6 +48,9 @@ class Ground(NamedTuple):
     grass: float = 0.35
 
 
+PAVEMENT = Ground(curb_left=-1e6, curb_right=-1e6 - 1)  # level, and all of it a sidewalk
+
+
 class GroundHit(NamedTuple):
     """What a ray meets of the ground: range m, inf where nothing; brightness and cosine of the
     incidence, 0 where nothing; semantic class, 0 where nothing."""

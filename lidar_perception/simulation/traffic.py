@@ -7,26 +7,19 @@ from collections.abc import Iterator
 import numpy as np
 
 from lidar_perception.simulation.actors import SIGHT, Actor, Room
+from lidar_perception.simulation.crowd import standing, walking
+from lidar_perception.simulation.places import Side, scattered
 from lidar_perception.simulation.shapes.cyclists import cyclist, parked_bicycle, parked_motorcycle
 from lidar_perception.simulation.shapes.furniture import bench
 from lidar_perception.simulation.shapes.heavy_vehicles import bus, tram, truck
-from lidar_perception.simulation.shapes.people import CARRIED, pedestrian, sitting
+from lidar_perception.simulation.shapes.people import sitting
 from lidar_perception.simulation.shapes.thing import Thing, block, disc, rigid
 from lidar_perception.simulation.shapes.vehicles import car, van
 from lidar_perception.simulation.solids import parts
-from lidar_perception.simulation.street import (
-    CORNER,
-    PARALLEL,
-    Lane,
-    Side,
-    Street,
-    parked_width,
-    scattered,
-)
+from lidar_perception.simulation.street import CORNER, PARALLEL, Lane, Street, parked_width
 
 DRAWBAR = 0.8  # between a car and what it pulls, m
 FREE = 5.0     # nobody parks so near to a crossing, m
-STANDING, WALKING = (0.55, 0.3, 0.1, 0.05), (0.62, 0.3, 0.08)  # chances of groups of 1, 2, ..
 OTHER_VEHICLE = 20  # of SemanticKITTI
 
 
@@ -49,10 +42,10 @@ def populate(rng: np.random.Generator, street: Street, room: Room, people: float
     for actor in _riders(rng, street, room.seconds, people):
         room.admit(actor, gap=0.3)
     for side in blocks:
-        for group in _standing(rng, side, kind.standers * people):
+        for group in standing(rng, side, kind.standers * people):
             room.admit(*group)
     for side in (*blocks, *_crosswalks(street)):
-        for group in _walking(rng, side, kind.walkers * people, roam=kind.curb < 0.05):
+        for group in walking(rng, side, kind.walkers * people, roam=kind.curb < 0.05):
             room.admit(*group)
 
 
@@ -200,41 +193,6 @@ def _riders(rng, street: Street, seconds: float, people: float) -> Iterator[Acto
             made = parked_bicycle if rng.random() < 0.75 else parked_motorcycle
             for i in range(rng.integers(1, 6)):
                 yield side.put(made(rng), along + 0.75 * i, out, turn)
-
-
-def _pedestrian(rng, speed: float = 0.0) -> Thing:
-    carried = rng.choice(CARRIED, p=(0.6, 0.14, 0.14, 0.04, 0.04, 0.04))
-    return pedestrian(rng, speed, child=rng.random() < 0.08, carried=str(carried))
-
-
-def _standing(rng, side: Side, rate: float) -> Iterator[list[Actor]]:
-    """People who wait, and some who talk and face one another."""
-    for along in scattered(rng, side.length, rate):
-        out, many = rng.uniform(0.4, max(side.walk - 0.4, 1.0)), rng.choice([1, 2, 3, 4],
-                                                                            p=STANDING)
-        first, wide = rng.uniform(-np.pi, np.pi), rng.uniform(0.5, 0.7) * (many > 1)
-        angles = first + 2 * np.pi / many * np.arange(many)
-        yield [side.put(_pedestrian(rng), along + wide * np.cos(a), out + wide * np.sin(a),
-                        a + np.pi + rng.normal(0, 0.15)) for a in angles]
-
-
-def _walking(rng, side: Side, rate: float, roam: bool) -> Iterator[list[Actor]]:
-    """People on their way along a sidewalk, alone, in pairs or more; where they may roam, on the
-    road and in any direction, too. Some start or stop on the way."""
-    for along in scattered(rng, side.length, rate):
-        speed = float(np.clip(rng.normal(1.35, 0.25), 0.6, 2.0) if rng.random() < 0.97 else 2.7)
-        turn = np.pi * rng.integers(2) + rng.normal(0, 0.02)
-        low = 0.9
-        if roam:
-            low, turn = -3.0, turn + rng.normal(0, 0.6) * (rng.random() < 0.5)
-        out = rng.uniform(low, max(side.walk - 0.5, low + 0.5))
-        moves = {"speed": speed}
-        pick = rng.random()
-        if pick < 0.2:
-            moves["start" if pick < 0.1 else "stop"] = rng.uniform(1, 15)
-        many = rng.choice([1, 2, 3], p=WALKING)
-        yield [side.put(_pedestrian(rng, speed), along + rng.uniform(-0.2, 0.2),
-                        out + 0.85 * i, turn, **moves) for i in range(many)]
 
 
 def _crosswalks(street: Street) -> list[Side]:

@@ -19,7 +19,7 @@ def domain() -> Iterator[int]:
     so that whatever the tests start is on it too."""
     from lidar_perception.candidates.warm_up import warm_up
     from lidar_perception.nodes.graph import private_domain
-    from lidar_perception.nodes.main import use_large_shared_memory
+    from lidar_perception.nodes.shared_memory import use_large_shared_memory
     with pytest.MonkeyPatch.context() as patch:
         number = private_domain()
         patch.setenv("ROS_DOMAIN_ID", str(number))

@@ -11,7 +11,7 @@ from typing import Any
 
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes.graph import private_domain
-from lidar_perception.nodes.main import use_large_shared_memory
+from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.types import InputError
 
 

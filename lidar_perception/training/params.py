@@ -139,8 +139,10 @@ class DataParams(Params):
 
 @dataclass(frozen=True)
 class SceneTraining(LoopParams):
-    """How long, and by which sensor."""
+    """How long, where, and by which sensor."""
 
+    scene: str = param("street", "Where the simulated scans are taken: street, campus or indoor, "
+                       "or several in turn, such as street,campus.")
     sensor: str = param("hdl64e", "Sensor of the simulated scans: a sensor.yaml, the name of a "
                         "preset, or generic:BEAMS,LOWEST,HIGHEST,STEP,RATE.")
     mount_height: float = param(0.0, "Its height above the ground. 0: what its file or preset "

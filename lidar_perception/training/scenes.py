@@ -18,6 +18,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.simulation.camera import (
     FORWARD_CAMERA,
     kitti_labels,
+    labels_around,
     turned_camera,
     worth_a_label,
 )
@@ -88,7 +89,7 @@ def random_split(names: tuple[str, ...], share: float,
 
 @dataclass(frozen=True)
 class SimulatedScenes:
-    """count scans of the streets first, first + 1, ..., of each so many, spread over its drive. To
+    """count scans of the scenes first, first + 1, ..., of each so many, spread over its drive. To
     make a street takes as long as to scan it. cache: folder for scans, or None; from cache_gb on
     nothing is added to it. around: frames to validate on have their labels in the image of a camera
     that looks ahead, left, behind, right in turn, not ahead only."""
@@ -125,9 +126,13 @@ class SimulatedScenes:
                              truth.class_ids, worth_a_label(truth), True, self.sensor.height)
 
     def frame(self, i: int) -> Frame:
-        """To validate on: with the labels that KITTI would have in the image of a camera."""
+        """To validate on: with the labels that KITTI would have in the image of a camera, or all
+        around where there is none."""
         scan, truth = self.scan(i)
         street, part = self.at(i)
+        if not self.streets.camera:
+            return Frame.of(f"scene {street} frame {part}", scan, labels_around(truth),
+                            sensor_height=self.sensor.height)
         camera = turned_camera(np.pi / 2 * (i % 4)) if self.around else FORWARD_CAMERA
         return Frame.of(f"street {street} frame {part}", scan, kitti_labels(truth, camera), camera,
                         sensor_height=self.sensor.height)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sized
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ from lidar_perception.data.frame import BOXES
 from lidar_perception.data.open import open_recording
 from lidar_perception.simulation.drive import longest_drive
 from lidar_perception.simulation.scene import Streets
-from lidar_perception.simulation.sensor import HDL64E, Sensor, sensor_named
+from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.params import DataParams
 from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes, random_split
 from lidar_perception.types import InputError
@@ -23,9 +22,11 @@ FIRST_STREET, FIRST_VALIDATION_STREET = 10_000_000, 20_000_000  # far from what 
 
 def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
                     val_split: Path | None, settings: DataParams, seed: int,
-                    sensor: Sensor = HDL64E, around: bool = False) -> tuple[tuple, tuple]:
-    """Sources to train on and to validate on. sensor: of simulated streets; around: validate on
-    what lies all around. InputError for what is not there, or an option that would not be used."""
+                    sensor: Sensor = HDL64E, around: bool = False,
+                    scene: str = "street") -> tuple[tuple, tuple]:
+    """Sources to train on and to validate on. sensor: of simulated scenes, which are those of
+    scene, see Streets; around: validate on what lies all around. InputError for what is not
+    there, or an option that would not be used."""
     folders = [Path(name) for name in data if name != SIM]
     val_folders = [Path(name) for name in val if name != SIM] or ([] if val else folders)
     if split is not None and len(folders) != 1:
@@ -52,19 +53,12 @@ def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | N
                       cache=Path(settings.cache) if settings.cache else None)
     if SIM in data:
         train_on.append(streets(FIRST_STREET, settings.scans,
-                                streets=Streets(people=settings.people),
+                                streets=Streets(None, settings.people, scene),
                                 per_street=min(settings.street_scans, longest_drive(sensor))))
     if SIM in (val or data):
         judge_on.append(streets(FIRST_VALIDATION_STREET, settings.val_scans,
-                                streets=Streets(people=settings.val_people), around=around))
+                                streets=Streets(None, settings.val_people, scene), around=around))
     return tuple(train_on), tuple(judge_on)
-
-
-def sensor_of(name: str, height: float = 0.0) -> Sensor:
-    """The sensor of that name or file, at another height above the ground if that is not 0, metres.
-    InputError for one that cannot be."""
-    sensor = sensor_named(name)
-    return replace(sensor, height=height) if height else sensor
 
 
 def names_of(path: Path, split: Path | None = None) -> tuple[str, ...]:

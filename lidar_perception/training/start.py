@@ -20,7 +20,7 @@ from lidar_perception.runs.files import make_folder, read_text, write_text
 from lidar_perception.runs.machine import cores
 from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import duration, errors
-from lidar_perception.simulation.sensor import Sensor
+from lidar_perception.simulation.sensor import Sensor, sensor_named
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.data import Batches, ReadScenes, Stream
@@ -39,7 +39,7 @@ from lidar_perception.training.preparing import keep_all
 from lidar_perception.training.ranks import joined, rank, wait, world
 from lidar_perception.training.run import Progress, Task
 from lidar_perception.training.scenes import SimulatedScenes
-from lidar_perception.training.sources import about_data, sensor_of, training_scenes
+from lidar_perception.training.sources import about_data, training_scenes
 from lidar_perception.types import InputError
 
 RUN = "run.json"  # what was asked for, measured and planned at the first start
@@ -105,8 +105,9 @@ def check(asked: Asked, init: Path | None) -> None:
 
 def scenes_of(asked: Asked, params: Any, sensor: Sensor) -> tuple[tuple, tuple]:
     """Sources to train on and to validate on."""
+    around = getattr(params, "range", "") == "around"
     return training_scenes(asked.data, asked.val, asked.split, asked.val_split, params.data,
-                           params.seed, sensor, getattr(params, "range", "") == "around")
+                           params.seed, sensor, around, params.scene)
 
 
 def start(network: Network, asked: Asked, params: Any,
@@ -125,7 +126,7 @@ def start(network: Network, asked: Asked, params: Any,
     decided = bool(params.steps or params.epochs)
     hours = asked.budget if decided else asked.budget or BUDGET
     with joined(chosen_device(asked.device)) as device:
-        sensor = sensor_of(params.sensor, params.mount_height)
+        sensor = sensor_named(params.sensor, params.mount_height)
         if rank() == 0:
             make_folder(Path(params.data.cache))
             _settle(network, asked, params, sensor, device)
@@ -265,7 +266,8 @@ def _require_room(cache: Path, most_gb: float, chosen: Plan, speed: Speed) -> No
 def _say(network: Network, params: Any, sensor: Sensor, chosen: Plan, speed: Speed,
          data: Data) -> None:
     scenes = " and ".join(text for count, text in (
-        (chosen.scans, f"{chosen.scans} scans of {params.sensor} at {sensor.height:g} m"),
+        (chosen.scans, f"{chosen.scans} {params.scene} scans of {params.sensor} at "
+                       f"{sensor.height:g} m"),
         (data.recorded, f"{data.recorded} recorded scenes")) if count)
     part = network.part(params) if chosen.part else {}
     where = f" up to {part['ahead']:g} m ahead and {part['aside']:g} m aside" if part else ""

@@ -327,3 +327,19 @@ def test_real_scans_are_scored_alike_from_folder_and_bag(data, tmp_path):
     counts = [sum(line.startswith("Pedestrian ") for line in text.splitlines()) for text in labels]
     assert content["frames"] == sum(n > 0 for n in counts)
     assert content["ground_truth"] == sum(counts)
+
+
+@pytest.mark.parametrize("command", [["demo"], ["run", "perception"]])
+def test_without_rclpy_the_remedy_is_said_before_any_work(command, tmp_path):
+    blocked = tmp_path / "rclpy"
+    blocked.mkdir()
+    (blocked / "__init__.py").write_text("raise ImportError('not for this Python')")
+    end = subprocess.run([sys.executable, "-m", "lidar_perception.cli.main", *command],
+                         capture_output=True, text=True, cwd=tmp_path,
+                         env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(
+                             None, sys.path)])})
+    assert end.returncode == 2
+    assert end.stderr.strip().splitlines()[-1].endswith(
+        "cannot load rclpy (not for this Python): source ROS 2 Jazzy, or pip install "
+        "'lidar_perception[ros]'")
+    assert not (tmp_path / "out").exists()

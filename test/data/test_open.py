@@ -15,10 +15,14 @@ from samples import CALIBRATION, STAMP, object_folder, scene, write
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES, Frame
 from lidar_perception.data.open import open_recording
+from lidar_perception.data.raw_clouds import open_clouds
 from lidar_perception.data.semantickitti import calibration_text, pose_line, write_scan
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS
+from msg_utils.point_cloud2 import from_array
+from msg_utils.stamps import header_message
 
 
 def drive(i):
@@ -57,6 +61,12 @@ def bag_folder(root):
     return root
 
 
+def cloud_folder(root):
+    for i in (1, 2, 10):  # in this order, as people count
+        write(root / f"scan{i}.bin", scene(i).astype(np.float32).tobytes())
+    return root
+
+
 MADE = {  # name: (make, inner folders or files that say the same, what is said of it)
     "object": (object_folder, ("", "training"), "KITTI object data, 2 frames", {BOXES, CAMERA}),
     "tracking": (tracking_folder, ("", "training"), "KITTI tracking data, 5 frames",
@@ -71,6 +81,7 @@ MADE = {  # name: (make, inner folders or files that say the same, what is said 
                       {POINT_LABELS, POSES}),
     "bag": (bag_folder, ("", "bag.mcap"), "rosbag2 bag, clouds on /points, 3 frames",
             {BOXES, CAMERA}),
+    "files": (cloud_folder, ("",), ".bin clouds, no times in their names, 3 frames", set()),
 }
 each_recording = pytest.mark.parametrize("kind", MADE)
 
@@ -125,6 +136,46 @@ def test_what_simulate_wrote_is_recognised(made):
     assert said == {"KITTI object data, 5 frames, a camera, labelled boxes",
                     "KITTI tracking data, 5 frames, a camera, labelled boxes",
                     "SemanticKITTI, 5 frames, labelled points, poses"}
+
+
+def test_clouds_in_files_have_the_order_and_the_times_of_their_names(tmp_path):
+    folder = cloud_folder(tmp_path / "counted")
+    assert [f.name for f in open_recording(folder)] == ["scan1", "scan2", "scan10"]
+    assert [f.name for f in open_recording(folder / "scan10.bin")] == ["scan10"]
+    for names in (["1700000000.1", "1700000000.35"], ["1700000000100", "1700000000350"],
+                  ["1700000000100000", "1700000000350000"],
+                  ["1700000000100000000", "1700000000350000000"]):
+        timed = tmp_path / names[0]
+        for name in names:
+            write(timed / f"{name}.bin", scene(0).astype(np.float32).tobytes())
+        recording = open_recording(timed)
+        assert [f.stamp_ns - 17 * 10**17 for f in recording] == [10**8, 35 * 10**7]
+        assert [f.load().stamp_ns for f in recording] == [f.stamp_ns for f in recording]
+        write(timed / "last.bin", scene(0).astype(np.float32).tobytes())
+        assert "no times" in str(open_recording(timed))
+
+
+def test_the_clouds_of_a_bag_are_found_or_named(tmp_path):
+    def bag(name, *topics):
+        with BagWriter(tmp_path / name) as writer:
+            for topic in topics:
+                writer.add_topic(topic, "sensor_msgs/msg/PointCloud2")
+                for i in range(2):
+                    writer.write(topic, STAMP + i, from_array(
+                        scene(i).astype("<f4").view([(n, "<f4") for n in "xyzi"]).ravel(),
+                        header_message(STAMP + i, "lidar", bag_message), bag_message))
+        return tmp_path / name
+
+    assert "on /ouster/points, 2" in str(open_recording(bag("one", "/ouster/points")))
+    assert "on /points, 2" in str(open_recording(bag("ours", "/ouster/points", "/points")))
+    both = bag("both", "/front", "/rear")
+    with pytest.raises(InputError, match=r"clouds on /front, /rear; name .*both:/front$"):
+        open_recording(both)
+    for recording in (open_recording(f"{both}:/rear"), open_recording(both, points="/rear")):
+        assert "on /rear, 2" in str(recording) and len(recording.reopen()) == 2
+    assert "on /rear" in open_clouds(f"{both}:/rear").layout
+    with pytest.raises(InputError, match="has no topic /side"):
+        open_recording(f"{both}:/side")
 
 
 @pytest.mark.parametrize("make, words", [

@@ -161,7 +161,7 @@ def test_a_bag_of_one_sensor_is_read_and_of_several_the_one_that_is_named(tmp_pa
     assert clouds.count == 4 and clouds.stamps_ns.tolist() == [0, 10**8, 2 * 10**8, 3 * 10**8]
     assert np.array_equal(to_array(clouds.load(2)), in_a_bag(92))
     write(tmp_path / "three", ["/left", "/right", "/rear"])
-    with pytest.raises(InputError, match="--topic: /left, /rear, /right"):
+    with pytest.raises(InputError, match="on /left, /rear, /right; name"):
         open_clouds(tmp_path / "three")
     assert open_clouds(tmp_path / "three", "/rear").load(1).header.frame_id == "rear"
     with pytest.raises(InputError, match="no topic /other"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from contextlib import contextmanager
@@ -16,9 +17,10 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from test_bad_input import CLOUD, MARKERS, cloud
 
+from lidar_perception.nodes import shared_memory
 from lidar_perception.nodes.graph import STAGES
-from lidar_perception.nodes.main import PROFILE_VARIABLES, SOCKET_BUFFER, socket_buffer
 from lidar_perception.nodes.reception import RATE_OF, SHARE_OF, Arrivals
+from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES, SOCKET_BUFFER, socket_buffer
 from lidar_perception.wire.codec import encode
 from msg_utils.stamps import to_ns
 
@@ -210,14 +212,35 @@ def test_a_sensor_that_slows_down_is_seen_by_its_own_clock():
     ("~/input/points:=clustering/output/points", 8 << 20, "fastdds.xml")])
 def test_clouds_of_a_driver_come_by_udp_where_a_socket_holds_one(remap, buffer, profile,
                                                                  monkeypatch):
-    from lidar_perception.nodes import main
-    monkeypatch.setattr(main, "socket_buffer", lambda: buffer)
+    monkeypatch.setattr(shared_memory, "socket_buffer", lambda: buffer)
     monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=1 << 20, f_frsize=4096))
     for name in PROFILE_VARIABLES:
         monkeypatch.setenv(name, "")
     arguments = ["pointpillars_detector", "--ros-args", "-r", remap]
-    main.use_large_shared_memory(main.fed_by_a_driver(arguments))
+    shared_memory.use_large_shared_memory(shared_memory.fed_by_a_driver(arguments))
     assert {Path(os.environ[name]).name for name in PROFILE_VARIABLES} == {profile}
     assert Path(os.environ[PROFILE_VARIABLES[0]]).is_file()
-    main.use_large_shared_memory(True)  # what is set stays
+    shared_memory.use_large_shared_memory(True)  # what is set stays
     assert Path(os.environ[PROFILE_VARIABLES[0]]).name == profile
+
+
+def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(peer, capsys):
+    def segments(pid) -> set[Path]:
+        maps = Path(f"/proc/{pid}/maps").read_text()
+        return {Path(p) for p in re.findall(r"/dev/shm/fastrtps_[0-9a-f]{16}$", maps, re.M)}
+
+    code = "import rclpy; rclpy.init(); node = rclpy.create_node('short'); print(); input()"
+    with subprocess.Popen([sys.executable, "-c", code], text=True, stdin=subprocess.PIPE,
+                          stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        theirs = segments(process.pid) - segments("self")
+        for segment in theirs:  # as if they were old
+            os.utime(f"{segment}_el", (0, 0))
+        shared_memory.remove_dead_segments()
+        assert theirs and all(segment.exists() for segment in theirs)
+        process.kill()
+    living = segments("self")
+    shared_memory.remove_dead_segments()
+    assert not any(segment.exists() or Path(f"{segment}_el").exists() for segment in theirs)
+    assert living and all(segment.exists() for segment in living)
+    assert "that killed processes left in /dev/shm" in capsys.readouterr().err

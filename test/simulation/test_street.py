@@ -52,7 +52,7 @@ def overlaps(boxes, many):
 
 def content(scene):
     moments = [scene.at(t, HEIGHT) for t in (0.0, 7.3)]
-    return [scene.ground, scene.speed] + [
+    return [scene.ground, scene.way.speed] + [
         array.tobytes() for m in moments
         for array in (*(getattr(m.solids, f.name) for f in fields(m.solids)), m.position, m.boxes,
                       m.class_ids, m.track_ids, m.speeds)]
@@ -96,7 +96,7 @@ def test_everything_is_on_the_ground(kind, seed):
         lowest = low[m.solids.owner == track].min()
         assert abs(lowest - (box[2] - box[5] / 2)) < 0.12
     for actor in [a for a in scene.actors if not a.thing.label][::15]:
-        m = replace(scene, actors=(actor,)).at(actor.x / max(scene.speed, 0.1), HEIGHT)
+        m = replace(scene, actors=(actor,)).at(actor.x / max(scene.way.speed, 0.1), HEIGHT)
         if len(m.solids):
             foot = (m.solids.centre[:, 2] - np.abs(m.solids.axes[:, 2] * m.solids.half).sum(axis=1)
                     ).min() + m.position[2]
@@ -135,7 +135,7 @@ def test_nobody_tailgates_the_ego_vehicle(kind, seed):
         lane = ((np.abs(m.boxes[:, 1]) < 1.0) & (np.abs(m.boxes[:, 6]) < 0.1)
                 & (m.class_ids < PEDESTRIAN))
         gap = np.abs(m.boxes[lane, 0]) - m.boxes[lane, 3] / 2 - 2.3
-        assert (gap > 0.6 * scene.speed).all()
+        assert (gap > 0.6 * scene.way.speed).all()
 
 
 def test_solids_carry_the_velocity_and_the_class_of_their_owner():

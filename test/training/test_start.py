@@ -57,7 +57,7 @@ def test_killed_in_the_preparation_and_in_the_steps_it_ends_as_if_it_had_not_bee
     unbroken = CliRunner().invoke(cli, words(whole, "--jobs", "2"))
     assert unbroken.exit_code == 0, unbroken.exception
     lines = unbroken.stderr.splitlines()
-    assert "6 scans of generic" in lines[1] and "4 steps of 1 scenes" in lines[1]
+    assert "6 street scans of generic" in lines[1] and "4 steps of 1 scenes" in lines[1]
     assert "simulating" in lines[2] and "validation" in lines[2]
 
     scans = broken / "scans"

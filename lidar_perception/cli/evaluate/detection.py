@@ -33,6 +33,9 @@ from lidar_perception.types import InputError
 @click.option("--keep", type=click.FloatRange(0, 1), default=1.0, metavar="SHARE",
               help="Keep only this share of the points of each scan, 0..1, drawn at random but "
               "always the same. Default: 1.")
+@click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
+              help="Height of the sensor above the ground. Default: what the recording says, or "
+              "KITTI's, as bags say none.")
 @a_path("--write-results", "Write the detections of --weights as KITTI result files, also for "
                            "frames without labels.", "DIR")
 @click.option("--errors", is_flag=True, help="Also say where found boxes differ from the true "
@@ -42,8 +45,8 @@ from lidar_perception.types import InputError
               metavar="SCORE", help="With --errors: of boxes from this score on.")
 @intervals_option
 def detection(walk: Walk, results: Path | None, weights: Path | None, device: str,
-              min_score: float, keep: float, write_results: Path | None, errors: bool,
-              errors_from: float, intervals: int) -> None:
+              min_score: float, keep: float, mount_height: float, write_results: Path | None,
+              errors: bool, errors_from: float, intervals: int) -> None:
     """Boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
 
     Average precision in the image, from above and in space, and of orientation, at 40 and 11
@@ -84,7 +87,7 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
             raise InputError(f"{results} is not a folder; give the folder of the result files")
         start = partial(by_files, results)
     else:
-        height = recording.frames[0].sensor_height
+        height = mount_height or recording.frames[0].sensor_height
         if weights.suffix == ".safetensors" and (other := read_header(weights).unlike(height)):
             terminal_errors.print(f"{weights}: {other}", soft_wrap=True)
         open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height)

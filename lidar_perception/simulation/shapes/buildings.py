@@ -50,6 +50,27 @@ def building(rng: np.random.Generator, length: float, depth: float, storeys: int
     return parts(rows, BUILDING)
 
 
+def glass_hall(rng: np.random.Generator, length: float, depth: float) -> np.ndarray:
+    """(P,) PART of a hall along x, centred, whose front at y = 0, which looks to -y, is all glass
+    between posts: a beam goes through or not, and then on to columns and walls within. A roof
+    stands out of it; at most 40 parts for 30 m."""
+    x, high, wall = length / 2, rng.uniform(3.5, 8.0), dict(reflectance=rng.uniform(0.35, 0.6))
+    posts = np.linspace(-x, x, max(int(length / rng.uniform(1.8, 3.5)), 1) + 1)
+    rows = [block((-x, 0.04, 0.05), (x, 0.06, high), reflectance=GLASS,
+                  transmission=rng.uniform(0.5, 0.85)),
+            block((-x, 0.0, FOOT), (x, 0.1, rng.uniform(0.05, 0.3)), reflectance=METAL),
+            block((-x, 0.0, 2.3), (x, 0.1, 2.45), reflectance=METAL),
+            block((-x, depth - 0.3, FOOT), (x, depth, high), **wall),
+            block((-x - 0.3, -rng.uniform(0.2, 3.0), high), (x + 0.3, depth, high + 0.5), **wall)]
+    rows += [block((s * x, 0.0, FOOT), (s * (x - 0.3), depth, high), **wall) for s in (-1, 1)]
+    rows += [block((at - 0.04, -0.03, FOOT), (at + 0.04, 0.15, high), reflectance=METAL)
+             for at in posts]
+    inside = rng.uniform((-0.9 * x, 1.5, 0.1, 0.9), (0.9 * x, depth - 1.0, 0.5, high), (4, 4))
+    rows += [block((at - half, y - half, FOOT), (at + half, y + half, top), reflectance=0.4)
+             for at, y, half, top in inside.tolist()]
+    return parts(rows, BUILDING)
+
+
 def _front_of(rng: np.random.Generator, below: float, sill: float, x: float, places: list[float],
               pitch: float) -> list[tuple]:
     """A sill along an upper storey, or a balcony on it, or nothing."""

@@ -221,6 +221,28 @@ def hydrant(rng: np.random.Generator) -> np.ndarray:
                        reflectance=rng.uniform(0.1, 0.4))], OTHER)
 
 
+def stairs(rng: np.random.Generator, length: float) -> np.ndarray:
+    """Stairs along x, centred, that climb to +y from y = 0, with a landing behind and rails."""
+    x, count, rise = length / 2, int(rng.integers(2, 7)), rng.uniform(0.12, 0.17)
+    end = 0.3 * count + rng.uniform(0.5, 2.0)
+    rows = [block((-x, 0.3 * i, DEEP), (x, end, rise * (i + 1)), reflectance=0.4)
+            for i in range(count)]
+    for at in np.linspace(-x + 0.05, x - 0.05, max(2, int(length / 4) + 1)):
+        top = (at, 0.3 * count, rise * count + 0.9)
+        rows += [rod((at, 0.0, 0.9), top, 0.025, reflectance=METAL),
+                 rod((at, 0.05, 0.0), (at, 0.05, 0.9), 0.02, reflectance=METAL),
+                 rod((at, 0.3 * count, 0.0), top, 0.02, reflectance=METAL)]
+    return parts(rows, BUILDING)
+
+
+def bicycle_stand(rng: np.random.Generator) -> np.ndarray:
+    """A hoop across x to which bicycles are locked."""
+    high = rng.uniform(0.7, 0.9)
+    rows = [rod((s * 0.35, 0, DEEP), (s * 0.35, 0, high), 0.025, reflectance=METAL)
+            for s in (-1, 1)]
+    return parts([*rows, rod((-0.35, 0, high), (0.35, 0, high), 0.025, reflectance=METAL)], POLE)
+
+
 def _post(height: float, radius: float) -> tuple:
     return _cylinder(DEEP, height, radius, METAL)
 

@@ -1,0 +1,97 @@
+"""Where things are put: along a line, in a rectangle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lidar_perception.simulation.actors import Actor, prop
+from lidar_perception.simulation.shapes.thing import Thing
+from lidar_perception.simulation.solids import extents
+
+
+class Side(NamedTuple):
+    """The line of a curb from x, y along heading. What is beyond it lies to its left: walk metres
+    of sidewalk, then the front. parking: width of the strip on this side of the curb."""
+
+    x: float
+    y: float
+    heading: float
+    length: float
+    walk: float
+    front: str
+    parking: float = 0.0
+
+    def put(self, thing: Thing | np.ndarray, along: float, out: float, turn: float = 0.0,
+            **moves) -> Actor:
+        """An actor so far along the curb and out from it, turned against its line; parts (P,) PART
+        are a thing without a label."""
+        thing = prop(thing) if isinstance(thing, np.ndarray) else thing
+        cos, sin = math.cos(self.heading), math.sin(self.heading)
+        return Actor(thing, self.x + cos * along - sin * out, self.y + sin * along + cos * out,
+                     self.heading + turn, **moves)
+
+
+class Court(NamedTuple):
+    """The rectangle from x0, y0 to x1, y1 (world, m)."""
+
+    x0: float
+    y0: float
+    x1: float
+    y1: float
+
+    @staticmethod
+    def around(way: np.ndarray, ends: np.ndarray, wide: np.ndarray) -> Court:
+        """What reaches so far (2,) behind and ahead of a way (T, 2), and right and left of it."""
+        low, high = way.min(axis=0), way.max(axis=0)
+        return Court(*(low - [ends[0], wide[0]]).tolist(), *(high + [ends[1], wide[1]]).tolist())
+
+    @property
+    def centre(self) -> tuple[float, float]:
+        return (self.x0 + self.x1) / 2, (self.y0 + self.y1) / 2
+
+    @property
+    def floor(self) -> Side:
+        """Its edge at y0 as a line with all of it to the left: what walks along it."""
+        return Side(self.x0, self.y0, 0.0, self.x1 - self.x0, self.y1 - self.y0, "")
+
+    def sides(self, walk: float = 0.0, front: str = "") -> tuple[Side, Side, Side, Side]:
+        """Its edges as lines with the outside to their left: at y1, x0, y0, x1."""
+        long, wide = self.x1 - self.x0, self.y1 - self.y0
+        return (Side(self.x0, self.y1, 0.0, long, walk, front),
+                Side(self.x0, self.y0, np.pi / 2, wide, walk, front),
+                Side(self.x1, self.y0, np.pi, long, walk, front),
+                Side(self.x1, self.y1, -np.pi / 2, wide, walk, front))
+
+    def inner(self, margin: float) -> Court:
+        """The rectangle that much within it."""
+        return Court(self.x0 + margin, self.y0 + margin, self.x1 - margin, self.y1 - margin)
+
+    def spots(self, rng: np.random.Generator, rate: float) -> Iterator[tuple[float, float]]:
+        """Places (x, y), rate of them on 100 square metres in the mean, each on its own."""
+        area = max(self.x1 - self.x0, 0.0) * max(self.y1 - self.y0, 0.0)
+        for _ in range(rng.poisson(area * rate / 100)):
+            yield rng.uniform(self.x0, self.x1), rng.uniform(self.y0, self.y1)
+
+
+def against(rng: np.random.Generator, side: Side, makers: Sequence[Callable],
+            rate: float) -> Iterator[Actor]:
+    """Things within a side with their backs to it, rate of them on 100 m, each by one of makers."""
+    for along in scattered(rng, side.length, rate):
+        made = makers[int(rng.integers(len(makers)))](rng)
+        low, _ = extents(made)
+        yield side.put(made, along, low[:, 0].min() - 0.05, -np.pi / 2 + rng.normal(0, 0.02))
+
+
+def evenly_spaced(rng, length: float, spacing: float) -> np.ndarray:
+    """Places along a length, spacing apart in the mean."""
+    places = np.arange(rng.uniform(0, spacing), length, spacing)
+    return np.clip(places + rng.uniform(-0.2, 0.2, len(places)) * spacing, 0, length)
+
+
+def scattered(rng, length: float, rate: float) -> np.ndarray:
+    """Places along a length, rate of them on 100 m in the mean, each on its own."""
+    return rng.uniform(0, length, rng.poisson(max(length, 0.0) * rate / 100))

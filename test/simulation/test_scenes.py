@@ -1,0 +1,188 @@
+"""Laws of the scenes for robots, and of streets beside them."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from samples import header
+from test_street import flat_boxes, overlaps
+
+from lidar_perception.cli.simulate import simulate
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.semantickitti import MOVING
+from lidar_perception.data.to_bag import points_of
+from lidar_perception.sensor_setup.mount import mount_of
+from lidar_perception.sensor_setup.scans import scan_of
+from lidar_perception.simulation.camera import worth_a_label
+from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.raycast import cast
+from lidar_perception.simulation.returns import returns_of
+from lidar_perception.simulation.scene import SCENES, Streets, make_scene
+from lidar_perception.simulation.sensor import generic, sensor_named
+from lidar_perception.simulation.terrain import surface_height
+from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.simulation.way import ROBOT, Way, swaying
+from lidar_perception.training.scenes import SimulatedScenes
+from lidar_perception.types import CLASSES, InputError
+from lidar_perception.wire.codec import bag_message
+from msg_utils.point_cloud2 import from_array
+
+ROBOTS = [(scene, kind) for scene in ("campus", "indoor") for kind in SCENES[scene].kinds]
+TINY = generic(16, -15.0, 15.0, 2.0, 10.0, height=0.6)
+EXACT = replace(TINY, range_noise=0.0, dropout=0.0, divergence=0.0)
+PEOPLE = {CLASSES.index(name) for name in ("Pedestrian", "Person_sitting", "Cyclist")}
+SITTING, GROUND = CLASSES.index("Person_sitting"), (40, 44, 48, 72)
+scene_of = cache(lambda scene, kind, seed=2: make_scene(seed, kind, 2.0, scene))
+
+
+def moved(xyz, pose):
+    return xyz @ pose[:3, :3].T + pose[:3, 3]
+
+
+@pytest.mark.parametrize("streets, seed, moment, points, metres, labels", [
+    (Streets(), 1, 0, 2574, 40360.19622, 129.929893373),
+    (Streets("zone", 3.0), 5, 60, 2543, 46171.189275, 694.671969233)])
+def test_streets_are_what_they_were_before_there_were_other_scenes(streets, seed, moment, points,
+                                                                   metres, labels):
+    scan = scan_at(seed, moment, TINY, streets)
+    assert len(scan.frame) == points
+    assert np.abs(scan.frame.xyz, dtype=float).sum() == pytest.approx(metres, rel=1e-6)
+    assert np.abs(scan.truth.boxes).sum() == pytest.approx(labels, rel=1e-9)
+
+
+def test_a_way_is_smooth():
+    """Its heading, velocity and yaw rate are the derivatives of where it is."""
+    h = 1e-4
+    for seed in range(20):
+        way = swaying(np.random.default_rng(seed), (0.5, 1.5), 0.2, 0.7)
+        for t in (0.0, 3.3, 19.0):
+            before, now, after = (way.at(t + d) for d in (-h, 0.0, h))
+            assert np.allclose(np.subtract(after[:2], before[:2]) / (2 * h), now.velocity,
+                               atol=1e-6)
+            assert (after.heading - before.heading) / (2 * h) == pytest.approx(now.yaw_rate,
+                                                                               abs=1e-6)
+            assert abs(now.heading) < 0.71 and np.hypot(*now.velocity) < 1.5 / np.cos(0.7)
+            assert np.allclose(np.tan(now.heading) * now.velocity[0], now.velocity[1])
+    assert way.sampled(20.0, 0.1).shape == (201, 3)
+    assert Way().at(7.0) == (0.0, 0.0, 0.0, (0.0, 0.0), 0.0)
+
+
+@pytest.mark.parametrize("scene, kind", ROBOTS)
+def test_nobody_runs_into_the_robot_or_each_other(scene, kind):
+    made = scene_of(scene, kind)
+    props = [a for a in made.actors if not a.thing.label]
+    fixed = flat_boxes(np.array([a.footprint for a in props]), 0.0)
+    for t in np.linspace(0.0, made.seconds, 9):
+        moment, pose = made.at(t, 0.6), made.sensor_pose(t, 0.6)
+        robot = np.array([[0.0, 0, 0, 1.4 * ROBOT, 1.4 * ROBOT, 1, 0]])
+        boxes = np.concatenate([robot, moment.boxes * [1, 1, 0, 1, 1, 1, 1]])
+        assert not {0} & set(overlaps(boxes, 1)[:, 0].tolist())
+        for i, j in overlaps(boxes, len(boxes)):
+            assert {moment.class_ids[i - 1], moment.class_ids[j - 1]} == {SITTING}
+        there = fixed - [*pose[:2, 3], 0, 0, 0, 0, 0]
+        assert not len(overlaps(np.concatenate([robot, there]), 1))
+    assert any(a.thing.label in ("Pedestrian", "Person_sitting") for a in made.actors)
+
+
+@pytest.mark.parametrize("scene, kind", ROBOTS)
+def test_points_and_boxes_are_where_they_are_in_the_world(scene, kind):
+    """Whatever the robot's heading and turning: the ground is that of the world, and points of who
+    has a label lie in that label."""
+    made = scene_of(scene, kind)
+    made = replace(made, ground=made.ground._replace(rough=0.0, litter=0.0))
+    for t in (0.0, 7.3):
+        moment, pose = made.at(t, 0.6), made.sensor_pose(t, 0.6)
+        hits = cast(moment.solids, made.ground, moment.position, EXACT, moment.motion, 1,
+                    moment.heading)
+        got = returns_of(hits, EXACT, moment.motion, np.random.default_rng(0))
+        world = moved(got.xyz.astype(float), pose)
+        ground = np.isin(got.semantic, GROUND) & (got.owner == 0)
+        off = world[ground, 2] - surface_height(made.ground, *world[ground, :2].T)
+        # On the edge of a kerb, height is that of either side.
+        assert ground.sum() > 100 and (np.abs(off) < 2e-3).mean() > 0.97
+        assert np.abs(off).max() <= made.ground.curb_height + 2e-3
+        boxes = moment.boxes.copy()
+        boxes[:, :3] = moved(boxes[:, :3], pose)
+        feet = surface_height(made.ground, *boxes[:, :2].T)
+        assert np.allclose(boxes[:, 2] - boxes[:, 5] / 2, feet)
+        for box, track, speed in zip(moment.boxes, moment.track_ids, moment.speeds):
+            own = got.xyz[(got.owner == track) & (got.semantic != 99)]
+            far = np.hypot(*(own[:, :2] - box[:2]).T) if len(own) else np.zeros(1)
+            assert far.max() < np.hypot(*box[3:5]) / 2 + 0.6 + speed / TINY.rate
+
+
+def test_a_turned_sensor_sees_the_same():
+    """Two robots at one place, one turned by twenty firings: its rays meet what those of the other
+    meet that look there, but for what glass lets through."""
+    made, ranges, turn = scene_of("indoor", "store"), [], 20 * 2 * np.pi / EXACT.columns
+    for aside in (0.0, np.tan(turn)):
+        one = replace(made, way=Way(1e-9, ((1e-9 * aside, 1.0, 0.0),)))
+        moment = one.at(0.0, 0.6)
+        ranges.append(cast(moment.solids, one.ground, moment.position, EXACT,
+                           heading=moment.heading).range)
+    assert moment.heading == pytest.approx(turn)
+    same = np.isclose(np.roll(ranges[0], -20, axis=0), ranges[1], atol=1e-6)
+    assert same.mean() > 0.95
+
+
+def test_robots_have_labels_all_around_and_no_camera(tmp_path):
+    frames = list(simulated_scans(3, 2, TINY, 1, Streets(None, 3.0, "campus")))
+    for number, frame in enumerate(frames):
+        truth, whole = frame.truth(), scan_at(3 + number, 0, TINY, Streets(None, 3.0, "campus"))
+        assert frame.camera() is None and frame.sensor_height == 0.6
+        assert len(truth) == worth_a_label(whole.truth).sum()
+    assert any((frame.truth().boxes[:, 0] < 0).any() for frame in frames)
+    assert next(simulated_scans(3, 1, TINY, 1)).camera() is not None
+
+
+def test_a_mix_takes_turns_and_is_trained_on():
+    mixed = Streets(None, 1.0, "street,indoor")
+    assert scene_of("indoor", None, 3).kind == make_scene(3, None, 2.0, mixed.scene).kind
+    assert make_scene(4, None, 1.0, mixed.scene).kind == make_scene(4).kind
+    source = SimulatedScenes(3, 2, TINY, mixed)
+    assert not mixed.camera and source.frame(0).camera() is None
+    assert source.scene(0).height == 0.6 and source.key(0) != SimulatedScenes(3, 2, TINY).key(0)
+
+
+@pytest.mark.parametrize("kind", SCENES["indoor"].kinds)
+def test_setup_finds_the_height_indoors(kind):
+    sensor = replace(sensor_named("vlp-16", 0.6), azimuth_step=float(np.radians(0.8)))
+    frames = [scan_at(7, i, sensor, Streets(kind, 1.0, "indoor")).frame for i in (0, 1, 90, 91)]
+    mount = mount_of([scan_of(from_array(points_of(frame), header(bag_message, frame.stamp_ns),
+                                         bag_message)) for frame in frames])
+    assert mount.height == pytest.approx(0.6, abs=0.02)
+    assert np.degrees([mount.roll, mount.pitch]) == pytest.approx([0.0, 0.0], abs=0.2)
+
+
+@pytest.mark.parametrize("layout", ["mcap", "kitti-tracking", "semantickitti"])
+def test_the_command_writes_every_layout_of_a_robot(layout, tmp_path):
+    out = tmp_path / "drive"
+    result = CliRunner().invoke(simulate, [
+        "--scene", "campus", "--kind", "path", "--sensor", "generic:16,-15,15,2,10",
+        "--mount-height", "0.6", "--format", layout, "--frames", "2", "--jobs", "1", "--out",
+        str(out)], catch_exceptions=False)
+    assert result.exit_code == 0
+    first, second = open_recording(out)
+    assert len(first.load()) > 500
+    if layout != "kitti-tracking":  # which has no poses
+        apart = np.linalg.inv(first.pose()) @ second.pose()
+        assert 0.0 <= np.linalg.norm(apart[:3, 3]) < 0.3
+    if layout == "semantickitti":
+        classes = set(np.unique(first.point_truth().classes))
+        assert classes & set(GROUND) and classes <= {1, 10, 11, 13, 15, 16, 18, 20, 30, 31, 50,
+                                                     51, 70, 71, 80, 81, 99, *GROUND, *MOVING}
+
+
+@pytest.mark.parametrize("streets, said", [
+    (Streets(scene="moon"), "unknown scene 'moon': must be one of street, campus, indoor"),
+    (Streets("zone", 1.0, "campus"), "kind = 'zone' must be one of forecourt, square, path")])
+def test_what_is_no_scene_is_named(streets, said):
+    with pytest.raises(InputError, match=said):
+        next(simulated_scans(0, 1, TINY, 1, streets))
+
+
+def test_only_streets_are_compared(tmp_path):
+    result = CliRunner().invoke(simulate, ["--compare", str(tmp_path), "--scene", "indoor"])
+    assert result.exit_code == 2 and "--compare compares streets" in result.output
