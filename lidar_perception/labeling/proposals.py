@@ -12,7 +12,7 @@ import numpy as np
 from lidar_perception.candidates.confidence import confidence
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.silhouette import similarity
-from lidar_perception.detectors.open import FUSED
+from lidar_perception.detectors.contract import FUSED
 from lidar_perception.geometry import centre_distances
 from lidar_perception.labeling.interpolation import Motion, filled
 from lidar_perception.labeling.snap import completed

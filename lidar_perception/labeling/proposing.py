@@ -14,7 +14,7 @@ import numpy as np
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.candidates.silhouette import similarity, to_pixels
-from lidar_perception.detectors.open import FUSED
+from lidar_perception.detectors.contract import FUSED
 from lidar_perception.geometry import centre_distances, points_in_box
 from lidar_perception.labeling.drive import Drive
 from lidar_perception.labeling.interpolation import Motion, corrected
