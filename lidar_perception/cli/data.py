@@ -109,11 +109,24 @@ def walk_options(data: Callable = data_option) -> Callable:
 
 
 def opened(data: Path, **how: Any) -> Any:
-    """The recording at a path, see data.open.open_recording; says in a line what it is."""
+    """The recording at a path, see data.open.open_recording; says in a line what it is. The height
+    of a sensor that the recording does not say is measured, unless it is about KITTI's."""
     from lidar_perception.data.open import open_recording
     recording = open_recording(data, **how)
     errors.print(escape(str(recording)), soft_wrap=True, style="dim")
-    return recording
+    if recording.mounted:
+        return recording
+    from lidar_perception.ground.segment import HEIGHT_TOLERANCE, first_height
+    from lidar_perception.types import SENSOR_HEIGHT
+    try:
+        height = first_height(recording)
+    except InputError:  # a damaged cloud is named by who needs it
+        return recording
+    if height is None or height < 0 or abs(height - SENSOR_HEIGHT) <= HEIGHT_TOLERANCE:
+        return recording
+    errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds",
+                 soft_wrap=True, style="dim")
+    return open_recording(data, **{**how, "sensor_height": round(height, 2)})
 
 
 def write_json(path: Path | None, content: dict) -> None:

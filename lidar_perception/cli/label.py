@@ -92,14 +92,15 @@ def _serve(drive: Drive, made: Session, port: int, browser: bool, propose: bool,
     import webbrowser
 
     from lidar_perception.labeling.results import Results
-    from lidar_perception.labeling.server import Served, serve
+    from lidar_perception.labeling.served import Served
+    from lidar_perception.labeling.server import serve
 
     def started(url: str) -> None:
         console.print(url, soft_wrap=True, markup=False)
         errors.print(f"journal: {made.journal.path}; ctrl-C ends", soft_wrap=True, markup=False,
                      style="dim")
-        if propose and not made.was_proposed:
-            made.do({"do": "propose"})
+        if propose:
+            made.prepare()
         if browser:
             webbrowser.open(url)
     layers = Results().layers_of(drive) if show_labels else None
@@ -121,8 +122,9 @@ def _simulated(recording: Recording, sequence: str | None, weights: str) -> dict
             _propose(drive, made)
             found[drive.name] = done = Annotator(made).work()
         console.print(f"{drive.name}: {done['people']} pedestrians, {done['boxes']} boxes: "
-                      f"{done['actions']} actions, by hand {done['by_hand']}, without tracks "
-                      f"{done['without_tracks']}", soft_wrap=True, markup=False)
+                      f"{done['actions']} actions, {done['looked_at']} proposals looked at; by "
+                      f"hand {done['by_hand']}, without tracks {done['without_tracks']}",
+                      soft_wrap=True, markup=False)
     if not any(done["boxes"] for done in found.values()):
         raise InputError(f"{recording.path} has no labelled pedestrian; give another drive")
     sums = totals(found)

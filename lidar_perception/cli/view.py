@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,18 +15,25 @@ from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
 
 if TYPE_CHECKING:
-    from lidar_perception.labeling.server import Served
+    from lidar_perception.labeling.served import Served
 
 
 @click.command()
-@click.argument("path", type=click.Path(path_type=Path))
+@click.argument("path", type=click.Path(path_type=Path), required=False)
+@click.option("--live", is_flag=True, help="Look at the running graph instead of a recording.")
 @click.option("--weights", multiple=True, metavar="FILE|NAME", help="Run the detector of this "
               "checkpoint, or one by its name: fused, pointpillars or pointnet. May be given "
               "several times.")
 @click.option("--results", multiple=True, type=click.Path(path_type=Path), metavar="FOLDER",
               help="KITTI result files, FOLDER/NAME.txt. May be given several times.")
-@click.option("--points", metavar="TOPIC", help="Topic of the clouds of a bag. Default: clustered "
-              "ones, else /points, else the only one there.")
+@click.option("--points", "--topic", "points", metavar="TOPIC", help="Topic of the clouds of a bag "
+              "or of the running graph. Default: clustered ones, else /points, else the only one "
+              "there.")
+@click.option("--detections", multiple=True, metavar="TOPIC", help="With --live: a topic of boxes, "
+              "MarkerArray or Detection3DArray. Default: all */output/detections that go with the "
+              "clouds. May be given several times.")
+@click.option("--namespace", default="", metavar="NAME", help="With --live: that of the nodes, "
+              "where there are several.")
 @click.option("--sequence", metavar="NAME", help="The drive of PATH to show, where it has "
               "several.")
 @device_option
@@ -35,18 +45,21 @@ if TYPE_CHECKING:
               help="Frame to begin with.")
 @click.option("--theme", type=click.Choice(["auto", "light", "dark"]), default="auto",
               show_default=True, help="Of the page.")
-def view(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], points: str | None,
-         sequence: str | None, device: str, port: int, browser: bool, screenshot: Path | None,
-         frame: int, theme: str) -> None:
+def view(path: Path | None, live: bool, weights: tuple[str, ...], results: tuple[Path, ...],
+         points: str | None, detections: tuple[str, ...], namespace: str, sequence: str | None,
+         device: str, port: int, browser: bool, screenshot: Path | None, frame: int,
+         theme: str) -> None:
     """Look at a recording and its results on a page in the browser: clouds with ground and
     clusters, labels, detections by source and score, what is missed and false, tracks. PATH is a
-    bag, such as the result bag of the demo, or the folder of a data set.
+    bag, such as the result bag of the demo, or the folder of a data set; with --live the nodes
+    that run on this ROS_DOMAIN_ID are looked at, the newest frame first.
 
     \b
     Examples:
       lidar-perception view out/demo/result
       lidar-perception view /data/kitti/tracking --weights fused
       lidar-perception view /data/kitti/object --results labels --screenshot frame.png --frame 12
+      lidar-perception view --live --namespace front
     """
     import asyncio
     import webbrowser
@@ -54,20 +67,49 @@ def view(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], points
     from lidar_perception.labeling.picture import screenshot_of
     from lidar_perception.labeling.server import serve
 
-    served = _served(path, weights, results, points, sequence, device)
-    if frame >= len(served.drive.frames):
-        raise InputError(f"{path} has no frame {frame}; it has {len(served.drive.frames)}")
+    if (path is None) != live:
+        raise click.UsageError("give the PATH of a recording, or --live")
+    only = {"--weights": weights, "--results": results, "--sequence": sequence,
+            "--screenshot": screenshot} if live else {"--detections": detections,
+                                                      "--namespace": namespace}
+    if given := [name for name, value in only.items() if value]:
+        raise click.UsageError(f"{', '.join(given)}: {'not with' if live else 'only with'} --live")
 
     def started(url: str) -> None:
         url += f"&frame={frame}&theme={theme}"
         console.print(url, soft_wrap=True, markup=False)
         if screenshot is None and browser:
             webbrowser.open(url)
+    if path is None:
+        with _listening(namespace, points or "", detections) as served:
+            asyncio.run(serve(served, port, started))
+        return
+    served = _served(path, weights, results, points, sequence, device)
+    if frame >= served.drive.end:
+        raise InputError(f"{path} has no frame {frame}; it has {served.drive.end}")
     if screenshot is None:
         asyncio.run(serve(served, port, started))
     else:
         asyncio.run(screenshot_of(served, screenshot, f"frame={frame}&theme={theme}"))
         console.print(f"{screenshot}", markup=False)
+
+
+@contextmanager
+def _listening(namespace: str, points: str, detections: tuple[str, ...]) -> Iterator[Served]:
+    """What the page shows of the running graph, while the block lasts."""
+    from lidar_perception.labeling.live import Live
+    from lidar_perception.labeling.served import Served
+    from lidar_perception.nodes import require_rclpy
+    from lidar_perception.nodes.shared_memory import use_large_shared_memory
+
+    require_rclpy()
+    use_large_shared_memory(from_driver=points != "" and not points.endswith("/output/points"))
+    from lidar_perception.nodes.live_view import listening  # with the profile already set
+    name = "/".join(filter(None, (f"ROS domain {os.environ.get('ROS_DOMAIN_ID') or 0}",
+                                  namespace.strip("/"))))
+    live = Live(name)
+    with listening(live, None, namespace, points, detections):
+        yield Served(live, layers=live.layers, tracks=live.tracks)
 
 
 def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], points: str | None,
@@ -77,7 +119,7 @@ def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], poi
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.labeling import results as shown
     from lidar_perception.labeling.drive import one_drive
-    from lidar_perception.labeling.server import Served
+    from lidar_perception.labeling.served import Served
 
     a_bag = path.exists() and recognises(path)
     recording = opened(path, points=points or shown.points_topic(path)) if a_bag else opened(path)
@@ -91,4 +133,4 @@ def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], poi
             for name in weights}
     more |= {folder.name: shown.by_files(folder) for folder in results}
     found = shown.Results({**found.sources, **more}, found.tracks)
-    return Served(drive, layers=found.layers_of(drive), tracks=found.tracks)
+    return Served(drive, layers=found.layers_of(drive), tracks=lambda: found.tracks)

@@ -5,31 +5,42 @@ from __future__ import annotations
 import numpy as np
 
 from lidar_perception.clustering.dbscan import distance_aware_dbscan
+from lidar_perception.clustering.density import density, followed, radii
 from lidar_perception.clustering.euclidean import euclidean
 from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.types import usable_returns
 
-METHODS = {  # finite points (M, 3), params -> (M,) int32
-    "dbscan": lambda xyz, p: distance_aware_dbscan(xyz, p.dbscan),
-    "euclidean": lambda xyz, p: euclidean(xyz, p.euclidean),
-}
 
-
-def cluster(xyz: np.ndarray, params: ClusteringParams = ClusteringParams()) -> np.ndarray:
+def cluster(xyz: np.ndarray, params: ClusteringParams = ClusteringParams(),
+            seen: float = 0.0) -> np.ndarray:
     """(N,) int32 cluster ids of points (N, 3) float32, metres in the LiDAR frame: 0 = none, 1..K.
-    Points that are not finite, and the origin, have 0; no points give (0,)."""
+    Points that are not finite, and the origin, have 0; no points give (0,). seen: points a square
+    degree of view, which params.density compares with; 0: params hold as they are."""
     usable = usable_returns(xyz)
     if usable.all():
-        return METHODS[params.method](xyz, params)
+        return _clustered(xyz, params, seen)
     labels = np.zeros(len(xyz), np.int32)
-    labels[usable] = METHODS[params.method](xyz[usable], params)
+    labels[usable] = _clustered(xyz[usable], params, seen)
     return labels
 
 
+def _clustered(xyz: np.ndarray, given: ClusteringParams, seen: float) -> np.ndarray:
+    params = followed(given, seen)
+    if params.method == "dbscan":
+        return distance_aware_dbscan(xyz, params.dbscan)
+    reach = None if params is given else radii(xyz, seen, given.euclidean.radius,
+                                               params.euclidean.radius)
+    return euclidean(xyz, params.euclidean, radii=reach)
+
+
 def cluster_obstacles(xyz: np.ndarray, ground: np.ndarray,
-                      params: ClusteringParams = ClusteringParams()) -> np.ndarray:
-    """(M,) int32 cluster ids of the points (M, 3) that are not ground (M,) bool; ground has 0."""
+                      params: ClusteringParams = ClusteringParams(),
+                      sensed: np.ndarray | None = None) -> np.ndarray:
+    """(M,) int32 cluster ids of the points (M, 3) that are not ground (M,) bool; ground has 0.
+    Where params are made for some density, that of all points is measured, or of sensed (N, 3), the
+    cloud as the sensor sees it, where xyz has been moved to another height."""
     labels = np.zeros(len(xyz), np.int32)
     obstacles = np.flatnonzero(~ground)
-    labels[obstacles] = cluster(xyz.take(obstacles, axis=0), params)
+    seen = density(xyz if sensed is None else sensed) if params.density else 0.0
+    labels[obstacles] = cluster(xyz.take(obstacles, axis=0), params, seen)
     return labels

@@ -51,9 +51,11 @@ DENSE = 2**15          # of them a point
 
 
 def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
-              patience: int = PATIENCE, work: int = WORK) -> np.ndarray:
+              patience: int = PATIENCE, work: int = WORK,
+              radii: np.ndarray | None = None) -> np.ndarray:
     """(N,) int32 clusters of finite points (N, 3) float32, metres: 0 none, 1..K by their first
-    point; N may be 0. Distances are computed in float64. patience and work: see PATIENCE, WORK."""
+    point; N may be 0. Distances are computed in float64. patience and work: see PATIENCE, WORK.
+    radii (N,): for the local threshold, of each point instead of params.radius."""
     n = len(xyz)
     if n == 0:
         return np.zeros(0, np.int32)
@@ -64,10 +66,11 @@ def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
     elif params.threshold == "fixed":
         cells, reach = cells_of(xyz, params.distance), np.full(n, params.distance)
     else:
-        cells, reach = cells_of(xyz, params.radius), np.empty(n)
-        work = min(work, DENSE * n)
-        means = (_means(cells, params.radius ** 2) if around(cells) * n <= work else
-                 _means_of_sample(cells, sample_of(cells, work), params.radius ** 2))
+        radii = np.full(n, params.radius) if radii is None else radii
+        cells, reach = cells_of(xyz, float(radii.max())), np.empty(n)
+        radii2, work = radii[cells.order] ** 2, min(work, DENSE * n)
+        means = (_means(cells, radii2) if around(cells) * n <= work else
+                 _means_of_sample(cells, sample_of(cells, work), radii2))
         reach[cells.order] = np.float32(params.alpha * means)
     if reach.max() > cells.reach:
         cells = cells_of(xyz, reach.max())
@@ -148,9 +151,9 @@ def _search(cells, squared, work):
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "nsz"})
-def _means(cells, radius2):
-    """(N,) mean distance to the other points within the radius, cell by cell. Each pair is computed
-    twice: without stores that is faster than once."""
+def _means(cells, radii2):
+    """(N,) mean distance to the other points within the radius of each, cell by cell. Each pair is
+    computed twice: without stores that is faster than once."""
     means, near = np.zeros(len(cells.order)), np.empty((3, cells.size.max()))
     x, y, z = cells.xyz[0], cells.xyz[1], cells.xyz[2]
     for a in range(len(cells.size)):
@@ -160,6 +163,7 @@ def _means(cells, radius2):
                 means[i] = means[i - 1]  # however many coincide
                 continue
             px, py, pz, total, count = x[i], y[i], z[i], 0.0, 0.0
+            radius2 = radii2[i]
             for j in range(np.uint64(cells.size[a])):
                 dx, dy, dz = px - near[0, j], py - near[1, j], pz - near[2, j]
                 squared = dx * dx + dy * dy + dz * dz
@@ -173,13 +177,13 @@ def _means(cells, radius2):
 
 
 @njit(cache=True, nogil=True, fastmath={"reassoc", "nsz"})
-def _means_of_sample(cells, sample, radius2):
+def _means_of_sample(cells, sample, radii2):
     """As _means, from a sample of each cell whose points stand for all of it."""
     means = np.zeros(len(cells.order))
     for a in range(len(cells.size)):
         near, weight = gather_sample(cells, sample, a)
         for i in range(cells.start[a], cells.start[a + 1]):
-            px, py, pz = cells.xyz[0, i], cells.xyz[1, i], cells.xyz[2, i]
+            px, py, pz, radius2 = cells.xyz[0, i], cells.xyz[1, i], cells.xyz[2, i], radii2[i]
             total, count = 0.0, 0.0
             for j in range(len(weight)):
                 dx, dy, dz = px - near[0, j], py - near[1, j], pz - near[2, j]

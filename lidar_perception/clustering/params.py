@@ -50,6 +50,7 @@ class EuclideanParams(Params):
 
 
 CLUSTERING_METHODS = ("dbscan", "euclidean")
+DENSE = 10.0  # points a square degree; KITTI's HDL-64E has 13 to 16
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,10 @@ class ClusteringParams(Params):
 
     method: str = param("dbscan", "dbscan: distance-aware DBSCAN (paper A). euclidean: adaptive "
                         "Euclidean clustering (paper C).", choices=CLUSTERING_METHODS)
+    density: float = param(0.0, "Points a square degree of view from which on the numbers below "
+                           "hold as they are. In a cloud that is measured to have fewer, "
+                           "neighbourhoods widen and least sizes shrink. 0: they hold for every "
+                           "cloud.", low=0.0, high=10_000.0)
     dbscan: DbscanParams = DbscanParams()
     euclidean: EuclideanParams = EuclideanParams()
 

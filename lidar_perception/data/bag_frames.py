@@ -25,7 +25,7 @@ from lidar_perception.data.frame import (
     PointTruth,
     Recording,
 )
-from lidar_perception.types import GroundTruth, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import decode
 from lidar_perception.wire.messages import calibration_of, column, pose_of, to_frame, to_truth
 from lidar_perception.wire.topics import (
@@ -80,7 +80,7 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
                            for _, _, data in islice(bag.raw({points}), 1))
     has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | (
         {POINT_LABELS} if labelled else set())
-    return Recording(path, f"rosbag2 bag, clouds on {points}", frames, has)
+    return Recording(path, f"rosbag2 bag, clouds on {points}", frames, has, mounted=False)
 
 
 class BagFrames(Sequence):
@@ -88,8 +88,14 @@ class BagFrames(Sequence):
     once, and each frame holds its cloud; a frame by its number reads it when it is asked for, found
     by its time after one look through the bag for the times of all."""
 
-    def __init__(self, path: Path, points: str, kind: str, count: int):
+    def __init__(self, path: Path, points: str, kind: str, count: int,
+                 sensor_height: float = SENSOR_HEIGHT):
         self.path, self.points, self.kind, self.count = path, points, kind, count
+        self.sensor_height = sensor_height
+
+    def mounted_at(self, sensor_height: float) -> BagFrames:
+        """The frames of a sensor at that height."""
+        return BagFrames(self.path, self.points, self.kind, self.count, sensor_height)
 
     def __len__(self) -> int:
         return self.count
@@ -173,7 +179,7 @@ class BagFrames(Sequence):
         return Frame(name, stamp, partial(self._load, time, data), partial(self._truth, stamp),
                      point_truth=partial(self._point_truth, time, data),
                      calibration=partial(self._calibration, time),
-                     pose=partial(self._pose, stamp), index=i,
+                     pose=partial(self._pose, stamp), index=i, sensor_height=self.sensor_height,
                      native=lambda: decode(data(), self.kind))
 
     def _load(self, time: int, data: Callable[[], bytes]) -> LidarFrame:

@@ -53,7 +53,8 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     kinds = " and ".join(sorted({file.suffix for file in files}))
     return Recording(path, f"{kinds} clouds, {'times' if said else 'no times'} in their names",
                      [Frame(name, stamp, partial(_load, file, stamp), index=i, points=file)
-                      for i, (name, stamp, file) in enumerate(zip(names, stamps, files))])
+                      for i, (name, stamp, file) in enumerate(zip(names, stamps, files))],
+                     mounted=False)
 
 
 def named_times(files: list[Path]) -> list[int]:

@@ -19,15 +19,16 @@ LAYOUTS = (bag_frames, nuscenes, semantickitti, kitti, cloud_files)
 
 
 def open_recording(path: str | Path, *, split: str | Path | None = None, points: str = "",
-                   scans: bool = True) -> Recording:
+                   scans: bool = True, sensor_height: float | None = None) -> Recording:
     """The frames at a path: a rosbag2 bag, or a folder of KITTI (object, tracking, raw, or what
     `simulate` wrote), nuScenes or SemanticKITTI, or one of its inner folders, or .pcd or .bin
     files.
 
     split: file that names frames or whole sequences, one a line; only these, in its order. points:
     topic of the clouds of a bag, where it is neither /points nor the only one; a path may name it,
-    too, see with_topic. Without scans, labels are enough to make a frame of KITTI. InputError says
-    what is missing, and what can be opened.
+    too, see with_topic. Without scans, labels are enough to make a frame of KITTI. sensor_height:
+    metres above the ground, instead of what the recording says. InputError says what is missing,
+    and what can be opened.
     """
     path, named = with_topic(path)
     points = points or named
@@ -42,8 +43,14 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
     recording = layout.open_recording(path, points=points, scans=scans)
     if len(recording) == 0:
         raise InputError(f"{path} ({recording.layout}) has no frame; record or download it again")
-    recording = replace(recording, reopen=partial(open_recording, path, split=split, points=points,
-                                                  scans=scans))
+    if sensor_height is not None:
+        frames = recording.frames
+        recording = replace(recording, mounted=True, frames=(
+            frames.mounted_at(sensor_height) if isinstance(frames, bag_frames.BagFrames)
+            else [replace(frame, sensor_height=sensor_height) for frame in frames]))
+    recording = replace(recording, reopen=partial(
+        open_recording, path, split=split, points=points, scans=scans,
+        sensor_height=sensor_height))
     return recording if split is None else _of_split(recording, Path(split))
 
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import islice
+
 import numpy as np
 
+from lidar_perception.data.frame import Recording
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.params import GroundParams, SensorPoseParams, ThresholdParams
 from lidar_perception.ground.patchwork import segment_by_patchwork
@@ -23,6 +26,7 @@ METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
 NEAREST, FARTHEST = 2.5, 25.0    # m
 PLANE = ThresholdParams(max_slope=15.0)
 MIN_SHARE = 0.15               # of these points on the plane
+FIRST = 3                      # clouds
 HEIGHT_TOLERANCE = 0.25          # m between the parameter and the measured height
 
 
@@ -64,6 +68,16 @@ def measured_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPoseParams()
     x, y, z = near.T
     on_plane = np.abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= PLANE.inlier_distance
     return -float(plane[2]) if on_plane.mean() >= MIN_SHARE else None
+
+
+def first_height(recording: Recording) -> float | None:
+    """Metres of the sensor above the ground in the first clouds of a recording, the median of those
+    that show some; None where they do not agree."""
+    clouds = (frame.load() for frame in islice(recording, FIRST))
+    measured = [measured_height(cloud.xyz) for cloud in clouds if len(cloud)]
+    heights = [height for height in measured if height is not None]
+    agree = heights and max(heights) - min(heights) <= HEIGHT_TOLERANCE
+    return float(np.median(heights)) if agree else None
 
 
 def height_problem(measured: float | None, pose: SensorPoseParams) -> str | None:

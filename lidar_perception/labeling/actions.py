@@ -53,7 +53,10 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
                     (state.seeds, seeds), (state.checked, checked),
                     (state.kept, action.get("kept", state.kept) if name == "import"
                      else state.kept))
-    after = replace(state.after(change), seq=state.seq + 1, done=(change, state.done), undone=None)
+    done = change, state.done
+    if action.get("joins") and state.done is not None:  # the rest of what the last action began
+        done = state.done[0].then(change), state.done[1]
+    after = replace(state.after(change), seq=state.seq + 1, done=done, undone=None)
     return after, change
 
 
@@ -222,6 +225,15 @@ def _class(state: State, action: Action, motion: Motion) -> Made:
     return _only(state, replace(track_of(state, action.get("track")), class_name=class_of(action)))
 
 
+def _reject_rest(state: State, action: Action, motion: Motion) -> Made:
+    only = class_of(action) if "class" in action else None
+    left = [t for t in state.tracks.values() if t.state == PROPOSED
+            and only in (None, t.class_name)]
+    if not left:
+        raise InputError(f"no track{f' of class {only}' if only else ''} is left to reject")
+    return _only(state, *(replace(t, state=REJECTED) for t in left))
+
+
 def _accept(state: State, action: Action, motion: Motion) -> Made:
     track, seeds = track_of(state, action.get("track")), state.seeds
     if action.get("seed") is not None:  # the frame in which it is the best one
@@ -270,6 +282,20 @@ def _split(state: State, action: Action, motion: Motion) -> Made:
             state.checked)
 
 
+def _trim(state: State, action: Action, motion: Motion) -> Made:
+    track, frame = track_of(state, action.get("track")), frame_of(action, motion)
+    side = action.get("side")
+    if side not in ("before", "after"):
+        raise InputError("a track is trimmed before or after a frame")
+    cut = {f for f in track.boxes if (f < frame if side == "before" else f > frame)}
+    kept = {f: b for f, b in track.boxes.items() if f not in cut}
+    if not cut or not kept:
+        raise InputError(f"track {track.id} has {'no' if kept else 'only'} boxes {side} frame "
+                         f"{frame}")
+    seeds = tuple(s for s in state.seeds if s[1] != track.id or s[0] not in cut)
+    return ({track.id: replace(track, boxes=kept, gone=track.gone | cut)}, seeds, state.checked)
+
+
 def _check(state: State, action: Action, motion: Motion) -> Made:
     frame, checked = frame_of(action, motion), action.get("checked", True)
     if not isinstance(checked, bool):
@@ -280,8 +306,9 @@ def _check(state: State, action: Action, motion: Motion) -> Made:
 DO: dict[str, Callable[[State, Action, Motion], Made]] = {
     "seed": _seed, "add": _add, "box": _box, "size": _size, "remove_box": _remove_box,
     "interpolate": _interpolate, "copy": _copy, "class": _class, "accept": _accept,
-    "reject": _reject, "reopen": _reopen, "merge": _merge, "split": _split, "check": _check,
-    "snap": _box, "propose": _results, "import": _results,
+    "reject": _reject, "reject_rest": _reject_rest, "reopen": _reopen, "merge": _merge,
+    "split": _split, "trim": _trim, "check": _check, "snap": _box, "propose": _results,
+    "import": _results,
 }
 
 

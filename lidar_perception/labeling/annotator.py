@@ -81,6 +81,7 @@ class Annotator:
     def __init__(self, session: Session) -> None:
         self.session, self.truth = session, Truth(session)
         self.counts: Counter[str] = Counter()
+        self.looked_at: set[int] = set()  # ids of proposals
         self._own: dict[int, int] = {}  # person -> id of the track
 
     def work(self) -> dict[str, Any]:
@@ -91,9 +92,11 @@ class Annotator:
             self._decide()
         for number in sorted(self.truth.people):
             self._finish(number)
+        self._reject_rest()
         self._check()
         return {"people": len(self.truth.people), "boxes": self.truth.boxes,
-                "actions": self.actions, "kinds": dict(sorted(self.counts.items())),
+                "looked_at": len(self.looked_at), "actions": self.actions,
+                "kinds": dict(sorted(self.counts.items())),
                 "corrections_in_full": self.actions + (ADJUST - 1) * self.counts["drag"],
                 "by_hand": (PLACE + ADJUST) * self.truth.boxes,
                 "without_tracks": without_tracks(self.session.proposer.looks or [], self.truth)}
@@ -105,26 +108,35 @@ class Annotator:
 
     def _do(self, kind: str, **action: Any) -> None:
         self.session.do(action, "annotator")
+        self.session.wait()  # a seed is followed
         self.counts[kind] += 1
 
     def _decide(self) -> None:
-        """Accept or reject every proposed pedestrian, the next uncertain one first: a key each. A
-        second track of a person is joined to the first."""
-        while (track := next_uncertain(self.session.state, among=self._is_asked)) is not None:
+        """Accept every proposed pedestrian who is one, as the frames are looked through: a key
+        each, while the pointer is on the box. A second track of a person is joined to the first."""
+        while (track := next_uncertain(self.session.state, among=self._is_new)) is not None:
             person = self.truth.person(track)
+            self.looked_at.add(track.id)
             if person is None:
-                self._do("key: reject", do="reject", track=track.id)
                 continue
             self._do("key: accept", do="accept", track=track.id)
             if self._own.setdefault(person, track.id) != track.id:
                 self.counts["click: select the other one"] += 1
                 self._do("key: merge", do="merge", tracks=[self._own[person], track.id])
 
-    def _is_asked(self, track: Track) -> bool:
-        """Whether a track is one of those to be decided: called a pedestrian, and some of it where
-        pedestrians are labelled."""
-        return track.class_name == PERSON and any(
-            self.truth.seen(f, np.array(b.values)) for f, b in track.boxes.items())
+    def _is_new(self, track: Track) -> bool:
+        """Whether a track is to be looked at: called a pedestrian, some of it where pedestrians are
+        labelled, and not looked at before."""
+        return (track.class_name == PERSON and track.id not in self.looked_at and any(
+            self.truth.seen(f, np.array(b.values)) for f, b in track.boxes.items()))
+
+    def _reject_rest(self) -> None:
+        """What was not accepted, at once: only pedestrians are listed, and the rest of them is
+        rejected."""
+        if any(t.state == PROPOSED and t.id in self.looked_at
+               for t in self.session.state.tracks.values()):
+            self.counts["click: only pedestrians"] += 1
+            self._do("key: reject the rest", do="reject_rest", **{"class": PERSON})
 
     def _track_of(self, person: int) -> Track:
         return self.session.state.tracks[self._own[person]]
@@ -191,8 +203,7 @@ class Annotator:
         self._do("drag", do="box", track=track.id, frame=frame, box=box.tolist())
 
     def _trim(self, person: int) -> None:
-        """Before its first frame and after its last, split off what is too much and reject it; in
-        between, remove boxes one by one."""
+        """Let it begin and end where the person does; in between, remove boxes one by one."""
         boxes = self.truth.people[person]
         for late in (True, False):
             track = self._track_of(person)
@@ -201,12 +212,8 @@ class Annotator:
             outside = [f for f in extra if (f > max(boxes) if late else f < min(boxes))]
             if not outside:
                 continue
-            cut = max(boxes) + 1 if late else min(boxes)
-            before = set(self.session.state.tracks)
-            self._do("key: split", do="split", track=track.id, frame=cut)
-            new, = set(self.session.state.tracks) - before
-            self._do("key: reject", do="reject", track=new if late else track.id)
-            self._own[person] = track.id if late else new
+            self._do("key: ends here" if late else "key: begins here", do="trim", track=track.id,
+                     frame=max(boxes) if late else min(boxes), side="after" if late else "before")
         track = self._track_of(person)
         for f in sorted(track.boxes):
             if f not in boxes and self.truth.seen(f, np.array(track.boxes[f].values)):
@@ -266,7 +273,8 @@ def _one_by_one(boxes: list[Array], people: list[Array]) -> int:
 
 def totals(results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Of several drives: the sums, and the shares of what labelling by hand takes."""
-    keys = ("people", "boxes", "actions", "corrections_in_full", "by_hand", "without_tracks")
+    keys = ("people", "boxes", "looked_at", "actions", "corrections_in_full", "by_hand",
+            "without_tracks")
     sums = {key: sum(int(r[key]) for r in results.values()) for key in keys}
     hand = max(sums["by_hand"], 1)
     return {**sums, "share_of_by_hand": sums["actions"] / hand,

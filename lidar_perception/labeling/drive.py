@@ -120,6 +120,16 @@ class Drive:
         """In the order of time."""
         return list(self.recording.frames)
 
+    @property
+    def first(self) -> int:
+        """Number of the first frame."""
+        return 0
+
+    @property
+    def end(self) -> int:
+        """One more than the number of the last frame."""
+        return len(self.frames)
+
     @cached_property
     def motion(self) -> Motion:
         """Times, and poses where every frame has one."""

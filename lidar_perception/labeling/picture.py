@@ -14,7 +14,8 @@ from typing import Any
 
 import aiohttp
 
-from lidar_perception.labeling.server import Served, serve
+from lidar_perception.labeling.served import Served
+from lidar_perception.labeling.server import serve
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError
 

@@ -3,8 +3,8 @@ through the drive, the surest first."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,10 +12,12 @@ import numpy as np
 from lidar_perception.candidates.confidence import confidence
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.silhouette import similarity
+from lidar_perception.classes import Size
 from lidar_perception.detectors.contract import FUSED
 from lidar_perception.geometry import centre_distances
+from lidar_perception.labeling.alike import alike
 from lidar_perception.labeling.interpolation import Motion, filled
-from lidar_perception.labeling.snap import completed
+from lidar_perception.labeling.snap import completed, usual_size
 from lidar_perception.labeling.state import PROPOSED, Box, Track
 from lidar_perception.labeling.survey import Look
 from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams
@@ -27,6 +29,7 @@ Placed = tuple[Array, str]  # a box (7,) and its class
 SAME = 0.6             # metres between the centres of a candidate and a detection of one person
 NEAR = 1.0             # metres between a track and the detection that it was hit by
 LEAST_CONFIDENCE = 0.3  # of a candidate
+UNDETECTED = 0.5       # share of a likeness that counts where a detector found nothing
 FEWEST_HITS = 2        # of a track that is proposed, in a drive of several frames
 LEAST_SCORE = 0.3      # of one
 SURE = 0.95            # score of a box that a person placed
@@ -43,6 +46,25 @@ class SeedLook:
     height: float
 
 
+@dataclass(frozen=True)
+class SeedSize:
+    """A seed of a class other than Pedestrian: one of CLASSES, and length, width and height."""
+
+    class_name: str
+    size: Size
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is looked for: what is like these seeds; and by frame, what a person put there.
+    detected: a detector looks too, so that what is as large as a seed but not found counts less."""
+
+    seeds: Sequence[SeedLook] = ()
+    sizes: Sequence[SeedSize] = ()
+    placed: Mapping[int, Placed] = field(default_factory=dict)
+    detected: bool = False
+
+
 def likeness(look: Look, seeds: Sequence[SeedLook]) -> Array:
     """(C,) float64: the probability that each cluster is a person, by the seed it is most like; 0
     without seeds."""
@@ -54,11 +76,11 @@ def likeness(look: Look, seeds: Sequence[SeedLook]) -> Array:
     return best
 
 
-def found_in(look: Look, seeds: Sequence[SeedLook],
+def found_in(look: Look, wanted: Wanted,
              placed: Placed | None = None) -> tuple[Detections, Array]:
     """What there is in a frame: detections, and candidates where none is; and which (K,) bool are
     these. What a person placed is there for sure."""
-    detections, candidates = _seen_in(look, seeds)
+    detections, candidates = _with_things(look, wanted, *_seen_in(look, wanted.seeds))
     if placed is None or placed[1] not in CLASSES:
         return detections, candidates
     box, name = placed
@@ -75,26 +97,53 @@ def _seen_in(look: Look, seeds: Sequence[SeedLook]) -> tuple[Detections, Array]:
     chosen = np.flatnonzero(scores >= LEAST_CONFIDENCE)
     found = look.detections
     people = found.boxes[np.isin(found.class_ids, ON_FOOT)]
-    boxes = np.array([completed(b, CLASSES[PEDESTRIAN])
+    boxes = np.array([completed(b, usual_size(CLASSES[PEDESTRIAN]))
                       for b in look.boxes[chosen].astype(np.float64)]).reshape(-1, 7)
     new = centre_distances(boxes, people).min(axis=1, initial=np.inf) > SAME
-    both = Detections(np.concatenate([found.boxes, boxes[new].astype(np.float32)]),
-                      np.concatenate([found.class_ids, np.full(new.sum(), PEDESTRIAN, np.int32)]),
-                      np.concatenate([found.scores, scores[chosen][new].astype(np.float32)]))
+    both = _and(found, boxes[new], np.full(new.sum(), PEDESTRIAN), scores[chosen][new])
     return both, np.arange(len(both)) >= len(found)
+
+
+def _with_things(look: Look, wanted: Wanted, found: Detections,
+                 candidates: Array) -> tuple[Detections, Array]:
+    """Clusters too that are as large as the seeds that are no pedestrians, each like one of them,
+    where nothing is found."""
+    sizes = wanted.sizes
+    if not sizes or not len(look.things):
+        return found, candidates
+    scores = np.array([alike(look.things, seed.size) for seed in sizes])
+    scores *= UNDETECTED if wanted.detected else 1.0
+    best = scores.argmax(axis=0)
+    chosen = np.flatnonzero(scores.max(axis=0) >= LEAST_CONFIDENCE)
+    shapes = look.things[chosen].astype(np.float64)
+    boxes = np.array([completed(b, sizes[best[k]].size)
+                      for k, b in zip(chosen, shapes)]).reshape(-1, 7)
+    apart = np.maximum(SAME, boxes[:, None, 3] / 3)
+    new = (centre_distances(boxes, found.boxes) > apart).all(axis=1)
+    classes = np.array([CLASSES.index(sizes[k].class_name) for k in best[chosen]], np.int32)
+    both = _and(found, boxes[new], classes[new], scores.max(axis=0)[chosen][new])
+    return both, np.append(candidates, np.ones(int(new.sum()), bool))
+
+
+def _and(found: Detections, boxes: Array, class_ids: Array, scores: Array) -> Detections:
+    return Detections(np.concatenate([found.boxes, boxes.astype(np.float32)]),
+                      np.concatenate([found.class_ids, class_ids.astype(np.int32)]),
+                      np.concatenate([found.scores, scores.astype(np.float32)]))
 
 
 ON_FOOT = [i for i, kind in enumerate(KIND_OF_CLASS) if kind != KIND_OF_CLASS[0]]
 
 
-def proposed(looks: Sequence[Look], seeds: Sequence[SeedLook], stamps_ns: Sequence[int],
-             motion: Motion, placed: Mapping[int, Placed] = {},
-             params: TrackingParams = TRACKING) -> list[Track]:
-    """The tracks of a drive of which looks (F) are known, the surest first; their ids are 0.
-    placed: by frame, boxes that a person put there."""
-    tracker, hits = Tracker(params), dict[int, list[tuple[int, Array, int, float, bool]]]()
-    for i, look in enumerate(looks):
-        found, candidates = found_in(look, seeds, placed.get(i))
+def proposed(looks: Sequence[Look], wanted: Wanted, stamps_ns: Sequence[int], motion: Motion,
+             frames: range, told: Callable[[int], bool] = lambda count: True) -> list[Track] | None:
+    """The tracks in some frames, one after the other, of a drive of which looks (F) are known, the
+    surest first; their ids are 0. told: how many frames are done, says whether to go on; None where
+    it does not."""
+    tracker, hits = Tracker(TRACKING), dict[int, list[tuple[int, Array, int, float, bool]]]()
+    for i in frames:
+        if not told(i - frames.start):
+            return None
+        found, candidates = found_in(looks[i], wanted, wanted.placed.get(i))
         pose = None if motion.poses is None else motion.poses[i]
         tracks = tracker(found, stamps_ns[i], pose)
         for k in np.flatnonzero(tracks.seen):
@@ -107,7 +156,7 @@ def proposed(looks: Sequence[Look], seeds: Sequence[SeedLook], stamps_ns: Sequen
             hits.setdefault(int(tracks.ids[k]), []).append(
                 (i, box, int(tracks.detections.class_ids[k]), float(found.scores[nearest]),
                  bool(candidates[nearest])))
-    fewest = min(FEWEST_HITS, len(looks))
+    fewest = min(FEWEST_HITS, len(frames))
     made = [_track(seen, motion) for seen in hits.values() if len(seen) >= fewest]
     return sorted((t for t in made if t.score >= LEAST_SCORE), key=lambda t: -t.score)
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,11 +15,22 @@ import numpy as np
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.candidates.silhouette import similarity, to_pixels
+from lidar_perception.classes import Size
 from lidar_perception.detectors.contract import FUSED
 from lidar_perception.geometry import centre_distances, points_in_box
+from lidar_perception.labeling import survey_cache
+from lidar_perception.labeling.alike import alike, cell_of, side_view
 from lidar_perception.labeling.drive import Drive
 from lidar_perception.labeling.interpolation import Motion, corrected
-from lidar_perception.labeling.proposals import CANDIDATES, SAME, SeedLook, proposed
+from lidar_perception.labeling.proposals import (
+    CANDIDATES,
+    SAME,
+    SeedLook,
+    SeedSize,
+    Wanted,
+    proposed,
+)
+from lidar_perception.labeling.snap import to_cluster
 from lidar_perception.labeling.state import REJECTED, State, Track
 from lidar_perception.labeling.survey import Look, surveyed
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
@@ -31,17 +43,28 @@ ALONG = 0.4
 
 
 class Proposer:
-    """Proposals for a drive. weights: of a detector, as open_detector takes them; "": none. looks:
-    of all frames, once they were surveyed, else None."""
+    """Proposals for a drive. weights: of a detector, as open_detector takes them; "": none. kept:
+    the file that keeps the survey, None for none. looks: of all frames, once they were surveyed,
+    else None; problem: what was wrong with that file, or None."""
 
-    def __init__(self, drive: Drive, weights: str = FUSED) -> None:
-        self.drive, self.weights = drive, weights
+    def __init__(self, drive: Drive, weights: str = FUSED, kept: Path | None = None) -> None:
+        self.drive, self.weights, self.kept = drive, weights, kept
         self.looks: list[Look] | None = None
+        self.problem: str | None = None
         self._seeds: dict[tuple[int, tuple[float, ...]], Seed | None] = {}
 
+    def remember(self) -> None:
+        """Take the looks that were kept, where they are of this drive and these weights."""
+        if self.kept is None or self.looks is not None:
+            return
+        try:
+            self.looks = survey_cache.read(self.kept, survey_cache.key_of(self.drive, self.weights))
+        except InputError as error:
+            self.problem = str(error)
+
     def survey(self, done: Callable[[int], bool], here: bool = False) -> bool:
-        """Look at all frames, in a process of its own or here; done is told how many there are, and
-        says whether to go on. Whether all were."""
+        """Look at all frames, in a process of its own or here, and keep that; done is told how many
+        there are, and says whether to go on. Whether all were."""
         looks: list[Look] = []
         with closing(surveyed(self.drive, self.weights, here)) as survey:
             for look in survey:
@@ -49,6 +72,11 @@ class Proposer:
                 if not done(len(looks)):
                     return False
         self.looks = looks
+        if self.kept is not None:
+            try:
+                survey_cache.write(self.kept, survey_cache.key_of(self.drive, self.weights), looks)
+            except InputError as error:
+                self.problem = str(error)
         return True
 
     def poses(self) -> list[list[float]] | None:
@@ -59,14 +87,25 @@ class Proposer:
         return [np.round(pose, 6).ravel().tolist() for pose in found] if len(found) == len(
             self.looks) else None
 
-    def proposals(self, state: State, motion: Motion) -> tuple[list[Track], list[int]]:
-        """Tracks that are new or other than they were, and the ids of those to remove. The drive is
-        surveyed."""
+    def proposals(self, state: State, motion: Motion, frames: range | None = None,
+                  told: Callable[[int], bool] = lambda count: True) -> list[Track] | None:
+        """The tracks that there are in some frames, None for all, of a drive that is surveyed; told
+        as in proposed()."""
         seeds = [SeedLook(seed.silhouette(BEST), seed.height) for seed in self.seeds(state)]
+        sizes = [SeedSize(t.class_name, _size(t, f))
+                 for f, t in self._things(state)]
         placed = {f: (np.array(b.values), t.class_name) for t in state.tracks.values()
                   if is_placed(t) for f, b in t.boxes.items()}
         stamps = [frame.stamp_ns for frame in self.drive.frames]
-        return merged(state, proposed(self.looks or [], seeds, stamps, motion, placed), motion)
+        wanted = Wanted(seeds, sizes, placed, self.weights != "")
+        return proposed(self.looks or [], wanted, stamps, motion,
+                        range(len(self.looks or [])) if frames is None else frames, told)
+
+    def _things(self, state: State) -> list[tuple[int, Track]]:
+        """The seeds that are no pedestrians: frame and track."""
+        found = [(f, state.tracks[t]) for f, t in state.seeds if t in state.tracks]
+        return [(f, t) for f, t in found if f in t.boxes and t.class_name in CLASSES
+                and t.class_name != CLASSES[PEDESTRIAN]]
 
     def seeds(self, state: State) -> list[Seed]:
         """Those of the state that have points enough."""
@@ -83,16 +122,16 @@ class Proposer:
 
     def cut_out(self, box: Array, frame: int) -> Seed | None:
         """What is in a box (7,) of a frame, as a seed; None where it has too few points."""
-        scan = self.drive.clouds(frame)
-        inside = points_in_box(scan.xyz, box, MARGIN) & ~scan.ground
         try:
-            return seed_from_points(scan.xyz[inside], box, certain=True)
+            return seed_from_points(self._inside(frame, box), box, certain=True)
         except InputError:
             return None
 
     def silhouettes(self, state: State, track: Track, frame: int) -> dict[str, Any]:
-        """Of the seed that a candidate is most like, and of the candidate, as the page has them.
-        InputError where there is none."""
+        """Of the seed that a candidate is most like, and of the candidate, as the page has them; of
+        what is no pedestrian, the view from the side. InputError where there is none."""
+        if track.class_name != CLASSES[PEDESTRIAN]:
+            return self._sides(state, track, frame)
         seeds = self.seeds(state)
         if not seeds:
             raise InputError("there is no seed yet; click a pedestrian")
@@ -101,10 +140,36 @@ class Proposer:
         if seen is None:
             raise InputError(f"track {track.id} has too few points in frame {frame} to be compared")
         image, templates = seen.silhouette(BEST), [seed.silhouette(BEST) for seed in seeds]
-        alike = [float(similarity(image[None], t, BEST.stm)[0]) for t in templates]
-        best = int(np.argmax(alike))
-        return {"seed": _drawn(templates[best]), "candidate": _drawn(image),
-                "similarity": alike[best]}
+        scores = [float(similarity(image[None], t, BEST.stm)[0]) for t in templates]
+        best = int(np.argmax(scores))
+        return {"seed": _drawn(to_pixels(templates[best])), "candidate": _drawn(to_pixels(image)),
+                "similarity": scores[best]}
+
+    def _sides(self, state: State, track: Track, frame: int) -> dict[str, Any]:
+        seeds = [(f, t) for f, t in self._things(state) if t.class_name == track.class_name]
+        if not seeds:
+            raise InputError(f"there is no seed of class {track.class_name} yet; click one")
+        if frame not in track.boxes:
+            raise InputError(f"track {track.id} has no box in frame {frame}")
+        box = np.array(track.boxes[frame].values)
+        try:
+            shape = to_cluster(self.drive.clouds(frame), box)
+        except InputError:
+            raise InputError(f"track {track.id} has too few points in frame {frame} to be "
+                             "compared") from None
+        shape[3:5] = max(shape[3:5]), min(shape[3:5])
+        scores = [float(alike(shape[None], _size(t, f))[0])
+                  for f, t in seeds]
+        f, seed = seeds[int(np.argmax(scores))]
+        like = np.array(seed.boxes[f].values)
+        cell = cell_of(box, like)
+        return {"seed": _drawn(side_view(self._inside(f, like), like, cell)),
+                "candidate": _drawn(side_view(self._inside(frame, box), box, cell)),
+                "similarity": max(scores)}
+
+    def _inside(self, frame: int, box: Array) -> Array:
+        scan = self.drive.clouds(frame)
+        return scan.xyz[points_in_box(scan.xyz, box, MARGIN) & ~scan.ground]
 
     def detected(self, frame: int, box: Array, class_name: str) -> Array:
         """(7,) the box of a detection of the class where a clicked cluster's box (7,) is; that one
@@ -119,8 +184,12 @@ class Proposer:
         return found.boxes[int(apart.argmin())].astype(np.float64)
 
 
-def _drawn(image: Array) -> dict[str, Any]:
-    pixels = to_pixels(image)
+def _size(track: Track, frame: int) -> Size:
+    length, width, height = track.boxes[frame].values[3:6]
+    return length, width, height
+
+
+def _drawn(pixels: Array) -> dict[str, Any]:
     return {"rows": pixels.shape[0], "cols": pixels.shape[1],
             "bits": "".join("01"[bit] for bit in pixels.ravel().astype(int))}
 

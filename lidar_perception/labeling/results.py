@@ -33,6 +33,7 @@ SIMILAR = {row.name: row.looks_like or row.name for row in TABLE}
 MARKERS = "visualization_msgs/msg/MarkerArray"
 FOUND, TRACKS = "/output/detections", "/output/tracks"  # the end of a topic, of whatever node
 CLUSTERED = ("/clustering/output/points", "/perception/output/points")
+MOST_SOURCES = 8                             # of one detection that are shown
 KEPT = 2000                                  # frames whose detections are kept
 
 
@@ -62,19 +63,30 @@ class Results:
         truth = frame.truth()
         camera = frame.camera() if self.sources and truth is not None else None
         found = {name: source.find(i, frame) for name, source in self.sources.items()}
-        labels = [] if truth is None else [
-            [*map(float, box), name, extra.get("track_id")]
-            for box, name, extra in zip(truth.boxes, truth.labels, truth.extras)]
-        rows = {name: [[*map(float, box), CLASSES[c], float(score)] for box, c, score
-                       in zip(d.boxes, d.class_ids, d.scores)] for name, d in found.items()}
         matches = {} if truth is None else {
             name: compared(truth, d, min_score, camera, self.sources[name].classes)
             for name, d in found.items()}
-        return {"labels": labels, "detections": rows, "matches": matches}
+        return shown_layers(truth, found, matches)
 
     def layers_of(self, drive: Drive) -> Callable[[int, float], dict[str, Any]]:
         """layers() of frame i of a drive, from a score on."""
         return lambda i, min_score: self.layers(i, drive.frames[i], min_score)
+
+
+def shown_layers(truth: GroundTruth | None, found: Mapping[str, Detections],
+                 matches: Mapping[str, Any]) -> dict[str, Any]:
+    """Labels, and by source its detections, as rows: the box, the class, and the track id or the
+    score; of a detection then what each of its own sources says."""
+    labels = [] if truth is None else [
+        [*map(float, box), name, extra.get("track_id")]
+        for box, name, extra in zip(truth.boxes, truth.labels, truth.extras)]
+    rows = {}
+    for name, d in found.items():
+        said = [{k: round(float(v[i]), 3) for k, v in d.sources.items() if np.isfinite(v[i])}
+                for i in range(len(d))]
+        rows[name] = [[*map(float, box), CLASSES[c], float(score), each]
+                      for box, c, score, each in zip(d.boxes, d.class_ids, d.scores, said)]
+    return {"labels": labels, "detections": rows, "matches": dict(matches)}
 
 
 def compared(truth: GroundTruth, found: Detections, min_score: float, camera: Camera | None = None,
@@ -153,13 +165,26 @@ def recorded(path: Path, stamps: list[int]) -> Results:
     for topic, marked in found.items():
         frames = {numbers[stamp]: each for stamp, each in marked.items() if stamp in numbers}
         if topic.endswith(TRACKS):
-            tracks += _tracks(frames, topic, len(tracks))
+            tracks += tracks_of(frames, topic, len(tracks))
         else:
-            sources[_short(topic)] = _given({i: to_detections(f) for i, f in frames.items()})
+            sources[source_name(topic)] = _given({i: with_sources(f) for i, f in frames.items()})
     return Results(sources, tuple(tracks))
 
 
-def _short(topic: str) -> str:
+def with_sources(objects: MarkedObjects) -> Detections:
+    """Detections from markers, with what each of their sources says where the text has it."""
+    said = [e["sources"] if isinstance(e.get("sources"), dict) else {} for e in objects.extras]
+    names = list(dict.fromkeys(name for each in said for name in each))[:MOST_SOURCES]
+    return replace(to_detections(objects), sources={
+        name: np.array([_probability(each.get(name)) for each in said], np.float32)
+        for name in names})
+
+
+def _probability(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) and 0 <= value <= 1 else np.nan
+
+
+def source_name(topic: str) -> str:
     """Of /fused_detector/output/detections the node's name."""
     return topic.strip("/").removesuffix(FOUND)
 
@@ -180,8 +205,10 @@ def recorded_scan(frame: Frame) -> Scan:
     return scan_of(cloud, ground > 0, renumbered(ids)[0])
 
 
-def _tracks(frames: Mapping[int, MarkedObjects], topic: str, before: int) -> list[dict[str, Any]]:
-    """Tracks as the page has them, numbered from before + 1 on where there are several trackers."""
+def tracks_of(frames: Mapping[int, MarkedObjects], topic: str,
+              before: int) -> list[dict[str, Any]]:
+    """What a tracker published, by frame, as the page has tracks; numbered from before + 1 on
+    where there are several trackers."""
     made: dict[int, dict[str, Any]] = {}
     for i in sorted(frames):
         objects = frames[i]

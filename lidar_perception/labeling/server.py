@@ -6,12 +6,10 @@ import asyncio
 import hmac
 import logging
 import re
-import secrets
 import signal
 from collections.abc import Awaitable, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,8 +17,7 @@ from typing import Any
 from aiohttp import WSMsgType, web
 
 from lidar_perception.labeling.actions import track_of
-from lidar_perception.labeling.drive import Drive, classes
-from lidar_perception.labeling.exchange import FORMATS
+from lidar_perception.labeling.served import Served
 from lidar_perception.labeling.session import Session
 from lidar_perception.labeling.state import next_uncertain
 from lidar_perception.runs.files import short
@@ -37,20 +34,6 @@ HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff",
            "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
                                       "img-src 'self' data: blob:; frame-ancestors 'none'"}
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-
-
-@dataclass(eq=False)
-class Served:
-    """What the page shows. session: the labels being made; None: results are only looked at.
-    layers: of frame i from a score on, as /api/labels has it, None where there is nothing to show;
-    tracks: as the page has them, where results are looked at."""
-
-    drive: Drive
-    session: Session | None = None
-    layers: Callable[[int, float], dict[str, Any]] | None = None
-    tracks: tuple[dict[str, Any], ...] = ()
-    live: bool = False
-    token: str = field(default_factory=partial(secrets.token_urlsafe, 24))
 
 
 class Server:
@@ -111,29 +94,22 @@ class Server:
 
     async def drive(self, request: web.Request) -> web.StreamResponse:
         """What is looked at."""
-        served, drive = self.served, self.served.drive
-        poses = (served.session or drive).motion.poses
-        frames = [{"name": f.name, "stamp_ns": f.stamp_ns, "sequence": f.sequence,
-                   "pose": None if poses is None else poses[i].ravel().tolist()}
-                  for i, f in enumerate(drive.frames)]
-        return web.json_response({
-            "name": drive.name, "path": str(drive.recording.path), "live": served.live,
-            "mode": "label" if served.session else "view", "frames": frames, "classes": classes(),
-            "layout": drive.recording.layout, "has": sorted(drive.recording.has),
-            "can_export": [*FORMATS] if served.session else []})
+        return web.json_response(self.served.described())
 
     def frame(self, text: str) -> int:
         """The number of a frame. InputError where there is none of it."""
-        frames = len(self.served.drive.frames)
-        if not text.isascii() or not text.isdigit() or not int(text[:9]) < frames:
-            raise InputError(f"there is no frame {text[:20]}; the drive has 0 .. {frames - 1}")
+        first, end = self.served.drive.first, self.served.drive.end
+        if not text.isascii() or not text.isdigit() or not first <= int(text[:9]) < end:
+            raise InputError(f"there is no frame {text[:20]}; there are {first} .. {end - 1}")
         return int(text)
 
     async def cloud(self, request: web.Request) -> web.StreamResponse:
         """The points of a frame; those around it are made ready."""
-        i, clouds = self.frame(request.match_info["i"]), self.served.drive.clouds
+        i, drive = self.frame(request.match_info["i"]), self.served.drive
+        clouds = drive.clouds
         body = await self.in_thread(lambda: clouds(i).encoded())
-        for near in range(max(i - AHEAD, 0), min(i + AHEAD + 1, len(self.served.drive.frames))):
+        ahead = 0 if self.served.live else AHEAD
+        for near in range(max(i - ahead, drive.first), min(i + ahead + 1, drive.end)):
             if near not in self.ready:
                 self.ready.add(near)
                 made = asyncio.get_running_loop().run_in_executor(self.pool, clouds, near)
@@ -159,7 +135,7 @@ class Server:
     async def state(self, request: web.Request) -> web.StreamResponse:
         """All labels, or all tracks of the results."""
         if self.served.session is None:
-            return web.json_response({"seq": 0, "tracks": self.served.tracks})
+            return web.json_response({"seq": 0, "tracks": list(self.served.tracks())})
         return web.json_response(self.session.everything())
 
     async def do(self, request: web.Request) -> web.StreamResponse:
@@ -171,7 +147,8 @@ class Server:
         return web.json_response({"seq": seq})
 
     async def events(self, request: web.Request) -> web.StreamResponse:
-        """What is done, also by other pages."""
+        """What is done, also by other pages; what comes, where a running graph is shown: a page
+        that has paused says so, and the frames are held for as long as it is there."""
         socket = web.WebSocketResponse(heartbeat=20.0)
         await socket.prepare(request)
         queue: asyncio.Queue[dict[str, Any]] = asyncio.Queue(MAX_WAITING)
@@ -181,7 +158,11 @@ class Server:
             async for message in socket:
                 if message.type == WSMsgType.ERROR:
                     break
+                if self.served.live and message.type == WSMsgType.TEXT:
+                    self.served.live.hold(id(socket), message.data == "hold")
         finally:
+            if self.served.live:
+                self.served.live.hold(id(socket), False)
             self.pages.discard(queue)
             sender.cancel()
             with suppress(asyncio.CancelledError, ConnectionError):
@@ -218,8 +199,9 @@ class Server:
 
     async def next(self, request: web.Request) -> web.StreamResponse:
         """The next uncertain track."""
-        after = _number(request.query.get("after", ""))
-        track = next_uncertain(self.session.state, after)
+        after, only = _number(request.query.get("after", "")), request.query.get("class")
+        track = next_uncertain(self.session.state, after,
+                               lambda track: only in (None, track.class_name))
         return web.json_response({"track": track and track.id,
                                   "frame": track.nearest_frame() if track else 0})
 
@@ -272,8 +254,9 @@ async def serve(served: Served, port: int, started: Callable[[str], None]) -> No
     server, loop, end = Server(served), asyncio.get_running_loop(), asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, end.set)
-    if served.session is not None:
-        served.session.listeners.append(partial(_in_loop, loop, server))
+    for source in (served.session, served.live):
+        if source is not None:
+            source.listeners.append(partial(_in_loop, loop, server))
     runner = web.AppRunner(server.app, access_log=None, shutdown_timeout=1.0)
     await runner.setup()
     site = web.TCPSite(runner, HOSTS[0], port)

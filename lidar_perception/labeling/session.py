@@ -6,6 +6,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.detectors.contract import FUSED
+from lidar_perception.labeling import survey_cache
 from lidar_perception.labeling.actions import (
     Action,
     apply,
@@ -29,7 +31,7 @@ from lidar_perception.labeling.exchange import export_labels, import_labels, rec
 from lidar_perception.labeling.interpolation import Motion
 from lidar_perception.labeling.journal import Journal, header, opened
 from lidar_perception.labeling.labelled import from_labels, to_labels
-from lidar_perception.labeling.proposing import Proposer
+from lidar_perception.labeling.proposing import Proposer, merged
 from lidar_perception.labeling.snap import around_click, to_cluster, to_ground, to_size
 from lidar_perception.labeling.state import (
     ACCEPTED,
@@ -39,6 +41,7 @@ from lidar_perception.labeling.state import (
     State,
     Track,
     progress,
+    track_from_json,
     track_to_json,
 )
 from lidar_perception.runs.files import short
@@ -46,6 +49,7 @@ from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 
 Array = np.ndarray[Any, Any]
 
+NEARBY = 20  # frames before and after a click through which it is followed before it is answered
 Listener = Callable[[dict[str, Any]], None]
 
 
@@ -55,11 +59,15 @@ class Session:
 
     def __init__(self, drive: Drive, journal: Journal, weights: str = FUSED) -> None:
         self.drive, self.journal, self.state = drive, journal, State()
-        self.proposer = Proposer(drive, weights)
+        self.proposer = Proposer(drive, weights, journal.path.with_name(survey_cache.NAME))
         self.listeners: list[Listener] = []
         self.busy: dict[str, Any] | None = None
         self.was_proposed = any(line.get("do") == "propose" for line in journal.lines)
         self._cancelled = False
+        self._beside: threading.Thread | None = None
+        self._what = ""  # goes on there
+        # Seeds that were followed nearby only: as they were placed, and as they are.
+        self._partly: dict[int, tuple[Track, Track]] = {}
         self._lock = threading.RLock()
         for line in journal.lines:
             self.state, _ = apply(self.state, line, drive.motion)
@@ -74,55 +82,115 @@ class Session:
         """Do an action of a page; its number. InputError where it cannot be done, or not be
         written: then nothing has changed."""
         if action.get("do") in ("propose", "cancel"):
-            return self._start_proposing(by) if action["do"] == "propose" else self.cancel()
+            return self.prepare(by, True) if action["do"] == "propose" else self.cancel()
         with self._lock:
-            return self._record(self._computed(_asked(action)), by)
+            seq = self._record(self._computed(_asked(action)), by)
+            if action.get("do") == "seed" and self._partly:
+                self._start("following", lambda: self._follow(by, seq))
+        return seq
 
     def cancel(self) -> int:
         """End what goes on; the number of the last action."""
         self._cancelled = True
         return self.state.seq
 
-    def _start_proposing(self, by: str) -> int:
+    def prepare(self, by: str = "", anew: bool = False) -> int:
+        """Begin to look at the drive, beside the page, and write down proposals where there were
+        none yet, or anew; the number of the last action. InputError while that goes on."""
         with self._lock:
-            if self.busy is not None:
+            if self._what == "proposing":
                 raise InputError("proposals are being made already")
-            self.busy = {"what": "proposing", "done": 0, "of": len(self.drive.frames)}
-            self._cancelled = False
-        threading.Thread(target=self._propose_beside, args=(by,), daemon=True).start()
+            self._start("proposing", lambda: self.propose(by, anew=anew or not self.was_proposed))
         return self.state.seq
 
-    def _propose_beside(self, by: str) -> None:
-        try:
-            self.propose(by)
-        except Exception as error:  # of a thread nobody waits for: the page is told
-            self.tell({"error": str(error) if isinstance(error, InputError) else
-                       f"no proposals: {type(error).__name__}: {short(error)}"})
-        finally:
-            self.busy = None
-            self.tell({"progress": self.progress()})
+    def _start(self, what: str, work: Callable[[], None]) -> None:
+        """Do what takes long in a thread of its own; what went on before ends."""
+        before, self._cancelled, self._what = self._beside, True, what
+
+        def beside() -> None:
+            if before is not None:
+                before.join()
+            self.busy = {"what": what, "done": 0, "of": len(self.drive.frames)}
+            self._cancelled = False
+            try:
+                work()
+            except Exception as error:  # of a thread nobody waits for: the page is told
+                self.tell({"error": str(error) if isinstance(error, InputError) else
+                           f"no proposals: {type(error).__name__}: {short(error)}"})
+            finally:
+                self.busy = None
+                with self._lock:
+                    if self._beside is threading.current_thread():
+                        self._what = ""
+                self.tell({"progress": self.progress()})
+        self._beside = threading.Thread(target=beside, daemon=True)
+        self._beside.start()
+
+    def wait(self) -> None:
+        """Until what goes on beside is done."""
+        if self._beside is not None:
+            self._beside.join()
 
     def propose(self, by: str = "", here: bool = False,
-                told: Callable[[int], object] = lambda count: None) -> None:
-        """Look at the drive, in a process of its own or here, and write down the proposals; nothing
-        is written if it is cancelled. told: how many frames were looked at. InputError where a
-        frame or the weights cannot be read."""
+                told: Callable[[int], object] = lambda count: None, anew: bool = True) -> None:
+        """Look at the drive, in a process of its own or here, and write down the proposals, but not
+        with anew=False; nothing is written if it is cancelled. told: how many frames were looked
+        at. InputError where a frame or the weights cannot be read."""
         def done(count: int) -> bool:
             told(count)
-            if self.busy is not None:
-                self.busy = {**self.busy, "done": count}
-                self.tell({"progress": self.progress()})
-            return not self._cancelled
+            return self._done(count)
+        self.proposer.remember()
+        if self.proposer.problem:
+            self.tell({"error": self.proposer.problem})
         if self.proposer.looks is None and not self.proposer.survey(done, here):
             return
         with self._lock:
             if not self.state.poses and (poses := self.proposer.poses()) is not None:
                 self._record({"do": "poses", "poses": poses}, by)
-            self._record({"do": "propose", **self._proposals(self.state)}, by)
+        if anew:
+            self._propose_all(by, None)
 
-    def _proposals(self, state: State) -> dict[str, Any]:
-        tracks, removed = self.proposer.proposals(state, motion_of(state, self.drive.motion))
-        return {"tracks": [track_to_json(t) for t in tracks], "removed": removed}
+    def _done(self, count: int) -> bool:
+        """So many frames of what goes on; whether to go on."""
+        if self.busy is not None:
+            self.busy = {**self.busy, "done": count}
+            self.tell({"progress": self.progress()})
+        return not self._cancelled
+
+    def _propose_all(self, by: str, seed: int | None) -> None:
+        """Follow everything through the whole drive, and write that down; with the number of the
+        action that began it as one action, if it is the last. Others may be done meanwhile."""
+        with self._lock:
+            state = self._as_placed(self.state)
+        motion = motion_of(state, self.drive.motion)
+        found = self.proposer.proposals(state, motion, None, self._done)
+        with self._lock:
+            if found is None or self._cancelled or (seed is not None and not self._waiting()):
+                return
+            state = self._as_placed(self.state)
+            tracks, removed = merged(state, found, motion_of(state, self.drive.motion))
+            followed = {t.id for t in tracks}
+            tracks += [state.tracks[n] for n in self._partly if n not in followed
+                       and state.tracks.get(n) != self.state.tracks.get(n)]
+            joins = {"joins": True} if seed == self.state.seq else {}
+            self._record({"do": "propose", **_made(tracks, removed), **joins}, by)
+            self._partly.clear()
+
+    def _follow(self, by: str, seed: int) -> None:
+        with self._lock:
+            waiting = self._waiting()
+        if waiting:
+            self._propose_all(by, seed)
+
+    def _waiting(self) -> bool:
+        """Whether there is a seed that is to be followed through the whole drive."""
+        return any(self.state.tracks.get(n) == partly for n, (_, partly) in self._partly.items())
+
+    def _as_placed(self, state: State) -> State:
+        """Without what was only followed nearby, and not touched since."""
+        placed = {n: alone for n, (alone, partly) in self._partly.items()
+                  if state.tracks.get(n) == partly}
+        return replace(state, tracks={**state.tracks, **placed})
 
     def _computed(self, action: Action) -> Action:
         """The action with what is computed for it, as the journal has it."""
@@ -167,10 +235,21 @@ class Session:
         alone = {**action, "track": track.id, "tracks": [track_to_json(track)]}
         if self.proposer.looks is None:
             return alone
-        made = self._proposals(apply(self.state, alone, self.drive.motion)[0])
-        if all(found["id"] != track.id for found in made["tracks"]):
-            made["tracks"] += alone["tracks"]
-        return {**alone, **made}
+        state = apply(self.state, alone, self.drive.motion)[0]
+        motion, count = motion_of(state, self.drive.motion), len(self.drive.frames)
+        nearby = range(max(frame - NEARBY, 0), min(frame + NEARBY + 1, count))
+        some = count > 2 * NEARBY
+        found = self.proposer.proposals(state, motion, nearby if some else None)
+        tracks, removed = merged(state, found or [], motion)
+        if some:  # what is known of the frames around says nothing of what is there already
+            tracks = [t for t in tracks if t.id == track.id or t.id not in state.tracks]
+            removed = []
+        if all(t.id != track.id for t in tracks):
+            tracks.append(track)
+        if some:
+            partly = next(t for t in tracks if t.id == track.id)
+            self._partly[track.id] = track, track_from_json(track_to_json(partly))
+        return {**alone, **_made(tracks, removed)}
 
     def _snapped(self, action: Action) -> Array:
         track, frame = track_of(self.state, action.get("track")), frame_of(action,
@@ -224,6 +303,10 @@ class Session:
                     "tracks": [track_to_json(t) for t in self.state.tracks.values()]}
 
 
+def _made(tracks: list[Track], removed: list[int]) -> dict[str, Any]:
+    return {"tracks": [track_to_json(t) for t in tracks], "removed": removed}
+
+
 def _asked(action: Mapping[str, Any]) -> Action:
     """What a page may say of an action; what is computed for it, it may not."""
     if action.get("do") == "poses":
@@ -231,7 +314,7 @@ def _asked(action: Mapping[str, Any]) -> Action:
     computed = {"seed": ("track", "tracks", "removed"), "propose": ("tracks", "removed"),
                 "import": ("tracks", "removed", "kept"),
                 "accept": ("seed",), "snap": ("box",)}
-    unwanted = ("seq", "time", "by", *computed.get(str(action.get("do")), ()))
+    unwanted = ("seq", "time", "by", "joins", *computed.get(str(action.get("do")), ()))
     return {k: v for k, v in action.items() if k not in unwanted}
 
 
@@ -242,6 +325,7 @@ def session(drive: Drive, folder: Path, weights: str = FUSED) -> Iterator[Sessio
     head = header(drive.name, [f.name for f in drive.frames], [f.stamp_ns for f in drive.frames])
     with opened(folder, head) as journal:
         made = Session(drive, journal, weights)
+        made.proposer.remember()
         try:
             yield made
         finally:

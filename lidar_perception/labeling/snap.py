@@ -21,6 +21,7 @@ NEAREST, FARTHEST = 20, 15.0  # points of the ground, and metres, where few are 
 PIECE = 0.2        # of the points of the largest cluster there: smaller ones are something else
 PIECES = 0.55      # of the usual length: so far from a click there are pieces of the same vehicle,
 MOST = 0.8         # if more of their points than this are there
+LARGER = 1.5       # times the usual length: more than the object that was clicked
 LONG = 2.5         # metres: what is usually longer hides its far side
 WIDER = 1.3        # times the width: a side that is no longer than this is the front or the rear
 
@@ -36,7 +37,11 @@ def around_click(scan: Scan, click: Array, class_name: str) -> Array:
         inside, whole = (np.bincount(scan.cluster_ids[mask], minlength=scan.cluster_ids.max() + 1)
                          for mask in (near, slice(None)))
         members |= ((inside > MOST * whole) & (np.arange(len(whole)) > 0))[scan.cluster_ids]
-    return completed(_around(scan, members), class_name)
+    box = _around(scan, members)
+    if usual is not None and box[3] > LARGER * usual[0]:  # it has grown together with others
+        around = np.hypot(*(scan.xyz[:, :2] - click[:2]).T) < usual[0] * PIECES
+        box = _around(scan, members & around)
+    return completed(box, usual)
 
 
 def to_cluster(scan: Scan, box: Array) -> Array:
@@ -92,11 +97,10 @@ def usual_size(class_name: str) -> Size | None:
     return DETECTED[class_name].mean_size if class_name in DETECTED else None
 
 
-def completed(box: Array, class_name: str) -> Array:
-    """(7,) the box of what is seen, made as long and wide as the class usually is. People are seen
+def completed(box: Array, usual: Size | None) -> Array:
+    """(7,) the box of what is seen, made as long and wide as its class usually is. People are seen
     through and through, so theirs grows evenly; others grow away from the sensor, and a side that
     is hardly longer than the width is taken for the width."""
-    usual = usual_size(class_name)
     if usual is None:
         return box
     length, width, height = usual

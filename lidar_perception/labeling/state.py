@@ -69,6 +69,14 @@ class Change(NamedTuple):
     checked: tuple[frozenset[int], frozenset[int]]
     kept: tuple[Kept, Kept]
 
+    def then(self, later: Change) -> Change:
+        """This change and one after it, as one."""
+        tracks = {n: (self.tracks[n] if n in self.tracks else later.tracks[n])[:1]
+                  + (later.tracks[n] if n in later.tracks else self.tracks[n])[1:]
+                  for n in (*self.tracks, *later.tracks)}
+        return Change(tracks, (self.seeds[0], later.seeds[1]),
+                      (self.checked[0], later.checked[1]), (self.kept[0], later.kept[1]))
+
     def turned_round(self) -> Change:
         """The change that takes it back."""
         return Change({k: (after, before) for k, (before, after) in self.tracks.items()},

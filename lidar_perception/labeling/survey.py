@@ -1,5 +1,5 @@
 """What is looked at once in each frame of a drive, so that proposals for another seed take no
-time: what a detector finds, and the clusters that may be people."""
+time: what a detector finds, and the clusters that may be people or things."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ import numpy as np
 from lidar_perception.candidates.confidence import shape_features
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
+from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.candidates.silhouette import ROWS, silhouettes
+from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.groups import group_points
@@ -28,18 +30,23 @@ LEAST_SCORE = 0.1             # of a detection: tracks make something of weak on
 HEIGHTS = 0.9, 2.4            # metres of a person above the ground
 WIDEST = 2.0                  # metres of one's cluster seen from above
 FEWEST = 5                    # points of one
+THINGS = 0.7, 4.5             # metres above the ground of what else may be a seed's like,
+LONGEST = 14.0                # the longest side of its cluster,
+FEWEST_OF_THING = 10          # and its points
 
 
 @dataclass(frozen=True)
 class Look:
     """Of one frame: detections; and C clusters that may be people: boxes (C, 7) on the ground,
-    silhouettes (C, 80) uint32, and their features by name, (C,) each. pose (4, 4) in the first
-    frame, by the scans, where the drive has none of its own."""
+    silhouettes (C, 80) uint32, and their features by name, (C,) each. things (T, 7): the L-shapes
+    of clusters of any kind, on the ground. pose (4, 4) in the first frame, by the scans, where the
+    drive has none of its own."""
 
     detections: Detections
     boxes: Array
     images: Array
     features: dict[str, Array]
+    things: Array
     pose: Array | None = None
 
 
@@ -55,11 +62,24 @@ def look_at(frame: Frame, detector: Detector | None = None,
     people = np.flatnonzero((found.boxes[:, 5] >= HEIGHTS[0]) & (found.boxes[:, 5] <= HEIGHTS[1])
                             & (np.hypot(found.boxes[:, 3], found.boxes[:, 4]) <= WIDEST)
                             & (counts >= FEWEST))
-    boxes = found.boxes[people]
+    boxes, things = found.boxes[people], _things(found, counts)
     if len(people) == 0:
-        return Look(detections, boxes, np.zeros((0, ROWS), np.uint32), {}, pose)
+        return Look(detections, boxes, np.zeros((0, ROWS), np.uint32), {}, things, pose)
     return Look(detections, boxes, *_described(found.xyz, found.cluster_ids, boxes, people + 1,
-                                               params), pose)
+                                               params), things, pose)
+
+
+def _things(found: Segmented, counts: Array) -> Array:
+    """(T, 7) float32."""
+    height, across = found.boxes[:, 5], np.hypot(found.boxes[:, 3], found.boxes[:, 4])
+    chosen = np.flatnonzero((height >= THINGS[0]) & (height <= THINGS[1]) & (across <= LONGEST)
+                            & (counts >= FEWEST_OF_THING))
+    numbers = np.zeros(len(found.boxes) + 1, np.int32)
+    numbers[chosen + 1] = np.arange(1, len(chosen) + 1)
+    labels = numbers[found.cluster_ids]
+    shapes = oriented_boxes(found.xyz[labels > 0], labels[labels > 0], "l_shape")
+    shapes[:, [2, 5]] = found.boxes[chosen][:, [2, 5]]  # down to the ground
+    return shapes
 
 
 def _described(xyz: Array, cluster_ids: Array, boxes: Array, numbers: Array,

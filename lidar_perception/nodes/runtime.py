@@ -114,7 +114,7 @@ class LidarNode(Node):
         def guarded(data: bytes, patient: bool = False) -> str | None:
             missing = None
             try:
-                msg = _decoded(data, type_name)
+                msg = decoded(data, type_name)
                 if type_name == CLOUD:
                     self.frame_id = msg.header.frame_id
                     missing = self.transforms.missing(msg)
@@ -252,7 +252,7 @@ class LidarNode(Node):
         """Called once before the node is destroyed."""
 
 
-def _decoded(data: bytes, type_name: str) -> Any:
+def decoded(data: bytes, type_name: str) -> Any:
     if type_name in typestore().fielddefs:
         return decode(data, type_name)
     return deserialize_message(data, message_class(type_name))

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.clustering.density import followed
+from lidar_perception.clustering.params import DENSE, ClusteringParams
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.sensor_setup.findings import body_fits, doubts
 from lidar_perception.sensor_setup.measure import SMALL_ROOM, Measured, sensor_of
@@ -21,6 +23,7 @@ EPS_BEAMS = 1.33
 LIMITS = (15.0, 30.0, 45.0)       # m, of the bands; the paper has the first two
 MAX_EPS = (0.5, 0.7, 0.9, 1.0)    # m; farther neighbours join people who walk side by side
 MIN_SAMPLES = 3
+RESERVE = 0.75                    # of the density of a sensor, that no cloud of it counts as thin
 NEAREST_GROUND = 0.9              # of the distance of the nearest ground: where Patchwork++ begins
 
 
@@ -128,6 +131,8 @@ def _of_resolution(m: Measured) -> dict[str, tuple[Any, str]]:
                 for gap, least, most in zip(gaps, paper, MAX_EPS))
     samples = int(np.clip(round(default["clustering.dbscan.min_samples"] * density), MIN_SAMPLES,
                           default["clustering.dbscan.min_samples"]))
+    seen = 1.0 / (up * aside)
+    made = followed(ClusteringParams(density=DENSE), seen).euclidean
     return {
         "clustering.dbscan.range_limits": (LIMITS, "a fourth band, as the resolution allows"),
         "clustering.dbscan.eps": (eps, f"{EPS_BEAMS} times the distance of the beams at the end "
@@ -136,7 +141,12 @@ def _of_resolution(m: Measured) -> dict[str, tuple[Any, str]]:
         "clustering.dbscan.join_bands": (True, "no cluster is cut at the end of a band"),
         "clustering.dbscan.min_samples": (samples, "10 for the HDL-64E; the sensor has "
                                           f"{density:.2f} times as many points on a surface"),
+        "clustering.density": (round(min(DENSE, RESERVE * seen), 2), "the numbers here are made "
+                               f"for {seen:.1f} points a square degree; in thinner clouds they "
+                               "follow the density"),
         "clustering.euclidean.min_size": (samples, "likewise"),
+        "clustering.euclidean.radius": (round(made.radius, 2), "likewise"),
+        "clustering.euclidean.beta": (round(made.beta, 2), "likewise"),
         "resolution.elevation_step": (round(up, 3), "between beams where people are, the median"),
         "resolution.azimuth_step": (round(aside, 3), "between points of a beam")}
 

@@ -1,5 +1,6 @@
 // All that is asked of the server, and what it says by itself.
 
+import { hearLive, reopenLive } from "./live.js";
 import { applyEvent, changed, setState, store } from "./store.js";
 import { say, sayError } from "./messages.js";
 
@@ -72,21 +73,28 @@ export async function loadState() {
 
 export const exportLabels = (content) => post("/api/export", content);
 
-export function nextUncertain(after) {
-  return getJson(`/api/next?after=${after ?? 0}`);
+export function nextUncertain(after, only) {
+  return getJson(`/api/next?after=${after ?? 0}${only ? `&class=${encodeURIComponent(only)}` : ""}`);
+}
+
+let socket = null;
+
+/** A word to the server that is no action. */
+export function tellServer(word) {
+  if (socket?.readyState === WebSocket.OPEN) socket.send(word);
 }
 
 /** Listen to what all pages do, for as long as the page is open. */
 export function listen() {
   const url = new URL(address("/api/events"), location.href);
   url.protocol = url.protocol.replace("http", "ws");
-  const socket = new WebSocket(url);
+  socket = new WebSocket(url);
   socket.onopen = async () => {
     const back = !store.online;
     store.online = true;
     changed("connection");
     try {
-      await loadState();
+      await Promise.all([loadState(), back && store.drive.live ? reopenLive() : null]);
       if (back) say("Connected again; all that was saved is here.");
     } catch (error) {
       sayError(error.message);
@@ -106,6 +114,7 @@ export function listen() {
 
 function hear(event) {
   if (event.error) sayError(event.error);
+  if (event.live || event.status) hearLive(event);
   if (event.seq === undefined) {
     if (event.progress) {
       store.progress = event.progress;

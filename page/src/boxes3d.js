@@ -76,6 +76,7 @@ function setFronts(boxes) {
 /** The places of a track's boxes up to now, in the frame shown; fixed places where there are
  * poses, else as the sensor saw them. */
 export function trailOf(track, frame = store.frame) {
+  if (track.trails) return track.trails[frame] ?? []; // as its tracker drew it
   const { frames } = store.drive, here = frames[frame].pose, found = [];
   for (let i = Math.max(0, frame - TRAIL); i <= frame; i++) {
     const box = track.byFrame.get(i)?.box;
@@ -113,8 +114,8 @@ function rebuild() {
     const entry = { track, box, colour: chosen ? SELECTED[theme()] : faded(rgb(colour), sure) };
     (chosen || store.also.has(track.id) || track.id === store.hover ? strong : usual).push(entry);
   }
-  for (const { box, colour, strong: loud } of resultBoxes()) {
-    (loud ? strong : usual).push({ box, colour: rgb(colour) });
+  for (const { box, colour, strong: loud, chosen } of resultBoxes()) {
+    (loud || chosen ? strong : usual).push({ box, colour: chosen ? SELECTED[theme()] : rgb(colour) });
   }
   setLines(thin, usual);
   setLines(thick, strong);

@@ -60,7 +60,7 @@ export function cloudOf(frame) {
 /** Show a frame as soon as its cloud is here; what was asked for last wins. */
 export async function goTo(frame) {
   const last = store.drive.frames.length - 1;
-  frame = Math.max(0, Math.min(last, Math.round(frame)));
+  frame = Math.max(store.drive.first, Math.min(last, Math.round(frame)));
   if (frame === store.wanted && store.cloud) return;
   store.wanted = frame;
   changed("wanted");
@@ -70,13 +70,13 @@ export async function goTo(frame) {
 export async function show(frame) {
   let cloud = EMPTY;
   try {
-    cloud = await cloudOf(frame);
+    if (frame >= 0) cloud = await cloudOf(frame); // -1: nothing has come yet
   } catch (error) {
     if (store.wanted === frame) {
       sayError(`Frame ${store.drive.frames[frame].name} has no cloud: ${error.message}`);
     }
   }
-  if (store.mode === "view") {
+  if (store.mode === "view" && frame >= 0) {
     await Promise.race([resultsOf(frame).catch(() => null),
                         new Promise((resolve) => setTimeout(resolve, PATIENCE_MS))]);
   }
@@ -91,13 +91,14 @@ export async function show(frame) {
 let direction = 1, before = 0;
 
 function ahead(frame) {
+  if (store.playing && store.drive.live) return; // the next one has not come yet
   if (frame !== before) direction = Math.sign(frame - before);
   before = frame;
   const frames = store.drive.frames.length;
   const wished = [1, -1, 2, 3].slice(0, AHEAD + 1).map((k) => frame + k * direction);
   (async () => { // one after another, so that the nearest is not held up by those behind it
     for (const next of wished) {
-      if (next < 0 || next >= frames || store.wanted !== frame) continue;
+      if (next < store.drive.first || next >= frames || store.wanted !== frame) continue;
       if (store.mode === "view") resultsOf(next).catch(() => null);
       try { await cloudOf(next); } catch { /* said when it is shown */ }
     }

@@ -55,16 +55,19 @@ async function onTrack(action) {
   return track ? act({ ...action, track: track.id }) : false;
 }
 
-/** accept, reject or reopen; then on to the next uncertain one, where that is wanted. */
+/** accept, reject or reopen what is selected, and then on to the next uncertain one, where that is
+ * wanted; else what is pointed at. */
 export async function decide(verb) {
-  const track = editable() && chosen();
+  if (!editable()) return;
+  const pointed = selectedTrack() ? null : store.tracks.get(store.hover);
+  const track = pointed ?? chosen();
   if (!track || !await act({ do: verb, track: track.id })) return;
-  if (store.advance && verb !== "reopen") await next();
+  if (!pointed && store.advance && verb !== "reopen") await next();
 }
 
 export async function next() {
   try {
-    const { track, frame } = await nextUncertain(store.selected);
+    const { track, frame } = await nextUncertain(store.selected, store.only);
     if (track === null) {
       say("Nothing is left to decide.");
       return;
@@ -77,21 +80,37 @@ export async function next() {
   }
 }
 
+/** Of the selected track; while a seed or a place is looked for, or nothing is selected, of new
+ * ones. */
 export function setClass(name) {
-  if (!selectedTrack()) {
-    store.newClass = name;
-    say(`New boxes and seeds are now of class ${name}.`);
-    changed("tool");
-    return null;
-  }
-  return onTrack({ do: "class", class: name });
+  if (store.tool === "select" && selectedTrack()) return onTrack({ do: "class", class: name });
+  store.newClass = name;
+  if (store.tool === "select") say(`New boxes and seeds are now of class ${name}.`);
+  changed("tool");
+  return null;
 }
+
+/** All that is left in the list, of the class that it shows or of all: one action. */
+export async function rejectRest() {
+  if (!editable()) return;
+  const { only } = store, count = leftIn(only);
+  if (count === 0) say("Nothing is left to reject.");
+  else if (await act({ do: "reject_rest", ...(only ? { class: only } : {}) })) {
+    say(`${count} rejected. Ctrl Z takes it back.`);
+  }
+}
+
+/** How many tracks of a class, null for all, are left to decide. */
+export const leftIn = (only) => [...store.tracks.values()].filter((track) =>
+  track.state === "proposed" && (!only || track.class === only)).length;
 
 export const classToAdd = () => store.newClass
   ?? (classOf("Pedestrian") ? "Pedestrian" : store.drive.classes[0]?.name ?? "Pedestrian");
 
 export const snap = (to) => onTrack({ do: "snap", frame: store.frame, to });
 export const removeBox = () => onTrack({ do: "remove_box", frame: store.frame });
+/** No boxes "before" or "after" this frame. */
+export const trim = (side) => onTrack({ do: "trim", frame: store.frame, side });
 export const split = () => onTrack({ do: "split", frame: store.frame });
 
 /** This frame's box of the selected track also in the next frame; then go there. */

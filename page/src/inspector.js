@@ -3,12 +3,13 @@
 import { getJson } from "./api.js";
 import { colourOfClass } from "./colours.js";
 import { element } from "./dom.js";
-import { copyOn, decide, interpolate, merge, removeBox, setClass, setNumbers, snap, split }
+import { copyOn, decide, interpolate, merge, removeBox, setClass, setNumbers, snap, split, trim }
   from "./edits.js";
 import { on, selectedBox, selectedTrack, store } from "./store.js";
 
 const FIELDS = [["x", "m"], ["y", "m"], ["z", "m"], ["length", "m"], ["width", "m"],
                 ["height", "m"], ["yaw", "°"]];
+const KINDS = { key: "set by hand", proposed: "proposed", interpolated: "interpolated" };
 const panel = document.getElementById("inspector");
 const nothing = document.getElementById("nothing-selected");
 const number = (name) => document.getElementById(`field-${name}`);
@@ -21,7 +22,9 @@ const BUTTONS = [
            ["interpolate", "I", "Between the boxes set by hand before and after", interpolate],
            ["remove", "Del", "Remove the box of this frame", removeBox]]],
   ["Track", [["merge", "M", "Merge with the tracks selected by Ctrl and a click", merge],
-             ["split", "X", "This frame and those after it become a new track", split]]],
+             ["split", "X", "This frame and those after it become a new track", split],
+             ["begin", "Q", "Begins here: no boxes before this frame", () => trim("before")],
+             ["end", "E", "Ends here: no boxes after this frame", () => trim("after")]]],
 ];
 
 export function openInspector() {
@@ -65,13 +68,17 @@ function takeNumbers() {
 }
 
 function fill({ all = false } = {}) {
-  const track = selectedTrack();
-  panel.hidden = !track;
+  const track = selectedTrack(), { found } = store;
+  panel.hidden = !track && !found;
   nothing.hidden = track !== null || store.mode === "view";
+  document.getElementById("facts").replaceChildren(...(store.mode === "view" && (track || found)
+    ? factsOf(track, found) : []).flatMap(([name, value]) =>
+    [element("dt", {}, name), element("dd", {}, value)]));
+  if (found) fillFound(found, all);
   if (!track) return;
   document.getElementById("who").textContent = `Track ${track.id}`;
   const badge = document.getElementById("state");
-  badge.textContent = track.state;
+  badge.textContent = store.mode === "view" ? track.class : track.state;
   badge.className = `badge ${track.state}`;
   document.getElementById("swatch").style.background = colourOfClass(track.class);
   const choice = document.getElementById("class");
@@ -81,15 +88,60 @@ function fill({ all = false } = {}) {
   choice.value = track.class;
   const here = selectedBox();
   document.getElementById("kind").textContent = here === null ? "no box in this frame"
-    : { key: "set by hand", proposed: "proposed", interpolated: "interpolated" }[here.kind];
+    : store.mode === "view" ? "" : KINDS[here.kind];
   document.getElementById("accept").setAttribute("aria-pressed", track.state === "accepted");
   document.getElementById("reject").setAttribute("aria-pressed", track.state === "rejected");
+  fillNumbers(here?.box, all);
+}
+
+function fillNumbers(box, all) {
   for (const [k, [name]] of FIELDS.entries()) {
-    const input = number(name), value = here?.box[k];
-    input.disabled = !here || store.mode === "view";
+    const input = number(name), value = box?.[k];
+    input.disabled = !box || store.mode === "view";
     if (document.activeElement === input && !store.draft && !all) continue; // being typed
     input.value = value === undefined ? "" : k === 6 ? (value * 180 / Math.PI).toFixed(1) : value.toFixed(2);
   }
+}
+
+/** A label or a detection that is looked at. */
+function fillFound({ layer, row, wrong, colour }, all) {
+  document.getElementById("who").textContent = row[7];
+  const badge = document.getElementById("state");
+  badge.textContent = wrong ?? (layer === "labels" ? "label" : "detection");
+  badge.className = `badge ${wrong ? "rejected" : ""}`;
+  document.getElementById("swatch").style.background = colour;
+  document.getElementById("kind").textContent = "";
+  fillNumbers(row, all);
+}
+
+/** What is known of it besides its box: [name, value]. */
+function factsOf(track, found) {
+  if (track) {
+    return [["source", track.source], ["score", track.score.toFixed(2)],
+            ["frames", `${track.byFrame.size}, from ${track.first} to ${track.last}`]];
+  }
+  const { layer, row } = found, facts = [];
+  facts.push(["away", `${Math.hypot(row[0], row[1]).toFixed(1)} m`]);
+  if (layer === "labels") {
+    if (row[8] !== null && row[8] !== undefined) facts.push(["track", `${row[8]}`]);
+    return facts;
+  }
+  facts.unshift(["source", layer], ["score", row[8].toFixed(3)]);
+  for (const [name, said] of Object.entries(row[9] ?? {})) facts.push([name, said.toFixed(3)]);
+  const id = trackThere(row);
+  if (id !== null) facts.push(["track", `${id}`]);
+  return facts;
+}
+
+/** The id of the track of that class whose box is there too, or null. */
+function trackThere(row) {
+  let best = null, least = Math.max(1, row[3] / 2);
+  for (const track of store.tracks.values()) {
+    const box = track.byFrame.get(store.frame)?.box;
+    const away = box && track.class === row[7] ? Math.hypot(box[0] - row[0], box[1] - row[1]) : Infinity;
+    if (away < least) { least = away; best = track.id; }
+  }
+  return best;
 }
 
 let asked = "", waiting = 0;

@@ -5,6 +5,7 @@ import "./boxes3d.js";
 import { show } from "./cloud.js";
 import { openInspector } from "./inspector.js";
 import { listKeys, openKeys } from "./keys.js";
+import { openLive, takeDrive } from "./live.js";
 import { sayError } from "./messages.js";
 import { loadResults } from "./results.js";
 import { openResults } from "./resultpanel.js";
@@ -27,8 +28,9 @@ async function open() {
   openKeys();
   on("focus", focus);
   try {
-    store.drive = await getJson("/api/drive");
+    takeDrive(await getJson("/api/drive"));
     store.mode = store.drive.mode;
+    store.minScore = store.drive.min_score;
     if (store.mode === "view") store.filter = "all";
     listKeys();
     changed("drive", "tool", "colour", "playing");
@@ -39,8 +41,10 @@ async function open() {
   }
   listen();
   const asked = new URLSearchParams(location.search);
-  store.wanted = Math.min(store.drive.frames.length - 1, Math.max(0, Number(asked.get("frame")) || 0));
+  const last = store.drive.frames.length - 1;
+  store.wanted = store.drive.live ? last : Math.min(last, Math.max(0, Number(asked.get("frame")) || 0));
   await show(store.wanted);
+  openLive();
   if (asked.has("track")) select(Number(asked.get("track")));
   await loadResults();
   changed("tracks"); // one more picture, now that all is here

@@ -4,7 +4,8 @@ import * as THREE from "three";
 import { rayBox } from "./boxmath.js";
 import { shownBoxes } from "./colours.js";
 import { camera, renderer } from "./scene.js";
-import { store } from "./store.js";
+import { resultBoxes } from "./results.js";
+import { on, store } from "./store.js";
 
 const REACH = 9; // pixels round the pointer in which a point is taken
 const ahead = new THREE.Vector3(), matrix = new THREE.Matrix4();
@@ -53,13 +54,32 @@ export function pointAt(clientX, clientY) {
   return best;
 }
 
-/** The track whose box the pointer meets first, the selected one before all others: id or null. */
-export function trackAt(clientX, clientY) {
-  const { origin, direction } = rayAt(clientX, clientY);
-  let best = null, least = Infinity;
-  for (const { track, box } of shownBoxes()) {
-    const along = rayBox(origin, direction, box);
-    if (along !== null && along < least) { least = along; best = track.id; }
+/** Whose box the pointer meets first: the id of a track, or a label or detection that is looked at,
+ * or neither. */
+export function hitAt(clientX, clientY) {
+  const { origin, direction } = rayAt(clientX, clientY), view = store.mode === "view";
+  const boxes = view && !store.layers.tracks ? [] : shownBoxes();
+  let best = { track: null, found: null }, least = Infinity;
+  for (const each of view ? [...boxes, ...resultBoxes()] : boxes) {
+    const along = rayBox(origin, direction, each.box);
+    if (along === null || along >= least) continue;
+    least = along;
+    best = each.track ? { track: each.track.id, found: null } : { track: null, found: each };
   }
   return best;
 }
+
+const WARM = 4; // so many picks at rest, and the browser has compiled the loop
+let warmed = 0;
+
+/** The first pick would take ten times as long as those after it. */
+export function warmUp() {
+  if (!store.cloud?.count || warmed >= WARM) return;
+  const area = renderer.domElement.getBoundingClientRect();
+  pointAt(area.left + area.width / 2, area.top + area.height / 2);
+  warmed += 1;
+  requestIdle(warmUp);
+}
+
+const requestIdle = globalThis.requestIdleCallback ?? ((then) => setTimeout(then, 50));
+on("cloud", () => requestIdle(warmUp));

@@ -1,11 +1,16 @@
 // Playing at 10 Hz, as fast as the frames come if that is slower.
 
 import { cloudOf, goTo } from "./cloud.js";
+import { pauseLive } from "./live.js";
 import { changed, store } from "./store.js";
 
 const PERIOD_MS = 100;
 
 export async function togglePlay() {
+  if (store.drive.live) {
+    pauseLive(store.playing);
+    return;
+  }
   if (store.playing) {
     stop();
     return;
@@ -26,11 +31,18 @@ export async function togglePlay() {
 }
 
 function stop() {
+  if (store.drive.live) {
+    if (store.playing) pauseLive(true);
+    return;
+  }
   store.playing = false;
   changed("playing");
 }
 
-export function step(by) {
+/** Another frame, after which nothing goes on by itself. */
+export function to(frame) {
   stop();
-  return goTo(store.wanted + by);
+  return goTo(frame);
 }
+
+export const step = (by) => to(store.wanted + by);

@@ -4,9 +4,9 @@ import { rayBox } from "./boxmath.js";
 import { addAt, seedAt } from "./edits.js";
 import { say } from "./messages.js";
 import { dragBody } from "./overlay.js";
-import { pointAt, rayAt, trackAt } from "./picking.js";
+import { hitAt, pointAt, rayAt } from "./picking.js";
 import { controls, mark, renderer } from "./scene.js";
-import { changed, on, select, selectedBox, store } from "./store.js";
+import { changed, on, select, selectFound, selectedBox, store } from "./store.js";
 
 const canvas = renderer.domElement;
 const STILL = 4; // pixels; less is a click, more turns the camera
@@ -35,8 +35,9 @@ canvas.addEventListener("pointerup", (event) => {
 
 function click(event) {
   if (store.tool === "select") {
-    const id = trackAt(event.clientX, event.clientY);
-    select(id, { more: event.ctrlKey || event.metaKey });
+    const { track, found } = hitAt(event.clientX, event.clientY);
+    if (found) selectFound(found);
+    else select(track, { more: event.ctrlKey || event.metaKey });
     return;
   }
   const index = pointAt(event.clientX, event.clientY);
@@ -57,6 +58,7 @@ canvas.addEventListener("pointermove", (event) => {
   });
 });
 canvas.addEventListener("pointerleave", () => { mark(0); setHover(null); });
+on("frame", () => { if (store.found && store.found.frame !== store.frame) select(null); });
 
 function hover(event) {
   if (store.tool === "seed") {
@@ -64,9 +66,10 @@ function hover(event) {
     mark(index < 0 ? 0 : store.cloud.cluster[index]);
     return;
   }
-  const id = store.tool === "select" ? trackAt(event.clientX, event.clientY) : null;
+  const { track: id, found } = store.tool === "select" ? hitAt(event.clientX, event.clientY)
+    : { track: null, found: null };
   setHover(id);
-  canvas.style.cursor = id === null ? "" : id === store.selected && store.mode === "label"
+  canvas.style.cursor = id === null && !found ? "" : id === store.selected && store.mode === "label"
     ? "move" : "pointer";
 }
 

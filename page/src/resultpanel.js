@@ -1,6 +1,7 @@
 // The panel of view mode: which boxes are shown, from which score on, and what is wrong.
 
 import { element } from "./dom.js";
+import { liveRows } from "./live.js";
 import { FALSE, MISSED, reload, resultCounts } from "./results.js";
 import { changed, on, store } from "./store.js";
 
@@ -32,22 +33,32 @@ function build() {
     element("h2", {}, "Detections"), ...(sources.length ? sources
       : [element("p", { class: "hint" }, "None in this recording.")]),
     element("div", { class: "slider" }, element("span", {}, "Score from"), slider, number),
-    element("h2", {}, "This frame"), element("div", { id: "counts" }));
+    element("h2", {}, "This frame"), element("div", { id: "counts" }),
+    ...(store.drive.live ? [element("h2", {}, "What comes"), element("div", { id: "comes" })] : []));
   count();
+  showComing();
+}
+
+const rowOf = (title, value, colour, what) => element("div", { class: "count-row", title: what },
+  element("span", {}, title), element("b", { style: colour ? `color:${colour}` : "" },
+    value === null ? "–" : String(value)));
+
+function showComing() {
+  document.getElementById("comes")?.replaceChildren(...liveRows().flatMap(
+    ([title, value, what, wrong]) => [rowOf(title, value, "", what),
+      ...(wrong ? [rowOf("", wrong, FALSE, what)] : [])]));
 }
 
 function count() {
   const area = document.getElementById("counts");
   if (!area) return;
   const { source, labels, missed, found, false: wrong } = resultCounts();
-  const row = (title, value, colour) => element("div", { class: "count-row" },
-    element("span", {}, title), element("b", { style: colour ? `color:${colour}` : "" },
-      value === null ? "–" : String(value)));
-  area.replaceChildren(row("labels", labels), row(source ? `by ${source}` : "detections", found),
-    row("missed", missed, missed ? MISSED : ""), row("false", wrong, wrong ? FALSE : ""));
+  area.replaceChildren(rowOf("labels", labels), rowOf(source ? `by ${source}` : "detections", found),
+    rowOf("missed", missed, missed ? MISSED : ""), rowOf("false", wrong, wrong ? FALSE : ""));
 }
 
 export function openResults() {
   on("drive sources", build);
   on("results layers", count);
+  on("status", showComing);
 }

@@ -3,7 +3,9 @@
 import { getJson } from "./api.js";
 import { colourOfClass } from "./colours.js";
 import { sayError } from "./messages.js";
-import { changed, on, store } from "./store.js";
+import { goTo } from "./cloud.js";
+import { say } from "./messages.js";
+import { changed, on, selectFound, store } from "./store.js";
 
 export const MISSED = "#ff4d5e", FALSE = "#ffb020";
 const SOURCES = ["#22c1a6", "#a78bfa", "#38bdf8", "#f472b6", "#a3e635", "#fb923c"];
@@ -12,34 +14,77 @@ const LABEL = "#94a3b8";
 const kept = new Map(); // frame -> promise
 const KEPT = 300, NOTHING = { labels: [], detections: {}, matches: {} };
 
-/** Boxes of the frame shown besides those of tracks: {box, colour, strong, text}. */
+/** Boxes of the frame shown besides those of tracks: {box, colour, strong, text, chosen}, and what
+ * each is of: {frame, layer, k, row, wrong}. */
 export function resultBoxes() {
-  const { labels, detections, matches } = store.results, found = [];
-  if (store.results.frame !== store.frame) return found;
+  return store.results.frame === store.frame ? boxesIn(store.results, store.frame) : [];
+}
+
+function boxesIn({ labels, detections, matches }, frame) {
+  const found = [];
+  const add = (entry, layer, k, row) => {
+    const { found: it } = store;
+    found.push({ ...entry, box: row.slice(0, 7), frame, layer, k, row,
+      chosen: it?.frame === frame && it.layer === layer && it.k === k });
+  };
   const compared = [...store.sources].find(([, { shown }]) => shown)?.[0];
   const missed = new Set(store.layers.errors ? matches[compared]?.missed : []);
   if (store.layers.labels) {
     for (const [k, label] of labels.entries()) {
       const wrong = missed.has(k);
-      found.push({ box: label.slice(0, 7), strong: wrong, colour: wrong ? MISSED
+      add({ strong: wrong, wrong: wrong ? "missed" : null, colour: wrong ? MISSED
         : store.mode === "view" ? LABEL : colourOfClass(label[7]),
-        text: wrong ? `missed ${label[7]}` : null });
+        text: wrong ? `missed ${label[7]}` : null }, "labels", k, label);
     }
   }
   for (const [source, { shown, colour }] of store.sources) {
     if (!shown) continue;
-    const wrong = new Set(store.layers.errors ? matches[source]?.false : []);
+    const wrong = new Set((store.layers.errors && matches[source]?.false) || []);
     for (const [k, row] of (detections[source] ?? []).entries()) {
       if (row[8] < store.minScore) continue;
-      found.push({ box: row.slice(0, 7), strong: wrong.has(k), colour: wrong.has(k) ? FALSE : colour,
-        text: `${wrong.has(k) ? "false " : ""}${row[7]} ${row[8].toFixed(2)}` });
+      const bad = wrong.has(k);
+      add({ strong: bad, wrong: bad ? "false" : null, colour: bad ? FALSE : colour,
+        text: `${bad ? "false " : ""}${row[7]} ${row[8].toFixed(2)}` }, source, k, row);
     }
   }
   return found;
 }
 
 export const resultNames = () => resultBoxes().filter(({ text }) => text !== null)
-  .map(({ box, colour, strong, text }) => ({ box, colour, text, loud: strong, state: "found" }));
+  .map(({ box, colour, strong, text, chosen }) => ({ box, colour, text, chosen, loud: strong,
+    state: "found" }));
+
+let search = 0;
+
+/** The next, or by -1 the last, label that was missed or detection that is false, in this frame or
+ * another. */
+export async function nextWrong(by) {
+  const mine = ++search, { frames, first } = store.drive;
+  const wrongIn = (results, frame) => boxesIn(results, frame).filter(({ wrong }) => wrong);
+  let { frame } = store, wrong = wrongIn(store.results, frame);
+  let at = wrong.findIndex(({ chosen }) => chosen);
+  at = at < 0 && by < 0 ? wrong.length - 1 : at + by;
+  try {
+    while (!wrong[at]) {
+      frame += by;
+      if (frame < first || frame >= frames.length) {
+        say(`Nothing is missed or false ${by > 0 ? "after" : "before"} this.`);
+        return;
+      }
+      wrong = wrongIn(await resultsOf(frame), frame);
+      if (mine !== search) return;
+      at = by > 0 ? 0 : wrong.length - 1;
+    }
+    await goTo(frame);
+    await loadResults();
+  } catch (error) {
+    sayError(error.message);
+    return;
+  }
+  if (mine !== search || store.frame !== frame) return;
+  selectFound(wrong[at]);
+  changed("focus");
+}
 
 /** How many of the frame shown: {labels, missed, found, false} of the first source shown. */
 export function resultCounts() {
@@ -48,7 +93,7 @@ export function resultCounts() {
   const rows = detections[source] ?? [], match = matches[source];
   return { source, labels: labels.length, missed: match?.missed.length ?? null,
            found: rows.filter((row) => row[8] >= store.minScore).length,
-           false: match ? match.false.filter((k) => rows[k][8] >= store.minScore).length : null };
+           false: match?.false ? match.false.filter((k) => rows[k][8] >= store.minScore).length : null };
 }
 
 /** The answer of the server for a frame, asked for once. */
@@ -62,10 +107,17 @@ export function resultsOf(frame) {
   return kept.get(frame);
 }
 
+/** What is known of a frame has changed. */
+export function forget(frame) {
+  kept.delete(frame);
+  if (frame === store.frame && store.cloud) loadResults();
+}
+
 /** Show those of the frame shown; boxes of another frame are never seen with it. */
 export async function loadResults() {
   const { frame } = store;
   let found = NOTHING;
+  if (!store.drive.frames[frame]) return;
   try {
     found = await resultsOf(frame);
   } catch (error) {

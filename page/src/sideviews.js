@@ -6,7 +6,7 @@ import { theme } from "./colours.js";
 import { element, svg } from "./dom.js";
 import { setDraft } from "./edits.js";
 import { follow } from "./overlay.js";
-import { on, selectedBox, selectedTrack, store } from "./store.js";
+import { on, selectedBox, store } from "./store.js";
 
 // Which local axis goes right and which up, with its sign: 0 length, 1 width, 2 height.
 const VIEWS = [
@@ -181,10 +181,9 @@ function redraw() {
       anchor = box.slice();
       gather();
     }
-    const colour = selectedTrack() ? "" : "none";
     for (const view of VIEWS) {
       view.panel.classList.toggle("empty", !box);
-      drawView(view, anchor && colour === "" ? box : null);
+      drawView(view, anchor ? box : null);
     }
   });
 }

@@ -11,12 +11,14 @@ export const store = {
   wanted: 0, // the frame that was asked for
   frame: 0, // the frame that is shown; every edit is of this one
   cloud: null, // of the frame that is shown
-  selected: null, also: new Set(), hover: null,
+  selected: null, also: new Set(), hover: null, // of tracks, by id
+  found: null, // the label or detection that is selected: {frame, layer, k, row, wrong}
+  status: null, // of a running graph
   tool: "select", // "select", "seed", "add"
   draft: null, // {track, frame, box}: only while something is dragged, or a key held
   colour: "height", names: true, online: true, playing: false, advance: true,
-  filter: "left", shownTracks: [],
-  results: { labels: [], detections: {}, matches: {} }, sources: new Map(), minScore: 0.3,
+  filter: "left", only: null, shownTracks: [],
+  results: { labels: [], detections: {}, matches: {} }, sources: new Map(), minScore: 0,
   layers: { labels: true, errors: true, tracks: true, trails: true },
 };
 
@@ -63,6 +65,30 @@ export function setState(state) {
   changed("tracks", "progress", "selection", "draft");
 }
 
+/** Tracks of one frame of a running graph, added to what is known; boxes before `first` are kept no
+ * more. */
+export function takeTracks(tracks, first) {
+  for (const sent of tracks) {
+    const track = store.tracks.get(sent.id);
+    if (!track) {
+      store.tracks.set(sent.id, toTrack(sent));
+      continue;
+    }
+    for (const [frame, box] of toTrack(sent).byFrame) track.byFrame.set(frame, box);
+    Object.assign(track.trails, sent.trails);
+    track.score = Math.max(track.score, sent.score);
+    track.last = Math.max(...track.byFrame.keys());
+  }
+  for (const [id, track] of store.tracks) {
+    if (track.first >= first) continue;
+    for (const frame of track.byFrame.keys()) if (frame < first) track.byFrame.delete(frame);
+    for (const frame of Object.keys(track.trails)) if (frame < first) delete track.trails[frame];
+    track.first = Math.min(...track.byFrame.keys());
+    if (track.byFrame.size === 0) store.tracks.delete(id);
+  }
+  forgetMissing();
+}
+
 /** One action of any page. */
 export function applyEvent(event) {
   for (const track of event.tracks ?? []) store.tracks.set(track.id, toTrack(track));
@@ -93,7 +119,14 @@ export function select(id, { more = false } = {}) {
     store.selected = id;
     store.also.clear();
   }
+  store.found = null;
   changed("selection");
+}
+
+/** Select a label or a detection of the frame shown. */
+export function selectFound(found) {
+  select(null);
+  store.found = found;
 }
 
 export function selectedTrack() {
@@ -110,6 +143,8 @@ export function boxOf(track, frame = store.frame) {
 }
 
 export function selectedBox() {
+  const { found } = store;
+  if (found?.frame === store.frame) return { box: found.row.slice(0, 7), kind: "found" };
   return boxOf(selectedTrack());
 }
 

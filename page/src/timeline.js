@@ -2,6 +2,7 @@
 
 import { colourOfClass, theme } from "./colours.js";
 import { goTo } from "./cloud.js";
+import { to } from "./playback.js";
 import { checkFrame } from "./edits.js";
 import { on, select, store } from "./store.js";
 
@@ -13,8 +14,10 @@ const INK = {
 const canvas = document.getElementById("timeline");
 const box = canvas.parentElement;
 
-const frames = () => store.drive?.frames.length ?? 1;
-const cell = () => (box.clientWidth - NAMES - 6) / frames();
+const first = () => store.drive?.first ?? 0;
+const frames = () => (store.drive?.frames.length ?? 1) - first();
+const cell = () => (box.clientWidth - NAMES - 6) / Math.max(1, frames());
+const left = (frame) => NAMES + (frame - first()) * cell();
 const rows = () => store.shownTracks;
 
 let asked = false;
@@ -36,9 +39,9 @@ function paint() {
   pen.clearRect(0, 0, width, height);
   pen.font = "11px system-ui, sans-serif";
   pen.textBaseline = "middle";
-  const first = Math.floor(box.scrollTop / ROW), count = Math.ceil(height / ROW) + 1;
-  for (const [k, track] of rows().slice(first, first + count).entries()) {
-    paintRow(pen, ink, track, HEAD + (first + k) * ROW - box.scrollTop, width, wide);
+  const top = Math.floor(box.scrollTop / ROW), count = Math.ceil(height / ROW) + 1;
+  for (const [k, track] of rows().slice(top, top + count).entries()) {
+    paintRow(pen, ink, track, HEAD + (top + k) * ROW - box.scrollTop, width, wide);
   }
   paintHead(pen, ink, width, wide, height);
 }
@@ -53,7 +56,7 @@ function paintRow(pen, ink, track, y, width, wide) {
   pen.fillStyle = ink.text;
   pen.fillText(`${track.id} ${track.class}`, 6, y + ROW / 2 + 0.5, NAMES - 12);
   for (const [frame, { kind }] of track.byFrame) {
-    const x = NAMES + frame * wide, w = Math.max(1, wide - (wide > 4 ? 1 : 0));
+    const x = left(frame), w = Math.max(1, wide - (wide > 4 ? 1 : 0));
     pen.fillStyle = colour;
     pen.globalAlpha = (track.state === "rejected" ? 0.25 : 1)
       * (kind === "key" ? 1 : kind === "interpolated" ? 0.7 : 0.4);
@@ -78,13 +81,15 @@ function paintHead(pen, ink, width, wide, height) {
   const step = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000].find((n) => n * wide > 34) ?? 2000;
   pen.fillStyle = ink.text;
   pen.textAlign = "center";
-  for (let i = 0; i < frames(); i += step) pen.fillText(i, NAMES + (i + 0.5) * wide, HEAD / 2);
+  for (let i = step * Math.ceil(first() / step); i < first() + frames(); i += step) {
+    pen.fillText(i, left(i + 0.5), HEAD / 2);
+  }
   pen.textAlign = "left";
   pen.fillStyle = ink.check;
   for (const frame of store.checked) {
-    pen.fillRect(NAMES + frame * wide, HEAD - 3, Math.max(1, wide - (wide > 4 ? 1 : 0)), 3);
+    pen.fillRect(left(frame), HEAD - 3, Math.max(1, wide - (wide > 4 ? 1 : 0)), 3);
   }
-  const x = NAMES + (store.wanted + 0.5) * wide;
+  const x = left(store.wanted + 0.5);
   pen.strokeStyle = ink.now;
   pen.lineWidth = 1.5;
   pen.beginPath();
@@ -97,24 +102,24 @@ function paintHead(pen, ink, width, wide, height) {
 function at(event) {
   const area = canvas.getBoundingClientRect();
   const x = event.clientX - area.left, y = event.clientY - area.top;
-  const frame = Math.floor((x - NAMES) / cell());
+  const frame = first() + Math.floor((x - NAMES) / cell());
   const row = y < HEAD ? -1 : Math.floor((y - HEAD + box.scrollTop) / ROW);
-  return { frame: Math.max(0, Math.min(frames() - 1, frame)), inNames: x < NAMES, track: rows()[row] };
+  return { frame: Math.max(first(), Math.min(first() + frames() - 1, frame)), inNames: x < NAMES, track: rows()[row] };
 }
 
 export function openTimeline() {
   const slider = document.getElementById("frame");
-  slider.oninput = () => goTo(Number(slider.value));
+  slider.oninput = () => to(Number(slider.value));
   canvas.addEventListener("pointerdown", (event) => {
     const { frame, track, inNames } = at(event);
     if (track) select(track.id, { more: event.ctrlKey || event.metaKey });
     if (!inNames) {
-      goTo(frame);
+      to(frame);
       canvas.setPointerCapture(event.pointerId);
     } else if (track && !track.byFrame.has(store.frame)) goTo(track.first);
   });
   canvas.addEventListener("pointermove", (event) => {
-    if (event.buttons === 1 && !at(event).inNames) goTo(at(event).frame);
+    if (event.buttons === 1 && !at(event).inNames) to(at(event).frame);
   });
   box.addEventListener("scroll", redraw);
   new ResizeObserver(redraw).observe(box);
@@ -122,15 +127,19 @@ export function openTimeline() {
   const check = document.getElementById("check");
   check.onclick = checkFrame;
   on("frame progress", () => check.setAttribute("aria-pressed", String(store.checked.has(store.frame))));
-  on("drive wanted frame", () => {
-    slider.max = frames() - 1;
+  on("drive wanted frame playing", () => {
+    const frame = store.drive.frames[store.wanted], last = first() + frames() - 1;
+    slider.min = first();
+    slider.max = last;
     slider.value = store.wanted;
-    const frame = store.drive.frames[store.wanted];
+    if (!frame) return;
     slider.setAttribute("aria-valuetext", `frame ${store.wanted}, ${frame.name}`);
-    document.getElementById("frame-number").textContent = `${store.wanted} / ${frames() - 1}`;
+    const behind = (frame.stamp_ns - store.drive.frames[last].stamp_ns) / 1e9;
+    document.getElementById("frame-number").textContent = !store.drive.live
+      ? `${store.wanted} / ${last}` : store.playing ? "live" : `${behind.toFixed(1)} s`;
     const name = document.getElementById("frame-name");
-    const seconds = (frame.stamp_ns - store.drive.frames[0].stamp_ns) / 1e9;
-    name.textContent = frame.name.length < 16 ? frame.name : `${seconds.toFixed(2)} s`;
+    const seconds = (frame.stamp_ns - store.drive.frames[first()].stamp_ns) / 1e9;
+    name.textContent = frame.name.length < 20 ? frame.name : `${seconds.toFixed(2)} s`;
     name.title = frame.name;
   });
   on("selection", () => { // keep the row of the selected track in sight

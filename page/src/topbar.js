@@ -2,7 +2,8 @@
 
 import { act, exportLabels } from "./api.js";
 import { element, icon } from "./dom.js";
-import { propose, redo, undo } from "./edits.js";
+import { colourOfClass } from "./colours.js";
+import { classToAdd, propose, redo, rejectRest, setClass, undo } from "./edits.js";
 import { COLOURS, setColour, showHelp } from "./keys.js";
 import { say, showLog } from "./messages.js";
 import { step, togglePlay } from "./playback.js";
@@ -16,7 +17,7 @@ const RUN = {
   "log-open": showLog, "help-open": showHelp, theme: nextTheme, export: () => by("export-dialog").showModal(),
   import: () => by("import-dialog").showModal(), reset: resetView, above: topView,
   "tool-select": () => setTool("select"), "tool-seed": () => setTool("seed"),
-  "tool-add": () => setTool("add"),
+  "tool-add": () => setTool("add"), "reject-rest": rejectRest,
 };
 
 const THEMES = ["auto", "light", "dark"];
@@ -53,8 +54,12 @@ export function openTopbar() {
   by("import-form").onsubmit = sendImport;
   on("drive", showDrive);
   on("progress drive", showProgress);
+  on("tracks drive", () => { // where none can come, there is nothing to be seen over time
+    document.documentElement.dataset.tracks = store.drive && store.mode === "view"
+      && !store.drive.live && store.tracks.size === 0 ? "none" : "some";
+  });
   on("selection drive", () => {
-    document.documentElement.dataset.chosen = String(store.selected !== null);
+    document.documentElement.dataset.chosen = String(store.selected !== null || store.found !== null);
   });
   on("connection", () => {
     by("lost").hidden = store.online;
@@ -66,7 +71,9 @@ export function openTopbar() {
   on("tool drive", showTool);
   on("playing", () => {
     by("play").replaceChildren(icon(store.playing ? "pause" : "play"));
-    by("play").setAttribute("aria-label", store.playing ? "Stop" : "Play");
+    const live = store.drive?.live, what = live ? ["Follow what comes", "Pause"] : ["Play", "Stop"];
+    by("play").setAttribute("aria-label", what[Number(store.playing)]);
+    by("play").title = `${what[Number(store.playing)]} (Space)`;
   });
 }
 
@@ -76,7 +83,7 @@ function showDrive() {
   document.documentElement.dataset.mode = store.mode;
   by("drive").textContent = name;
   by("drive").title = path;
-  by("layout").textContent = `${layout} · ${frames.length} frame${frames.length === 1 ? "" : "s"}`;
+  by("layout").textContent = store.drive.live ? "the running graph" : `${layout} · ${frames.length} frame${frames.length === 1 ? "" : "s"}`;
   const choices = () => (formats ?? []).map((format) =>
     element("option", { value: format }, format.replaceAll("_", " ")));
   by("export-format").replaceChildren(...choices());
@@ -108,10 +115,16 @@ function showTool() {
   for (const name of ["select", "seed", "add"]) {
     by(`tool-${name}`).setAttribute("aria-pressed", String(store.tool === name));
   }
-  by("tool-hint").textContent = {
-    select: "", seed: "Click a person: similar ones are looked for in the whole drive. Esc ends.",
-    add: "Click where the new box stands. Esc ends.",
-  }[store.tool];
+  by("tool-hint").hidden = store.tool === "select" || !store.drive;
+  if (by("tool-hint").hidden) return;
+  by("tool-hint").firstElementChild.textContent = store.tool === "add"
+    ? "Click where the new box stands. Esc ends."
+    : "Click one of its points: similar ones are looked for in the whole drive. Esc ends.";
+  by("tool-classes").replaceChildren(...store.drive.classes.slice(0, 9).map(({ name }, k) =>
+    element("button", { class: "chip", "aria-pressed": String(name === classToAdd()),
+      onclick: () => setClass(name) },
+      element("i", { class: "dot", style: `background:${colourOfClass(name)}` }), name,
+      element("kbd", {}, `${k + 1}`))));
 }
 
 async function sendExport(event) {

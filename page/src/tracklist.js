@@ -1,6 +1,6 @@
 // The list of tracks: what is left, accepted, rejected; the most uncertain first.
 
-import { colourOfClass } from "./colours.js";
+import { colourOfClass, theme } from "./colours.js";
 import { goTo } from "./cloud.js";
 import { element, icon } from "./dom.js";
 import { decide } from "./edits.js";
@@ -11,17 +11,23 @@ const STATE = { left: "proposed", accepted: "accepted", rejected: "rejected" };
 const ROW = 34; // pixels, as in app.css
 const list = document.getElementById("tracks");
 const tabs = document.getElementById("filters");
+const classes = document.getElementById("only"), rest = document.getElementById("reject-rest");
 
 function listed() {
   const wanted = STATE[store.filter];
   return [...store.tracks.values()]
-    .filter((track) => wanted === undefined || track.state === wanted || track.id === store.selected)
-    .sort((a, b) => (b.uncertainty ?? 0) - (a.uncertainty ?? 0) || a.id - b.id);
+    .filter((track) => track.id === store.selected || ((wanted === undefined || track.state === wanted)
+      && (!store.only || track.class === store.only)))
+    .sort((a, b) => store.drive?.live ? b.last - a.last || b.id - a.id // the newest first
+      : (b.uncertainty ?? 0) - (a.uncertainty ?? 0) || a.id - b.id);
 }
 
 function counts() {
   const found = { left: 0, accepted: 0, rejected: 0, all: store.tracks.size };
-  for (const { state } of store.tracks.values()) found[state === "proposed" ? "left" : state] += 1;
+  for (const { state, class: name } of store.tracks.values()) {
+    if (store.only && name !== store.only) { found.all -= 1; continue; }
+    found[state === "proposed" ? "left" : state] += 1;
+  }
   return found;
 }
 
@@ -37,7 +43,7 @@ function row(track) {
   element("i", { class: "dot", style: `background:${colourOfClass(track.class)}` }),
   element("span", { class: "who" }, element("b", {}, `${track.id}`), ` ${track.class}`),
   element("span", { class: "what" }, `${track.byFrame.size} frame${track.byFrame.size === 1 ? "" : "s"}`,
-          ` · ${track.source} ${percent} %`),
+          ` · ${percent} % ${track.source}`),
   ...(store.mode === "label" ? [
     verdict(track, "accept", "check", "accepted"), verdict(track, "reject", "reject", "rejected"),
   ] : []));
@@ -74,9 +80,26 @@ function rebuild() {
     tab.setAttribute("aria-selected", String(tab.dataset.filter === store.filter));
     tab.querySelector("span").textContent = found[tab.dataset.filter];
   }
+  rest.disabled = found.left === 0;
+  rest.querySelector("span").textContent = found.left || "";
+  showClasses();
   place();
   const at = store.shownTracks.findIndex((track) => track.id === store.selected);
   list.setAttribute("aria-activedescendant", at < 0 ? "" : `track-${store.selected}`);
+}
+
+/** One button a class that there are tracks of, where there are several: only these, or all again. */
+function showClasses() {
+  const names = [...new Set([...store.tracks.values()].map((track) => track.class))].sort();
+  if (store.only && !names.includes(store.only)) store.only = null;
+  classes.hidden = names.length < 2;
+  const key = `${names} ${store.only} ${theme()}`;
+  if (classes.hidden || classes.dataset.key === key) return;
+  classes.dataset.key = key;
+  classes.replaceChildren(...names.map((name) => element("button", {
+    class: "chip", "aria-pressed": String(name === store.only), title: `Only ${name}, or all again`,
+    onclick: () => { store.only = store.only === name ? null : name; rebuild(); },
+  }, element("i", { class: "dot", style: `background:${colourOfClass(name)}` }), name)));
 }
 
 /** Only the rows in sight are made. */
@@ -93,10 +116,10 @@ function emptyHint() {
   if (store.mode === "view") return "No tracks in this recording.";
   if (store.tracks.size === 0 && store.progress?.busy) {
     return "Detectors look through the whole drive; proposals appear here when they are done. "
-      + "Meanwhile S and a click on a person, or B and a click, begin a track by hand.";
+      + "Meanwhile S and a click on an object, or B and a click, begin a track by hand.";
   }
   if (store.tracks.size === 0) {
-    return "No tracks yet. Press P to let the detectors propose some, S and click a person, or B "
+    return "No tracks yet. Press P to let the detectors propose some, S and click an object, or B "
       + "and click to add a box.";
   }
   return store.filter === "left" ? "Nothing is left to decide." : `None ${store.filter}.`;
@@ -135,6 +158,6 @@ export function openTrackList() {
     walk(by);
   });
   new ResizeObserver(place).observe(list);
-  on("tracks selection drive frame busy", rebuild);
+  on("tracks selection drive frame busy theme", rebuild);
   on("selection", scrollToChosen);
 }

@@ -175,9 +175,10 @@ def test_a_sample_gives_nearly_the_same_means_whatever_the_order(arrange):
     xyz = points_of(arrange, 3000)
     cells = cells_of(xyz, 0.5)
     exact, sampled = np.empty(3000), np.empty(3000)
-    exact[cells.order] = module._means(cells, 0.25)
+    radii2 = np.full(3000, 0.25)
+    exact[cells.order] = module._means(cells, radii2)
     part = sample_of(cells, int(around(cells) * 3000 / 4))
-    sampled[cells.order] = module._means_of_sample(cells, part, 0.25)
+    sampled[cells.order] = module._means_of_sample(cells, part, radii2)
     dense = exact > 0
     error = np.abs(sampled[dense] / exact[dense] - 1)
     assert len(error) == 0 or np.median(error) < 0.05
@@ -185,7 +186,7 @@ def test_a_sample_gives_nearly_the_same_means_whatever_the_order(arrange):
     again = cells_of(xyz[order], 0.5)
     other = np.empty(3000)
     other[order[again.order]] = module._means_of_sample(
-        again, sample_of(again, int(around(again) * 3000 / 4)), 0.25)
+        again, sample_of(again, int(around(again) * 3000 / 4)), radii2)
     np.testing.assert_allclose(other, sampled, rtol=1e-9, atol=1e-12)
 
 

@@ -12,13 +12,14 @@ from bag_samples import cloud_frame, message_bytes, same_cloud, scans
 from kitti_samples import raw_folder, tracking_folder
 from samples import CALIBRATION, STAMP, object_folder, scene, write
 
+from lidar_perception.cli.data import opened
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES, Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.raw_clouds import open_clouds
 from lidar_perception.data.semantickitti import calibration_text, pose_line, write_scan
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS
 from msg_utils.point_cloud2 import from_array
@@ -176,6 +177,23 @@ def test_the_clouds_of_a_bag_are_found_or_named(tmp_path):
     assert "on /rear" in open_clouds(f"{both}:/rear").layout
     with pytest.raises(InputError, match="has no topic /side"):
         open_recording(f"{both}:/side")
+
+
+@pytest.mark.parametrize("height, taken", [(0.6, 0.6), (1.8, SENSOR_HEIGHT)])
+def test_commands_measure_the_height_that_a_recording_does_not_say(tmp_path, height, taken):
+    rng = np.random.default_rng(0)
+    ground = rng.uniform([-20, -20, -0.02], [20, 20, 0.02], (9000, 3)) - [0, 0, height]
+    cloud = np.column_stack([ground, np.ones(len(ground))]).astype(np.float32)
+    write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(cloud, STAMP + i * 10**8))
+                                 for i in range(4)])
+    write(tmp_path / "files/0.bin", cloud.tobytes())
+    for path in (tmp_path / "bag", tmp_path / "files"):
+        recording = opened(path)
+        for each in (recording, recording.reopen()):
+            heights = [f.sensor_height for f in (*each, each.frames[0], *each.frames[-1:])]
+            assert heights == pytest.approx([taken] * len(heights), abs=0.02)
+        assert {f.sensor_height for f in open_recording(path)} == {SENSOR_HEIGHT}
+        assert {f.sensor_height for f in open_recording(path, sensor_height=3.0)} == {3.0}
 
 
 @pytest.mark.parametrize("make, words", [

@@ -10,6 +10,7 @@ import torch
 from detection_samples import eager, frame, lively, random_detector, same, tiny
 
 from lidar_perception.clustering.cluster import cluster
+from lidar_perception.clustering.density import density
 from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointpillars import detector as detector_module
@@ -44,7 +45,7 @@ def test_columns_that_are_given_say_the_same_as_those_that_are_computed(version)
     flat[indices] = segment_ground(seen, EXPERT_GROUND)
     ids = np.zeros(len(scan), np.uint32)
     obstacles = indices[~flat[indices]]
-    ids[obstacles] = cluster(scan.xyz[obstacles], EXPERT_CLUSTERING)
+    ids[obstacles] = cluster(scan.xyz[obstacles], EXPERT_CLUSTERING, density(seen.xyz))
     ids[ids > 0] *= 3  # whatever the numbers
     assert flat.any() and ids.max() >= 6
     computed = detector(scan)

@@ -62,6 +62,9 @@ ACTIONS = st.one_of(
     st.fixed_dictionaries({"do": st.just("merge"), "tracks": st.tuples(tracks, tracks).map(list)}),
     st.fixed_dictionaries({"do": st.sampled_from(["accept", "reject", "reopen"]),
                            "track": tracks}),
+    st.fixed_dictionaries({"do": st.just("trim"), "track": tracks, "frame": frames,
+                           "side": st.sampled_from(["before", "after"])}),
+    st.sampled_from([{"do": "reject_rest"}, {"do": "reject_rest", "class": "Van"}]),
     st.fixed_dictionaries({"do": st.just("class"), "track": tracks, "class": st.just("Van")}),
     st.fixed_dictionaries({"do": st.just("check"), "frame": frames, "checked": st.booleans()}),
     st.sampled_from([{"do": "undo"}, {"do": "redo"}]))
@@ -243,6 +246,20 @@ def test_split_and_merge_are_inverses(there, cut):
     assert again.tracks[3] == replace(parts.tracks[2], id=3)
 
 
+def test_trimming_keeps_what_splitting_there_would_keep():
+    true = walking((5.0, 3.0), (1.0, 0.5), DRIVING, PROPOSED)
+    state = State({1: Track(1, "Pedestrian", boxes=true)}, seeds=((2, 1), (6, 1)), next_id=2)
+    early, _ = apply(state, {"do": "trim", "track": 1, "frame": 3, "side": "after"}, DRIVING)
+    late, _ = apply(state, {"do": "trim", "track": 1, "frame": 4, "side": "before"}, DRIVING)
+    parts, _ = apply(state, {"do": "split", "track": 1, "frame": 4}, DRIVING)
+    assert early.tracks[1].boxes == parts.tracks[1].boxes and early.seeds == ((2, 1),)
+    assert late.tracks[1].boxes == parts.tracks[2].boxes and late.seeds == ((6, 1),)
+    assert early.tracks[1].gone == late.tracks[1].boxes.keys()
+    for frame, side in ((7, "after"), (0, "before")):
+        with pytest.raises(InputError, match="no boxes"):
+            apply(state, {"do": "trim", "track": 1, "frame": frame, "side": side}, DRIVING)
+
+
 def test_copying_there_and_back_is_the_identity_and_a_copy_stands_still_in_the_world():
     box = [12.0, -3.0, -0.9, *SIZE, 0.4]
     state, _ = done([{"do": "add", "frame": 1, "box": box, "class": "Car"},
@@ -263,8 +280,39 @@ def test_the_next_uncertain_one_goes_round():
     assert next_uncertain(State()) is None
 
 
+def test_the_rest_of_a_class_is_rejected_at_once_and_comes_back_at_once():
+    def track(number, name, **more):
+        return Track(number, name, boxes={0: Box((9.0,) * 7, PROPOSED)}, **more)
+    state = State({t.id: t for t in (track(1, "Car"), track(2, "Van"), track(3, "Car"),
+                                     track(4, "Car", state="accepted"))})
+    cars, _ = apply(state, {"do": "reject_rest", "class": "Car"}, STANDING)
+    assert [t.state for t in cars.tracks.values()] == ["rejected", "proposed", "rejected",
+                                                      "accepted"]
+    every, _ = apply(cars, {"do": "reject_rest"}, STANDING)
+    assert every.tracks[2].state == "rejected" and every.tracks[4].state == "accepted"
+    with pytest.raises(InputError, match="left to reject"):
+        apply(every, {"do": "reject_rest"}, STANDING)
+    back, _ = apply(cars, {"do": "undo"}, STANDING)
+    assert back.tracks == state.tracks
+
+
+@given(st.lists(ACTIONS, max_size=6), ACTIONS)
+def test_what_joins_the_last_action_is_undone_with_it(before, action):
+    state, _ = done([*before, {"do": "add", "frame": 1, "box": [5, 0, 0, *SIZE, 0],
+                               "class": "Van"}], DRIVING)
+    below = state.done[1]
+    rest = {"do": "propose", "joins": True, "removed": [state.next_id - 1], "tracks": [
+        track_to_json(Track(state.next_id, "Car", boxes={2: Box((9.0,) * 7, PROPOSED)}))]}
+    both, _ = apply(state, rest, DRIVING)
+    back, _ = apply(both, {"do": "undo"}, DRIVING)
+    undone, _ = apply(state, {"do": "undo"}, DRIVING)
+    assert labels(back) == labels(undone) and back.done == below
+    again, _ = apply(back, {"do": "redo"}, DRIVING)
+    assert labels(again) == labels(both)
+
+
 def test_every_action_is_tried():
     tried = {"seed", "propose", "import"}  # with what is computed for them: test_label_server.py
     named = {"add", "box", "snap", "size", "remove_box", "split", "interpolate", "copy", "merge",
-             "accept", "reject", "reopen", "class", "check"}
+             "accept", "reject", "reject_rest", "trim", "reopen", "class", "check"}
     assert tried | named == DO.keys()

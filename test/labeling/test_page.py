@@ -191,13 +191,49 @@ def test_undo_and_redo_go_back_and_forth_over_every_step(page, labels, person):
     assert page.locator("#errors .toast").count() == 0
 
 
-def test_two_pages_see_each_others_edits(page, browser, labels, person):
+def test_the_class_of_a_seed_is_chosen_at_the_click(page, labels, person):
     number = labels.chosen(page, person)
-    with opened(browser, labels.url) as other:
+    page.keyboard.press("s")
+    page.keyboard.press("3")  # of new ones, though a track is selected
+    name = page.evaluate("page.store.drive.classes[2].name")
+    page.wait_for_selector(f"#tool-classes [aria-pressed=true]:has-text('{name}')")
+    before = set(labels.tracks())
+    labels.look_at(page, person)
+    page.keyboard.press("Enter")
+    page.wait_for_function("before => page.store.selected !== null "
+                           "&& !before.includes(page.store.selected)", arg=sorted(before))
+    tracks = labels.tracks()
+    assert tracks[page.evaluate("page.store.selected")]["class"] == name
+    assert tracks[number]["class"] != name and labels.lines()[-1]["class"] == name
+    page.keyboard.press("4")  # as it was
+    page.keyboard.press("Escape")
+
+
+def test_one_key_rejects_all_that_is_left_and_one_takes_it_back(page, labels, person):
+    others = []
+    for _ in range(2):
+        others.append(number := labels.chosen(page, person))
+        page.keyboard.press("u")
+        labels.wait(page, number, lambda t: t["state"] == "proposed")
+    before, actions = labels.tracks(), labels.state()["seq"]
+    page.keyboard.press("Shift+R")
+    for number in others:
+        labels.wait(page, number, lambda t: t["state"] == "rejected")
+    assert labels.state()["seq"] == actions + 1 and labels.state()["progress"]["left"] == 0
+    assert page.locator("#reject-rest").is_disabled()
+    page.keyboard.press("Control+z")
+    labels.wait(page, others[0], lambda t: t["state"] == "proposed")
+    assert labels.tracks() == before
+
+
+def test_pages_see_each_others_edits(page, browser, labels, person):
+    number = labels.chosen(page, person)
+    with opened(browser, labels.url) as other, opened(browser, labels.url) as third:
         page.keyboard.press("3")
         name = page.evaluate("page.store.drive.classes[2].name")
-        other.wait_for_function("([n, c]) => page.store.tracks.get(n).class === c",
-                                arg=[number, name])
+        for each in (other, third):
+            each.wait_for_function("([n, c]) => page.store.tracks.get(n).class === c",
+                                   arg=[number, name])
         other.wait_for_selector("#notes .toast")
         other.click("#undo")
         page.wait_for_function("([n, c]) => page.store.tracks.get(n).class !== c",
@@ -288,3 +324,33 @@ def test_view_shows_labels_and_detections_from_a_score_on(browser, drive_bag):
         reply = json.loads(page.evaluate("""async () => (await fetch("/api/do", {method: "POST",
             body: '{"do": "undo"}'})).text()"""))
         assert "label" in reply["error"]
+
+
+def test_view_selects_single_labels_and_keys_step_through_what_is_missed(browser, drive_bag,
+                                                                         tmp_path):
+    results = tmp_path / "nothing"  # was found in any frame
+    results.mkdir()
+    with serving("view", str(drive_bag), "--results", str(results), "--no-open") as (_, url), \
+            opened(browser, url) as page:
+        missed = page.evaluate("page.store.results.matches.nothing.missed")
+        seen = []
+        for k in [*missed, None]:
+            page.keyboard.press("n")
+            page.wait_for_function("([n, seen]) => page.store.found?.wrong === 'missed' && "
+                                   "page.store.found.frame * 1000 + page.store.found.k !== seen",
+                                   arg=[k, seen[-1] if seen else -1])
+            seen.append(page.evaluate("page.store.found.frame * 1000 + page.store.found.k"))
+        assert seen[:-1] == missed and seen[-1] >= 1000  # then the next frame
+        assert page.inner_text("#state") == "missed" and page.is_visible("#facts")
+        page.keyboard.press("[")
+        page.wait_for_function("k => page.store.frame === 0 && page.store.found?.k === k",
+                               arg=missed[-1])
+        row = page.evaluate("page.store.found.row")
+        page.keyboard.press("Escape")
+        page.wait_for_function("() => page.store.found === null")
+        page.evaluate("b => page.lookAt(b.slice(0, 3), [b[0] - 4, b[1] - 1, b[2] + 3])", row)
+        area = page.locator("#scene").bounding_box()
+        at = page.evaluate("b => page.project(...b.slice(0, 3))", row)
+        page.mouse.click(area["x"] + at[0], area["y"] + at[1])
+        page.wait_for_function("k => page.store.found?.k === k", arg=missed[-1])
+        assert page.inner_text("#who") == row[7]

@@ -3,14 +3,20 @@ makes of them. On a simulated drive, by seeds alone."""
 
 from __future__ import annotations
 
+import math
 import threading
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from lidar_perception.classes import CAR
 from lidar_perception.data.frame import BOXES, POSES, Recording
 from lidar_perception.geometry import points_in_box
+from lidar_perception.labeling import survey_cache
+from lidar_perception.labeling.alike import alike
 from lidar_perception.labeling.annotator import Annotator, Truth, is_right
 from lidar_perception.labeling.drive import Clouds, Drive, Scan, one_drive
 from lidar_perception.labeling.interpolation import Motion
@@ -65,6 +71,95 @@ def test_a_clicked_person_is_followed_through_the_drive(made):
     assert max(near) < 0.5
     assert all(t.class_name == "Pedestrian" and t.state == PROPOSED
                for t in made.state.tracks.values() if t.id != track.id)
+
+
+def boxes_of(made):
+    """Of all tracks, with what they are but for their ids, which say when they were found."""
+    return {(t.class_name, t.state, t.source, t.score, tuple(sorted(t.boxes.items())))
+            for t in made.state.tracks.values()}
+
+
+def test_a_seed_in_a_long_drive_is_answered_at_once_and_in_the_end_in_full(
+        made, drive, tmp_path, monkeypatch):
+    made.propose(here=True)
+    click(made)
+    full = boxes_of(made)
+    with session(drive, tmp_path / "long", weights="") as long:
+        long.propose(here=True)
+        before = long.state
+        monkeypatch.setattr("lidar_perception.labeling.session.NEARBY", 1)
+        _, frame, xyz = person(long)
+        answered = []
+        long.listeners.append(lambda event: answered.append(event.get("tracks")))
+        long.do({"do": "seed", "frame": frame, "xyz": xyz, "class": "Pedestrian"})
+        long.wait()
+        at_once = next(tracks for tracks in answered if tracks)
+        assert {row[0] for t in at_once for row in t["boxes"]} <= {frame, frame + 1}
+        assert boxes_of(long) == full
+        long.do({"do": "undo"})  # both are one action
+        assert long.state.tracks == before.tracks and long.state.seeds == before.seeds
+
+
+def test_a_car_that_is_clicked_is_a_seed_too_and_others_like_it_are_proposed(made):
+    made.propose(here=True)
+    frame = made.drive.frames[0]
+    truth, scan = frame.truth(), made.drive.clouds(0)
+    cars = truth.of_class(CAR)
+    inside = [scan.xyz[points_in_box(scan.xyz, b) & (scan.cluster_ids > 0)] for b in cars]
+    seen = sorted(range(len(cars)), key=lambda k: -len(inside[k]))
+    points = inside[seen[0]]
+    middle = points[np.linalg.norm(points - cars[seen[0]][:3], axis=1).argmin()]
+    made.do({"do": "seed", "frame": 0, "xyz": middle.tolist(), "class": "Car"})
+    own = made.state.tracks[made.state.seeds[-1][1]]
+    assert own.class_name == "Car" and math.dist(own.boxes[0].values[:2], cars[seen[0]][:2]) < 1.5
+    other = [t for t in made.state.tracks.values() if t.id != own.id]
+    assert other and all(t.class_name == "Car" and t.state == PROPOSED for t in other)
+    scores = [t.score for t in sorted(other, key=lambda t: t.id)]
+    assert scores == sorted(scores, reverse=True)
+    silhouettes = made.proposer.silhouettes(made.state, own, 0)
+    assert silhouettes["similarity"] > 0.3 and "1" in silhouettes["seed"]["bits"]
+
+
+@given(st.floats(0.5, 12), st.floats(0.3, 3), st.floats(0.5, 4), st.floats(0.2, 1.2))
+def test_what_is_as_large_as_the_seed_is_most_alike(length, width, height, share):
+    length, width = max(length, width), min(length, width)
+    size = length, width, height
+    same = np.array([[9.0, 0, 0, *size, 0.3]])
+    assert alike(same, size) == pytest.approx(1.0)
+    scaled = same * [1, 1, 1, share, 1, 1, 1]
+    assert 0 <= alike(scaled, size)[0] <= 1
+    larger = [alike(same * [1, 1, 1, s, s, s, 1], size)[0] for s in (1.0, 1.1, 1.3, 1.6)]
+    assert larger == sorted(larger, reverse=True) and larger[-1] < 0.1
+
+
+def test_the_survey_is_kept_over_a_restart_and_made_again_where_it_is_damaged(drive, tmp_path):
+    with session(drive, tmp_path, weights="") as made:
+        made.propose(here=True)
+    kept, key = tmp_path / survey_cache.NAME, survey_cache.key_of(drive, "")
+    looks = survey_cache.read(kept, key)
+    for old, new in zip(made.proposer.looks, looks, strict=True):
+        for name in ("boxes", "images", "things"):
+            assert np.array_equal(getattr(old, name), getattr(new, name))
+        assert np.array_equal(old.detections.boxes, new.detections.boxes)
+        assert old.features.keys() == new.features.keys()
+        assert all(np.array_equal(old.features[n], new.features[n]) for n in old.features)
+    assert survey_cache.read(kept, survey_cache.key_of(drive, "fused")) is None
+    content = kept.read_bytes()
+    for damaged in (content[:len(content) // 2], content[:-30], b"",
+                    content[:3000] + bytes(100) + content[3100:]):
+        kept.write_bytes(damaged)
+        with pytest.raises(InputError, match="damaged"):
+            survey_cache.read(kept, key)
+    with session(drive, tmp_path, weights="") as again:
+        said = []
+        again.listeners.append(lambda event: said.append(event.get("error", "")))
+        assert again.was_proposed and again.proposer.looks is None
+        again.propose(here=True, anew=False)
+        assert any("damaged" in line for line in said) and again.proposer.looks is not None
+    with session(drive, tmp_path, weights="") as third:
+        assert third.proposer.looks is not None
+        click(third)
+        assert len(third.state.tracks) >= 1 and third.state.seeds
 
 
 def test_a_person_who_was_clicked_before_the_drive_was_looked_at_is_followed_then(made):

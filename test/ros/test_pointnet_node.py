@@ -95,7 +95,7 @@ def test_no_cloud_ends_the_detector_and_each_has_its_reason(talker, found, share
         "all is ground": (message(1, ground=count.astype("u1") + 1), "no clusters"),
         "no clusters": (message(1, cluster_id=count.astype("u4")), "no clusters"),
         "clusters of one point": (message(1, cluster_id=np.arange(len(count), dtype="u4")),
-                                  "fewer than 5 points"),
+                                  "fewer than 3 points"),
         "numbers of another program": (message(1, cluster_id=(count + 2**32 - 1).astype("u4")),
                                        "no clusters"),
         "one large cluster": (message(1, cluster_id=(count + 2**31 - 1).astype("u4")),
@@ -156,4 +156,4 @@ def test_weights_that_cannot_be_used_are_a_diagnostic(shared_processes, peer, tm
 
 def test_help_knows_the_node(capsys):
     assert run(NODE, [NODE, "--help"]) == 0
-    assert "pointnet.min_points (default 5)" in capsys.readouterr().out
+    assert "pointnet.min_points (default 3)" in capsys.readouterr().out

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from lidar_perception.classes import CAR
-from lidar_perception.clustering.cluster import cluster
+from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.fused.boxes import on_ground, on_points
@@ -97,7 +97,7 @@ class FusedDetector(NetworkDetector):
         times.append(perf_counter())
         proposed = self._proposer()(seen, ground=ground, cluster_ids=cluster_ids)
         times.append(perf_counter())
-        people = cluster(obstacles.xyz, self.params.people)
+        people = cluster_obstacles(seen.xyz, ground, self.params.people, frame.xyz)[~ground]
         times.append(perf_counter())
         found = proposed.detections
         evidence = {"network": clipped_logit(found.scores), "silhouette": clipped_logit(

@@ -53,7 +53,8 @@ class PointNetDetector(NetworkDetector):
         ground = np.asarray(ground, bool)
         t2 = perf_counter()
         if cluster_ids is None:
-            cluster_ids = cluster_obstacles(seen.xyz, ground, self.params.clustering)
+            cluster_ids = cluster_obstacles(seen.xyz, ground, self.params.clustering,
+                                            frame.xyz)
         t3 = perf_counter()
         clusters = clusters_of(seen, cluster_ids, self.settings.min_points)
         most = self.settings.max_clusters

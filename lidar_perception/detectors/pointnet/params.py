@@ -19,7 +19,7 @@ STEPS = ("preprocess", "ground", "clustering", "network", "postprocess")  # each
 class PointNetParams(NetworkParams):
     """Which network, where it runs, which clusters it reads, and what counts as a detection."""
 
-    min_points: int = param(5, "Clusters of fewer points are left out.", low=1, high=1_000_000)
+    min_points: int = param(3, "Clusters of fewer points are left out.", low=1, high=1_000_000)
     max_clusters: int = param(4000, "Clusters that are looked at, the nearest first; a scan has "
                               "some hundred. The diagnostics say how many are left out.", low=1,
                               high=1_000_000)

@@ -1,0 +1,130 @@
+"""view --live over real DDS: a bag player, a detector with tracks, and the page that looks on."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from lidar_perception.nodes.graph import SINGLE
+from lidar_perception.wire.messages import to_detections
+from msg_utils.markers import from_marker_array
+
+MARKERS = "visualization_msgs/msg/MarkerArray"
+FOUND = "/perception/output/detections"
+
+
+class Looking:
+    """The command at work, asked over HTTP."""
+
+    def __init__(self, processes):
+        self.processes = processes
+        processes.run("view", [sys.executable, "-m", "lidar_perception.cli.main", "view", "--live",
+                               "--no-open"])
+
+    @property
+    def url(self):
+        found = re.search(r"http://\S+", self.processes.log("view"))
+        return found and found.group()
+
+    def bytes(self, path):
+        base, _, token = self.url.partition("?")
+        with urllib.request.urlopen(f"{base}{path}?{token}") as reply:
+            return reply.read()
+
+    def json(self, path):
+        return json.loads(self.bytes(path))
+
+
+@pytest.fixture(scope="module")
+def looking(shared_processes, shared_peer):
+    made = Looking(shared_processes)
+    shared_peer.wait(lambda: made.url, "the address of the page")
+    return made
+
+
+@pytest.fixture(scope="module")
+def heard(shared_processes, shared_peer, looking, drive_bag):
+    """What the detector published, of a bag that is played again and again."""
+    shared_peer.wait(lambda: any("nobody publishes clouds" in line for line in
+                                 looking.json("api/drive")["status"]["lines"]), "a clear line")
+    assert looking.json("api/drive")["frames"] == []
+    arrays = shared_peer.listen(FOUND, MARKERS)
+    for node, remap in SINGLE.items():
+        shared_processes.start(node, remap, {"seed.source": "ground_truth", "view.enabled": False,
+                                             "tracking.enabled": True})
+    shared_processes.play(drive_bag, loop=True, rate=0.5)
+    return arrays
+
+
+def test_frames_hold_the_columns_and_boxes_that_are_published(looking, heard, shared_peer):
+    drive = None
+
+    def complete():
+        nonlocal drive
+        drive = looking.json("api/drive")
+        kinds = {t["kind"] for t in drive["status"]["topics"] if t["came"]}
+        return kinds == {"detections", "tracks", "labels"} and len(drive["frames"]) >= 3 and (
+            drive["status"]["clouds"]["topic"] == "/perception/output/points")
+    shared_peer.wait(complete, "clouds with columns, detections, tracks and labels")
+    published = {m.stamp_ns: to_detections(m) for m in map(from_marker_array, heard)}
+
+    def compared():
+        for frame in looking.json("api/drive")["frames"]:
+            shown = looking.json(f"api/labels/{frame['frame']}")
+            rows = shown["detections"].get("perception", [])
+            if rows and shown["labels"] and frame["stamp_ns"] in published:
+                return frame, rows
+        return None
+    shared_peer.wait(compared, "a frame with detections and labels")
+    frame, rows = compared()
+    expected = published[frame["stamp_ns"]]
+    assert np.allclose([row[:7] for row in rows], expected.boxes, atol=1e-6)
+    assert [row[8] for row in rows] == pytest.approx(expected.scores.tolist())
+    body = looking.bytes(f"api/cloud/{frame['frame']}")
+    count = int(np.frombuffer(body, np.uint32, 1, 4)[0])
+    ground = np.frombuffer(body, np.uint8, count, 8 + 13 * count)
+    clusters = np.frombuffer(body, np.uint32, count, len(body) - 4 * count)
+    assert 0.2 < ground.mean() < 1 and clusters.max() >= 1 and not clusters[ground == 1].any()
+    tracks = looking.json("api/state")["tracks"]
+    assert any(len(t["boxes"]) > 1 and t["trails"] for t in tracks)
+
+
+def test_the_newest_frame_appears_and_one_can_pause_and_step_back(looking, heard, shared_peer):
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if (browser := shutil.which("chromium")) is None:
+        pytest.skip("chromium is not installed")
+    with sync_api.sync_playwright() as playwright:
+        page = playwright.chromium.launch(executable_path=browser, args=[
+            "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
+            "--no-first-run", "--disable-background-networking", "--disable-component-update",
+            "--disable-sync"]).new_page(viewport={"width": 1280, "height": 720})
+        page.set_default_timeout(120_000)
+        page.goto(looking.url)
+        page.wait_for_selector("html[data-ready=true]", state="attached")
+        first = page.evaluate("page.store.frame")
+        page.wait_for_function("n => page.store.frame > n + 3 && page.store.results.frame > n + 3",
+                               arg=first)
+        assert page.evaluate("page.store.cloud.count") > 1000
+        page.keyboard.press(" ")  # pause
+        page.wait_for_function("() => !page.store.playing"
+                               " && page.store.wanted === page.store.frame")
+        held = page.evaluate("page.store.frame")
+        page.wait_for_function("() => page.store.status.clouds.passed > 2")  # what comes is counted
+        page.keyboard.press(",")
+        page.wait_for_function("n => page.store.frame === n - 1", arg=held)
+        page.keyboard.press(" ")
+        page.wait_for_function("n => page.store.playing && page.store.frame > n + 1", arg=held)
+        assert page.locator("#errors .toast").count() == 0
+
+
+def test_it_ends_cleanly_at_sigint(looking, heard, shared_processes):
+    assert shared_processes.end("view", 60.0) == 0
+    assert "Traceback" not in shared_processes.log("view")
