@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,17 @@ def pytest_itemcollected(item):
     """Hypothesis runs the same lines a hundred times; to measure them takes longer than to run."""
     if getattr(item.obj, "is_hypothesis_test", False):
         item.add_marker("no_cover")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish():
+    """What multiprocessing runs beside us ends now and not some time after us: else coverage would
+    combine its data files while they are written."""
+    for process in multiprocessing.active_children():
+        process.kill()
+        process.join()
+    forkserver._forkserver._stop()
+    resource_tracker._resource_tracker._stop()
 
 
 @pytest.fixture(scope="session")

@@ -5,16 +5,15 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
 from samples import for_all
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = sorted(p for package in ("lidar_perception", "msg_utils")
-                 for p in (ROOT / package).rglob("*.py"))
-TREES = {p.relative_to(ROOT).as_posix(): ast.parse(p.read_text(encoding="utf-8"), str(p))
-         for p in SOURCES}
+SOURCES = [p.relative_to(ROOT).as_posix() for package in ("lidar_perception", "msg_utils")
+           for p in sorted((ROOT / package).rglob("*.py"))]
 ROS = {"rclpy", "ament_index_python", "launch", "launch_ros", "launch_testing", "sensor_msgs",
        "std_msgs", "geometry_msgs", "visualization_msgs", "vision_msgs", "builtin_interfaces",
        "rosbag2_py"}
@@ -41,10 +40,16 @@ STRANGERS = {
 }
 
 
-def imports(tree, everywhere=True):
+@cache  # parsed by the first test: every process that collects the tests imports this file
+def tree_of(name):
+    return ast.parse((ROOT / name).read_text(encoding="utf-8"), name)
+
+
+@cache
+def imports(name, everywhere=True):
     """Modules that a source imports; `from a import b` counts as a.b. Those inside functions and
     `if TYPE_CHECKING` only with everywhere."""
-    nodes = ast.walk(tree) if everywhere else _run_on_import(tree)
+    nodes = ast.walk(tree_of(name)) if everywhere else _run_on_import(tree_of(name))
     found = set()
     for node in nodes:
         if isinstance(node, ast.Import):
@@ -77,11 +82,11 @@ def standard(module):
 
 
 def files_in(*folders):
-    return [name for name in TREES if any(name.startswith(f"{folder}/") for folder in folders)]
+    return [name for name in SOURCES if any(name.startswith(f"{folder}/") for folder in folders)]
 
 
 def strangers(name, allowed, everywhere=True):
-    return sorted(m for m in imports(TREES[name], everywhere)
+    return sorted(m for m in imports(name, everywhere)
                   if not standard(m) and not within(m, allowed))
 
 
@@ -92,8 +97,8 @@ def public_functions(tree):
 
 def test_there_are_sources_to_look_at():
     assert len(files_in("msg_utils")) >= 5
-    assert {n.split("/")[1].removesuffix(".py") for n in TREES if n.startswith("lidar_perception/")
-            } == {*ROOMS, "__init__"}
+    assert {n.split("/")[1].removesuffix(".py") for n in SOURCES
+            if n.startswith("lidar_perception/")} == {*ROOMS, "__init__"}
     for folder in ROOMS[6:ROOMS.index("params")]:
         assert len(files_in(f"lidar_perception/{folder}")) >= 2
 
@@ -106,26 +111,26 @@ def test_msg_utils_needs_numpy_and_itself_only(name):
 
 def test_only_messages_of_msg_utils_imports_by_name():
     by_name = [name for name in files_in("msg_utils")
-               if any(m.startswith("importlib") for m in imports(TREES[name]))]
+               if any(m.startswith("importlib") for m in imports(name))]
     assert by_name == ["msg_utils/messages.py"]
 
 
-OUTSIDE = [name for name in TREES
+OUTSIDE = [name for name in SOURCES
            if not name.startswith(tuple(f"lidar_perception/{room}/" for room in ROOMS[-4:]))]
 
 
 @for_all(OUTSIDE)
 def test_the_core_imports_no_ros_no_nodes_and_no_command_line(name):
-    ros = {m for m in imports(TREES[name]) if m.partition(".")[0] in ROS}
+    ros = {m for m in imports(name) if m.partition(".")[0] in ROS}
     assert ros == set()
-    above = [m for m in imports(TREES[name])
+    above = [m for m in imports(name)
              if within(m, ["lidar_perception.nodes", "lidar_perception.cli"])]
     assert above == []
 
 
 @for_all(files_in("lidar_perception/cli"))
 def test_the_command_line_imports_no_ros_when_it_is_imported(name):
-    ros = {m for m in imports(TREES[name], everywhere=False) if m.partition(".")[0] in ROS}
+    ros = {m for m in imports(name, everywhere=False) if m.partition(".")[0] in ROS}
     assert ros == set()
 
 
@@ -134,17 +139,17 @@ def room(name):
     return name.replace("/", ".").split(".")[1] if "." in name.replace("/", ".") else ""
 
 
-@for_all([n for n in TREES if n.startswith("lidar_perception/")
+@for_all([n for n in SOURCES if n.startswith("lidar_perception/")
                                   and n != "lidar_perception/__init__.py"])
 def test_no_arrow_points_up(name):
     """Imports inside functions count, and those for types."""
     below = ROOMS[:ROOMS.index(room(name.removesuffix(".py"))) + 1]
-    above = [m for m in imports(TREES[name]) if m.startswith("lidar_perception.")
+    above = [m for m in imports(name) if m.startswith("lidar_perception.")
              and m != "lidar_perception.__version__" and room(m) not in below]
     assert above == []
 
 
-@for_all([n for n in TREES if room(n.removesuffix(".py")) in STRANGERS])
+@for_all([n for n in SOURCES if room(n.removesuffix(".py")) in STRANGERS])
 def test_a_room_of_the_core_needs_no_other_library(name):
     allowed = [*STRANGERS[room(name.removesuffix(".py"))], "lidar_perception"]
     assert strangers(name, allowed) == []
@@ -156,7 +161,7 @@ NETWORKS = "lidar_perception.detectors.pointpillars", "lidar_perception.detector
 @for_all(files_in(*(n.replace(".", "/") for n in NETWORKS)))
 def test_a_network_knows_no_other(name):
     other, = (n for n in NETWORKS if not name.startswith(n.replace(".", "/")))
-    assert [m for m in imports(TREES[name]) if within(m, [other])] == []
+    assert [m for m in imports(name) if within(m, [other])] == []
 
 
 SHARED_TRAINING = [f"lidar_perception/training/{name}.py" for name in (
@@ -165,19 +170,19 @@ SHARED_TRAINING = [f"lidar_perception/training/{name}.py" for name in (
 
 @for_all(SHARED_TRAINING)
 def test_what_all_networks_train_with_knows_none_of_them(name):
-    assert [m for m in imports(TREES[name]) if within(m, NETWORKS)] == []
+    assert [m for m in imports(name) if within(m, NETWORKS)] == []
 
 
 def test_modules_do_not_import_in_circles():
     """Imports inside functions count, and those for types."""
-    modules = {name.removesuffix(".py").removesuffix("/__init__").replace("/", "."): tree
-               for name, tree in TREES.items()}
-    packages = {name.removesuffix("/__init__.py").replace("/", ".") for name in TREES
+    modules = {name.removesuffix(".py").removesuffix("/__init__").replace("/", "."): name
+               for name in SOURCES}
+    packages = {name.removesuffix("/__init__.py").replace("/", ".") for name in SOURCES
                 if name.endswith("/__init__.py")}
-    arrows = {m: {other for i in imports(tree)
+    arrows = {m: {other for i in imports(name)
                   for other in (i, i.rpartition(".")[0])
                   if other in modules and other not in packages and other != m}
-              for m, tree in modules.items()}
+              for m, name in modules.items()}
     done, path = set(), []
 
     def visit(module):
@@ -197,18 +202,18 @@ FORMATS = ("lidar_perception/classes.py", "lidar_perception/data/",  # whose wor
            "lidar_perception/detectors/pointpillars/import_weights.py")
 
 
-@for_all([n for n in TREES if n.startswith("lidar_perception/")
+@for_all([n for n in SOURCES if n.startswith("lidar_perception/")
                                   and not n.startswith(FORMATS)])
 def test_a_class_is_named_in_one_table(name):
     from lidar_perception.classes import CLASSES
-    written = {node.value for node in ast.walk(TREES[name]) if isinstance(node, ast.Constant)
+    written = {node.value for node in ast.walk(tree_of(name)) if isinstance(node, ast.Constant)
                and isinstance(node.value, str)}
     assert written & set(CLASSES) - {"DontCare", "Misc"} == set()
 
 
-@for_all([n for n in OUTSIDE if public_functions(TREES[n])])
+@for_all(OUTSIDE)
 def test_every_public_function_has_a_docstring(name):
-    without = [node.name for node in public_functions(TREES[name])
+    without = [node.name for node in public_functions(tree_of(name))
                if isinstance(node, ast.FunctionDef) and not ast.get_docstring(node)]
     assert without == []
 
@@ -218,7 +223,7 @@ STRICT = tuple(f"lidar_perception/{room}" for room in ROOMS[:ROOMS.index("data")
     if room != "runs") + ("msg_utils",)
 
 
-@for_all([n for n in TREES if n.startswith(STRICT)])
+@for_all([n for n in SOURCES if n.startswith(STRICT)])
 def test_every_function_of_the_core_says_its_types_but_those_that_numba_compiles(name):
     """mypy asks for all or none (setup.cfg); Numba reads none."""
     def typed(node):
@@ -226,19 +231,19 @@ def test_every_function_of_the_core_says_its_types_but_those_that_numba_compiles
                  *filter(None, (node.args.vararg, node.args.kwarg))]
         return (node.returns or node.name == "__init__") and all(
             a.annotation or a.arg in ("self", "cls") for a in named)
-    assert [node.name for node in ast.walk(TREES[name]) if isinstance(node, ast.FunctionDef)
+    assert [node.name for node in ast.walk(tree_of(name)) if isinstance(node, ast.FunctionDef)
             and not any("njit" in ast.unparse(d) for d in node.decorator_list)
             and not typed(node)] == []
 
 
-@for_all(TREES)
+@for_all(SOURCES)
 def test_every_module_says_what_it_is_for_and_is_no_room_for_odds_and_ends(name):
-    assert ast.get_docstring(TREES[name]), "no docstring"
+    assert ast.get_docstring(tree_of(name)), "no docstring"
     parts = Path(name).with_suffix("").parts
     assert not {"utils", "util", "helpers", "common", "misc"} & set(parts)
 
 
-@for_all(TREES)
+@for_all(SOURCES)
 def test_no_source_is_longer_than_a_reader_can_hold(name):
     assert len((ROOT / name).read_text(encoding="utf-8").splitlines()) <= MAX_LINES
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import click
 
 from lidar_perception.runs.terminal import errors
+from lidar_perception.runs.threads import one_thread_each
 from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -77,6 +78,7 @@ class Beside:
 
 def _everything(folder: Path) -> list[str]:
     """Run all that is tested. What failed; the measured coverage lies in folder for a while."""
+    one_thread_each()  # as many processes as cores
     environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
     if sys.version_info >= (3, 12):
         environment["COVERAGE_CORE"] = "sysmon"  # lines are noticed once, and then cost nothing

@@ -61,7 +61,7 @@ def label(data: Path, sequence: str | None, out: Path | None, weights: Path | No
       lidar-perception label --data drive --out labels --no-open --port 8080
       lidar-perception label --data drive --export kitti_tracking --to labels
     """
-    from lidar_perception.detectors.open import FUSED
+    from lidar_perception.detectors.contract import FUSED
     from lidar_perception.labeling.drive import one_drive
     from lidar_perception.labeling.session import session
 

@@ -14,6 +14,8 @@ import numpy as np
 
 from lidar_perception.types import Detections, InputError, LidarFrame
 
+FUSED = "fused"  # the default where one detector is wanted: all of them together
+
 
 @dataclass(frozen=True)
 class Found:

@@ -6,12 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from lidar_perception.detectors.checkpoint import POINTNET, POINTPILLARS, network_of
-from lidar_perception.detectors.contract import Detector
+from lidar_perception.detectors.contract import FUSED, Detector
 from lidar_perception.detectors.fused.detector import load_fused_detector
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointpillars.detector import load_detector
-
-FUSED = "fused"  # the default where one detector is wanted: all of them together
 
 # Each opens its detector: load(path, device), where an empty path means its own weights, if it has
 # any. A new detector is one line here.

@@ -13,7 +13,7 @@ from lidar_perception.candidates.confidence import confidence
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.silhouette import similarity
 from lidar_perception.classes import Size
-from lidar_perception.detectors.open import FUSED
+from lidar_perception.detectors.contract import FUSED
 from lidar_perception.geometry import centre_distances
 from lidar_perception.labeling.alike import alike
 from lidar_perception.labeling.interpolation import Motion, filled

@@ -16,7 +16,7 @@ from lidar_perception.candidates.configurations import BEST
 from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.candidates.silhouette import similarity, to_pixels
 from lidar_perception.classes import Size
-from lidar_perception.detectors.open import FUSED
+from lidar_perception.detectors.contract import FUSED
 from lidar_perception.geometry import centre_distances, points_in_box
 from lidar_perception.labeling import survey_cache
 from lidar_perception.labeling.alike import alike, cell_of, side_view

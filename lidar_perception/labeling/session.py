@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.detectors.open import FUSED
+from lidar_perception.detectors.contract import FUSED
 from lidar_perception.labeling import survey_cache
 from lidar_perception.labeling.actions import (
     Action,

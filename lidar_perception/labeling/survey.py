@@ -19,7 +19,6 @@ from lidar_perception.candidates.silhouette import ROWS, silhouettes
 from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.contract import Detector
-from lidar_perception.detectors.open import open_detector
 from lidar_perception.groups import group_points
 from lidar_perception.labeling.drive import Drive, one_drive, settings
 from lidar_perception.runs.processes import in_processes
@@ -106,6 +105,7 @@ def surveyed(drive: Drive, weights: str,
 
 
 def _here(drive: Drive, weights: str) -> Callable[[int], Look]:
+    from lidar_perception.detectors.open import open_detector  # loads torch; a page need not
     detector = None if weights == "" else open_detector(
         weights, sensor_height=drive.frames[0].sensor_height, min_score=LEAST_SCORE)
     by_scans = recorded_source(drive.motion.poses is not None) == "kiss_icp"

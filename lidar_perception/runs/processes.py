@@ -7,6 +7,7 @@ import multiprocessing
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from typing import Any
@@ -19,7 +20,8 @@ def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, job
     """start()(item) of all items, in the order in which they are done.
 
     start is called once in each of `jobs` new processes, and can be pickled; with one job or one
-    item there is no new process, unless they are to be done apart. InputError, and the end of all
+    item there is no new process, unless they are to be done apart. They are forked from a process
+    that has imported what start needs, and nothing else has run in. InputError, and the end of all
     processes, where one fails: its own, or, naming what it did ("wrote frames"), where a process
     ended. They end with the iterator too.
     """
@@ -28,7 +30,8 @@ def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, job
         if items:
             yield from map(start(), items)
         return
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([*_modules(start)])
     running: dict[Connection, multiprocessing.process.BaseProcess] = {}
     try:
         for j in range(jobs):
@@ -47,6 +50,13 @@ def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, job
             process.terminate()
         for process in running.values():
             process.join()
+
+
+def _modules(work: Any) -> set[str]:
+    """Where functions and objects come from that a process is given."""
+    if isinstance(work, partial):
+        return set[str]().union(*map(_modules, (work.func, *work.args, *work.keywords.values())))
+    return {getattr(work, "__module__", "builtins")}
 
 
 def _receive(receiver: Connection, running: dict, what: str) -> Iterator:

@@ -18,7 +18,7 @@ from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.params import PointNetTraining
 from lidar_perception.types import InputError
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "streets")
 SENSOR = "generic:32,-24,5,0.8,10"
 
 

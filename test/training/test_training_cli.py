@@ -19,7 +19,7 @@ from lidar_perception.training.params import PAPER_SHARE, DataParams, PointPilla
 from lidar_perception.training.sources import training_scenes
 from lidar_perception.types import InputError
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "streets")
 SENSOR = "generic:16,-20,5,2,10"
 
 
