@@ -53,6 +53,17 @@ def one_thread():
     torch.set_num_threads(before)
 
 
+@pytest.fixture(scope="module")
+def one_thread_for_all():
+    """As one_thread, for fixtures of the module too: runs are compared bit by bit, and other
+    numbers of threads may add in another order."""
+    import torch
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
 @pytest.fixture(scope="session")
 def streets():
     """Each simulated street is made once in a session, as it never changes."""

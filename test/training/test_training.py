@@ -31,13 +31,7 @@ PARAMS = LoopParams(steps=13, validate_steps=4, save_steps=3, log_steps=1, seed=
                     amp="off")
 
 
-@pytest.fixture(scope="module", autouse=True)
-def one_thread_for_all():
-    """Runs are compared bit by bit, and other numbers of threads may add in another order."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+pytestmark = pytest.mark.usefixtures("one_thread_for_all")
 
 
 class Toy:
