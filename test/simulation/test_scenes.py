@@ -42,10 +42,10 @@ def moved(xyz, pose):
 
 
 @pytest.mark.parametrize("streets, seed, moment, points, metres, labels", [
-    (Streets(), 1, 0, 2574, 40360.19622, 129.929893373),
-    (Streets("zone", 3.0), 5, 60, 2543, 46171.189275, 694.671969233)])
-def test_streets_are_what_they_were_before_there_were_other_scenes(streets, seed, moment, points,
-                                                                   metres, labels):
+    (Streets(), 1, 0, 2575, 40385.126304, 129.929893373),
+    (Streets("zone", 3.0), 5, 60, 2543, 46185.171547, 659.233862469)])
+def test_a_seed_gives_the_street_that_it_always_gave(streets, seed, moment, points, metres, labels):
+    """Written down anew where simulated cars, say, are made otherwise on purpose."""
     scan = scan_at(seed, moment, TINY, streets)
     assert len(scan.frame) == points
     assert np.abs(scan.frame.xyz, dtype=float).sum() == pytest.approx(metres, rel=1e-6)

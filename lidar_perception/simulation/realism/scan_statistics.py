@@ -17,7 +17,7 @@ from lidar_perception.candidates.boxes import height_matches
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.refine import STAGES
-from lidar_perception.classes import DETECTED
+from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.geometry import box_corners, horizontal_range, points_in_box, to_box_frame
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
@@ -39,6 +39,11 @@ INTENSITIES = np.arange(20) * 0.05 - 0.005  # between the steps of KITTI's refle
 INTENSITY_STEP = 0.01
 ROUGH_STEP = 0.002        # metres
 BELT = 0.65               # of an object's height; above it a car has windows
+CAR_NAME = CLASSES[CAR]
+FROM = f"{CAR_NAME} from "
+# Where a sensor stands, in degrees from straight ahead of a car, that sees one face of it only.
+FACES = {"behind": (160.0, 180.0), "the side": (45.0, 135.0), "the front": (0.0, 20.0)}
+FACE_POINTS, FACE_QUANTILES, FACE_STEP = 20, (10, 25, 50), 0.01  # the step in metres
 SCORES = {"precision": ("tp", "fp"), "recall": ("tp", "fn"), "f1": ("tp", "fp", "fn")}
 
 
@@ -84,6 +89,9 @@ CURVES = {
            ("points", "points, not occluded"), ("points of all", "points, all"),
            ("height", "height seen / box"), ("length", "length seen / box"),
            ("width", "width seen / box"), ("above", "points above 0.65 of the height"))},
+    **{FROM + face: Curve(f"{FROM}{face}: how far in its box the points are [m]",
+                          tuple(f"{q}%" for q in FACE_QUANTILES), "quantile", step=FACE_STEP)
+       for face in FACES},
     **{f"{stage} {score}": Curve(f"paper A, {stage}: {score}", (*RANGE_NAMES, "all"))
        for stage in STAGES for score in SCORES},
 }
@@ -145,9 +153,26 @@ def object_rows(frame: LidarFrame, truth: GroundTruth, camera: Camera | None) ->
                for what, value in values.items()}
         if frame.intensity is not None and len(inside) >= MIN_POINTS:
             new |= _intensity(name, frame.intensity[inside])
+        if name == CAR_NAME and truth.extras[i].get("occluded", 0) == 0:
+            new |= _depths(frame.xyz[inside].astype(float), box)
         for curve, row in new.items():
             rows.setdefault(curve, []).append(row)
     return {curve: np.array(values) for curve, values in rows.items()}
+
+
+def _depths(xyz: np.ndarray, box: np.ndarray) -> dict:
+    """Of the points (N, 3) in a car's box the quantiles of the distance to the face of the box that
+    the sensor looks at, if it sees one face only and enough points."""
+    if len(xyz) < FACE_POINTS:
+        return {}
+    sensor, own = to_box_frame(np.zeros((1, 3)), box)[0], to_box_frame(xyz, box)
+    angle = abs(np.degrees(np.arctan2(sensor[1], sensor[0])))
+    for face, (low, high) in FACES.items():
+        if low <= angle <= high:
+            axis = int(face == "the side")
+            depth = box[3 + axis] / 2 - np.sign(sensor[axis]) * own[:, axis]
+            return {FROM + face: np.quantile(depth, np.array(FACE_QUANTILES) / 100)}
+    return {}
 
 
 def square_degrees(box: np.ndarray) -> float:

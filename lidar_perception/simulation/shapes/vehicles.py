@@ -21,7 +21,7 @@ from lidar_perception.simulation.shapes.thing import (
     slope,
     upright_pane,
 )
-from lidar_perception.simulation.solids import ELLIPSOID, part, parts
+from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, part, parts
 
 CAR = 10
 PILLAR = 0.035   # radius, m
@@ -29,11 +29,17 @@ LIGHTS = 0.9
 # Only the middle of a bumper is where a car ends. On KITTI's cars seen from the front, points of
 # the middle third are 0.06 m behind the end of the box at 0.25 to 0.35 of the height, 0.2 m at
 # 0.45, 0.33 m at 0.52 and 0.84 m at 0.62; 0.43 of the width beside the middle, 0.3 m more (medians
-# of 25 to 38 cars up to 40 m away). Tails are upright: 0.03 m at the bumper, 0.07 m above.
+# of 25 to 38 cars up to 40 m away). Tails are upright: 0.06 m in the middle third up to 0.7 of the
+# height; round at their corners: 0.15 m at 0.86 of the half width, 0.4 m at 0.96. Sides are 0.04 m
+# inside of the box: that is as wide as the mirrors, or is drawn so.
 BUMPER = 0.29    # of the height: there a car ends
 BONNET = 0.13    # m: so far behind the end is a bonnet's edge in the middle
 CORNER = 0.3     # m: and at its sides
 TAIL = 0.07      # m: so far before its end a tail is flat
+TAIL_FLAT, TAIL_SIDE = 0.59, 0.95  # of the half width: so far, and from there to here it is round
+TAIL_ROUND = 0.45  # m: lengthwise
+TAIL_LOW, TAIL_TOP = 0.22, 0.67  # of the height: between these a tail is closed
+SIDE = 0.035     # m: so far inside of its box a body is
 DOME = 0.09      # m: so much higher is a roof in its middle
 MOTTLE = 0.7     # standard deviation of the logarithm of the reflectance of parts of one body
 LEGS = 0.5       # m: from a bench to the front seats, at least
@@ -106,7 +112,7 @@ def body(size: tuple[float, float, float], style: Style, colour: float, glass: f
     glass: share of the beams that pass a pane. Below the belt are door panels, boxes over the
     axles and a floor with sills between the wheels."""
     length, width, height = size
-    x, y = length / 2, width / 2
+    x, y = length / 2, width / 2 - SIDE
     radius = min(0.205 * height, 0.34)
     arch, clear = 2 * radius, 0.13 * height
     axle = max(0.305 * length, x - 0.95)
@@ -114,14 +120,18 @@ def body(size: tuple[float, float, float], style: Style, colour: float, glass: f
     belt, bonnet = style.belt * height, style.bonnet * height
     low, high, roof, tail = ((share - 0.5) * length for share in style[:4])
     load = (style.load - 0.5) * length if style.load else rear - radius
-    deck = height if style.load else belt
+    deck = height if style.load else TAIL_TOP * height
     top, narrow = height - DOME, 0.86 * y if not style.load else 0.92 * y
     shell = dict(reflectance=colour)
     pane = dict(reflectance=GLASS, transmission=glass)
     rows = [
         block((rear, -0.98 * y, clear), (front, 0.98 * y, arch), **shell),
         *_bonnet((low, bonnet), x, 0.97 * y, height, shell),
-        block((TAIL - x, -0.93 * y, clear), (load, 0.93 * y, deck - 0.02), **shell),
+        block((TAIL - x, -TAIL_FLAT * y, TAIL_LOW * height), (load, TAIL_FLAT * y, deck - 0.02),
+              **shell),
+        block((TAIL + TAIL_ROUND - x, -TAIL_SIDE * y, clear), (load, TAIL_SIDE * y, deck - 0.02),
+              **shell),
+        *_corners(TAIL - x, y, (TAIL_LOW * height, deck - 0.02), shell),
         _bumper(x, 0.97 * y, height, shell),
         _bumper(-x, 0.97 * y, height, shell),
         block((roof, -narrow, height - 0.13), (high, narrow, height - DOME), **shell),
@@ -131,27 +141,27 @@ def body(size: tuple[float, float, float], style: Style, colour: float, glass: f
     if style.load:
         rows.append(block((0.02 - x, -0.95 * y, belt), (0.2 - x, 0.95 * y, top), **shell))
     else:
-        rows.append(slope((roof, top), (tail, belt), 0.88 * y, **pane))
+        rows.append(slope((roof, top), (tail, deck), 0.88 * y, **pane))
     for side in (-1, 1):
         start, end = (load if style.load else (roof + tail) / 2), (low + high) / 2
         rows += [
             block((0.15 - x, side * y, arch), (low + 0.02, side * (y - 0.05), belt), **shell),
             upright_pane((start, end), (side * 0.97 * y, belt), (side * narrow, top), **pane),
-            rod((low, side * 0.95 * y, bonnet), (high, side * narrow, top), PILLAR, **shell),
+            rod((low, side * 0.94 * y, bonnet), (high, side * narrow, top), PILLAR, **shell),
             disc((axle, side * (y - 0.1), radius), radius, 0.1, reflectance=0.2),
             disc((-axle, side * (y - 0.1), radius), radius, 0.1, reflectance=0.2),
             part(ELLIPSOID, (low - 0.1, side * (y + 0.08), belt + 0.05), (0.07, 0.1, 0.08),
                  **shell)]
         if not style.load:
-            rows.append(rod((max(tail, 0.06 - x), side * 0.91 * y, belt),
+            rows.append(rod((max(tail, 0.06 - x), side * 0.9 * y, belt),
                             (max(roof, 0.06 - x), side * narrow, top - 0.02), 0.06, **shell))
     plate = BUMPER * height
-    rows += [  # plates in front and behind; the tail lights are the ends of a strip in the tail
+    rows += [  # plates in front and behind; the tail lights are at its corners
         block((x - 0.05, -0.26, plate - 0.055), (x, 0.26, plate + 0.055), reflectance=PLATE),
         block((TAIL - 0.02 - x, -0.26, 0.4 * height), (TAIL - x, 0.26, 0.4 * height + 0.11),
               reflectance=PLATE),
-        block((TAIL - 0.005 - x, -0.92 * y, 0.38 * height), (0.2 - x, 0.92 * y, 0.44 * height),
-              reflectance=LIGHTS)]
+        *_corners(TAIL - 0.005 - x, y + 0.005, (0.38 * height, 0.44 * height),
+                  dict(reflectance=LIGHTS))]
     rows += _seats(0.5 * (low + high) - 0.75, load, 0.75 * y, arch, 0.45 * belt + 0.55 * top,
                    driver)
     return parts(rows, CAR)
@@ -161,6 +171,14 @@ def _bumper(x: float, y: float, height: float, surface: dict) -> tuple:
     """What reaches x in its middle, rounded seen from above and from the side."""
     return part(ELLIPSOID, (x - copysign(0.5, x), 0.0, BUMPER * height), (0.5, y, 0.17 * height),
                 **surface)
+
+
+def _corners(x: float, y: float, heights: tuple, surface: dict) -> list[tuple]:
+    """The two corners of a tail at x, round seen from above, between two heights."""
+    low, high = heights
+    return [part(CYLINDER, (x + TAIL_ROUND, side * TAIL_FLAT * y, (low + high) / 2),
+                 (TAIL_ROUND, (TAIL_SIDE - TAIL_FLAT) * y, (high - low) / 2), **surface)
+            for side in (-1, 1)]
 
 
 def _bonnet(foot: tuple, x: float, y: float, height: float, surface: dict) -> list[tuple]:
