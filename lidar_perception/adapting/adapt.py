@@ -38,6 +38,7 @@ from lidar_perception.classes import CLASSES
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.open import open_detector
+from lidar_perception.ground.segment import mounted
 from lidar_perception.runs.files import make_folder, read_text, write_bytes, write_text
 from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import duration, errors, track
@@ -94,7 +95,7 @@ class Adapting:
         if not 0 < hours < np.inf:
             raise InputError(f"--budget {hours:g} must be a number of hours above 0")
         self.header = read_header(weights)
-        self.frames = frames_of(open_recording(data), params.mount_height)
+        self.frames = frames_of(mounted(open_recording(data)), params.mount_height)
         self.height = self.frames[0].sensor_height
         known = self.header.training.get("sensor")
         known = known.get("name") if isinstance(known, dict) else None

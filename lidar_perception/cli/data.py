@@ -116,17 +116,13 @@ def opened(data: Path, **how: Any) -> Any:
     errors.print(escape(str(recording)), soft_wrap=True, style="dim")
     if recording.mounted:
         return recording
-    from lidar_perception.ground.segment import HEIGHT_TOLERANCE, first_height
-    from lidar_perception.types import SENSOR_HEIGHT
-    try:
-        height = first_height(recording)
-    except InputError:  # a damaged cloud is named by who needs it
-        return recording
-    if height is None or height < 0 or abs(height - SENSOR_HEIGHT) <= HEIGHT_TOLERANCE:
-        return recording
-    errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds",
-                 soft_wrap=True, style="dim")
-    return open_recording(data, **{**how, "sensor_height": round(height, 2)})
+    from lidar_perception.ground.segment import mounted
+    measured = mounted(recording)
+    if measured is not recording:
+        height = next(iter(measured)).sensor_height
+        errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds",
+                     soft_wrap=True, style="dim")
+    return measured
 
 
 def write_json(path: Path | None, content: dict) -> None:

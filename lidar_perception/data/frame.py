@@ -83,8 +83,8 @@ class Recording:
 
     layout: what was recognised, for people. has: which of BOXES, POINT_LABELS, CAMERA and POSES
     some frames have. lost: labels whose scan is not there, name -> reason. reopen: opens the same
-    recording again, in another process. mounted: whether it says how high its sensor is mounted;
-    otherwise the sensor_height of its frames is KITTI's.
+    recording again, in another process, too; takes what data.open.open_recording does. mounted:
+    whether it says how high its sensor is; otherwise the sensor_height of its frames is KITTI's.
     """
 
     path: Path
@@ -92,7 +92,7 @@ class Recording:
     frames: Sequence[Frame]
     has: frozenset[str] = frozenset()
     lost: tuple[tuple[str, str], ...] = ()
-    reopen: Callable[[], Recording] | None = None
+    reopen: Callable[..., Recording] | None = None
     mounted: bool = True
 
     def __len__(self) -> int:

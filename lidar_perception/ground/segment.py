@@ -12,7 +12,7 @@ from lidar_perception.ground.params import GroundParams, SensorPoseParams, Thres
 from lidar_perception.ground.patchwork import segment_by_patchwork
 from lidar_perception.ground.threshold import ransac_plane, segment_by_threshold
 from lidar_perception.robot.placing import tilted
-from lidar_perception.types import LidarFrame, usable_returns
+from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame, usable_returns
 
 METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
     "threshold": lambda xyz, intensity, p: segment_by_threshold(xyz, p.threshold,
@@ -70,14 +70,23 @@ def measured_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPoseParams()
     return -float(plane[2]) if on_plane.mean() >= MIN_SHARE else None
 
 
-def first_height(recording: Recording) -> float | None:
-    """Metres of the sensor above the ground in the first clouds of a recording, the median of those
-    that show some; None where they do not agree."""
-    clouds = (frame.load() for frame in islice(recording, FIRST))
+def mounted(recording: Recording) -> Recording:
+    """A recording that does not say how high its sensor is, with the height that its first clouds
+    show, the median, where they agree on another one than about KITTI's; else as it is."""
+    if recording.mounted or recording.reopen is None:
+        return recording
+    try:
+        clouds = [frame.load() for frame in islice(recording, FIRST)]
+    except InputError:  # a damaged cloud is named by who needs it
+        return recording
     measured = [measured_height(cloud.xyz) for cloud in clouds if len(cloud)]
     heights = [height for height in measured if height is not None]
-    agree = heights and max(heights) - min(heights) <= HEIGHT_TOLERANCE
-    return float(np.median(heights)) if agree else None
+    if not heights or max(heights) - min(heights) > HEIGHT_TOLERANCE:
+        return recording
+    height = round(float(np.median(heights)), 2)
+    if height < 0 or abs(height - SENSOR_HEIGHT) <= HEIGHT_TOLERANCE:
+        return recording
+    return recording.reopen(sensor_height=height)
 
 
 def height_problem(measured: float | None, pose: SensorPoseParams) -> str | None:
