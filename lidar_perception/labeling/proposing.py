@@ -17,7 +17,7 @@ from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.candidates.silhouette import similarity, to_pixels
 from lidar_perception.classes import Size
 from lidar_perception.detectors.contract import FUSED
-from lidar_perception.geometry import centre_distances, points_in_box
+from lidar_perception.geometry import centre_distances, points_in_box, to_box_frame
 from lidar_perception.labeling import survey_cache
 from lidar_perception.labeling.alike import alike, cell_of, side_view
 from lidar_perception.labeling.drive import Drive
@@ -30,13 +30,13 @@ from lidar_perception.labeling.proposals import (
     Wanted,
     proposed,
 )
-from lidar_perception.labeling.snap import to_cluster
 from lidar_perception.labeling.state import REJECTED, State, Track
 from lidar_perception.labeling.survey import Look, surveyed
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 
 Array = np.ndarray[Any, Any]
 MARGIN = 0.1    # metres around a box whose points are a seed's
+FEWEST = 5      # points of what is compared with a seed
 SHARE = 0.5     # of the boxes of the shorter of two tracks that are one
 REACH = 0.7     # metres between the centres of boxes that are one, or this share of the length:
 ALONG = 0.4
@@ -152,12 +152,12 @@ class Proposer:
         if frame not in track.boxes:
             raise InputError(f"track {track.id} has no box in frame {frame}")
         box = np.array(track.boxes[frame].values)
-        try:
-            shape = to_cluster(self.drive.clouds(frame), box)
-        except InputError:
-            raise InputError(f"track {track.id} has too few points in frame {frame} to be "
-                             "compared") from None
-        shape[3:5] = max(shape[3:5]), min(shape[3:5])
+        seen = to_box_frame(self._inside(frame, box), box)
+        if len(seen) < FEWEST:
+            raise InputError(f"track {track.id} has too few points in frame {frame} to be compared")
+        # As the heading of the box is known, no L-shape need be found.
+        sides, shape = np.ptp(seen[:, :2], axis=0), box.copy()
+        shape[3:6] = sides.max(), sides.min(), seen[:, 2].max() + box[5] / 2
         scores = [float(alike(shape[None], _size(t, f))[0])
                   for f, t in seeds]
         f, seed = seeds[int(np.argmax(scores))]

@@ -117,7 +117,7 @@ def test_a_car_that_is_clicked_is_a_seed_too_and_others_like_it_are_proposed(mad
     scores = [t.score for t in sorted(other, key=lambda t: t.id)]
     assert scores == sorted(scores, reverse=True)
     silhouettes = made.proposer.silhouettes(made.state, own, 0)
-    assert silhouettes["similarity"] > 0.3 and "1" in silhouettes["seed"]["bits"]
+    assert silhouettes["similarity"] > 0.9 and "1" in silhouettes["seed"]["bits"]
 
 
 @given(st.floats(0.5, 12), st.floats(0.3, 3), st.floats(0.5, 4), st.floats(0.2, 1.2))

@@ -77,7 +77,7 @@ def test_frames_hold_the_columns_and_boxes_that_are_published(looking, heard, sh
     published = {m.stamp_ns: to_detections(m) for m in map(from_marker_array, heard)}
 
     def compared():
-        for frame in looking.json("api/drive")["frames"]:
+        for frame in looking.json("api/drive")["frames"][-20:]:  # older ones are dropped soon
             shown = looking.json(f"api/labels/{frame['frame']}")
             rows = shown["detections"].get("perception", [])
             if rows and shown["labels"] and frame["stamp_ns"] in published:
