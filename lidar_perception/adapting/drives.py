@@ -17,6 +17,7 @@ PIECE = 60        # frames of a piece, where not all are looked at
 HELD = 5          # one of so many frames is held out, at the end of each piece
 FEWEST = 10       # frames
 WENT = 1.0        # metres that the sensor must go
+GAP = 2.0         # seconds without a frame, after which another drive begins
 
 
 @dataclass(frozen=True)
@@ -48,18 +49,29 @@ def frames_of(recording: Recording, height: float = 0.0) -> list[Frame]:
 
 
 def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
-    """All frames by drive; where there are more than `most`, pieces of PIECE spread over all."""
-    drives: dict[str, list[int]] = {}
+    """All frames by drive; where there are more than `most`, pieces of PIECE spread over all. A
+    drive ends where the stamps leave a GAP, or go back. InputError where none has FEWEST."""
+    drives: dict[str, list[list[int]]] = {}
     for number, frame in enumerate(frames):
-        drives.setdefault(frame.sequence, []).append(number)
-    pieces = [Piece(name, tuple(numbers)) for name, numbers in drives.items()]
-    if len(frames) <= most:
+        runs = drives.setdefault(frame.sequence, [])
+        if not runs or not 0 <= frame.stamp_ns - frames[runs[-1][-1]].stamp_ns <= GAP * 1e9:
+            runs.append([])
+        runs[-1].append(number)
+    if max(len(run) for runs in drives.values() for run in runs) < FEWEST:
+        raise InputError(f"no {FEWEST} frames follow each other within {GAP:g} s, so that nothing "
+                         "can be followed; record every scan")
+    whole = len(frames) <= most
+    pieces: list[Piece] = []
+    for name, runs in drives.items():
+        parts = [run[i:i + PIECE] for run in runs for i in range(0, len(run), PIECE)]
+        cut = runs if whole else parts
+        pieces += [Piece(f"{name or 'drive'} {k}" if len(cut) > 1 else name or "drive", tuple(part))
+                   for k, part in enumerate(cut, 1)]
+    if whole:
         return pieces
-    parts = [Piece(piece.name, piece.numbers[i:i + PIECE]) for piece in pieces
-             for i in range(0, len(piece.numbers), PIECE)]
-    parts = [part for part in parts if len(part.numbers) >= min(PIECE // 2, most)] or parts
-    count = min(max(1, most // PIECE), len(parts))
-    return [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, count).astype(int))]
+    long = [piece for piece in pieces if len(piece.numbers) >= min(PIECE // 2, most)] or pieces
+    count = min(max(1, most // PIECE), len(long))
+    return [long[i] for i in np.unique(np.linspace(0, len(long) - 1, count).astype(int))]
 
 
 def seconds_of(frames: Sequence[Frame], piece: Piece) -> np.ndarray:
