@@ -18,6 +18,7 @@ from lidar_perception.adapting.drives import (
     frames_of,
     pieces_of,
     poses_of,
+    require_clouds,
     require_motion,
     seconds_of,
 )
@@ -100,6 +101,7 @@ class Adapting:
             raise InputError(f"--budget {hours:g} must be a number of hours above 0")
         self.header = read_header(weights)
         self.frames = frames_of(mounted(open_recording(data)), params.mount_height)
+        require_clouds(self.frames, data)
         self.height = self.frames[0].sensor_height
         self.params = settled(params, self.header)
         self.sensor = sensor_named(self.params.sensor, self.height)

@@ -10,12 +10,14 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.sensor_setup.scans import elevations_of, require_metres, require_space
 from lidar_perception.tracking.ego import Odometry, usable
 from lidar_perception.types import InputError
 
 PIECE = 60        # frames of a piece, where not all are looked at
 HELD = 5          # one of so many frames is held out, at the end of each piece
 FEWEST = 10       # frames
+CHECKED = 5       # clouds, for what they are
 WENT = 1.0        # metres that the sensor must go
 GAP = 2.0         # seconds without a frame, after which another drive begins
 
@@ -46,6 +48,17 @@ def frames_of(recording: Recording, height: float = 0.0) -> list[Frame]:
         raise InputError(f"{recording.path} has {len(frames)} frame{'s' * (len(frames) != 1)}; "
                          f"adapting needs a drive of {FEWEST} at least, of which minutes are best")
     return [replace(f, sensor_height=height) for f in frames] if height else frames
+
+
+def require_clouds(frames: Sequence[Frame], source: Path) -> None:
+    """InputError where the clouds of some frames, spread over all, have no points, or such as of no
+    sensor that can be adapted to."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, CHECKED).astype(int))
+    xyz = np.concatenate([frames[i].load().xyz for i in chosen]).astype(np.float64)
+    if len(xyz) == 0:
+        raise InputError(f"{source}: its clouds have no points; record while the sensor turns")
+    require_metres(np.linalg.norm(xyz, axis=1), str(source))
+    require_space(elevations_of(xyz), str(source))
 
 
 def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:

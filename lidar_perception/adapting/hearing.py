@@ -53,23 +53,24 @@ def recognised(looker: Callable[[Frame, np.ndarray], FrameLook], frames: Iterabl
 def heard_of(counts: Counts) -> Heard:
     """The sources that are asked: all but those that were seen to miss most objects of a class; of
     one with less than FEWEST, those of all classes."""
-    heard = {}
-    for of, each in counts.items():
-        enough = {name: own if own[1] >= FEWEST else _together(counts, name)
-                  for name, own in each.items()}
-        heard[CLASSES.index(of)] = tuple(name for name, (yes, asked) in enough.items()
-                                         if asked < FEWEST or yes >= RECOGNISED * asked)
-    return heard
-
-
-def _together(counts: Counts, name: str) -> tuple[int, int]:
-    every = [each[name] for each in counts.values() if name in each]
-    return sum(yes for yes, _ in every), sum(asked for _, asked in every)
+    return {CLASSES.index(of): tuple(name for name in each if _asked(*_judged_by(counts, of, name)))
+            for of, each in counts.items()}
 
 
 def unheard(counts: Counts) -> list[str]:
     """What to say of each class of which a source is not asked."""
-    heard = heard_of(counts)
-    return [f"{of}: {name} is not asked, it recognises {each[name][0]} of {each[name][1]} "
-            "simulated ones" for of, each in counts.items() for name in each
-            if name not in heard[CLASSES.index(of)]]
+    return [f"{of}: {name} is not asked, it recognises {yes} of {asked} simulated objects"
+            for of, each in counts.items() for name in each
+            for yes, asked in [_judged_by(counts, of, name)] if not _asked(yes, asked)]
+
+
+def _asked(yes: int, asked: int) -> bool:
+    return asked < FEWEST or yes >= RECOGNISED * asked
+
+
+def _judged_by(counts: Counts, of: str, name: str) -> tuple[int, int]:
+    own = counts[of][name]
+    if own[1] >= FEWEST:
+        return own
+    every = [each[name] for each in counts.values() if name in each]
+    return sum(yes for yes, _ in every), sum(asked for _, asked in every)
