@@ -15,10 +15,10 @@ import numpy as np
 
 from lidar_perception.adapting.drives import (
     Piece,
+    checked,
     frames_of,
     pieces_of,
     poses_of,
-    require_clouds,
     require_motion,
     seconds_of,
 )
@@ -101,13 +101,14 @@ class Adapting:
             raise InputError(f"--budget {hours:g} must be a number of hours above 0")
         self.header = read_header(weights)
         self.frames = frames_of(mounted(open_recording(data)), params.mount_height)
-        require_clouds(self.frames, data)
         self.height = self.frames[0].sensor_height
         self.params = settled(params, self.header)
         self.sensor = sensor_named(self.params.sensor, self.height)
         if self.frames[0].pose() is None and not has_odometry():
             raise InputError(f"{data} has no poses, and to find them by the scans needs kiss-icp; "
                              "pip install 'lidar_perception[odometry]'")
+        for line in checked(self.frames, data):
+            errors.print(line, soft_wrap=True)
         self.network = network_to_train(self.header)
         detector = opened_with(weights, self.header, device)
         self.low, self.high = (np.array(end[:2]) for end in (detector.config.low,

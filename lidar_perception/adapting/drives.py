@@ -50,20 +50,26 @@ def frames_of(recording: Recording, height: float = 0.0) -> list[Frame]:
     return [replace(f, sensor_height=height) for f in frames] if height else frames
 
 
-def require_clouds(frames: Sequence[Frame], source: Path) -> None:
-    """InputError where the clouds of some frames, spread over all, have no points, or such as of no
-    sensor that can be adapted to."""
+def checked(frames: Sequence[Frame], source: Path) -> list[str]:
+    """What to say of the clouds of some frames, spread over all. InputError where they have no
+    points, or such as of no sensor that can be adapted to."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, CHECKED).astype(int))
-    xyz = np.concatenate([frames[i].load().xyz for i in chosen]).astype(np.float64)
+    clouds = [frames[i].load() for i in chosen]
+    xyz = np.concatenate([cloud.xyz for cloud in clouds]).astype(np.float64)
     if len(xyz) == 0:
         raise InputError(f"{source}: its clouds have no points; record while the sensor turns")
     require_metres(np.linalg.norm(xyz, axis=1), str(source))
     require_space(elevations_of(xyz), str(source))
+    if any(cloud.intensity is not None and cloud.intensity.any() for cloud in clouds):
+        return []
+    return [f"{source} has no intensity, which the networks were trained with, so that they may "
+            "find little: turn it on in the driver"]
 
 
 def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
-    """All frames by drive; where there are more than `most`, pieces of PIECE spread over all. A
-    drive ends where the stamps leave a GAP, or go back. InputError where none has FEWEST."""
+    """All frames by drive; where there are more than `most`, pieces of PIECE, or of `most` if that
+    is less, spread over all. A drive ends where the stamps leave a GAP, or go back. InputError
+    where none has FEWEST."""
     drives: dict[str, list[list[int]]] = {}
     for number, frame in enumerate(frames):
         runs = drives.setdefault(frame.sequence, [])
@@ -73,17 +79,17 @@ def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
     if max(len(run) for runs in drives.values() for run in runs) < FEWEST:
         raise InputError(f"no {FEWEST} frames follow each other within {GAP:g} s, so that nothing "
                          "can be followed; record every scan")
-    whole = len(frames) <= most
+    whole, size = len(frames) <= most, max(FEWEST, min(PIECE, most))
     pieces: list[Piece] = []
     for name, runs in drives.items():
-        parts = [run[i:i + PIECE] for run in runs for i in range(0, len(run), PIECE)]
+        parts = [run[i:i + size] for run in runs for i in range(0, len(run), size)]
         cut = runs if whole else parts
         pieces += [Piece(f"{name or 'drive'} {k}" if len(cut) > 1 else name or "drive", tuple(part))
                    for k, part in enumerate(cut, 1)]
     if whole:
         return pieces
-    long = [piece for piece in pieces if len(piece.numbers) >= min(PIECE // 2, most)] or pieces
-    count = min(max(1, most // PIECE), len(long))
+    long = [piece for piece in pieces if len(piece.numbers) >= size // 2] or pieces
+    count = min(max(1, most // size), len(long))
     return [long[i] for i in np.unique(np.linspace(0, len(long) - 1, count).astype(int))]
 
 

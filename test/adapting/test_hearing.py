@@ -79,6 +79,7 @@ def test_a_gap_of_the_stamps_ends_a_drive():
         assert [len(p.numbers) for p in pieces] == [12, 15]
         assert [n for p in pieces for n in p.numbers] == list(range(27))
         assert len({p.name for p in pieces}) == 2
+    assert [len(p.numbers) for p in pieces_of(frames(*np.arange(200) / 10), 25)] == [25]
     assert len(pieces_of(frames(*np.zeros(20)), 100)) == 1  # a data set without stamps
     with pytest.raises(InputError, match=f"{FEWEST} frames"):
         pieces_of(frames(*range(0, 100, 5)), 100)
