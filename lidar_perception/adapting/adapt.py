@@ -118,6 +118,7 @@ class Adapting:
         self.seen: list[Seen] = []
         self.first_seen: list[Seen] = []
         self.recognised: Counts = {}
+        self.not_asked: list[str] = []
         self.before: Watched | None = None
         self.rounds: list[Round] = []
         self.best = weights
@@ -198,7 +199,8 @@ class Adapting:
             write_text(path, json.dumps(recognised(looker, track(frames, "looking at simulated "
                                                                  "scans", len(frames)))))
         counts: Counts = json.loads(read_text(path, 10**6))
-        for line in unheard(counts):
+        self.not_asked = unheard(counts)
+        for line in self.not_asked:
             errors.print(line, soft_wrap=True)
         return counts
 

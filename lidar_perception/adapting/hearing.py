@@ -18,7 +18,7 @@ from lidar_perception.geometry import centre_distances
 
 AGREE = 0.4       # a source agrees from this probability on
 POINTS = 10       # in the box of an object that counts, at least
-FEWEST = 10       # objects by which a source is judged
+FEWEST = 5        # objects by which a source is judged
 RECOGNISED = 0.5  # share of them from which on it is asked
 
 # By class, the sources that may speak against an object of it.

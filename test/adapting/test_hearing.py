@@ -1,15 +1,12 @@
-"""Laws of who is asked: a source that says no to what is there says nothing, and a drive ends where
-the recording has a gap."""
+"""Laws of who is asked: a source that says no to what is there says nothing."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from adapting_samples import FRAMES, KINDS, POST, boxes_at, drive
 
-from lidar_perception.adapting.drives import FEWEST, pieces_of
 from lidar_perception.adapting.hearing import ALL, heard_of, recognised, unheard
 from lidar_perception.adapting.judging import IGNORED, KEPT, REJECTED, judged
 from lidar_perception.adapting.looking import FrameLook
@@ -17,7 +14,7 @@ from lidar_perception.adapting.tracks import tracks_of
 from lidar_perception.data.frame import Frame
 from lidar_perception.robot.poses import inverse
 from lidar_perception.tracking.ego import moved_boxes
-from lidar_perception.types import GroundTruth, InputError, LidarFrame
+from lidar_perception.types import GroundTruth, LidarFrame
 
 TRUE = np.arange(len(KINDS)) != POST
 
@@ -67,19 +64,3 @@ def test_where_no_source_recognises_anything_nothing_is_kept():
     looks, stamps, _ = drive()
     deaf = heard_of(counts_of(said(looks, network=0.1, silhouette=0.1, classifier=0.1)))
     assert KEPT not in states(looks, stamps, deaf)
-
-
-def test_a_gap_of_the_stamps_ends_a_drive():
-    def frames(*stamps: float) -> list[Frame]:
-        return [Frame(str(s), int(s * 1e9), lambda: None) for s in stamps]
-
-    first, second = np.arange(12) / 10, np.arange(15) / 10
-    for later in (30.0, -0.5):  # a pause, and a clock that was put back
-        pieces = pieces_of(frames(*first, *(second + later)), 100)
-        assert [len(p.numbers) for p in pieces] == [12, 15]
-        assert [n for p in pieces for n in p.numbers] == list(range(27))
-        assert len({p.name for p in pieces}) == 2
-    assert [len(p.numbers) for p in pieces_of(frames(*np.arange(200) / 10), 25)] == [25]
-    assert len(pieces_of(frames(*np.zeros(20)), 100)) == 1  # a data set without stamps
-    with pytest.raises(InputError, match=f"{FEWEST} frames"):
-        pieces_of(frames(*range(0, 100, 5)), 100)
