@@ -21,6 +21,9 @@ POINTS = 10       # in the box of an object that counts, at least
 FEWEST = 5        # objects by which a source is judged
 RECOGNISED = 0.5  # share of them from which on it is asked
 
+NAMES = {"network": "PointPillars", "silhouette": "the silhouette",
+         "classifier": "the cluster network"}  # for people
+
 # By class, the sources that may speak against an object of it.
 Heard = Mapping[int, Sequence[str]]
 ALL: Heard = {CLASSES.index(name): ("network", "classifier") for name in DETECTED} | {
@@ -59,7 +62,8 @@ def heard_of(counts: Counts) -> Heard:
 
 def unheard(counts: Counts) -> list[str]:
     """What to say of each class of which a source is not asked."""
-    return [f"{of}: {name} is not asked, it recognises {yes} of {asked} simulated objects"
+    return [f"{of}: {NAMES[name]} is not asked: it recognises {yes} of {asked} simulated objects"
+            + " of all classes" * (counts[of][name][1] < FEWEST)
             for of, each in counts.items() for name in each
             for yes, asked in [_judged_by(counts, of, name)] if not _asked(yes, asked)]
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lidar_perception.adapting.hearing import AGREE, ALL, POINTS, Heard
+from lidar_perception.adapting.hearing import AGREE, ALL, NAMES, POINTS, Heard
 from lidar_perception.adapting.tracks import Followed
 from lidar_perception.classes import CAR, CLASSES, CYCLIST, PEDESTRIAN
 
@@ -93,7 +93,8 @@ def _doubts(track: Followed, heard: Sequence[str]) -> Iterator[str]:
         yield f"seen in {len(track)} frame{'s' * (len(track) != 1)} only"
     if track.score < SURE:
         yield f"score {track.score:.2f}"
-    against = [f"{name} {p:.2f}" for name, p in track.said.items() if p < AGREE and name in heard]
+    against = [f"{NAMES[name]} {p:.2f}" for name, p in track.said.items()
+               if p < AGREE and name in heard]
     if against:
         yield f"not all agree: {', '.join(against)}"
     if track.share < SHARE:

@@ -50,7 +50,8 @@ def pictures(seen: Sequence[Seen], frames: Sequence[Frame], low: np.ndarray,
     for piece, k in (places[i] for i in chosen):
         frame = frames[piece.piece.numbers[k]]
         png = drawn(frame.load().xyz, piece.labels[k], low, high)
-        found[frame.name] = "data:image/png;base64," + base64.b64encode(png).decode()
+        title = f"{piece.piece.name}, frame {piece.piece.numbers[k]}: {frame.name}"
+        found[title] = "data:image/png;base64," + base64.b64encode(png).decode()
     return found
 
 

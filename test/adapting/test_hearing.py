@@ -51,7 +51,7 @@ def test_a_source_that_is_deaf_to_this_sensor_keeps_nothing_from_being_learned()
     assert counts["Pedestrian"]["silhouette"] == (0, 2 * FRAMES)
     assert set(heard_of(counts).values()) == {("classifier",)}
     assert states(deaf, stamps, heard_of(counts)) == [KEPT] * 4 + [REJECTED]
-    assert any("Pedestrian: silhouette is not asked" in line for line in unheard(counts))
+    assert any("Pedestrian: the silhouette is not asked" in line for line in unheard(counts))
 
 
 def test_one_that_recognises_most_of_what_is_there_is_asked():
