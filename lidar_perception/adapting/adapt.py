@@ -95,7 +95,8 @@ class Adapting:
         if not 0 < hours < np.inf:
             raise InputError(f"--budget {hours:g} must be a number of hours above 0")
         self.header = read_header(weights)
-        self.frames = frames_of(mounted(open_recording(data)), params.mount_height)
+        height = params.mount_height or None
+        self.frames = frames_of(mounted(open_recording(data, sensor_height=height)))
         self.height = self.frames[0].sensor_height
         known = self.header.training.get("sensor")
         known = known.get("name") if isinstance(known, dict) else None

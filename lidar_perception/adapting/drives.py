@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -37,14 +37,14 @@ class Piece:
         return range(len(self.learned), len(self.numbers))
 
 
-def frames_of(recording: Recording, height: float = 0.0) -> list[Frame]:
-    """The frames of a recording, of a sensor at another height above the ground if that is not 0,
-    metres. InputError for less than FEWEST."""
-    frames = list(recording)
-    if len(frames) < FEWEST:
-        raise InputError(f"{recording.path} has {len(frames)} frame{'s' * (len(frames) != 1)}; "
-                         f"adapting needs a drive of {FEWEST} at least, of which minutes are best")
-    return [replace(f, sensor_height=height) for f in frames] if height else frames
+def frames_of(recording: Recording) -> Sequence[Frame]:
+    """The frames of a recording, which read their clouds when these are asked for. InputError for
+    less than FEWEST."""
+    count = len(recording)
+    if count < FEWEST:
+        raise InputError(f"{recording.path} has {count} frame{'s' * (count != 1)}; adapting needs "
+                         f"a drive of {FEWEST} at least, of which minutes are best")
+    return recording.frames
 
 
 def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
