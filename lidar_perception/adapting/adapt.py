@@ -43,7 +43,7 @@ from lidar_perception.runs.files import make_folder, read_text, write_bytes, wri
 from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import duration, errors, track
 from lidar_perception.simulation.sensor import sensor_named
-from lidar_perception.tracking.ego import has_odometry
+from lidar_perception.tracking.ego import NO_SOURCE, recorded_source
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.cache import kept as made_once
 from lidar_perception.training.sources import SIM
@@ -102,7 +102,7 @@ class Adapting:
         known = known.get("name") if isinstance(known, dict) else None
         self.sensor_name = params.sensor or known or "hdl64e"
         self.sensor = sensor_named(self.sensor_name, self.height)
-        if self.frames[0].pose() is None and not has_odometry():
+        if recorded_source(self.frames[0].pose() is not None) == NO_SOURCE:
             raise InputError(f"{data} has no poses, and to find them by the scans needs kiss-icp; "
                              "pip install 'lidar_perception[odometry]'")
         self.network = network_to_train(self.header)

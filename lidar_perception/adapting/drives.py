@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.tracking.ego import Odometry, usable
+from lidar_perception.tracking.ego import Odometry, recorded_source, usable
 from lidar_perception.types import InputError
 
 PIECE = 60        # frames of a piece, where not all are looked at
@@ -71,10 +71,10 @@ def seconds_of(frames: Sequence[Frame], piece: Piece) -> np.ndarray:
 
 
 def poses_of(frames: Sequence[Frame], piece: Piece) -> Iterator[Any]:
-    """(4, 4) of each frame of a piece in a frame that stands: the recording's, else by the scans.
-    InputError where neither can be had."""
+    """(4, 4) of each frame of a piece in a frame that stands, from its recorded_source. InputError
+    where there is none."""
     own = [frames[number].pose() for number in piece.numbers]
-    if all(map(usable, own)):
+    if recorded_source(all(map(usable, own))) == "recording":
         yield from own
         return
     odometry = Odometry()
