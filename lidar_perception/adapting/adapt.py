@@ -22,7 +22,7 @@ from lidar_perception.adapting.drives import (
     seconds_of,
 )
 from lidar_perception.adapting.judging import KEPT, STATES, Verdict, judged
-from lidar_perception.adapting.labels import FrameLabels, labels_of
+from lidar_perception.adapting.labels import ConcludedLabels, labels_of
 from lidar_perception.adapting.learning import (
     network_to_train,
     opened_with,
@@ -67,7 +67,7 @@ class Seen:
     looks: list[FrameLook]
     tracks: list[Followed]
     verdicts: list[Verdict]
-    labels: list[FrameLabels]
+    labels: list[ConcludedLabels]
 
 
 @dataclass(frozen=True)

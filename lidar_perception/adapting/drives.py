@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.labeling.interpolation import Motion
 from lidar_perception.tracking.ego import Odometry, recorded_source, usable
 from lidar_perception.types import InputError
 
@@ -65,9 +66,7 @@ def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
 def seconds_of(frames: Sequence[Frame], piece: Piece) -> np.ndarray:
     """(F,) float64 seconds since the first frame of a piece; 0.1 s a frame where the stamps do not
     rise."""
-    stamps = np.array([frames[n].stamp_ns for n in piece.numbers])
-    seconds = (stamps - stamps[0]) / 1e9
-    return np.arange(len(stamps)) * 0.1 if (np.diff(seconds) <= 0).any() else seconds
+    return Motion.of(np.array([frames[n].stamp_ns for n in piece.numbers])).times
 
 
 def poses_of(frames: Sequence[Frame], piece: Piece) -> Iterator[Any]:

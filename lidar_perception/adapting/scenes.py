@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.adapting.judging import IGNORED, KEPT
-from lidar_perception.adapting.labels import FrameLabels
+from lidar_perception.adapting.labels import ConcludedLabels
 from lidar_perception.classes import DONT_CARE
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
@@ -21,7 +21,7 @@ from lidar_perception.training.cache import write_arrays
 from lidar_perception.types import InputError
 
 
-def save_labels(path: Path, numbers: Sequence[int], labels: Sequence[FrameLabels]) -> None:
+def save_labels(path: Path, numbers: Sequence[int], labels: Sequence[ConcludedLabels]) -> None:
     """Write an .npz file of the labels of frames with these numbers in their recording: what is
     kept, and what is ignored as regions; what is rejected is background."""
     chosen = [np.flatnonzero(each.of(KEPT) | each.of(IGNORED)) for each in labels]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.adapting.judging import AGREE, IGNORED, KEPT
-from lidar_perception.adapting.labels import FrameLabels
+from lidar_perception.adapting.labels import ConcludedLabels
 from lidar_perception.adapting.looking import FrameLook
 from lidar_perception.adapting.params import AdaptParams
 from lidar_perception.classes import CLASSES, DETECTED, PEDESTRIAN
@@ -55,7 +55,7 @@ def worse(before: Watched, after: Watched, params: AdaptParams) -> str:
     return " and ".join(reasons)
 
 
-def agreement_of(detector: Detector, frames: Sequence[Frame], labels: Sequence[FrameLabels],
+def agreement_of(detector: Detector, frames: Sequence[Frame], labels: Sequence[ConcludedLabels],
                  low: np.ndarray, high: np.ndarray) -> tuple[float, int, int]:
     """F1 of a detector with what is kept in frames, between low and high (2,), metres, and how many
     boxes there were of each; what touches a region that is ignored is not counted. 1 where there is
@@ -68,7 +68,7 @@ def agreement_of(detector: Detector, frames: Sequence[Frame], labels: Sequence[F
     return (2 * right / (found + kept) if found + kept else 1.0), found, kept
 
 
-def _compared(boxes: Detections, labels: FrameLabels, low: np.ndarray,
+def _compared(boxes: Detections, labels: ConcludedLabels, low: np.ndarray,
               high: np.ndarray) -> tuple[int, int, int]:
     """Boxes that are of one object, all that were found, and all that are kept."""
     kept = labels.of(KEPT) & _within(labels.boxes, low, high)
