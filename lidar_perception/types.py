@@ -55,6 +55,11 @@ class LidarFrame:
         intensity = None if self.intensity is None else self.intensity.take(indices)
         return LidarFrame(self.xyz.take(indices, axis=0), intensity, self.stamp_ns, self.frame_id)
 
+    def points(self) -> np.ndarray:
+        """(N, 4) float32 [x y z intensity]; 0 without intensity."""
+        intensity = np.zeros(len(self), np.float32) if self.intensity is None else self.intensity
+        return np.column_stack([self.xyz, intensity])
+
 
 def usable_returns(xyz: np.ndarray) -> np.ndarray:
     """(N,) bool: finite, within 100 km, and not the origin, where drivers put missing returns."""

@@ -39,13 +39,12 @@ class Piece:
 
 
 def frames_of(recording: Recording) -> Sequence[Frame]:
-    """The frames of a recording, which read their clouds when these are asked for. InputError for
-    less than FEWEST."""
+    """The frames of a recording. InputError for less than FEWEST."""
     count = len(recording)
     if count < FEWEST:
         raise InputError(f"{recording.path} has {count} frame{'s' * (count != 1)}; adapting needs "
                          f"a drive of {FEWEST} at least, of which minutes are best")
-    return recording.frames
+    return recording.frames[:]  # of a bag, without the clouds that iterating would keep
 
 
 def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:

@@ -26,7 +26,7 @@ def training_scans(seed: int = 0, sensor: Sensor = HDL64E,
     for number in itertools.count(seed + first, step):
         scan = scan_at(number, 0, sensor, scenes)
         arrays = {
-            "points": np.column_stack([scan.frame.xyz, scan.frame.intensity]),
+            "points": scan.frame.points(),
             "boxes": scan.truth.boxes.astype(np.float32),
             "class_ids": scan.truth.class_ids.astype(np.int64),
             "num_points": np.array([e["num_points"] for e in scan.truth.extras], np.int64)}

@@ -59,7 +59,7 @@ def write_frame(folder: Path, plan: Plan, number: int) -> None:
     sequence, moment = divmod(number, plan.streets_of)
     scan = scan_at(plan.seed + sequence, moment, plan.sensor, plan.scenes)
     order = np.argsort(scan.ring, kind="stable")  # as in KITTI's files, beam after beam
-    cloud = np.column_stack([scan.frame.xyz, scan.frame.intensity])[order]
+    cloud = scan.frame.points()[order]
     if plan.layout == "semantickitti":
         shares = _semantic(folder, plan, sequence, moment, scan, cloud, order)
     else:

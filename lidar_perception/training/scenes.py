@@ -59,8 +59,7 @@ class RecordedScenes:
         """InputError naming the file that cannot be used."""
         frame = self.frame(i)
         scan, truth, camera = frame.load(), frame.truth(), frame.camera()
-        intensity = np.zeros(len(scan), np.float32) if scan.intensity is None else scan.intensity
-        points = np.column_stack([scan.xyz, intensity])
+        points = scan.points()
         if self.view and camera is not None:
             points = points[camera.in_view(scan.xyz)]
         return TrainingScene(points, truth.boxes, truth.class_ids, np.ones(len(truth), bool),
@@ -122,8 +121,8 @@ class SimulatedScenes:
     def scene(self, i: int) -> TrainingScene:
         """With the labels all around."""
         frame, truth = self.scan(i)
-        return TrainingScene(np.column_stack([frame.xyz, frame.intensity]), truth.boxes,
-                             truth.class_ids, worth_a_label(truth), True, self.sensor.height)
+        return TrainingScene(frame.points(), truth.boxes, truth.class_ids, worth_a_label(truth),
+                             True, self.sensor.height)
 
     def frame(self, i: int) -> Frame:
         """To validate on: with the labels that KITTI would have in the image of a camera, or all
