@@ -81,6 +81,7 @@ class Live:
         self._by_stamp: dict[int, LiveFrame] = {}
         self._next = self._bytes = 0
         self._holding: set[int] = set()
+        self._numbers: dict[tuple[str, str], int] = {}  # of each topic among those of its kind
         self._said: dict[str, Any] = {}
         self._lock = threading.RLock()
 
@@ -103,8 +104,8 @@ class Live:
         """Expect boxes of a kind on a topic: clouds wait for them."""
         with self._lock:
             if topic not in self.topics:
-                number = sum(t.kind == kind for t in self.topics.values())
-                self.topics[topic] = Heard(kind, number)
+                number = sum(known == kind for known, _ in self._numbers)
+                self.topics[topic] = Heard(kind, self._numbers.setdefault((kind, topic), number))
 
     def forget(self, topic: str) -> None:
         """Nobody publishes the topic any more."""
