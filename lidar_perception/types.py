@@ -101,6 +101,12 @@ class Detections:
         return Detections(self.boxes[index], self.class_ids[index], self.scores[index],
                           {name: said[index] for name, said in self.sources.items()})
 
+    def followed_by(self, others: Detections) -> Detections:
+        """These and then the others, without sources."""
+        return Detections(np.concatenate([self.boxes, others.boxes]),
+                          np.concatenate([self.class_ids, others.class_ids]),
+                          np.concatenate([self.scores, others.scores]))
+
 
 def class_ids(names: Iterable[str]) -> list[int]:
     """Into CLASSES; a name that is not there is Misc."""

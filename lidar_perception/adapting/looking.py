@@ -89,11 +89,7 @@ def with_clusters(look: Look, clusters: Detections, silent: float) -> Look:
     added = clusters[new]
     said = {"network": clipped_logit(np.full(len(added), silent)),
             "classifier": clipped_logit(added.scores), "silhouette": np.full(len(added), np.nan)}
-    before = look.proposed
-    proposed = Detections(np.concatenate([before.boxes, added.boxes]),
-                          np.concatenate([before.class_ids, added.class_ids]),
-                          np.concatenate([before.scores, added.scores]))
-    return look._replace(proposed=proposed, evidence={
+    return look._replace(proposed=look.proposed.followed_by(added), evidence={
         name: np.concatenate([odds, said[name]]) for name, odds in look.evidence.items()})
 
 

@@ -84,10 +84,8 @@ def found_in(look: Look, wanted: Wanted,
     box, name = placed
     others = centre_distances(detections.boxes, box[None])[:, 0] > max(SAME, box[3] / 3)
     kept = detections[others]
-    return Detections(np.concatenate([kept.boxes, box[None].astype(np.float32)]),
-                      np.append(kept.class_ids, np.int32(CLASSES.index(name))),
-                      np.append(kept.scores, np.float32(SURE))), np.append(candidates[others],
-                                                                           False)
+    sure = Detections.of(box, CLASSES.index(name), SURE)
+    return kept.followed_by(sure), np.append(candidates[others], False)
 
 
 def _seen_in(look: Look, seeds: Sequence[SeedLook]) -> tuple[Detections, Array]:
@@ -98,7 +96,7 @@ def _seen_in(look: Look, seeds: Sequence[SeedLook]) -> tuple[Detections, Array]:
     boxes = np.array([completed(b, usual_size(CLASSES[PEDESTRIAN]))
                       for b in look.boxes[chosen].astype(np.float64)]).reshape(-1, 7)
     new = centre_distances(boxes, people).min(axis=1, initial=np.inf) > SAME
-    both = _and(found, boxes[new], np.full(new.sum(), PEDESTRIAN), scores[chosen][new])
+    both = found.followed_by(Detections.of(boxes[new], PEDESTRIAN, scores[chosen][new]))
     return both, np.arange(len(both)) >= len(found)
 
 
@@ -119,14 +117,9 @@ def _with_things(look: Look, wanted: Wanted, found: Detections,
     apart = np.maximum(SAME, boxes[:, None, 3] / 3)
     new = (centre_distances(boxes, found.boxes) > apart).all(axis=1)
     classes = np.array([CLASSES.index(sizes[k].class_name) for k in best[chosen]], np.int32)
-    both = _and(found, boxes[new], classes[new], scores.max(axis=0)[chosen][new])
+    both = found.followed_by(Detections.of(boxes[new], classes[new],
+                                           scores.max(axis=0)[chosen][new]))
     return both, np.append(candidates, np.ones(int(new.sum()), bool))
-
-
-def _and(found: Detections, boxes: Array, class_ids: Array, scores: Array) -> Detections:
-    return Detections(np.concatenate([found.boxes, boxes.astype(np.float32)]),
-                      np.concatenate([found.class_ids, class_ids.astype(np.int32)]),
-                      np.concatenate([found.scores, scores.astype(np.float32)]))
 
 
 ON_FOOT = [i for i, kind in enumerate(KIND_OF_CLASS) if kind != KIND_OF_CLASS[0]]
