@@ -285,7 +285,8 @@ class Adapting:
         f1, found, kept = agreement_of(open_detector(weights, self.device), frames,
                                        [seen.labels[k] for seen, k in held], self.low, self.high)
         looker = Looker(opened_with(weights, self.header, self.device))
-        looks = [looker(frame, np.eye(4)) for frame in track(frames, "judging", len(frames))]
+        looks = [looker(frame, np.eye(4)) for frame in track(frames, "judging all sources",
+                                                             len(frames))]
         watched = Watched(
             metrics["score"], {name: value for name, value in metrics.items()
                                if name.endswith("_bev_relaxed") and np.isfinite(value)},

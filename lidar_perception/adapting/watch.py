@@ -62,7 +62,7 @@ def agreement_of(detector: Detector, frames: Sequence[Frame], labels: Sequence[C
     boxes there were of each; what touches a region that is ignored is not counted. 1 where there is
     nothing."""
     right = found = kept = 0
-    for frame, own in track(zip(frames, labels), "comparing", len(frames)):
+    for frame, own in track(zip(frames, labels), "judging the network alone", len(frames)):
         boxes = detector.mounted_at(frame.sensor_height)(frame.load()).detections
         counts = _compared(boxes, own, low, high)
         right, found, kept = right + counts[0], found + counts[1], kept + counts[2]
