@@ -12,7 +12,7 @@ from lidar_perception.adapting.params import RECORD, AdaptParams
 from lidar_perception.cli.data import WHAT, a_path, device_option
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.runs.machine import cores
-from lidar_perception.runs.terminal import console
+from lidar_perception.runs.terminal import console, errors
 from lidar_perception.types import InputError
 
 
@@ -64,6 +64,9 @@ def adapt(data: Path, weights: Path, out: Path, budget: float, resume: bool, for
         except InputError:
             if run.seen:  # so that one sees why
                 write_report(run)
+            raise
+        except KeyboardInterrupt:
+            errors.print(f"stopped; what is in {out} is kept, --resume goes on", soft_wrap=True)
             raise
         write_report(run)
     tell(run)

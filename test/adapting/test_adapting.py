@@ -223,8 +223,8 @@ def test_regions_give_no_gradient_and_change_none_elsewhere():
 
 def standing(path: Path) -> Path:
     looks, stamps, _ = drive()
-    frames = [Frame.of(str(i), LidarFrame(np.ones((50, 3), np.float32), np.ones(50, np.float32),
-                                          stamps[i], "velodyne"),
+    points = two_objects()
+    frames = [Frame.of(str(i), LidarFrame(points[:, :3], points[:, 3], stamps[i], "velodyne"),
                        pose=partial(np.eye, 4)) for i in range(len(looks))]
     write_bag(path, frames)
     return path
