@@ -161,6 +161,7 @@ def test_the_cluster_network_is_adapted_in_the_same_way(bag, tmp_path):
                                          worse_agreement=1.0))
     assert isinstance(open_detector(out / BEST, "cpu"), PointNetDetector)
     assert run.best != old and tensors(out / BEST) != tensors(old)
+    assert (run.low < 0).all()  # it sees all around, and so does all that is learned
 
 
 def test_report_and_labels_say_what_was_kept(bag, weights, whole):
