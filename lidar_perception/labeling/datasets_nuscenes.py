@@ -105,7 +105,11 @@ class NuscenesTables:
         placed = places(sample, *in_global(labels.boxes, pose))
         for k, place in enumerate(placed):
             track, name, extra = labels.track_ids[k], labels.class_names[k], labels.extra[k]
-            place["rotation"] = rotation_read(labels, k, pose) or place["rotation"]
+            lidar, radar = int(inside[k]), 0
+            if rotation := rotation_read(labels, k, pose):  # as it was, and so are its points
+                place["rotation"] = rotation
+                lidar = extra.get("lidar_points", lidar)
+                radar = extra.get("points", lidar) - lidar
             instance = token(scene, "track", track) if track != NO_TRACK else token(sample, k)
             kind = WRITTEN.get(name, name)
             category = extra.get("category")
@@ -123,7 +127,7 @@ class NuscenesTables:
             self._chain("sample_annotation", instance, token(sample, instance), **place,
                         instance_token=instance, visibility_token="",
                         attribute_tokens=[token(said)] if said in ATTRIBUTES else [],
-                        num_lidar_pts=int(inside[k]), num_radar_pts=0)
+                        num_lidar_pts=lidar, num_radar_pts=radar)
 
     def _category(self, name: str) -> str:
         if name not in self.categories:
