@@ -9,7 +9,7 @@ import { openLive, takeDrive } from "./live.js";
 import { sayError } from "./messages.js";
 import { loadResults } from "./results.js";
 import { openResults } from "./resultpanel.js";
-import { drawn, focus, fly, limits, lookAt, openScene } from "./scene.js";
+import { draw, drawn, focus, fly, limits, lookAt, openScene } from "./scene.js";
 import { openSideViews } from "./sideviews.js";
 import { changed, on, select, store } from "./store.js";
 import { openTimeline } from "./timeline.js";
@@ -54,5 +54,5 @@ async function open() {
 }
 
 // For measurements and for pictures from a script; nothing on the page uses it.
-globalThis.page = { store, drawn, pointAt, project, fly, limits, lookAt };
+globalThis.page = { store, draw, drawn, pointAt, project, fly, limits, lookAt };
 open();
