@@ -13,9 +13,15 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from test_robot_frames import mounted, transforms
+
 from lidar_perception.nodes.graph import SINGLE
+from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, TF_MESSAGE, has_tf
+from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import to_detections
-from msg_utils.markers import from_marker_array
+from msg_utils.markers import from_marker_array, to_marker_array
+from msg_utils.stamps import header_message
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 FOUND = "/perception/output/detections"
@@ -123,6 +129,44 @@ def test_the_newest_frame_appears_and_one_can_pause_and_step_back(looking, heard
         page.keyboard.press(" ")
         page.wait_for_function("n => page.store.playing && page.store.frame > n + 1", arg=held)
         assert page.locator("#errors .toast").count() == 0
+
+
+def test_boxes_in_another_frame_are_shown_where_tf_says(looking, heard, shared_peer):
+    """Those of the detector again, as a node publishes them whose target_frame is the robot's."""
+    talker, sent = shared_peer.talker("/robot/output/detections", MARKERS), {}
+
+    def sent_again():
+        found = from_marker_array(heard[-1])
+        if len(found) and found.stamp_ns not in sent:
+            sent[found.stamp_ns] = moved_boxes(found.boxes, mounted(0.5, 0.2, 1.7, 0, 0, 0.3))
+            talker.publish(encode(to_marker_array(
+                sent[found.stamp_ns], found.labels, found.scores, make=bag_message,
+                header=header_message(found.stamp_ns, "base", bag_message))))
+
+    def said():
+        sent_again()
+        return [line for line in looking.json("api/drive")["status"]["lines"]
+                if "/robot/output/detections are not shown: TF does not connect 'base'" in line]
+    shared_peer.wait(said, "a line that names the frames")
+    if not has_tf():
+        assert NO_TF in looking.json("api/drive")["status"]["lines"]
+        pytest.skip("the wheels of the pip environment lack tf2_msgs")
+    static = shared_peer.talker("/tf_static", TF_MESSAGE, STATIC_QOS)
+    static.publish(encode(transforms(("base", "velodyne", mounted(0.5, 0.2, 1.7, 0, 0, 0.3), 0))))
+    sent.clear()
+
+    def shown():
+        sent_again()
+        for frame in looking.json("api/drive")["frames"][-20:]:
+            rows = looking.json(f"api/labels/{frame['frame']}")["detections"]
+            if frame["stamp_ns"] in sent and rows.get("robot") and rows.get("perception"):
+                return rows
+        return None
+    shared_peer.wait(shown, "boxes of both")
+    rows = shown()
+    np.testing.assert_allclose([row[:7] for row in rows["robot"]],
+                               [row[:7] for row in rows["perception"]], atol=1e-6)
+    shared_peer.node.destroy_publisher(talker)
 
 
 def test_it_ends_cleanly_at_sigint(looking, heard, shared_processes):
