@@ -11,7 +11,8 @@ import numpy as np
 from numba import njit, types
 
 REACTION = 5.0  # seconds for the work in hand; what hangs longer is not waited for
-TEARDOWN = 1.5  # seconds for DDS to be taken down, after all is written
+TEARDOWN = 3.0  # seconds for DDS to be taken down, after all is written; cut short, it may leave
+# others a port in shared memory that they wait for (docs/reliability.md); launch sends SIGTERM at 5
 RUNNING, CLOSING, CLOSED = range(3)
 TICK = 0.02  # seconds
 

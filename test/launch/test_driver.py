@@ -21,7 +21,7 @@ pytest.importorskip("launch_ros", reason="needs launch_ros, which comes with ROS
 import launch_testing
 import launch_testing.asserts
 
-from lidar_perception.nodes.main import PROFILE_VARIABLES
+from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES
 from lidar_perception.testing.launching import description, launch_file
 from lidar_perception.testing.peer import Peer
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import sys
 from pathlib import Path
@@ -204,3 +205,13 @@ def test_weights_and_device_of_a_detector_are_arguments(name, launched):
 def test_what_cannot_be_started_is_refused_by_name(given, words, launched):
     with pytest.raises(InputError, match=words):
         launched("detectors")[1](**given)
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "test/launch").glob("*.py")), ids=lambda p: p.stem)
+def test_what_the_launch_tests_import_of_ours_exists(path):
+    """They run only where launch_testing is."""
+    pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and str(node.module).startswith("lidar_perception"):
+            module = importlib.import_module(str(node.module))
+            assert all(hasattr(module, alias.name) for alias in node.names), ast.unparse(node)

@@ -80,20 +80,24 @@ def test_frames_hold_the_columns_and_boxes_that_are_published(looking, heard, sh
         return kinds == {"detections", "tracks", "labels"} and len(drive["frames"]) >= 3 and (
             drive["status"]["clouds"]["topic"] == "/perception/output/points")
     shared_peer.wait(complete, "clouds with columns, detections, tracks and labels")
-    published = {m.stamp_ns: to_detections(m) for m in map(from_marker_array, heard)}
+
+    def published(stamp_ns):
+        """Of a bag that is looped: a stamp comes again, with tracks that are not as old."""
+        return [to_detections(m) for m in map(from_marker_array, heard[-40:])
+                if m.stamp_ns == stamp_ns]
 
     def compared():
         for frame in looking.json("api/drive")["frames"][-20:]:  # older ones are dropped soon
             shown = looking.json(f"api/labels/{frame['frame']}")
             rows = shown["detections"].get("perception", [])
-            if rows and shown["labels"] and frame["stamp_ns"] in published:
+            if rows and shown["labels"] and published(frame["stamp_ns"]):
                 return frame, rows
         return None
     shared_peer.wait(compared, "a frame with detections and labels")
     frame, rows = compared()
-    expected = published[frame["stamp_ns"]]
-    assert np.allclose([row[:7] for row in rows], expected.boxes, atol=1e-6)
-    assert [row[8] for row in rows] == pytest.approx(expected.scores.tolist())
+    shown = np.array([[*row[:7], row[8]] for row in rows])
+    expected = [np.column_stack([d.boxes, d.scores]) for d in published(frame["stamp_ns"])]
+    assert any(shown.shape == e.shape and np.allclose(shown, e, atol=1e-6) for e in expected)
     body = looking.bytes(f"api/cloud/{frame['frame']}")
     count = int(np.frombuffer(body, np.uint32, 1, 4)[0])
     ground = np.frombuffer(body, np.uint8, count, 8 + 13 * count)
