@@ -3,6 +3,7 @@
 import { getJson, listen, loadState } from "./api.js";
 import "./boxes3d.js";
 import { show } from "./cloud.js";
+import { leftIn } from "./edits.js";
 import { openInspector } from "./inspector.js";
 import { listKeys, openKeys } from "./keys.js";
 import { openLive, takeDrive } from "./live.js";
@@ -35,6 +36,7 @@ async function open() {
     listKeys();
     changed("drive", "tool", "colour", "playing");
     await loadState();
+    if (store.mode === "label" && store.tracks.size && leftIn(null) === 0) store.filter = "all";
   } catch (error) {
     sayError(`The drive cannot be opened: ${error.message}`);
     return;
