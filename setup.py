@@ -40,9 +40,9 @@ setup(
     maintainer_email="maintainers@lidar-perception.invalid",
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "msg_utils*"]),
-    package_data={NAME: ["nodes/*.xml", "candidates/*.json", "reproduction/*.html",
-                         "simulation/sensors/*.yaml", "sensor_setup/*.html", "adapting/*.html",
-                         "labeling/page/*", "detectors/*/weights/*", "detectors/fused/*.json"]},
+    package_data={NAME: ["nodes/*.xml", "candidates/*.json", "*/*.html",
+                         "simulation/sensors/*.yaml", "labeling/page/*", "detectors/*/weights/*",
+                         "detectors/fused/*.json"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -24,7 +24,7 @@ from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.geometry import box_corners, points_in_box
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.simulation.drive import scan_at
-from lidar_perception.simulation.scene import Streets
+from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import CLASSES
 from msg_utils.markers import COLORS
@@ -59,7 +59,7 @@ class View:
 
 
 FOLDER = Path(__file__).parent / "images"
-SEED, STREETS = 9, Streets("zone", people=3.0)
+SEED, STREETS = 9, Scenes("zone", people=3.0)
 README = View(eye=(-9.0, -4.5, 5.2), target=(14.0, 1.6, -0.9), fov=58.0, width=1600, height=720)
 LOOK = View(eye=(-12.0, -6.0, 8.0), target=(12.0, 1.0, -1.2), fov=60.0, width=1600, height=800)
 POINT = 0.024  # a point's radius in metres

@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from lidar_perception.geometry import box_corners
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.raycast import Hits, cast
-from lidar_perception.simulation.scene import Streets, make_scene
+from lidar_perception.simulation.scene import Scenes, make_scene
 from lidar_perception.simulation.sensor import generic, sensor_named
 
 SHOWN = (("campus", "forecourt", 2), ("indoor", "hall", 12))  # scene, kind, seed
@@ -34,7 +34,7 @@ def main() -> None:
         moment = made.at(MOMENT / FINE.rate, HEIGHT)
         draw_view(view, cast(moment.solids, made.ground, moment.position, FINE, moment.motion,
                              heading=moment.heading))
-        scan = scan_at(seed, MOMENT, sensor_named("vlp-16", HEIGHT), Streets(kind, 1.0, scene))
+        scan = scan_at(seed, MOMENT, sensor_named("vlp-16", HEIGHT), Scenes(kind, 1.0, scene))
         ground = np.isin(scan.semantic, GROUND)
         for mask, size, colour in ((ground, 0.3, "0.7"), (~ground, 0.8, "tab:brown")):
             above.scatter(*scan.frame.xyz[mask, :2].T, s=size, c=colour, linewidths=0)

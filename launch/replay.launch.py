@@ -29,7 +29,7 @@ from lidar_perception.nodes.graph import (
     result_topics,
     wait_for,
 )
-from lidar_perception.nodes.main import use_large_shared_memory
+from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.wire.topics import POINTS, TF_STATIC
 
 HERE = Path(__file__).resolve().parent

@@ -20,6 +20,13 @@ def horizontal_range(xyz: np.ndarray) -> np.ndarray:
     return np.sqrt(xyz[:, 0] * xyz[:, 0] + xyz[:, 1] * xyz[:, 1])
 
 
+def within(at: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
+    """(N,) bool: whether x and y of points, or of boxes, (N, >=2) are at least low and less than
+    high, of which x and y count, too; not what is NaN."""
+    flat, low, high = at[:, :2], np.asarray(low)[:2], np.asarray(high)[:2]
+    return np.asarray(((flat >= low) & (flat < high)).all(axis=1))
+
+
 def to_box_frame(xyz: np.ndarray, box: np.ndarray) -> np.ndarray:
     """(N, 3) points relative to the centre of box (7,), rotated so that x runs along its length."""
     cos, sin = np.cos(box[6]), np.sin(box[6])

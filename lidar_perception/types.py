@@ -55,6 +55,11 @@ class LidarFrame:
         intensity = None if self.intensity is None else self.intensity.take(indices)
         return LidarFrame(self.xyz.take(indices, axis=0), intensity, self.stamp_ns, self.frame_id)
 
+    def points(self) -> np.ndarray:
+        """(N, 4) float32 [x y z intensity]; 0 without intensity."""
+        intensity = np.zeros(len(self), np.float32) if self.intensity is None else self.intensity
+        return np.column_stack([self.xyz, intensity])
+
 
 def usable_returns(xyz: np.ndarray) -> np.ndarray:
     """(N,) bool: finite, within 100 km, and not the origin, where drivers put missing returns."""
@@ -95,6 +100,12 @@ class Detections:
         """The detections under a mask, slice or index array."""
         return Detections(self.boxes[index], self.class_ids[index], self.scores[index],
                           {name: said[index] for name, said in self.sources.items()})
+
+    def followed_by(self, others: Detections) -> Detections:
+        """These and then the others, without sources."""
+        return Detections(np.concatenate([self.boxes, others.boxes]),
+                          np.concatenate([self.class_ids, others.class_ids]),
+                          np.concatenate([self.scores, others.scores]))
 
 
 def class_ids(names: Iterable[str]) -> list[int]:

@@ -71,7 +71,7 @@ def streets():
 
     from lidar_perception.simulation import drive
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(drive, "_street", cache(drive._street.__wrapped__))
+        patch.setattr(drive, "_scene", cache(drive._scene.__wrapped__))
         yield
 
 

@@ -29,13 +29,13 @@ NUMBERS = ["numpy", "scipy", "numba"]
 STRANGERS = {
     "classes": [], "types": ["numpy"], "param_fields": [], "geometry": ["numpy", "numba"],
     "camera": NUMBERS,
-    "groups": ["numpy"], "robot": ["numpy", "scipy"], "runs": ["rich"],
+    "groups": ["numpy"], "robot": ["numpy", "scipy"], "runs": ["rich", "jinja2"],
     "wire": ["numpy", "scipy", "rosbags", "msg_utils"],
     "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils", "lz4", "zstandard"],
     "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,
     "detectors": [*NUMBERS, "torch", "safetensors", "onnx", "onnxruntime", "onnxscript"],
     "tracking": ["numpy", "scipy", "kiss_icp"],
-    "sensor_setup": ["numpy", "scipy", "matplotlib", "jinja2", "msg_utils"],
+    "sensor_setup": ["numpy", "scipy", "matplotlib", "msg_utils"],
     "labeling": ["numpy", "aiohttp", "msg_utils"], "params": [],
 }
 

@@ -14,6 +14,7 @@ from lidar_perception.geometry import (
     horizontal_range,
     points_in_box,
     to_box_frame,
+    within,
     wrap_angle,
 )
 from lidar_perception.types import MAX_RANGE, LidarFrame, usable_returns
@@ -28,6 +29,17 @@ some_boxes = st.tuples(places, places, places, sizes, sizes, sizes, angles).map(
 # Front left, rear left, rear right, front right, seen from above: counter-clockwise.
 SIGNS = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1],
                   [1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]]) / 2
+
+
+@few
+@given(seeds)
+def test_within_is_half_open_and_holds_nothing_that_is_nan(seed):
+    at = np.random.default_rng(seed).integers(-3, 4, (40, 7)).astype(np.float32)
+    at[::5, :2] = np.nan
+    low, high = (-1.0, -2.0, 5.0), (2.0, 1.0, 5.0)
+    expected = [low[0] <= x < high[0] and low[1] <= y < high[1] for x, y in at[:, :2].tolist()]
+    assert within(at, low, high).tolist() == expected
+    assert within(at[:0], low, high).shape == (0,)
 
 
 @few

@@ -69,7 +69,7 @@ def _ground_hits(ground, start, way, since, velocity, lift, max_range):
 def tilted(sensor: Sensor, roll: float, pitch: float, street: int, number: int, even: bool = True):
     """Returns of one turn of a sensor that leans against the road beneath it, degrees, at
     sensor.height above it; even: streets slope and have curbs, and are smooth otherwise."""
-    scene = drive._street(street, ANY)
+    scene = drive._scene(street, ANY)
     ground = scene.ground._replace(**EVEN) if even else scene.ground
     scene = replace(scene, ground=ground)
     sensor = sensor.at_turn(number)

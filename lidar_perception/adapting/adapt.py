@@ -22,7 +22,7 @@ from lidar_perception.adapting.drives import (
     seconds_of,
 )
 from lidar_perception.adapting.judging import KEPT, STATES, Verdict, judged
-from lidar_perception.adapting.labels import FrameLabels, labels_of
+from lidar_perception.adapting.labels import ConcludedLabels, labels_of
 from lidar_perception.adapting.learning import (
     network_to_train,
     opened_with,
@@ -30,7 +30,7 @@ from lidar_perception.adapting.learning import (
     training_params,
 )
 from lidar_perception.adapting.looking import FrameLook, Looker
-from lidar_perception.adapting.params import AdaptParams
+from lidar_perception.adapting.params import RECORD, AdaptParams
 from lidar_perception.adapting.scenes import AdaptedScenes, save_labels
 from lidar_perception.adapting.tracks import Followed, tracks_of
 from lidar_perception.adapting.watch import Watched, agreement_of, confirmed_share, worse
@@ -43,14 +43,14 @@ from lidar_perception.runs.files import make_folder, read_text, write_bytes, wri
 from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import duration, errors, track
 from lidar_perception.simulation.sensor import sensor_named
-from lidar_perception.tracking.ego import has_odometry
+from lidar_perception.tracking.ego import NO_SOURCE, recorded_source
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.cache import kept as made_once
 from lidar_perception.training.sources import SIM
 from lidar_perception.training.start import start
 from lidar_perception.types import InputError
 
-RECORD, BEST, LAST, JUDGED = "adapt.json", "best.safetensors", "last.safetensors", "judged.json"
+BEST, LAST, JUDGED = "best.safetensors", "last.safetensors", "judged.json"
 LOOKING = 0.3     # of the budget, to look at frames
 LEARNING = 0.5    # of it, to learn; what is left is for the poses and to judge
 MEASURED = 3      # frames that are looked at to know how long one takes
@@ -67,7 +67,7 @@ class Seen:
     looks: list[FrameLook]
     tracks: list[Followed]
     verdicts: list[Verdict]
-    labels: list[FrameLabels]
+    labels: list[ConcludedLabels]
 
 
 @dataclass(frozen=True)
@@ -95,13 +95,14 @@ class Adapting:
         if not 0 < hours < np.inf:
             raise InputError(f"--budget {hours:g} must be a number of hours above 0")
         self.header = read_header(weights)
-        self.frames = frames_of(mounted(open_recording(data)), params.mount_height)
+        height = params.mount_height or None
+        self.frames = frames_of(mounted(open_recording(data, sensor_height=height)))
         self.height = self.frames[0].sensor_height
         known = self.header.training.get("sensor")
         known = known.get("name") if isinstance(known, dict) else None
         self.sensor_name = params.sensor or known or "hdl64e"
         self.sensor = sensor_named(self.sensor_name, self.height)
-        if self.frames[0].pose() is None and not has_odometry():
+        if recorded_source(self.frames[0].pose() is not None) == NO_SOURCE:
             raise InputError(f"{data} has no poses, and to find them by the scans needs kiss-icp; "
                              "pip install 'lidar_perception[odometry]'")
         self.network = network_to_train(self.header)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.tracking.ego import Odometry, usable
+from lidar_perception.labeling.interpolation import Motion
+from lidar_perception.tracking.ego import Odometry, recorded_source, usable
 from lidar_perception.types import InputError
 
 PIECE = 60        # frames of a piece, where not all are looked at
@@ -37,14 +38,13 @@ class Piece:
         return range(len(self.learned), len(self.numbers))
 
 
-def frames_of(recording: Recording, height: float = 0.0) -> list[Frame]:
-    """The frames of a recording, of a sensor at another height above the ground if that is not 0,
-    metres. InputError for less than FEWEST."""
-    frames = list(recording)
-    if len(frames) < FEWEST:
-        raise InputError(f"{recording.path} has {len(frames)} frame{'s' * (len(frames) != 1)}; "
-                         f"adapting needs a drive of {FEWEST} at least, of which minutes are best")
-    return [replace(f, sensor_height=height) for f in frames] if height else frames
+def frames_of(recording: Recording) -> Sequence[Frame]:
+    """The frames of a recording. InputError for less than FEWEST."""
+    count = len(recording)
+    if count < FEWEST:
+        raise InputError(f"{recording.path} has {count} frame{'s' * (count != 1)}; adapting needs "
+                         f"a drive of {FEWEST} at least, of which minutes are best")
+    return recording.frames[:]  # of a bag, without the clouds that iterating would keep
 
 
 def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
@@ -65,16 +65,14 @@ def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
 def seconds_of(frames: Sequence[Frame], piece: Piece) -> np.ndarray:
     """(F,) float64 seconds since the first frame of a piece; 0.1 s a frame where the stamps do not
     rise."""
-    stamps = np.array([frames[n].stamp_ns for n in piece.numbers])
-    seconds = (stamps - stamps[0]) / 1e9
-    return np.arange(len(stamps)) * 0.1 if (np.diff(seconds) <= 0).any() else seconds
+    return Motion.of(np.array([frames[n].stamp_ns for n in piece.numbers])).times
 
 
 def poses_of(frames: Sequence[Frame], piece: Piece) -> Iterator[Any]:
-    """(4, 4) of each frame of a piece in a frame that stands: the recording's, else by the scans.
-    InputError where neither can be had."""
+    """(4, 4) of each frame of a piece in a frame that stands, from its recorded_source. InputError
+    where there is none."""
     own = [frames[number].pose() for number in piece.numbers]
-    if all(map(usable, own)):
+    if recorded_source(all(map(usable, own))) == "recording":
         yield from own
         return
     odometry = Odometry()

@@ -7,7 +7,7 @@ from io import BytesIO
 import numpy as np
 
 from lidar_perception.adapting.judging import IGNORED, KEPT, REJECTED
-from lidar_perception.adapting.labels import FrameLabels
+from lidar_perception.adapting.labels import ConcludedLabels
 from lidar_perception.geometry import box_corners
 
 COLORS = {KEPT: "#009e73", IGNORED: "#e69f00", REJECTED: "#d55e00"}  # Okabe and Ito, 2008
@@ -16,7 +16,7 @@ SIZE = 8.0          # inches
 CONCLUDED = "--"    # line of boxes that are concluded from other frames
 
 
-def drawn(xyz: np.ndarray, labels: FrameLabels, low: np.ndarray, high: np.ndarray) -> bytes:
+def drawn(xyz: np.ndarray, labels: ConcludedLabels, low: np.ndarray, high: np.ndarray) -> bytes:
     """One frame between low and high (2,), metres: points (N, 3), and boxes with their numbers;
     dashed what was not detected in this frame. x points up, y to the left."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

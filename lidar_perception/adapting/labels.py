@@ -4,7 +4,7 @@ of which nothing is learned."""
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ OVERLAP = 0.05   # of two kept boxes, seen from above: more, and one of them is 
 
 
 @dataclass(frozen=True)
-class FrameLabels:
+class ConcludedLabels:
     """K boxes (K, 7) float64 in a frame's own coordinates, with class_ids (K,) int, states (K,) int
     into STATES, numbers (K,) int of the objects in their drive, scores (K,), seen (K,) bool: not
     concluded from other frames."""
@@ -42,7 +42,7 @@ class FrameLabels:
 
 
 def labels_of(tracks: Sequence[Followed], verdicts: Sequence[Verdict], poses: Sequence[np.ndarray],
-              seconds: np.ndarray) -> list[FrameLabels]:
+              seconds: np.ndarray) -> list[ConcludedLabels]:
     """The labels of all frames of a drive, with poses (4, 4) in the frame of the tracks and times
     seconds (F,). Of kept boxes that overlap the best stays and the others are ignored."""
     rows: list[list[tuple[Any, ...]]] = [[] for _ in poses]
@@ -55,15 +55,15 @@ def labels_of(tracks: Sequence[Followed], verdicts: Sequence[Verdict], poses: Se
     return [_apart(_frame(each)) for each in rows]
 
 
-def _frame(rows: list[tuple[Any, ...]]) -> FrameLabels:
+def _frame(rows: list[tuple[Any, ...]]) -> ConcludedLabels:
     columns: list[Any] = [*zip(*rows)] or [[]] * 6
     boxes, class_ids, states, numbers, scores, seen = columns
-    return FrameLabels(np.array(boxes, float).reshape(-1, 7), np.array(class_ids, int),
-                       np.array(states, int), np.array(numbers, int), np.array(scores, float),
-                       np.array(seen, bool))
+    return ConcludedLabels(np.array(boxes, float).reshape(-1, 7), np.array(class_ids, int),
+                           np.array(states, int), np.array(numbers, int),
+                           np.array(scores, float), np.array(seen, bool))
 
 
-def _apart(labels: FrameLabels) -> FrameLabels:
+def _apart(labels: ConcludedLabels) -> ConcludedLabels:
     kept = np.flatnonzero(labels.of(KEPT))
     order = kept[np.argsort(-labels.scores[kept], kind="stable")]
     states, taken = labels.states.copy(), list[int]()
@@ -72,8 +72,7 @@ def _apart(labels: FrameLabels) -> FrameLabels:
             states[k] = STATES.index(IGNORED)
         else:
             taken.append(k)
-    return FrameLabels(labels.boxes, labels.class_ids, states, labels.numbers, labels.scores,
-                       labels.seen)
+    return replace(labels, states=states)
 
 
 def placed(track: Followed, seconds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -13,7 +13,7 @@ from lidar_perception.detectors.fused.detector import FusedDetector, Look
 from lidar_perception.detectors.fused.evidence import clipped_logit
 from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.detectors.view import in_sensor_frame
-from lidar_perception.geometry import centre_distances, points_in_boxes
+from lidar_perception.geometry import centre_distances, points_in_boxes, within
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError
 
@@ -70,9 +70,8 @@ class Looker:
         boxes = clusters.boxes.copy()
         boxes[:, 2] += np.float32(frame.sensor_height - SENSOR_HEIGHT)
         look = detector.look(cloud, scores=ScoreParams.all_alike(LEAST))
-        low, high = np.array(detector.config.low), np.array(detector.config.high)
-        inside: np.ndarray = (boxes[:, :2] >= low[:2]) & (boxes[:, :2] < high[:2])
-        clusters = replace(clusters, boxes=boxes)[np.flatnonzero(inside.all(axis=1))]
+        inside = within(boxes, detector.config.low, detector.config.high)
+        clusters = replace(clusters, boxes=boxes)[np.flatnonzero(inside)]
         look = with_clusters(look, clusters, detector.settings.proposals)
         found = in_sensor_frame(detector.weighed(look)[0], mount)
         counts, tops = seen_in(found.boxes, cloud.xyz)
@@ -90,11 +89,7 @@ def with_clusters(look: Look, clusters: Detections, silent: float) -> Look:
     added = clusters[new]
     said = {"network": clipped_logit(np.full(len(added), silent)),
             "classifier": clipped_logit(added.scores), "silhouette": np.full(len(added), np.nan)}
-    before = look.proposed
-    proposed = Detections(np.concatenate([before.boxes, added.boxes]),
-                          np.concatenate([before.class_ids, added.class_ids]),
-                          np.concatenate([before.scores, added.scores]))
-    return look._replace(proposed=proposed, evidence={
+    return look._replace(proposed=look.proposed.followed_by(added), evidence={
         name: np.concatenate([odds, said[name]]) for name, odds in look.evidence.items()})
 
 

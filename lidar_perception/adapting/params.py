@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from lidar_perception.param_fields import Params, param
 
+RECORD = "adapt.json"  # in the folder of a run: what was asked for, and how it went
+
 
 @dataclass(frozen=True)
 class AdaptParams(Params):

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +14,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.labeling.exchange import export_labels
 from lidar_perception.labeling.labels import DriveLabels, FrameLabels, Row, of_rows
 from lidar_perception.runs.files import write_text
+from lidar_perception.runs.page import data_url, render
 from lidar_perception.types import CLASSES
 
 REPORT, LABELS = "report.html", "labels"
@@ -25,18 +24,14 @@ PICTURES = 6   # of all pieces
 
 def write_report(run: Adapting) -> None:
     """Write REPORT and LABELS into the run's folder; also of one that found too little."""
-    import jinja2
-
-    source = (files("lidar_perception.adapting") / REPORT).read_text()
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
     rows = [{"piece": seen.piece.name, "number": number, "name": CLASSES[one.class_id],
              "state": verdict.state, "reason": verdict.reason, "score": one.score,
              "seen": f"{len(one)} of {one.frames[-1] - one.frames[0] + 1} frames"}
             for seen in run.seen for number, (one, verdict) in enumerate(
                 zip(seen.tracks, seen.verdicts))]
     rows.sort(key=lambda row: (STATES.index(str(row["state"])), -float(str(row["score"]))))
-    write_text(run.out / REPORT, environment.from_string(source).render(
-        title="A detector, adapted", run=run, rows=rows, colors=COLORS, states=STATES,
+    write_text(run.out / REPORT, render(
+        "adapting/report.html", title="A detector, adapted", run=run, rows=rows, colors=COLORS,
         pictures=pictures(run.seen, run.frames, run.low, run.high)))
     write_labels(run.seen, run.frames, run.out / LABELS)
 
@@ -50,7 +45,7 @@ def pictures(seen: Sequence[Seen], frames: Sequence[Frame], low: np.ndarray,
     for piece, k in (places[i] for i in chosen):
         frame = frames[piece.piece.numbers[k]]
         png = drawn(frame.load().xyz, piece.labels[k], low, high)
-        found[frame.name] = "data:image/png;base64," + base64.b64encode(png).decode()
+        found[frame.name] = data_url(png)
     return found
 
 

@@ -12,16 +12,17 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.adapting.judging import IGNORED, KEPT
-from lidar_perception.adapting.labels import FrameLabels
+from lidar_perception.adapting.labels import ConcludedLabels
 from lidar_perception.classes import DONT_CARE
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
+from lidar_perception.geometry import within
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cache import write_arrays
 from lidar_perception.types import InputError
 
 
-def save_labels(path: Path, numbers: Sequence[int], labels: Sequence[FrameLabels]) -> None:
+def save_labels(path: Path, numbers: Sequence[int], labels: Sequence[ConcludedLabels]) -> None:
     """Write an .npz file of the labels of frames with these numbers in their recording: what is
     kept, and what is ignored as regions; what is rejected is background."""
     chosen = [np.flatnonzero(each.of(KEPT) | each.of(IGNORED)) for each in labels]
@@ -75,9 +76,8 @@ class AdaptedScenes:
         """InputError naming the file that cannot be used."""
         a = self._arrays
         scan = self._frames[int(a["numbers"][i])].load()
-        within = ((scan.xyz[:, :2] >= self.low) & (scan.xyz[:, :2] < self.high)).all(axis=1)
-        intensity = np.zeros(len(scan), np.float32) if scan.intensity is None else scan.intensity
-        points = np.column_stack([scan.xyz, intensity])[within]
+        points = scan.points()
+        points = points[within(points, self.low, self.high)]
         own = slice(a["first"][i], a["first"][i + 1])
         everywhere = self.low[0] < 0
         return TrainingScene(points, a["boxes"][own], a["class_ids"][own], a["kept"][own],

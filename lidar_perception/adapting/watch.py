@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.adapting.judging import AGREE, IGNORED, KEPT
-from lidar_perception.adapting.labels import FrameLabels
+from lidar_perception.adapting.labels import ConcludedLabels
 from lidar_perception.adapting.looking import FrameLook
 from lidar_perception.adapting.params import AdaptParams
 from lidar_perception.classes import CLASSES, DETECTED, PEDESTRIAN
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.params import ScoreParams
-from lidar_perception.geometry import bev_iou
+from lidar_perception.geometry import bev_iou, within
 from lidar_perception.runs.terminal import track
 from lidar_perception.types import Detections
 
@@ -55,7 +55,7 @@ def worse(before: Watched, after: Watched, params: AdaptParams) -> str:
     return " and ".join(reasons)
 
 
-def agreement_of(detector: Detector, frames: Sequence[Frame], labels: Sequence[FrameLabels],
+def agreement_of(detector: Detector, frames: Sequence[Frame], labels: Sequence[ConcludedLabels],
                  low: np.ndarray, high: np.ndarray) -> tuple[float, int, int]:
     """F1 of a detector with what is kept in frames, between low and high (2,), metres, and how many
     boxes there were of each; what touches a region that is ignored is not counted. 1 where there is
@@ -68,11 +68,11 @@ def agreement_of(detector: Detector, frames: Sequence[Frame], labels: Sequence[F
     return (2 * right / (found + kept) if found + kept else 1.0), found, kept
 
 
-def _compared(boxes: Detections, labels: FrameLabels, low: np.ndarray,
+def _compared(boxes: Detections, labels: ConcludedLabels, low: np.ndarray,
               high: np.ndarray) -> tuple[int, int, int]:
     """Boxes that are of one object, all that were found, and all that are kept."""
-    kept = labels.of(KEPT) & _within(labels.boxes, low, high)
-    boxes = boxes[_within(boxes.boxes, low, high)]
+    kept = labels.of(KEPT) & within(labels.boxes, low, high)
+    boxes = boxes[within(boxes.boxes, low, high)]
     taken, right, found = np.zeros(len(labels), bool), 0, 0
     overlaps = bev_iou(boxes.boxes.astype(np.float64), labels.boxes)
     for k in np.argsort(-boxes.scores, kind="stable"):
@@ -84,11 +84,6 @@ def _compared(boxes: Detections, labels: FrameLabels, low: np.ndarray,
         elif not (overlaps[k, labels.of(IGNORED)] > TOUCHES).any():
             found += 1
     return right, found, int(kept.sum())
-
-
-def _within(boxes: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    inside: np.ndarray = (boxes[:, :2] >= low) & (boxes[:, :2] < high)
-    return np.asarray(inside.all(axis=1))
 
 
 def confirmed_share(looks: Sequence[FrameLook]) -> float:

@@ -8,15 +8,12 @@ from typing import Any
 
 import click
 
-from lidar_perception.adapting.params import AdaptParams
+from lidar_perception.adapting.params import RECORD, AdaptParams
 from lidar_perception.cli.data import WHAT, a_path, device_option
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
-
-RECORD = "adapt.json"
-NAMES = ("pointpillars", "pointnet")  # of --weights: those that come with the package
 
 
 @click.command()
@@ -86,14 +83,16 @@ def begin(out: Path, weights: Path, resume: bool, force: bool) -> None:
 
 
 def package_weights(weights: Path) -> Path:
-    """The file of --weights."""
+    """The file of --weights, which may be the name of a network."""
+    from lidar_perception.detectors.pointnet.config import PointNetConfig
     from lidar_perception.detectors.pointnet.params import PointNetParams
     from lidar_perception.detectors.pointnet.weights_file import weights_file as of_pointnet
+    from lidar_perception.detectors.pointpillars.config import NetworkConfig
     from lidar_perception.detectors.pointpillars.params import PointPillarsParams
     from lidar_perception.detectors.pointpillars.weights_file import weights_file
-    if str(weights) == NAMES[0]:
+    if str(weights) == NetworkConfig.network:
         return weights_file(PointPillarsParams())
-    return of_pointnet(PointNetParams()) if str(weights) == NAMES[1] else weights
+    return of_pointnet(PointNetParams()) if str(weights) == PointNetConfig.network else weights
 
 
 def tell(run: Any) -> None:

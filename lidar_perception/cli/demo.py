@@ -131,7 +131,7 @@ def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:
     else:
         from lidar_perception.simulation.scene import CROWDED
         from lidar_perception.simulation.to_bag import simulated_scans
-        found = track(simulated_scans(drive_seed, frames, streets=CROWDED), "simulating a drive",
+        found = track(simulated_scans(drive_seed, frames, scenes=CROWDED), "simulating a drive",
                       frames)
     write_bag(path, found, force=True)
     return path

@@ -16,7 +16,7 @@ from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.simulation.dataset import LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import longest_drive
-from lidar_perception.simulation.scene import SCENES, Streets
+from lidar_perception.simulation.scene import SCENES, Scenes
 from lidar_perception.simulation.sensor import GENERIC, NAMES, sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.types import InputError
@@ -70,11 +70,11 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
     """
     if (out is None) == (compare is None):
         raise click.UsageError("give either --out FOLDER or --compare PATH")
-    streets = Streets(kind, people, scene)
+    scenes = Scenes(kind, people, scene)
     if compare is not None:
         if scene != "street":
             raise click.UsageError("--compare compares streets, as all real data here does")
-        _compare(compare, frames, seed, streets, json, png)
+        _compare(compare, frames, seed, scenes, json, png)
         return
     if json or png:
         raise click.UsageError("--json and --png go with --compare")
@@ -82,7 +82,7 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
         raise click.UsageError("--resume resumes, --force starts over: give one of them")
     sensor = sensor_named(sensor_name, mount_height)
     plan = Plan(layout, sensor, seed, frames,
-                streets_of or (1 if layout == "kitti" else longest_drive(sensor)), streets)
+                streets_of or (1 if layout == "kitti" else longest_drive(sensor)), scenes)
     if layout == "mcap":
         if resume:
             raise click.UsageError("a bag is one file and cannot be resumed; make kitti-tracking, "
@@ -93,7 +93,7 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
 
 
 def _bag(out: Path, plan: Plan, force: bool) -> None:
-    scans = simulated_scans(plan.seed, plan.frames, plan.sensor, plan.streets_of, plan.streets)
+    scans = simulated_scans(plan.seed, plan.frames, plan.sensor, plan.streets_of, plan.scenes)
     try:
         count = write_bag(out, track(scans, "simulating", plan.frames), force=force)
     except OSError as error:
@@ -104,16 +104,16 @@ def _bag(out: Path, plan: Plan, force: bool) -> None:
 
 def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
               force: bool) -> None:
-    streets = plan.streets
+    scenes = plan.scenes
     asked = {"format": plan.layout, "sensor": sensor_name, "height": plan.sensor.height,
-             "seed": plan.seed, "frames": plan.frames, "scene": streets.scene,
-             "street": streets.kind, "people": streets.people, "streets_of": plan.streets_of,
+             "seed": plan.seed, "frames": plan.frames, "scene": scenes.scene,
+             "street": scenes.kind, "people": scenes.people, "streets_of": plan.streets_of,
              "version": __version__}
     asked["command"] = (f"lidar-perception simulate --format {plan.layout} --sensor {sensor_name} "
                         f"--mount-height {plan.sensor.height:g} --seed {plan.seed} "
-                        f"--frames {plan.frames} --scene {streets.scene} "
-                        f"--people {streets.people:g} --streets-of {plan.streets_of}"
-                        + (f" --street {streets.kind}" if streets.kind else ""))
+                        f"--frames {plan.frames} --scene {scenes.scene} "
+                        f"--people {scenes.people:g} --streets-of {plan.streets_of}"
+                        + (f" --street {scenes.kind}" if scenes.kind else ""))
     complete, begun = resume and is_finished(out), False
     try:
         with unfinished(out, asked, resume=resume, force=force) as missing:
@@ -131,7 +131,7 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
                                                    "before" if resume else ""), soft_wrap=True)
 
 
-def _compare(real: Path, frames: int, seed: int, streets: Streets, json_file: Path | None,
+def _compare(real: Path, frames: int, seed: int, scenes: Scenes, json_file: Path | None,
              png: Path | None) -> None:
     from lidar_perception.candidates.configurations import PAPER
     from lidar_perception.candidates.warm_up import warm_up
@@ -143,7 +143,7 @@ def _compare(real: Path, frames: int, seed: int, streets: Streets, json_file: Pa
     chosen = evenly(recording)
     warm_up()
     measured = measured_scans(track(chosen, "measuring real scans", len(chosen)), PAPER)
-    made = simulated_scans(seed, frames, streets_of=1, streets=streets)
+    made = simulated_scans(seed, frames, streets_of=1, scenes=scenes)
     simulated = measured_scans(track(made, "measuring simulated scans", frames), PAPER)
     content = {"data": str(real), "seed": seed, **side_by_side(measured, simulated)}
     write_json(json_file, content)

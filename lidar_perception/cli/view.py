@@ -100,10 +100,10 @@ def _listening(namespace: str, points: str, detections: tuple[str, ...]) -> Iter
     from lidar_perception.labeling.live import Live
     from lidar_perception.labeling.served import Served
     from lidar_perception.nodes import require_rclpy
-    from lidar_perception.nodes.shared_memory import use_large_shared_memory
+    from lidar_perception.nodes.shared_memory import fed_by_a_driver, use_large_shared_memory
 
     require_rclpy()
-    use_large_shared_memory(from_driver=points != "" and not points.endswith("/output/points"))
+    use_large_shared_memory(points != "" and fed_by_a_driver([points]))
     from lidar_perception.nodes.live_view import listening  # with the profile already set
     name = "/".join(filter(None, (f"ROS domain {os.environ.get('ROS_DOMAIN_ID') or 0}",
                                   namespace.strip("/"))))

@@ -114,8 +114,7 @@ def _cloud(frame: Frame, summary: Summary) -> np.ndarray:
     scan = frame.load()
     if scan.intensity is None:
         summary.remark("assumed: an intensity of 0, as the clouds have none")
-    intensity = np.zeros(len(scan), np.float32) if scan.intensity is None else scan.intensity
-    return np.column_stack([scan.xyz, intensity])
+    return scan.points()
 
 
 def _remark_losses(summary: Summary, placed: Placed, kept: str) -> None:

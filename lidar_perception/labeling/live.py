@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.groups import renumbered
-from lidar_perception.labeling.drive import Scan, scan_of
+from lidar_perception.labeling.drive import Scan
 from lidar_perception.labeling.results import (
     compared,
+    scan_in,
     shown_layers,
     source_name,
     tracks_of,
@@ -25,7 +25,7 @@ from lidar_perception.robot.poses import moved_points
 from lidar_perception.robot.tree import Missing, TransformTree
 from lidar_perception.tracking.ego import moved_boxes
 from lidar_perception.types import InputError
-from lidar_perception.wire.messages import column, to_frame, to_truth
+from lidar_perception.wire.messages import to_truth
 from lidar_perception.wire.track_markers import drawn_trails
 from msg_utils.markers import MarkedObjects
 from msg_utils.stamps import to_ns
@@ -88,6 +88,7 @@ class Live:
         self._next = self._bytes = 0
         self._holding: set[int] = set()
         self._unplaced: list[tuple[LiveFrame, str, MarkedObjects, Any]] = []  # until TF has come
+        self._numbers: dict[tuple[str, str], int] = {}  # of each topic among those of its kind
         self._said: dict[str, Any] = {}
         self._lock = threading.RLock()
 
@@ -110,8 +111,8 @@ class Live:
         """Expect boxes of a kind on a topic: clouds wait for them."""
         with self._lock:
             if topic not in self.topics:
-                number = sum(t.kind == kind for t in self.topics.values())
-                self.topics[topic] = Heard(kind, number)
+                number = sum(known == kind for known, _ in self._numbers)
+                self.topics[topic] = Heard(kind, self._numbers.setdefault((kind, topic), number))
 
     def forget(self, topic: str) -> None:
         """Nobody publishes the topic any more."""
@@ -257,11 +258,7 @@ class Live:
     def clouds(self, i: int) -> Scan:
         """The points of a frame, with the ground and clusters that its cloud has. InputError where
         it is broken, or kept no more."""
-        message = self._frame(i).cloud
-        cloud, indices = to_frame(message, intensity_max=0.0)
-        ground, ids = (column(message, name, indices) for name in ("ground", "cluster_id"))
-        return scan_of(cloud, np.zeros(len(cloud), bool) if ground is None else ground > 0,
-                       np.zeros(len(cloud), np.int32) if ids is None else renumbered(ids)[0])
+        return scan_in(self._frame(i).cloud)
 
     def layers(self, i: int, min_score: float) -> dict[str, Any]:
         """Labels and detections of a frame, as /api/labels has them, and what is missed from this

@@ -5,16 +5,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
+from lidar_perception.data.bag_frames import CLOUD
 from lidar_perception.labeling.live import BOXES, LABELS, TRACKS
-from lidar_perception.labeling.results import FOUND, MARKERS
+from lidar_perception.labeling.results import CLUSTERED, FOUND, MARKERS
 from lidar_perception.labeling.results import TRACKS as TRACKED
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS, TRUTH
 
-CLOUD, ARRAY = "sensor_msgs/msg/PointCloud2", "vision_msgs/msg/Detection3DArray"
+ARRAY = "vision_msgs/msg/Detection3DArray"
 # The ends of topics of clouds, those with the most columns first.
-CLOUDS = ("clustering/output/points", "perception/output/points",
-          "ground_segmentation/output/points", POINTS.lstrip("/"))
+CLOUDS = tuple(topic.lstrip("/") for topic in (
+    *CLUSTERED, "/ground_segmentation/output/points", POINTS))
 ENDS = {FOUND: BOXES, TRACKED: TRACKS, TRUTH: LABELS}
 TWIN = "_3d"  # what a topic of markers is called as a Detection3DArray
 

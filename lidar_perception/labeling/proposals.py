@@ -20,22 +20,20 @@ from lidar_perception.labeling.interpolation import Motion, filled
 from lidar_perception.labeling.snap import completed, usual_size
 from lidar_perception.labeling.state import PROPOSED, Box, Track
 from lidar_perception.labeling.survey import Look
-from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams
+from lidar_perception.tracking.follow import NONE, WHOLE, hits
+from lidar_perception.tracking.params import KIND_OF_CLASS
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
 
 Array = np.ndarray[Any, Any]
 Placed = tuple[Array, str]  # a box (7,) and its class
 SAME = 0.6             # metres between the centres of a candidate and a detection of one person
-NEAR = 1.0             # metres between a track and the detection that it was hit by
 LEAST_CONFIDENCE = 0.3  # of a candidate
 UNDETECTED = 0.5       # share of a likeness that counts where a detector found nothing
 FEWEST_HITS = 2        # of a track that is proposed, in a drive of several frames
 LEAST_SCORE = 0.3      # of one
 SURE = 0.95            # score of a box that a person placed
 CANDIDATES = "candidates"  # source of a track that no detector sees
-# All that is followed comes out; what is proposed is chosen among whole tracks.
-TRACKING = TrackingParams(report=0.0, report_unseen=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,10 +84,8 @@ def found_in(look: Look, wanted: Wanted,
     box, name = placed
     others = centre_distances(detections.boxes, box[None])[:, 0] > max(SAME, box[3] / 3)
     kept = detections[others]
-    return Detections(np.concatenate([kept.boxes, box[None].astype(np.float32)]),
-                      np.append(kept.class_ids, np.int32(CLASSES.index(name))),
-                      np.append(kept.scores, np.float32(SURE))), np.append(candidates[others],
-                                                                           False)
+    sure = Detections.of(box, CLASSES.index(name), SURE)
+    return kept.followed_by(sure), np.append(candidates[others], False)
 
 
 def _seen_in(look: Look, seeds: Sequence[SeedLook]) -> tuple[Detections, Array]:
@@ -100,7 +96,7 @@ def _seen_in(look: Look, seeds: Sequence[SeedLook]) -> tuple[Detections, Array]:
     boxes = np.array([completed(b, usual_size(CLASSES[PEDESTRIAN]))
                       for b in look.boxes[chosen].astype(np.float64)]).reshape(-1, 7)
     new = centre_distances(boxes, people).min(axis=1, initial=np.inf) > SAME
-    both = _and(found, boxes[new], np.full(new.sum(), PEDESTRIAN), scores[chosen][new])
+    both = found.followed_by(Detections.of(boxes[new], PEDESTRIAN, scores[chosen][new]))
     return both, np.arange(len(both)) >= len(found)
 
 
@@ -121,14 +117,9 @@ def _with_things(look: Look, wanted: Wanted, found: Detections,
     apart = np.maximum(SAME, boxes[:, None, 3] / 3)
     new = (centre_distances(boxes, found.boxes) > apart).all(axis=1)
     classes = np.array([CLASSES.index(sizes[k].class_name) for k in best[chosen]], np.int32)
-    both = _and(found, boxes[new], classes[new], scores.max(axis=0)[chosen][new])
+    both = found.followed_by(Detections.of(boxes[new], classes[new],
+                                           scores.max(axis=0)[chosen][new]))
     return both, np.append(candidates, np.ones(int(new.sum()), bool))
-
-
-def _and(found: Detections, boxes: Array, class_ids: Array, scores: Array) -> Detections:
-    return Detections(np.concatenate([found.boxes, boxes.astype(np.float32)]),
-                      np.concatenate([found.class_ids, class_ids.astype(np.int32)]),
-                      np.concatenate([found.scores, scores.astype(np.float32)]))
 
 
 ON_FOOT = [i for i, kind in enumerate(KIND_OF_CLASS) if kind != KIND_OF_CLASS[0]]
@@ -139,25 +130,22 @@ def proposed(looks: Sequence[Look], wanted: Wanted, stamps_ns: Sequence[int], mo
     """The tracks in some frames, one after the other, of a drive of which looks (F) are known, the
     surest first; their ids are 0. told: how many frames are done, says whether to go on; None where
     it does not."""
-    tracker, hits = Tracker(TRACKING), dict[int, list[tuple[int, Array, int, float, bool]]]()
+    tracker, seen = Tracker(WHOLE), dict[int, list[tuple[int, Array, int, float, bool]]]()
     for i in frames:
         if not told(i - frames.start):
             return None
         found, candidates = found_in(looks[i], wanted, wanted.placed.get(i))
         pose = None if motion.poses is None else motion.poses[i]
         tracks = tracker(found, stamps_ns[i], pose)
-        for k in np.flatnonzero(tracks.seen):
+        by = hits(tracks, found)
+        for k in np.flatnonzero(by != NONE):
             box = tracks.detections.boxes[k].astype(np.float64)
-            apart = centre_distances(found.boxes, box[None])[:, 0]
-            if apart.min(initial=np.inf) > NEAR:
-                continue
-            nearest = int(apart.argmin())
-            box[:3] = found.boxes[nearest, :3]
-            hits.setdefault(int(tracks.ids[k]), []).append(
-                (i, box, int(tracks.detections.class_ids[k]), float(found.scores[nearest]),
-                 bool(candidates[nearest])))
+            box[:3] = found.boxes[by[k], :3]
+            seen.setdefault(int(tracks.ids[k]), []).append(
+                (i, box, int(tracks.detections.class_ids[k]), float(found.scores[by[k]]),
+                 bool(candidates[by[k]])))
     fewest = min(FEWEST_HITS, len(frames))
-    made = [_track(seen, motion) for seen in hits.values() if len(seen) >= fewest]
+    made = [_track(each, motion) for each in seen.values() if len(each) >= fewest]
     return sorted((t for t in made if t.score >= LEAST_SCORE), key=lambda t: -t.score)
 
 

@@ -19,12 +19,11 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.results import read_results
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.geometry import bev_iou
-from lidar_perception.groups import renumbered
 from lidar_perception.labeling.drive import Drive, Scan, scan_of, scanned
 from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_to_one
 from lidar_perception.scoring.recorded import by_stamp
 from lidar_perception.types import Detections, GroundTruth, InputError
-from lidar_perception.wire.messages import column, to_detections, to_frame
+from lidar_perception.wire.messages import cluster_column, column, to_detections, to_frame
 from lidar_perception.wire.topics import TRUTH
 from msg_utils.markers import MarkedObjects
 
@@ -198,11 +197,17 @@ def recorded_scan(frame: Frame) -> Scan:
     """The cloud of a frame of a bag with the ground and clusters that are recorded in it; those of
     our own where there are none. InputError where it cannot be read."""
     message = frame.native()
+    both = {"ground", "cluster_id"} <= {field.name for field in message.fields}
+    return scan_in(message) if both else scanned(frame)
+
+
+def scan_in(message: Any) -> Scan:
+    """A PointCloud2 with the ground and clusters that it has; none where it has no such column.
+    InputError where it is broken."""
     cloud, indices = to_frame(message, intensity_max=0.0)
-    ground, ids = (column(message, name, indices) for name in ("ground", "cluster_id"))
-    if ground is None or ids is None:
-        return scanned(frame)
-    return scan_of(cloud, ground > 0, renumbered(ids)[0])
+    ground, clusters = column(message, "ground", indices), cluster_column(message, indices)
+    return scan_of(cloud, np.zeros(len(cloud), bool) if ground is None else ground > 0,
+                   np.zeros(len(cloud), np.int32) if clusters is None else clusters[0])
 
 
 def tracks_of(frames: Mapping[int, MarkedObjects], topic: str,
@@ -215,9 +220,8 @@ def tracks_of(frames: Mapping[int, MarkedObjects], topic: str,
         for box, label, number, score in zip(objects.boxes, objects.labels, objects.ids.tolist(),
                                              objects.scores):
             track = made.setdefault(number, {
-                "id": before + number if before else number, "class": label, "state": "accepted",
-                "score": 0.0, "source": topic.strip("/").split("/")[0], "boxes": [],
-                "uncertainty": 0.0})
+                "id": before + number, "class": label, "state": "accepted", "score": 0.0,
+                "source": topic.strip("/").split("/")[0], "boxes": [], "uncertainty": 0.0})
             track["score"] = max(track["score"], float(score))
             track["boxes"].append([i, *map(float, box), "proposed"])
     return list(made.values())

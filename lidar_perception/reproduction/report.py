@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import base64
 import csv
 import dataclasses
 import io
 import json
 import math
 import re
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ from rich.table import Table as Grid
 from lidar_perception.reproduction.experiment import Cell, Experiment, Figure, Section, Table
 from lidar_perception.reproduction.figures import draw
 from lidar_perception.runs.files import write_bytes, write_text
+from lidar_perception.runs.page import data_url, render
 
 LEGEND = ("A figure, [its 95 % interval] from drawing the frames anew with replacement "
           "(bootstrap), and the paper's figure. An interval from a few frames, or from frames that "
@@ -77,18 +76,13 @@ def is_number(cell: str | Cell) -> bool:
 def to_html(experiment: Experiment, sections: list[Section], about: dict[str, str],
             skipped: list[dict[str, Any]]) -> str:
     """One page that needs no other file."""
-    import jinja2
-
     def picture(figure: Figure, dark: bool) -> str:
-        drawn = base64.b64encode(draw(figure, "svg", dark=dark)).decode()
-        return f"data:image/svg+xml;base64,{drawn}"
+        return data_url(draw(figure, "svg", dark=dark), "svg+xml")
 
-    source = (files("lidar_perception.reproduction") / "report.html").read_text()
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined)
-    return environment.from_string(source).render(
-        title=experiment.title, question=experiment.question, about=about, skipped=skipped,
-        sections=sections, legend=LEGEND, max_rows=MAX_ROWS, parts=parts, picture=picture,
-        is_number=is_number)
+    return render(
+        "reproduction/report.html", title=experiment.title, question=experiment.question,
+        about=about, skipped=skipped, sections=sections, legend=LEGEND, max_rows=MAX_ROWS,
+        parts=parts, picture=picture, is_number=is_number)
 
 
 def to_markdown(experiment: Experiment, sections: list[Section], about: dict[str, str],

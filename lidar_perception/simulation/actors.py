@@ -1,4 +1,4 @@
-"""Who is in a street: looks, straight ways, and room that nobody shares."""
+"""Who is in a scene: looks, straight ways, and room that nobody shares."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from lidar_perception.simulation.way import Way
 
 HEAD_ROOM = 2.2  # metres; what hangs higher is in nobody's way
 SIGHT, FAR_SIGHT = 80.0, 120.0  # metres from the sensor; what is farther is left out of a moment;
-STEP = 0.1                      # s between the places of a robot that others keep clear of
 LARGE = 5.0                     # FAR_SIGHT is for what is so large, m
+STEP = 0.1                      # s between the places of a robot that others keep clear of
 
 
 def prop(made: np.ndarray) -> Thing:
@@ -145,7 +145,7 @@ def _meets_way(one, way, radius):
 
 
 class Room:
-    """The actors of a street so far; a newcomer must keep clear of all of them all the time."""
+    """The actors of a scene so far; a newcomer must keep clear of all of them all the time."""
 
     def __init__(self, seconds: float, keep_clear: np.ndarray | None = None,
                  way: Way | None = None, radius: float = 0.0):

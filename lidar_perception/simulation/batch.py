@@ -9,24 +9,24 @@ import numpy as np
 import torch
 
 from lidar_perception.simulation.drive import scan_at
-from lidar_perception.simulation.scene import ANY, Streets
+from lidar_perception.simulation.scene import ANY, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 
 
 def training_scans(seed: int = 0, sensor: Sensor = HDL64E,
-                   streets: Streets = ANY) -> Iterator[dict[str, torch.Tensor]]:
-    """Without end: the first scan of the streets seed, seed + 1, ..., with all their labels.
+                   scenes: Scenes = ANY) -> Iterator[dict[str, torch.Tensor]]:
+    """Without end: the first scan of the scenes seed, seed + 1, ..., with all their labels.
 
     points (N, 4) float32 [x y z intensity], boxes (K, 7) float32 and class_ids (K,) int64 as in
-    GroundTruth, num_points (K,) int64. In worker w of n of a DataLoader: every nth street from
-    seed + w on, so that the workers together give each street once.
+    GroundTruth, num_points (K,) int64. In worker w of n of a DataLoader: every nth scene from
+    seed + w on, so that the workers together give each scene once.
     """
     worker = torch.utils.data.get_worker_info()
     first, step = (worker.id, worker.num_workers) if worker else (0, 1)
-    for street in itertools.count(seed + first, step):
-        scan = scan_at(street, 0, sensor, streets)
+    for number in itertools.count(seed + first, step):
+        scan = scan_at(number, 0, sensor, scenes)
         arrays = {
-            "points": np.column_stack([scan.frame.xyz, scan.frame.intensity]),
+            "points": scan.frame.points(),
             "boxes": scan.truth.boxes.astype(np.float32),
             "class_ids": scan.truth.class_ids.astype(np.int64),
             "num_points": np.array([e["num_points"] for e in scan.truth.extras], np.int64)}

@@ -19,7 +19,7 @@ from lidar_perception.runs.folder import finish_frame
 from lidar_perception.runs.processes import in_processes
 from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
 from lidar_perception.simulation.drive import SimulatedScan, longest_drive, scan_at
-from lidar_perception.simulation.scene import ANY, Streets
+from lidar_perception.simulation.scene import ANY, Scenes
 from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.types import InputError
 
@@ -28,7 +28,7 @@ LAYOUTS = ("kitti", "kitti-tracking", "semantickitti")
 
 @dataclass(frozen=True)
 class Plan:
-    """frames scans, streets_of of each of the streets seed, seed + 1, ..., in one of LAYOUTS.
+    """frames scans, streets_of of each of the scenes seed, seed + 1, ..., in one of LAYOUTS.
     InputError for numbers that cannot be."""
 
     layout: str
@@ -36,11 +36,11 @@ class Plan:
     seed: int
     frames: int
     streets_of: int
-    streets: Streets = ANY
+    scenes: Scenes = ANY
 
     def __post_init__(self) -> None:
         most = longest_drive(self.sensor)
-        self.streets.sorts()
+        self.scenes.sorts()
         for wrong, what in (
                 (self.layout not in ("mcap", *LAYOUTS), f"layout = {self.layout!r} must be one of "
                                              f"{', '.join(LAYOUTS)}"),
@@ -57,9 +57,9 @@ def write_frame(folder: Path, plan: Plan, number: int) -> None:
     """Simulate and write frame number, all of its files. InputError where one cannot be
     written."""
     sequence, moment = divmod(number, plan.streets_of)
-    scan = scan_at(plan.seed + sequence, moment, plan.sensor, plan.streets)
+    scan = scan_at(plan.seed + sequence, moment, plan.sensor, plan.scenes)
     order = np.argsort(scan.ring, kind="stable")  # as in KITTI's files, beam after beam
-    cloud = np.column_stack([scan.frame.xyz, scan.frame.intensity])[order]
+    cloud = scan.frame.points()[order]
     if plan.layout == "semantickitti":
         shares = _semantic(folder, plan, sequence, moment, scan, cloud, order)
     else:

@@ -1,4 +1,4 @@
-"""Simulated drives: scans of a street, one a turn of the sensor, with all that is known of them."""
+"""Simulated drives: scans of a scene, one a turn of the sensor, with all that is known of them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from lidar_perception.data.semantickitti import MOVING
 from lidar_perception.simulation.raycast import Hits, cast
 from lidar_perception.simulation.returns import returns_of
-from lidar_perception.simulation.scene import ANY, SECONDS, Moment, Scene, Streets, make_scene
+from lidar_perception.simulation.scene import ANY, SECONDS, Moment, Scene, Scenes, make_scene
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.topics import LIDAR_FRAME
@@ -42,13 +42,13 @@ class SimulatedScan:
 
 
 def longest_drive(sensor: Sensor) -> int:
-    """Scans that fit into the time of one street."""
+    """Scans that fit into the time of one drive."""
     return int(SECONDS * sensor.rate)
 
 
 def scans(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
-          streets: Streets = ANY) -> Iterator[SimulatedScan]:
-    """A drive along the street make_scene(seed, *streets); the same for the same arguments.
+          scenes: Scenes = ANY) -> Iterator[SimulatedScan]:
+    """A drive through make_scene(seed, *scenes); the same for the same arguments.
 
     Points are where they were met, in the sensor's frame at the stamp; boxes are those at the
     stamp. Objects without a point or beyond LABEL_RANGE have no label. extras: track_id,
@@ -61,12 +61,12 @@ def scans(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
         raise InputError(f"frames = {frames} must be 1 .. {most}: the street is that long")
     if seed < 0:
         raise InputError(f"seed = {seed} must not be negative")
-    return (scan_at(seed, i, sensor, streets) for i in range(frames))
+    return (scan_at(seed, i, sensor, scenes) for i in range(frames))
 
 
-def scan_at(seed: int, i: int, sensor: Sensor, streets: Streets = ANY) -> SimulatedScan:
-    """Scan i of the drive along street seed, whatever was asked for before."""
-    scene, sensor = _street(seed, streets), sensor.at_turn(i)
+def scan_at(seed: int, i: int, sensor: Sensor, scenes: Scenes = ANY) -> SimulatedScan:
+    """Scan i of the drive through the scene of a seed, whatever was asked for before."""
+    scene, sensor = _scene(seed, scenes), sensor.at_turn(i)
     moment = scene.at(i / sensor.rate, sensor.height)
     hits = cast(moment.solids, scene.ground, moment.position, sensor, moment.motion,
                 (seed << 20) + i, moment.heading)
@@ -97,8 +97,8 @@ def truth(moment: Moment, hits: Hits, owner: np.ndarray) -> GroundTruth:
 
 
 @functools.lru_cache(maxsize=2)
-def _street(seed: int, streets: Streets) -> Scene:
-    return make_scene(seed, *streets)
+def _scene(seed: int, scenes: Scenes) -> Scene:
+    return make_scene(seed, *scenes)
 
 
 def _moving(moment: Moment, owner: np.ndarray, semantic: np.ndarray) -> np.ndarray:

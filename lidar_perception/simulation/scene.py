@@ -28,7 +28,7 @@ from lidar_perception.types import CLASSES, InputError
 EGO = (3.0, 1.1)  # half length and width that the ego vehicle keeps clear, m
 
 
-class Streets(NamedTuple):
+class Scenes(NamedTuple):
     """Which scenes, see make_scene: all kinds, or one; how many times as many people as usual;
     scene: one of SCENES, or several with commas between, in turn from seed to seed."""
 
@@ -53,8 +53,8 @@ class Streets(NamedTuple):
         return all(sort.camera for sort in self.sorts())
 
 
-ANY = Streets()
-CROWDED = Streets("zone", 3.0)  # for demos and tests of pedestrian detectors
+ANY = Scenes()
+CROWDED = Scenes("zone", 3.0)  # for demos and tests of pedestrian detectors
 
 
 class Moment(NamedTuple):
@@ -175,7 +175,7 @@ def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0,
                scene: str = "street") -> Scene:
     """A scene of its own for every seed. kind: one of those of the scene; None draws it by their
     shares. people: multiplies how many pedestrians, sitting people and cyclists are tried; on
-    streets 1 comes near KITTI's labels, 0 is none. scene: see Streets.
+    streets 1 comes near KITTI's labels, 0 is none. scene: see Scenes.
 
     What is placed later is dropped where it would ever touch what is there already. InputError
     for a negative seed or people and an unknown scene or kind.
@@ -184,7 +184,7 @@ def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0,
         raise InputError(f"seed = {seed} must not be negative")
     if not 0 <= people < np.inf:
         raise InputError(f"people = {people} must be 0 or more, such as 1")
-    sorts = Streets(kind, people, scene).sorts()
+    sorts = Scenes(kind, people, scene).sorts()
     chosen = sorts[seed % len(sorts)]
     rng = np.random.default_rng(seed)
     drawn = str(rng.choice(list(chosen.kinds), p=[k.share for k in chosen.kinds.values()]))
@@ -205,7 +205,7 @@ def _street(rng: np.random.Generator, kind: Kind,
 
 class Sort(NamedTuple):
     """A sort of scene: its kinds by name, each with the share that it is drawn with; make(rng,
-    kind, people): ground, actors and way; camera: see Streets."""
+    kind, people): ground, actors and way; camera: see Scenes."""
 
     kinds: dict[str, Any]
     make: Callable[[np.random.Generator, Any, float], tuple[Ground, tuple[Actor, ...], Way]]

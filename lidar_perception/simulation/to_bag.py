@@ -8,25 +8,25 @@ from dataclasses import replace
 from lidar_perception.data.frame import Frame
 from lidar_perception.simulation.camera import FORWARD_CAMERA, labels_around, labels_in_view
 from lidar_perception.simulation.drive import longest_drive, scan_at
-from lidar_perception.simulation.scene import ANY, Streets
+from lidar_perception.simulation.scene import ANY, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 
-GAP_NS = 10 * 10**9  # between the drives along two streets, as between KITTI's recordings
+GAP_NS = 10 * 10**9  # between the drives through two scenes, as between KITTI's recordings
 
 
 def simulated_scans(seed: int, frames: int, sensor: Sensor = HDL64E,
-                    streets_of: int | None = None, streets: Streets = ANY) -> Iterator[Frame]:
+                    streets_of: int | None = None, scenes: Scenes = ANY) -> Iterator[Frame]:
     """Frames with the forward camera and, as in KITTI, labels of the objects whose centre it sees;
     where not all scenes have a camera, without one and with labels all around: streets_of
     (default: as many as fit) of each of the scenes seed, seed + 1, ..."""
-    camera, labels = ((FORWARD_CAMERA, labels_in_view) if streets.camera else
+    camera, labels = ((FORWARD_CAMERA, labels_in_view) if scenes.camera else
                       (None, labels_around))
     each = streets_of or longest_drive(sensor)
     drive_ns = GAP_NS + round(each * 10**9 / sensor.rate)
     for number in range(frames):
-        street, moment = divmod(number, each)
-        scan = scan_at(seed + street, moment, sensor, streets)
-        frame = replace(scan.frame, stamp_ns=scan.frame.stamp_ns + street * drive_ns)
-        yield Frame.of(f"{street:04}/{moment:06}", frame, labels(scan.truth),
-                       camera, pose=scan.pose.copy, sequence=f"{street:04}", index=moment,
+        scene, moment = divmod(number, each)
+        scan = scan_at(seed + scene, moment, sensor, scenes)
+        frame = replace(scan.frame, stamp_ns=scan.frame.stamp_ns + scene * drive_ns)
+        yield Frame.of(f"{scene:04}/{moment:06}", frame, labels(scan.truth),
+                       camera, pose=scan.pose.copy, sequence=f"{scene:04}", index=moment,
                        sensor_height=sensor.height)

@@ -85,7 +85,7 @@ def drive_bag(make_bag) -> Path:
     """A simulated drive among people: eight clouds of 64 beams with labels and a camera."""
     from lidar_perception.simulation.scene import CROWDED
     from lidar_perception.simulation.to_bag import simulated_scans
-    return make_bag(simulated_scans(33, FRAMES, streets=CROWDED))
+    return make_bag(simulated_scans(33, FRAMES, scenes=CROWDED))
 
 
 @pytest.hookimpl(wrapper=True)

@@ -15,6 +15,8 @@ from lidar_perception.types import Detections
 
 NEAR = 1.0  # metres between a track and the detection that it was hit by
 NONE = -1
+# All that is followed is reported; what is sure is chosen among whole tracks.
+WHOLE = TrackingParams(report=0.0, report_unseen=0.0)
 Hit = tuple[int, int]  # a frame, and a detection there
 
 
@@ -29,8 +31,7 @@ def hits(tracks: Tracks, found: Detections) -> np.ndarray:
 
 
 def followed(found: Sequence[Detections], stamps_ns: Sequence[int], poses: Sequence[np.ndarray],
-             params: TrackingParams = TrackingParams(report=0.0, report_unseen=0.0)
-             ) -> list[list[Hit]]:
+             params: TrackingParams = WHOLE) -> list[list[Hit]]:
     """The objects of a drive, each with its detections in the order of time. found: of its frames,
     with stamps, rising and not 0, and poses (4, 4) in a fixed frame.
 

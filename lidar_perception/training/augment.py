@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidar_perception.geometry import bev_iou, to_box_frame, wrap_angle
+from lidar_perception.geometry import bev_iou, to_box_frame, within, wrap_angle
 from lidar_perception.training.params import AugmentParams, NoiseParams, ThingParams
 from lidar_perception.training.putting import TOUCH, inside
 from lidar_perception.types import SENSOR_HEIGHT
@@ -66,8 +66,7 @@ def cropped(scene: TrainingScene, low: np.ndarray, high: np.ndarray) -> Training
     kept = np.ones(len(scene.points), bool)
     for axis in range(3):
         kept &= (scene.points[:, axis] >= low[axis]) & (scene.points[:, axis] < high[axis])
-    centres = scene.boxes[:, :2]
-    here = ((centres >= low[:2]) & (centres < high[:2])).all(axis=1)
+    here = within(scene.boxes, low, high)
     return replace(scene, points=scene.points[kept], boxes=scene.boxes[here],
                    class_ids=scene.class_ids[here], wanted=scene.wanted[here])
 

@@ -9,7 +9,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN
-from lidar_perception.geometry import bev_iou
+from lidar_perception.geometry import bev_iou, within
 from lidar_perception.training.augment import BORDER, TrainingScene, grown, turned, varied
 from lidar_perception.training.cache import write_arrays
 from lidar_perception.training.params import AugmentParams
@@ -146,7 +146,7 @@ def _direction(box: np.ndarray, free: np.ndarray, low: np.ndarray, high: np.ndar
     turns = rng.uniform(-np.pi, np.pi, TRIES)
     angles = np.arctan2(box[1], box[0]) + turns
     centres = np.stack([at * np.cos(angles), at * np.sin(angles)], axis=1)
-    fits = ((centres >= low[:2]) & (centres < high[:2])).all(axis=1)
+    fits = within(centres, low, high)
     for aside in (-half, 0.0, half):
         fits &= free[_sectors(angles + aside / max(at, half))] > at + half
     return float(turns[fits.argmax()]) if fits.any() else None

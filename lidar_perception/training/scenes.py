@@ -1,4 +1,4 @@
-"""Where labelled scenes come from: recordings, and simulated streets with a cache on disk.
+"""Where labelled scenes come from: recordings, and simulated scenes with a cache on disk.
 
 A source has a length, scene(i) to train on, and frame(i) to validate on. It can be sent to other
 processes: files are opened where they are read.
@@ -23,7 +23,7 @@ from lidar_perception.simulation.camera import (
     worth_a_label,
 )
 from lidar_perception.simulation.drive import longest_drive, scan_at
-from lidar_perception.simulation.scene import ANY, Streets
+from lidar_perception.simulation.scene import ANY, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cache import kept, path_in, size_of
@@ -59,8 +59,7 @@ class RecordedScenes:
         """InputError naming the file that cannot be used."""
         frame = self.frame(i)
         scan, truth, camera = frame.load(), frame.truth(), frame.camera()
-        intensity = np.zeros(len(scan), np.float32) if scan.intensity is None else scan.intensity
-        points = np.column_stack([scan.xyz, intensity])
+        points = scan.points()
         if self.view and camera is not None:
             points = points[camera.in_view(scan.xyz)]
         return TrainingScene(points, truth.boxes, truth.class_ids, np.ones(len(truth), bool),
@@ -90,30 +89,30 @@ def random_split(names: tuple[str, ...], share: float,
 @dataclass(frozen=True)
 class SimulatedScenes:
     """count scans of the scenes first, first + 1, ..., of each so many, spread over its drive. To
-    make a street takes as long as to scan it. cache: folder for scans, or None; from cache_gb on
+    make a scene takes as long as to scan it. cache: folder for scans, or None; from cache_gb on
     nothing is added to it. around: frames to validate on have their labels in the image of a camera
     that looks ahead, left, behind, right in turn, not ahead only."""
 
     first: int
     count: int
     sensor: Sensor = HDL64E
-    streets: Streets = ANY
+    scenes: Scenes = ANY
     cache: Path | None = None
     cache_gb: float = 20.0
-    per_street: int = 1
+    per_scene: int = 1
     around: bool = False
 
     def __len__(self) -> int:
         return self.count
 
     def at(self, i: int) -> tuple[int, int]:
-        """Street and frame of scan i."""
-        street, part = divmod(i, self.per_street)
-        return self.first + street, part * longest_drive(self.sensor) // self.per_street
+        """Scene and frame of scan i."""
+        scene, part = divmod(i, self.per_scene)
+        return self.first + scene, part * longest_drive(self.sensor) // self.per_scene
 
     def key(self, i: int) -> str:
         """All that scan i depends on."""
-        return repr((self.sensor, tuple(self.streets), self.at(i)))
+        return repr((self.sensor, tuple(self.scenes), self.at(i)))
 
     def path(self, i: int) -> Path | None:
         """The file that keeps scan i."""
@@ -122,19 +121,19 @@ class SimulatedScenes:
     def scene(self, i: int) -> TrainingScene:
         """With the labels all around."""
         frame, truth = self.scan(i)
-        return TrainingScene(np.column_stack([frame.xyz, frame.intensity]), truth.boxes,
-                             truth.class_ids, worth_a_label(truth), True, self.sensor.height)
+        return TrainingScene(frame.points(), truth.boxes, truth.class_ids, worth_a_label(truth),
+                             True, self.sensor.height)
 
     def frame(self, i: int) -> Frame:
         """To validate on: with the labels that KITTI would have in the image of a camera, or all
         around where there is none."""
         scan, truth = self.scan(i)
-        street, part = self.at(i)
-        if not self.streets.camera:
-            return Frame.of(f"scene {street} frame {part}", scan, labels_around(truth),
+        scene, part = self.at(i)
+        if not self.scenes.camera:
+            return Frame.of(f"scene {scene} frame {part}", scan, labels_around(truth),
                             sensor_height=self.sensor.height)
         camera = turned_camera(np.pi / 2 * (i % 4)) if self.around else FORWARD_CAMERA
-        return Frame.of(f"street {street} frame {part}", scan, kitti_labels(truth, camera), camera,
+        return Frame.of(f"street {scene} frame {part}", scan, kitti_labels(truth, camera), camera,
                         sensor_height=self.sensor.height)
 
     def scan(self, i: int) -> tuple[LidarFrame, GroundTruth]:
@@ -148,7 +147,7 @@ class SimulatedScenes:
             self.scan(i)
 
     def _simulated(self, i: int) -> tuple[LidarFrame, GroundTruth]:
-        scan = scan_at(*self.at(i), self.sensor, self.streets)
+        scan = scan_at(*self.at(i), self.sensor, self.scenes)
         return scan.frame, scan.truth
 
 

@@ -10,14 +10,14 @@ from typing import Any
 from lidar_perception.data.frame import BOXES
 from lidar_perception.data.open import open_recording
 from lidar_perception.simulation.drive import longest_drive
-from lidar_perception.simulation.scene import Streets
+from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.params import DataParams
 from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes, random_split
 from lidar_perception.types import InputError
 
-SIM = "sim"  # the name of simulated streets where a folder could stand
-FIRST_STREET, FIRST_VALIDATION_STREET = 10_000_000, 20_000_000  # far from what anybody else takes
+SIM = "sim"  # the name of simulated scenes where a folder could stand
+FIRST_SCENE, FIRST_VALIDATION_SCENE = 10_000_000, 20_000_000  # far from what anybody else takes
 
 
 def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
@@ -25,7 +25,7 @@ def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | N
                     sensor: Sensor = HDL64E, around: bool = False,
                     scene: str = "street") -> tuple[tuple, tuple]:
     """Sources to train on and to validate on. sensor: of simulated scenes, which are those of
-    scene, see Streets; around: validate on what lies all around. InputError for what is not
+    scene, see Scenes; around: validate on what lies all around. InputError for what is not
     there, or an option that would not be used."""
     folders = [Path(name) for name in data if name != SIM]
     val_folders = [Path(name) for name in val if name != SIM] or ([] if val else folders)
@@ -49,15 +49,15 @@ def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | N
     for folder in val_folders if val else ():
         if folder not in folders or val_split is None:
             judge_on.append(RecordedScenes(folder, names_of(folder, val_split), settings.view))
-    streets = partial(SimulatedScenes, sensor=sensor, cache_gb=settings.cache_gb,
-                      cache=Path(settings.cache) if settings.cache else None)
+    simulated = partial(SimulatedScenes, sensor=sensor, cache_gb=settings.cache_gb,
+                        cache=Path(settings.cache) if settings.cache else None)
     if SIM in data:
-        train_on.append(streets(FIRST_STREET, settings.scans,
-                                streets=Streets(None, settings.people, scene),
-                                per_street=min(settings.street_scans, longest_drive(sensor))))
+        train_on.append(simulated(FIRST_SCENE, settings.scans,
+                                  scenes=Scenes(None, settings.people, scene),
+                                  per_scene=min(settings.street_scans, longest_drive(sensor))))
     if SIM in (val or data):
-        judge_on.append(streets(FIRST_VALIDATION_STREET, settings.val_scans,
-                                streets=Streets(None, settings.val_people, scene), around=around))
+        judge_on.append(simulated(FIRST_VALIDATION_SCENE, settings.val_scans,
+                                  scenes=Scenes(None, settings.val_people, scene), around=around))
     return tuple(train_on), tuple(judge_on)
 
 

@@ -235,11 +235,11 @@ def _recorded(sources: Sequence[Any]) -> int:
 
 
 def _some_scenes(sources: Sequence[Any]) -> tuple[list[TrainingScene], float]:
-    """Up to four scenes, and the seconds to simulate one with its share of the street; 0 where
+    """Up to four scenes, and the seconds to simulate one with its share of the scene; 0 where
     nothing is simulated. No source has a cache. InputError where none can be read."""
     for source in sources:
         if isinstance(source, SimulatedScenes):
-            many = source.per_street
+            many = source.per_scene
             source.scene(0)  # so that what is compiled is there
             begun = time.perf_counter()
             made = [source.scene(i) for i in range(many, many + min(many, 4))]
@@ -293,8 +293,8 @@ def _say(network: Network, params: Any, sensor: Sensor, chosen: Plan, speed: Spe
 
 def _prepare(network: Network, asked: Asked, sources: Sequence[Any], held_out: Sequence[Any],
              cut: tuple[list[Any], list]) -> None:
-    streets = [s for s in (*sources, *held_out) if isinstance(s, SimulatedScenes)]
-    keep_all(streets, [range(len(s)) for s in streets], asked.jobs, "simulating")
+    simulated = [s for s in (*sources, *held_out) if isinstance(s, SimulatedScenes)]
+    keep_all(simulated, [range(len(s)) for s in simulated], asked.jobs, "simulating")
     keep_all(*cut, asked.jobs, network.cutting)
 
 

@@ -24,7 +24,7 @@ from samples import write
 from lidar_perception.adapting import adapt as adapt_module
 from lidar_perception.adapting.adapt import BEST, LAST, Adapting
 from lidar_perception.adapting.judging import IGNORED, KEPT, REJECTED, STATES
-from lidar_perception.adapting.labels import FrameLabels
+from lidar_perception.adapting.labels import ConcludedLabels
 from lidar_perception.adapting.looking import SOURCES, FrameLook
 from lidar_perception.adapting.params import AdaptParams
 from lidar_perception.adapting.scenes import AdaptedScenes, save_labels
@@ -177,10 +177,10 @@ def test_report_and_labels_say_what_was_kept(bag, weights, whole):
 
 # what is learned from
 
-def labelled(states: list[str]) -> FrameLabels:
-    return FrameLabels(BOXES.numpy().astype(np.float64), np.array([CAR, PEDESTRIAN]),
-                       np.array([STATES.index(s) for s in states]), np.arange(2), np.ones(2),
-                       np.ones(2, bool))
+def labelled(states: list[str]) -> ConcludedLabels:
+    return ConcludedLabels(BOXES.numpy().astype(np.float64), np.array([CAR, PEDESTRIAN]),
+                           np.array([STATES.index(s) for s in states]), np.arange(2), np.ones(2),
+                           np.ones(2, bool))
 
 
 def test_scenes_are_the_clouds_with_kept_boxes_and_regions(bag, tmp_path):

@@ -188,6 +188,10 @@ def test_tracks_of_two_trackers_keep_apart_and_labels_say_what_is_missed(live):
     assert len({t["id"] for t in live.tracks()}) == 2
     match = live.layers(0, 0.0)["matches"]["fused_detector"]
     assert match == {"missed": [0], "false": None}
+    live.forget(TRACKED)  # another graph takes its place
+    live.hear("/c/tracker/output/tracks", TRACKS)
+    live.boxes("/c/tracker/output/tracks", boxes(1), None)
+    assert len({t["id"] for t in live.tracks()}) == 2
 
 
 def test_the_cloud_with_most_columns_is_chosen_and_the_boxes_of_its_namespace():

@@ -33,7 +33,7 @@ FRAMES = 6
 
 @pytest.mark.launch_test
 def generate_test_description():
-    bag = bag_of(FOLDER / "drive", simulated_scans(33, FRAMES, streets=CROWDED))
+    bag = bag_of(FOLDER / "drive", simulated_scans(33, FRAMES, scenes=CROWDED))
     return description(launch_file("replay", bag=bag, scores=FOLDER / "scores.json", loop=True))
 
 

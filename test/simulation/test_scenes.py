@@ -19,7 +19,7 @@ from lidar_perception.simulation.camera import worth_a_label
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.raycast import cast
 from lidar_perception.simulation.returns import returns_of
-from lidar_perception.simulation.scene import SCENES, Streets, make_scene
+from lidar_perception.simulation.scene import SCENES, Scenes, make_scene
 from lidar_perception.simulation.sensor import generic, sensor_named
 from lidar_perception.simulation.terrain import surface_height
 from lidar_perception.simulation.to_bag import simulated_scans
@@ -41,12 +41,12 @@ def moved(xyz, pose):
     return xyz @ pose[:3, :3].T + pose[:3, 3]
 
 
-@pytest.mark.parametrize("streets, seed, moment, points, metres, labels", [
-    (Streets(), 1, 0, 2575, 40385.126304, 129.929893373),
-    (Streets("zone", 3.0), 5, 60, 2543, 46185.171547, 659.233862469)])
-def test_a_seed_gives_the_street_that_it_always_gave(streets, seed, moment, points, metres, labels):
+@pytest.mark.parametrize("scenes, seed, moment, points, metres, labels", [
+    (Scenes(), 1, 0, 2575, 40385.126304, 129.929893373),
+    (Scenes("zone", 3.0), 5, 60, 2543, 46185.171547, 659.233862469)])
+def test_a_seed_gives_the_street_that_it_always_gave(scenes, seed, moment, points, metres, labels):
     """Written down anew where simulated cars, say, are made otherwise on purpose."""
-    scan = scan_at(seed, moment, TINY, streets)
+    scan = scan_at(seed, moment, TINY, scenes)
     assert len(scan.frame) == points
     assert np.abs(scan.frame.xyz, dtype=float).sum() == pytest.approx(metres, rel=1e-6)
     assert np.abs(scan.truth.boxes).sum() == pytest.approx(labels, rel=1e-9)
@@ -128,9 +128,9 @@ def test_a_turned_sensor_sees_the_same():
 
 
 def test_robots_have_labels_all_around_and_no_camera(tmp_path):
-    frames = list(simulated_scans(3, 2, TINY, 1, Streets(None, 3.0, "campus")))
+    frames = list(simulated_scans(3, 2, TINY, 1, Scenes(None, 3.0, "campus")))
     for number, frame in enumerate(frames):
-        truth, whole = frame.truth(), scan_at(3 + number, 0, TINY, Streets(None, 3.0, "campus"))
+        truth, whole = frame.truth(), scan_at(3 + number, 0, TINY, Scenes(None, 3.0, "campus"))
         assert frame.camera() is None and frame.sensor_height == 0.6
         assert len(truth) == worth_a_label(whole.truth).sum()
     assert any((frame.truth().boxes[:, 0] < 0).any() for frame in frames)
@@ -138,7 +138,7 @@ def test_robots_have_labels_all_around_and_no_camera(tmp_path):
 
 
 def test_a_mix_takes_turns_and_is_trained_on():
-    mixed = Streets(None, 1.0, "street,indoor")
+    mixed = Scenes(None, 1.0, "street,indoor")
     assert scene_of("indoor", None, 3).kind == make_scene(3, None, 2.0, mixed.scene).kind
     assert make_scene(4, None, 1.0, mixed.scene).kind == make_scene(4).kind
     source = SimulatedScenes(3, 2, TINY, mixed)
@@ -149,7 +149,7 @@ def test_a_mix_takes_turns_and_is_trained_on():
 @pytest.mark.parametrize("kind", SCENES["indoor"].kinds)
 def test_setup_finds_the_height_indoors(kind):
     sensor = replace(sensor_named("vlp-16", 0.6), azimuth_step=float(np.radians(0.8)))
-    frames = [scan_at(7, i, sensor, Streets(kind, 1.0, "indoor")).frame for i in (0, 1, 90, 91)]
+    frames = [scan_at(7, i, sensor, Scenes(kind, 1.0, "indoor")).frame for i in (0, 1, 90, 91)]
     mount = mount_of([scan_of(from_array(points_of(frame), header(bag_message, frame.stamp_ns),
                                          bag_message)) for frame in frames])
     assert mount.height == pytest.approx(0.6, abs=0.02)
@@ -175,12 +175,12 @@ def test_the_command_writes_every_layout_of_a_robot(layout, tmp_path):
                                                      51, 70, 71, 80, 81, 99, *GROUND, *MOVING}
 
 
-@pytest.mark.parametrize("streets, said", [
-    (Streets(scene="moon"), "unknown scene 'moon': must be one of street, campus, indoor"),
-    (Streets("zone", 1.0, "campus"), "kind = 'zone' must be one of forecourt, square, path")])
-def test_what_is_no_scene_is_named(streets, said):
+@pytest.mark.parametrize("scenes, said", [
+    (Scenes(scene="moon"), "unknown scene 'moon': must be one of street, campus, indoor"),
+    (Scenes("zone", 1.0, "campus"), "kind = 'zone' must be one of forecourt, square, path")])
+def test_what_is_no_scene_is_named(scenes, said):
     with pytest.raises(InputError, match=said):
-        next(simulated_scans(0, 1, TINY, 1, streets))
+        next(simulated_scans(0, 1, TINY, 1, scenes))
 
 
 def test_only_streets_are_compared(tmp_path):

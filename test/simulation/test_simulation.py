@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("streets")
 
 
 def street(seed):
-    return drives._street(seed, ANY)
+    return drives._scene(seed, ANY)
 
 
 def scan(seed, t, sensor=COARSE):
@@ -128,7 +128,7 @@ def test_scans_look_like_those_of_the_real_sensor():
     about 27 000 over the square of its range."""
     density, labels = [], set()
     for seed in (0, 33):
-        scan = next(scans(seed, 1, streets=CROWDED))
+        scan = next(scans(seed, 1, scenes=CROWDED))
         frame, found = scan.frame, scan.truth
         assert 95_000 < len(frame) < 135_000
         assert 0.15 < frame.intensity.mean() < 0.4

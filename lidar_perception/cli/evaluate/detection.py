@@ -35,7 +35,7 @@ from lidar_perception.types import InputError
               "always the same. Default: 1.")
 @click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
               help="Height of the sensor above the ground. Default: what the recording says, or "
-              "KITTI's, as bags say none.")
+              "else what its first clouds show.")
 @a_path("--write-results", "Write the detections of --weights as KITTI result files, also for "
                            "frames without labels.", "DIR")
 @click.option("--errors", is_flag=True, help="Also say where found boxes differ from the true "
@@ -81,13 +81,14 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
     if keep != 1 and weights is None:
         raise click.UsageError("--keep thins the scans that a detector sees; --results DIR sees "
                                "none")
-    recording = walk.opened(BOXES if write_results is None else None, scans=weights is not None)
+    recording = walk.opened(BOXES if write_results is None else None, scans=weights is not None,
+                            sensor_height=mount_height or None)
     if results is not None:
         if not results.is_dir():
             raise InputError(f"{results} is not a folder; give the folder of the result files")
         start = partial(by_files, results)
     else:
-        height = mount_height or recording.frames[0].sensor_height
+        height = recording.frames[0].sensor_height
         if weights.suffix == ".safetensors" and (other := read_header(weights).unlike(height)):
             terminal_errors.print(f"{weights}: {other}", soft_wrap=True)
         open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height)

@@ -5,14 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidar_perception.simulation.shapes.buildings import BUILDING
+from lidar_perception.simulation.shapes.furniture import BUILDING, DEEP, OTHER
 from lidar_perception.simulation.shapes.thing import GLASS, METAL, RUBBER, block, disc, rod
 from lidar_perception.simulation.solids import CYLINDER, part, parts
 
-OTHER = 99
 DOOR = 2.1   # m: height of a door
 THICK = 0.2  # m: of walls
-DEEP = -0.3  # foot of walls, m
 
 
 def wall(rng: np.random.Generator, length: float, height: float) -> np.ndarray:

@@ -35,6 +35,7 @@ from lidar_perception.detectors.pointpillars.targets import (
     stacked,
 )
 from lidar_perception.detectors.view import visible
+from lidar_perception.geometry import within
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.detections import detected
@@ -107,8 +108,7 @@ class Preparation:
         low, high = np.array(self.config.low), np.array(self.config.high)
         names = [CLASSES[i] for i in scene.class_ids]
         labels = np.array([self._label(LIKE.get(name, name)) for name in names], np.int64)
-        within = ((scene.boxes[:, :2] >= low[:2]) & (scene.boxes[:, :2] < high[:2])).all(axis=1)
-        kept = np.flatnonzero(within & (labels != -1))
+        kept = np.flatnonzero(within(scene.boxes, low, high) & (labels != -1))
         counted = [bool(scene.wanted[i]) and names[i] not in LIKE and labels[i] != REGION
                    and len(inside(xyz, scene.boxes[i], 0.0)) >= self.min_points
                    for i in kept]
