@@ -141,7 +141,7 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
                 _prepare(network, asked, sources, held_out, cut)
                 network.gather(params, cut, asked.out)
                 if not decided:
-                    _refit(asked.out, begun, hours or BUDGET)
+                    _refit(network, asked, given, sensor, device, own, begun, hours or BUDGET)
             except KeyboardInterrupt:
                 errors.print("stopped; what is prepared is kept, --resume goes on")
                 raise
@@ -166,11 +166,7 @@ def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
         errors.print(f"resuming {asked.out}", soft_wrap=True)
         return
     errors.print("measuring this machine with a few scenes ...")
-    few = with_values(params, {"data.scans": 8, "data.val_scans": 1, "data.cache": ""})
-    sources, held_out = scenes_of(asked, few, sensor, own)
-    scenes, scan = _some_scenes((*sources, *held_out))
-    cut, step, whole, frame = network.measured(few, scenes, held_out[0], device)
-    speed = Speed(scan, cut, step, whole, frame, scenes[0].points.nbytes * 1.02e-6)
+    speed, sources, held_out = _measured(network, asked, params, sensor, device, own)
     data = Data(_simulated(sources), _simulated(held_out), _recorded(sources), _recorded(held_out),
                 params.batch * world(), network.most_cuts(params))
     given = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps,
@@ -186,19 +182,40 @@ def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
                                  "speed": asdict(speed), "data": asdict(data)}, indent=1))
 
 
-def _refit(out: Path, begun: float, hours: float) -> None:
-    """Plan fewer steps, before the first, where the preparation took longer than planned."""
-    if (out / STATE).exists():
+def _measured(network: Network, asked: Asked, params: Any, sensor: Sensor,
+              device: torch.device, own: tuple) -> tuple[Speed, Sequence[Any], Sequence[Any]]:
+    """What the machine does now, and the sources of scenes to train with and to validate on."""
+    few = with_values(params, {"data.scans": 8, "data.val_scans": 1, "data.cache": ""})
+    sources, held_out = scenes_of(asked, few, sensor, own)
+    scenes, scan = _some_scenes((*sources, *held_out))
+    cut, step, whole, frame = network.measured(few, scenes, held_out[0], device)
+    speed = Speed(scan, cut, step, whole, frame, scenes[0].points.nbytes * 1.02e-6)
+    return speed, sources, held_out
+
+
+def _refit(network: Network, asked: Asked, params: Any, sensor: Sensor, device: torch.device,
+           own: tuple, begun: float, hours: float) -> None:
+    """Plan fewer steps, before the first, where the preparation took longer than planned. How much
+    slower steps are than planned is measured, as other work slows them in another way."""
+    if (asked.out / STATE).exists():
         return
-    known = json.loads(read_text(out / RUN, 10**6))
+    known = json.loads(read_text(asked.out / RUN, 10**6))
     made, speed, data = Plan(**known["plan"]), Speed(**known["speed"]), Data(**known["data"])
+
+    def left() -> float:
+        return begun + 3600 * hours - time.monotonic()
     passed = time.monotonic() - begun
     slower = max(1.0, (passed - STARTING) / preparing(made, cores(), speed))
-    refit = refitted(made, 3600 * hours - passed, slower, speed, data)
+    if refitted(made, left(), slower, speed, data) == made:
+        return
+    now = _measured(network, asked, params, sensor, device, own)[0]
+    steps = now.step / speed.step if made.part else now.whole / speed.whole
+    refit = refitted(made, left(), max(1.0, steps), speed, data)
     if refit != made:
         errors.print(f"the preparation took {duration(passed)}, {slower:.1f} times as long as "
-                     f"planned: {refit.steps} steps instead of {made.steps}", soft_wrap=True)
-        write_text(out / RUN, json.dumps({**known, "plan": asdict(refit)}, indent=1))
+                     f"planned, and a step takes {steps:.1f} times as long: {refit.steps} steps "
+                     f"instead of {made.steps}", soft_wrap=True)
+        write_text(asked.out / RUN, json.dumps({**known, "plan": asdict(refit)}, indent=1))
 
 
 def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor, own: tuple) -> Any:
