@@ -80,6 +80,7 @@ def _everything(folder: Path) -> list[str]:
     """Run all that is tested. What failed; the measured coverage lies in folder for a while."""
     one_thread_each()  # as many processes as cores
     environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # compiled once, not in each process
     if sys.version_info >= (3, 12):
         environment["COVERAGE_CORE"] = "sysmon"  # lines are noticed once, and then cost nothing
     pytest = ("-m", "pytest", "--cov", "--cov-report=", "--cov-fail-under=0")
