@@ -116,9 +116,12 @@ def test_bag_time_runs_at_the_rate_and_stands_still_while_paused(monkeypatch):
 
 def test_looping_starts_again_and_the_clock_follows_the_bag(processes, peer, text_bag):
     heard, clock = peer.listen("/text", TEXT), peer.listen("/clock", "rosgraph_msgs/msg/Clock")
-    start(processes, text_bag, loop=True, rate=20.0, clock_hz=200.0)
+    start(processes, text_bag, loop=True, rate=10.0, clock_hz=200.0)
     peer.wait(lambda: len(heard) > 45, "two and a half rounds")
-    assert texts(heard)[18:22] == ["18", "19", "0", "1"]
+    numbers = np.array(texts(heard), int)
+    again = np.flatnonzero(np.diff(numbers) < 0)  # a busy listener may miss some, but no round
+    assert 2 <= len(again) <= 3 and (np.diff(numbers) != 0).all()
+    assert (numbers[again] > 14).all() and (numbers[again + 1] < 5).all()
     times = np.array([to_ns(c.clock) for c in clock])
     assert (times >= START).all() and (times <= START + 25 * STEP).all()
     back = np.diff(times) < 0
@@ -126,7 +129,7 @@ def test_looping_starts_again_and_the_clock_follows_the_bag(processes, peer, tex
 
 
 def test_it_waits_for_its_subscribers(processes, peer, text_bag):
-    start(processes, text_bag, wait_for=["/text:=2"], rate=20.0)
+    start(processes, text_bag, wait_for=["/text:=2"], rate=5.0)
     first = peer.listen("/text", TEXT)
     peer.wait(lambda: peer.value_of("bag_player", "subscribers of /text") == "1", "one subscriber")
     assert first == []
