@@ -5,12 +5,15 @@ Needs playwright (pip install playwright) and chromium; draws in software, as wi
 
 from __future__ import annotations
 
+import os
 import shutil
 import statistics
 import sys
+from contextlib import suppress
 from pathlib import Path
+from time import monotonic
 
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Page, sync_playwright
 
 FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
          "--disable-background-networking --disable-component-update --disable-sync").split()
@@ -28,6 +31,18 @@ PICTURES = """async ([count, thinned]) => {
   limits.thinned = 30000;
   return { took, points: drawn.points };
 }"""
+STANDING = """async (count) => {
+  const { drawn, draw } = page, took = [];
+  await new Promise((r) => setTimeout(r, 1000));
+  for (let k = 0; k < count; k++) {
+    const start = performance.now(), before = drawn.pictures;
+    draw(); // as after each step of a box that is dragged
+    while (drawn.pictures === before) await new Promise(requestAnimationFrame);
+    await new Promise(requestAnimationFrame);
+    took.push(performance.now() - start);
+  }
+  return { took, points: drawn.points };
+}"""
 PICKS = """(count) => {
   const took = [];
   for (let k = 0; k < count; k++) {
@@ -36,6 +51,28 @@ PICKS = """(count) => {
     took.push(performance.now() - start);
   }
   return { took, points: page.store.cloud.count };
+}"""
+HOVER = """async (count) => {
+  const scene = document.getElementById("scene"), area = scene.getBoundingClientRect();
+  const { cloud } = page.store, places = new Map(), took = [];
+  for (let i = 0; i < cloud.count; i++) { // one point of each cluster in view
+    if (!cloud.cluster[i] || places.has(cloud.cluster[i])) continue;
+    const at = page.project(...cloud.xyz.subarray(3 * i, 3 * i + 3));
+    if (at && at[0] > 0 && at[1] > 0 && at[0] < area.width && at[1] < area.height) {
+      places.set(cloud.cluster[i], at);
+    }
+  }
+  for (const [x, y] of [...places.values()].slice(0, count)) {
+    const start = performance.now(), before = page.drawn.pictures;
+    scene.dispatchEvent(new PointerEvent("pointermove",
+                                         { clientX: area.left + x, clientY: area.top + y }));
+    while (page.drawn.pictures === before && performance.now() < start + 1000) {
+      await new Promise(requestAnimationFrame);
+    }
+    await new Promise(requestAnimationFrame);
+    if (page.drawn.pictures !== before) took.push(performance.now() - start);
+  }
+  return { took, points: cloud.count };
 }"""
 NEXT = """async (count) => {
   const took = [];
@@ -54,45 +91,86 @@ NEXT = """async (count) => {
 }"""
 
 
-def renderers() -> dict[int, int]:
-    """Memory of each of chromium's renderers by its process, bytes (proportional set size)."""
+def processes() -> dict[int, str]:
+    """Those of all browsers: what each is for."""
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            if "--type=renderer" in (folder / "cmdline").read_text():
-                line = next(x for x in (folder / "smaps_rollup").read_text().splitlines()
-                            if x.startswith("Pss:"))
-                found[int(folder.name)] = int(line.split()[1]) * 1024
-        except (OSError, StopIteration):
-            continue
+        with suppress(OSError):
+            line = (folder / "cmdline").read_text()
+            if "chromium" in line:
+                found[int(folder.name)] = next(
+                    (kind for kind in ("renderer", "gpu-process") if f"--type={kind}" in line), "")
     return found
 
 
-def say(what: str, measured: dict) -> None:
-    took = sorted(measured["took"])
-    print(f"{what}, {measured['points']:,} points: median {statistics.median(took):.1f} ms, "
-          f"slowest of {len(took)} {took[-1]:.1f} ms")
+def cpu_ms(pid: int) -> float:
+    """That a process has used."""
+    rows = (Path("/proc") / str(pid) / "stat").read_text().rsplit(")", 1)[1].split()
+    return 1e3 * (int(rows[11]) + int(rows[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def memory(pid: int) -> int:
+    """Of a process, bytes (proportional set size)."""
+    lines = (Path("/proc") / str(pid) / "smaps_rollup").read_text().splitlines()
+    return int(next(x for x in lines if x.startswith("Pss:")).split()[1]) * 1024
+
+
+class Measured:
+    """A page, with the processes of its browser."""
+
+    def __init__(self, page: Page, others: set[int]) -> None:
+        self.page = page
+        mine = {pid: kind for pid, kind in processes().items() if pid not in others}
+        self.page_pid = max((p for p, kind in mine.items() if kind == "renderer"), key=memory)
+        self.pids = {"page": self.page_pid,
+                     "drawing": next(p for p, kind in mine.items() if kind == "gpu-process")}
+
+    def say(self, what: str, script: str, arguments: object) -> None:
+        """Run a script that gives the times of what it has done; print these, and the CPU time of
+        the page's processes for each."""
+        before = {name: cpu_ms(pid) for name, pid in self.pids.items()}
+        measured = self.page.evaluate(script, arguments)
+        took, count = sorted(measured["took"]), len(measured["took"])
+        cpu = ", ".join(f"{name} {(cpu_ms(pid) - before[name]) / count:.1f}"
+                        for name, pid in self.pids.items())
+        print(f"{what}, {measured['points']:,} points: median {statistics.median(took):.1f} ms, "
+              f"slowest of {count} {took[-1]:.1f} ms; CPU each, ms: {cpu}", flush=True)
+
+    def walk(self) -> None:
+        """Play to the last frame; print what that took, and the memory."""
+        page, most = self.page, 0
+        first, start = page.evaluate("page.store.frame"), monotonic()
+        last = page.evaluate("page.store.drive.frames.length - 1")
+        page.locator("#scene").focus()
+        page.keyboard.press(" ")
+        while page.evaluate("page.store.frame") < last:
+            page.wait_for_timeout(1000)
+            most = max(most, memory(self.page_pid))
+        each = 1e3 * (monotonic() - start) / max(last - first, 1)
+        page.wait_for_timeout(2000)
+        print(f"played {last - first} frames, {each:.0f} ms each; memory of the page at most "
+              f"{most / 1e6:.0f} MB, at the end {memory(self.page_pid) / 1e6:.0f} MB")
 
 
 def main() -> None:
-    others = set(renderers())
+    others = set(processes())
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=FLAGS)
         page = browser.new_page(viewport={"width": 1280, "height": 720})
         page.goto(sys.argv[1])
         page.wait_for_selector("html[data-ready=true]", state="attached")
-        page.wait_for_timeout(1000)
-        say("picture while moving", page.evaluate(PICTURES, [40, 30_000]))
-        say("picture with all points", page.evaluate(PICTURES, [20, 10**9]))
-        say("pick", page.evaluate(PICKS, 50))
-        say("next frame", page.evaluate(NEXT, 12))
-        for _ in range(80):
-            page.keyboard.press(".")
-            page.wait_for_timeout(60)
         page.wait_for_timeout(2000)
-        mine = [size for pid, size in renderers().items() if pid not in others]
-        print(f"memory of the page after {page.evaluate('page.store.frame') + 1} frames: "
-              f"{max(mine) / 1e6:.0f} MB")
+        measured = Measured(page, others)
+        measured.say("picture while the view moves", PICTURES, [40, 30_000])
+        measured.say("picture of all points", PICTURES, [20, 10**9])
+        measured.say("picture while the view stands still", STANDING, 40)
+        measured.say("pick", PICKS, 50)
+        page.locator("#scene").focus()
+        page.keyboard.press("s")
+        measured.say("cluster under the pointer shown", HOVER, 25)
+        page.keyboard.press("Escape")
+        measured.say("next frame", NEXT, 12)
+        measured.walk()
         browser.close()
 
 

@@ -15,17 +15,21 @@ import numpy as np
 
 from lidar_perception.adapting.drives import (
     Piece,
+    checked,
     frames_of,
     pieces_of,
     poses_of,
     require_motion,
     seconds_of,
 )
+from lidar_perception.adapting.hearing import Counts, Heard, heard_of, recognised, unheard
 from lidar_perception.adapting.judging import KEPT, STATES, Verdict, judged
 from lidar_perception.adapting.labels import ConcludedLabels, labels_of
 from lidar_perception.adapting.learning import (
     network_to_train,
     opened_with,
+    settled,
+    simulated_frames,
     simulated_score,
     training_params,
 )
@@ -51,10 +55,11 @@ from lidar_perception.training.start import start
 from lidar_perception.types import InputError
 
 BEST, LAST, JUDGED = "best.safetensors", "last.safetensors", "judged.json"
+HEARD = "heard.json"
 LOOKING = 0.3     # of the budget, to look at frames
 LEARNING = 0.5    # of it, to learn; what is left is for the poses and to judge
 MEASURED = 3      # frames that are looked at to know how long one takes
-HELD = 24         # at most so many frames of those that are held out judge a round
+MOST_HELD = 24    # at most so many frames of those that are held out judge a round
 FEWEST_KEPT = 3   # objects: of less there is nothing to learn
 
 
@@ -90,7 +95,7 @@ class Adapting:
 
     def __init__(self, data: Path, weights: Path, out: Path, hours: float, params: AdaptParams,
                  device: str = "auto", jobs: int = 0) -> None:
-        self.data, self.weights, self.out, self.params = data, weights, out, params
+        self.data, self.weights, self.out = data, weights, out
         self.hours, self.device, self.jobs = hours, device, jobs
         if not 0 < hours < np.inf:
             raise InputError(f"--budget {hours:g} must be a number of hours above 0")
@@ -98,13 +103,13 @@ class Adapting:
         height = params.mount_height or None
         self.frames = frames_of(mounted(open_recording(data, sensor_height=height)))
         self.height = self.frames[0].sensor_height
-        known = self.header.training.get("sensor")
-        known = known.get("name") if isinstance(known, dict) else None
-        self.sensor_name = params.sensor or known or "hdl64e"
-        self.sensor = sensor_named(self.sensor_name, self.height)
+        self.params = settled(params, self.header)
+        self.sensor = sensor_named(self.params.sensor, self.height)
         if recorded_source(self.frames[0].pose() is not None) == NO_SOURCE:
             raise InputError(f"{data} has no poses, and to find them by the scans needs kiss-icp; "
                              "pip install 'lidar_perception[odometry]'")
+        for line in checked(self.frames, data):
+            errors.print(line, soft_wrap=True)
         self.network = network_to_train(self.header)
         detector = opened_with(weights, self.header, device)
         self.low, self.high = (np.array(end[:2]) for end in (detector.config.low,
@@ -113,6 +118,8 @@ class Adapting:
         self.poses: list[np.ndarray] = []
         self.seen: list[Seen] = []
         self.first_seen: list[Seen] = []
+        self.recognised: Counts = {}
+        self.not_asked: list[str] = []
         self.before: Watched | None = None
         self.rounds: list[Round] = []
         self.best = weights
@@ -124,6 +131,7 @@ class Adapting:
         self._choose()
         self.poses = [self._poses(i) for i in range(len(self.pieces))]
         require_motion(self.poses, self.data)
+        self.recognised = self._recognised()
         for number in range(1, self.params.rounds + 1):
             if not self._round(number, begun):
                 break
@@ -151,8 +159,9 @@ class Adapting:
             most = self.params.frames or self._affordable()
         self.pieces = pieces_of(self.frames, most)
         count = sum(len(piece.numbers) for piece in self.pieces)
-        errors.print(f"{count} of {len(self.frames)} frames in {len(self.pieces)} pieces, "
-                     f"{self.params.rounds} rounds", soft_wrap=True)
+        errors.print(f"{count} of {len(self.frames)} frames, pieces: {len(self.pieces)}, rounds: "
+                     f"{self.params.rounds}; mixed with {self.params.scene} scans of "
+                     f"{self.params.sensor} at {self.height:g} m", soft_wrap=True)
         if not path.is_file():
             write_text(path, json.dumps({"asked": asked, "frames": most}, indent=1))
 
@@ -177,6 +186,24 @@ class Adapting:
                                        len(piece.numbers))))
         return made_once(self.out / "poses" / f"{i:03}.npz", made, lambda a: a["poses"],
                          lambda poses: {"poses": poses})
+
+    @property
+    def heard(self) -> Heard:
+        """Which sources are asked."""
+        return heard_of(self.recognised)
+
+    def _recognised(self) -> Counts:
+        path = self.out / HEARD
+        if not path.is_file():
+            frames = simulated_frames(self._training(self.out), self._params(1), self.sensor)
+            looker = Looker(opened_with(self.weights, self.header, self.device))
+            write_text(path, json.dumps(recognised(looker, track(frames, "looking at simulated "
+                                                                 "scans", len(frames)))))
+        counts: Counts = json.loads(read_text(path, 10**6))
+        self.not_asked = unheard(counts)
+        for line in self.not_asked:
+            errors.print(line, soft_wrap=True)
+        return counts
 
     def _round(self, number: int, begun: float) -> bool:
         """One round; whether its weights were taken."""
@@ -219,7 +246,7 @@ class Adapting:
         seconds = seconds_of(self.frames, piece)
         tracks = tracks_of(looks, (1e9 + seconds * 1e9).astype(np.int64).tolist())
         way = np.linalg.inv(self.poses[i][0]) @ self.poses[i]
-        verdicts = [judged(each, way[:, :2, 3]) for each in tracks]
+        verdicts = [judged(each, way[:, :2, 3], self.heard) for each in tracks]
         return Seen(piece, looks, tracks, verdicts, labels_of(tracks, verdicts, way, seconds))
 
     def _learn(self, folder: Path, begun: float) -> Path:
@@ -244,8 +271,7 @@ class Adapting:
                      hours)
 
     def _params(self, count: int) -> Any:
-        return training_params(self.header, self.params, count, self.sensor_name, self.height,
-                               self.out / "scans")
+        return training_params(self.header, self.params, count, self.height, self.out / "scans")
 
     def _watch(self, path: Path, weights: Path) -> Watched:
         """How good weights are, from the file if it is known."""
@@ -254,16 +280,17 @@ class Adapting:
         metrics = simulated_score(self.network, self._training(self.out), self._params(1),
                                   self.sensor, weights)
         held = [(seen, k) for seen in self.first_seen for k in seen.piece.held]
-        held = [held[i] for i in np.unique(np.linspace(0, len(held) - 1, HELD).astype(int))]
+        held = [held[i] for i in np.unique(np.linspace(0, len(held) - 1, MOST_HELD).astype(int))]
         frames = [self.frames[seen.piece.numbers[k]] for seen, k in held]
         f1, found, kept = agreement_of(open_detector(weights, self.device), frames,
                                        [seen.labels[k] for seen, k in held], self.low, self.high)
         looker = Looker(opened_with(weights, self.header, self.device))
-        looks = [looker(frame, np.eye(4)) for frame in track(frames, "judging", len(frames))]
+        looks = [looker(frame, np.eye(4)) for frame in track(frames, "judging all sources",
+                                                             len(frames))]
         watched = Watched(
             metrics["score"], {name: value for name, value in metrics.items()
                                if name.endswith("_bev_relaxed") and np.isfinite(value)},
-            f1, confirmed_share(looks), found, kept)
+            f1, confirmed_share(looks, self.heard), found, kept)
         write_text(path, json.dumps(watched.json(), indent=1))
         errors.print(f"{weights}: simulated AP {watched.simulated:.1f}, agreement "
                      f"{watched.agreement:.2f}, confirmed {watched.confirmed:.2f}", soft_wrap=True)
@@ -274,7 +301,7 @@ class Adapting:
         known = json.loads(read_text(path, 10**8))
         results = {"before": self.before and self.before.json(),
                    "rounds": [asdict(each) for each in self.rounds],
-                   "best": str(self.best), "objects": [
+                   "recognised": self.recognised, "best": str(self.best), "objects": [
                        {"piece": seen.piece.name, "first": seen.piece.numbers[0], "objects": [
                            {"class": CLASSES[t.class_id], "state": v.state, "reason": v.reason,
                             "score": round(t.score, 3), "frames": t.frames.tolist()}

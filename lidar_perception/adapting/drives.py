@@ -11,13 +11,16 @@ import numpy as np
 
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.labeling.interpolation import Motion
+from lidar_perception.sensor_setup.scans import elevations_of, require_metres, require_space
 from lidar_perception.tracking.ego import Odometry, recorded_source, usable
 from lidar_perception.types import InputError
 
 PIECE = 60        # frames of a piece, where not all are looked at
 HELD = 5          # one of so many frames is held out, at the end of each piece
 FEWEST = 10       # frames
+CHECKED = 5       # clouds, for what they are
 WENT = 1.0        # metres that the sensor must go
+GAP = 2.0         # seconds without a frame, after which another drive begins
 
 
 @dataclass(frozen=True)
@@ -47,19 +50,47 @@ def frames_of(recording: Recording) -> Sequence[Frame]:
     return recording.frames[:]  # of a bag, without the clouds that iterating would keep
 
 
+def checked(frames: Sequence[Frame], source: Path) -> list[str]:
+    """What to say of the clouds of some frames, spread over all. InputError where they have no
+    points, or such as of no sensor that can be adapted to."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, CHECKED).astype(int))
+    clouds = [frames[i].load() for i in chosen]
+    xyz = np.concatenate([cloud.xyz for cloud in clouds]).astype(np.float64)
+    if len(xyz) == 0:
+        raise InputError(f"{source}: its clouds have no points; record while the sensor turns")
+    require_metres(np.linalg.norm(xyz, axis=1), str(source))
+    require_space(elevations_of(xyz), str(source))
+    if any(cloud.intensity is not None and cloud.intensity.any() for cloud in clouds):
+        return []
+    return [f"{source} has no intensity, which the networks were trained with, so that they may "
+            "find little: turn it on in the driver"]
+
+
 def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
-    """All frames by drive; where there are more than `most`, pieces of PIECE spread over all."""
-    drives: dict[str, list[int]] = {}
+    """All frames by drive; where there are more than `most`, pieces of PIECE, or of `most` if that
+    is less, spread over all. A drive ends where the stamps leave a GAP, or go back. InputError
+    where none has FEWEST."""
+    drives: dict[str, list[list[int]]] = {}
     for number, frame in enumerate(frames):
-        drives.setdefault(frame.sequence, []).append(number)
-    pieces = [Piece(name, tuple(numbers)) for name, numbers in drives.items()]
-    if len(frames) <= most:
+        runs = drives.setdefault(frame.sequence, [])
+        if not runs or not 0 <= frame.stamp_ns - frames[runs[-1][-1]].stamp_ns <= GAP * 1e9:
+            runs.append([])
+        runs[-1].append(number)
+    if max(len(run) for runs in drives.values() for run in runs) < FEWEST:
+        raise InputError(f"no {FEWEST} frames follow each other within {GAP:g} s, so that nothing "
+                         "can be followed; record every scan")
+    whole, size = len(frames) <= most, max(FEWEST, min(PIECE, most))
+    pieces: list[Piece] = []
+    for name, runs in drives.items():
+        parts = [run[i:i + size] for run in runs for i in range(0, len(run), size)]
+        cut = runs if whole else parts
+        pieces += [Piece(f"{name or 'drive'} {k}" if len(cut) > 1 else name or "drive", tuple(part))
+                   for k, part in enumerate(cut, 1)]
+    if whole:
         return pieces
-    parts = [Piece(piece.name, piece.numbers[i:i + PIECE]) for piece in pieces
-             for i in range(0, len(piece.numbers), PIECE)]
-    parts = [part for part in parts if len(part.numbers) >= min(PIECE // 2, most)] or parts
-    count = min(max(1, most // PIECE), len(parts))
-    return [parts[i] for i in np.unique(np.linspace(0, len(parts) - 1, count).astype(int))]
+    long = [piece for piece in pieces if len(piece.numbers) >= size // 2] or pieces
+    count = min(max(1, most // size), len(long))
+    return [long[i] for i in np.unique(np.linspace(0, len(long) - 1, count).astype(int))]
 
 
 def seconds_of(frames: Sequence[Frame], piece: Piece) -> np.ndarray:

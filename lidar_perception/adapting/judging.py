@@ -7,11 +7,12 @@ none is fitted to labels of real ones.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from lidar_perception.adapting.hearing import AGREE, ALL, NAMES, POINTS, Heard
 from lidar_perception.adapting.tracks import Followed
 from lidar_perception.classes import CAR, CLASSES, CYCLIST, PEDESTRIAN
 
@@ -21,8 +22,6 @@ STATES = (KEPT, REJECTED, IGNORED)
 FEWEST = 4             # detections of an object that is kept
 SURE = 0.6             # its score, at least
 SHARE = 0.6            # of the frames from its first to its last
-AGREE = 0.4            # a source agrees from this probability on
-POINTS = 10            # in one of its boxes, at least
 CLOSER, TURNED = 1.5, 4.0  # metres of range, degrees: views that differ
 WEAK = 0.06            # of score and share: below, it is nothing that flickers up
 MOVED = 1.0            # metres over the ground, for what moves
@@ -48,12 +47,13 @@ def moves(track: Followed) -> bool:
     return track.way > MOVED and track.way > 2 * track.scatter
 
 
-def judged(track: Followed, way: np.ndarray) -> Verdict:
-    """What is made of an object; way (F, 2): where the sensor was in all frames of the drive."""
+def judged(track: Followed, way: np.ndarray, heard: Heard = ALL) -> Verdict:
+    """What is made of an object; way (F, 2): where the sensor was in all frames of the drive;
+    heard: which sources are asked."""
     wrong = next(_wrong(track, way), None)
     if wrong is not None:
         return Verdict(REJECTED, wrong)
-    doubt = next(_doubts(track), None)
+    doubt = next(_doubts(track, heard.get(track.class_id, ())), None)
     if doubt is not None:
         return Verdict(IGNORED, doubt)
     return Verdict(KEPT, f"{len(track)} times, score {track.score:.2f}, "
@@ -85,14 +85,16 @@ def _covering(boxes: np.ndarray, places: np.ndarray) -> np.ndarray:
             & (np.abs(cos * off[:, 1] - sin * off[:, 0]) < THROUGH * boxes[:, 4]))
 
 
-def _doubts(track: Followed) -> Iterator[str]:
+def _doubts(track: Followed, heard: Sequence[str]) -> Iterator[str]:
     """What keeps it from being sure."""
+    if not heard:
+        yield f"no source recognises a {CLASSES[track.class_id]} with this sensor"
     if len(track) < FEWEST:
         yield f"seen in {len(track)} frame{'s' * (len(track) != 1)} only"
     if track.score < SURE:
         yield f"score {track.score:.2f}"
-    against = [f"{name} {p:.2f}" for name, p in track.said.items() if p < AGREE and (
-        name != "silhouette" or track.class_id == PEDESTRIAN)]  # it is of people on foot
+    against = [f"{NAMES[name]} {p:.2f}" for name, p in track.said.items()
+               if p < AGREE and name in heard]
     if against:
         yield f"not all agree: {', '.join(against)}"
     if track.share < SHARE:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from lidar_perception.adapting.params import AdaptParams
+from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import POINTPILLARS, Header
 from lidar_perception.detectors.devices import chosen_device
 from lidar_perception.detectors.fused.detector import FusedDetector, load_fused_detector
@@ -21,8 +22,10 @@ from lidar_perception.training.pointnet.start import PointNetStart
 from lidar_perception.training.pointpillars.start import PointPillarsStart
 from lidar_perception.training.preparing import keep_all
 from lidar_perception.training.start import scenes_of
+from lidar_perception.types import InputError
 
 AT_THE_END = 10**9  # steps between validations: one, after the last
+HDL, STREET = "hdl64e", "street"  # of weights that do not say
 
 
 def network_to_train(header: Header) -> Any:
@@ -33,21 +36,36 @@ def network_to_train(header: Header) -> Any:
 
 
 def opened_with(weights: Path, header: Header, device: str) -> FusedDetector:
-    """All sources together, with these weights, of the header's kind, in the place of their own."""
+    """All sources together, with these weights, of the header's kind, in the place of their own.
+    The cluster network sees all around, and so do all with it."""
     if header.network == POINTPILLARS:
         return load_fused_detector(weights, device)
     return load_fused_detector("", device, FusedDetectorParams(
-        fused=FusedParams(classifier=str(weights))))
+        fused=FusedParams(classifier=str(weights)))).seeing("around")
 
 
-def training_params(header: Header, params: AdaptParams, frames: int, sensor: str, height: float,
+def settled(params: AdaptParams, header: Header) -> AdaptParams:
+    """The params, sensor and scene those of a header where they are not given. InputError where the
+    file of that sensor is not there."""
+    known = header.training
+    sensor, given = known.get("sensor"), known.get("params")
+    name = (sensor.get("name") if isinstance(sensor, dict) else "") or HDL
+    if not params.sensor and Path(name).suffix in (".yaml", ".yml") and not Path(name).is_file():
+        raise InputError(f"the weights are for the sensor {name}, which is not there; say where it "
+                         "is, or what sensor this is, with --sensor")
+    return replace(
+        params, sensor=params.sensor or name,
+        scene=params.scene or (given.get("scene") if isinstance(given, dict) else "") or STREET)
+
+
+def training_params(header: Header, params: AdaptParams, frames: int, height: float,
                     cache: Path) -> PointPillarsTraining | PointNetTraining:
     """The settings of a training that mixes so many real frames with simulated scans, which are
-    kept in cache."""
+    kept in cache; params are settled."""
     values: dict[str, Any] = {
         "steps": params.steps, "lr": params.lr, "batch": params.batch, "seed": params.seed,
-        "validate_steps": AT_THE_END, "scene": params.scene, "sensor": sensor,
-        "mount_height": height,
+        "validate_steps": AT_THE_END, "scene": params.scene,
+        "sensor": params.sensor, "mount_height": height,
         "data.scans": params.scans or max(SCANS[0], frames), "data.val_scans": params.val_scans,
         "data.cache": str(cache)}
     if header.network == POINTPILLARS:
@@ -56,13 +74,24 @@ def training_params(header: Header, params: AdaptParams, frames: int, sensor: st
     return with_values(PointNetTraining(), values)
 
 
+def simulated_frames(asked: Asked, params: Any, sensor: Sensor) -> list[Frame]:
+    """The simulated scans that are validated on, with their labels; they are made once."""
+    return [source.frame(i) for source in _held_out(asked, params, sensor)
+            for i in range(len(source))]
+
+
+def _held_out(asked: Asked, params: Any, sensor: Sensor) -> tuple[Any, ...]:
+    _, held_out = scenes_of(replace(asked, data=()), params, sensor)
+    keep_all(held_out, [range(len(s)) for s in held_out], asked.jobs, "simulating")
+    return held_out
+
+
 def simulated_score(network: Any, asked: Asked, params: Any, sensor: Sensor,
                     weights: Path) -> dict[str, float]:
     """The metrics of weights on the simulated scans that are validated on, see
-    training/record.metrics_of; they are made once."""
-    _, held_out = scenes_of(replace(asked, data=()), params, sensor)
+    training/record.metrics_of."""
+    held_out = _held_out(asked, params, sensor)
     cuts, numbers = network.cut(params, (), held_out, Path(params.data.cache))
-    keep_all(held_out, [range(len(s)) for s in held_out], asked.jobs, "simulating")
     keep_all(cuts, numbers, asked.jobs, network.cutting)
     stream, to_validate = network.scenes(params, (), held_out, (cuts, numbers), asked.out)
     task = network.task(params, Batches(stream, params.batch, asked.jobs), to_validate, asked.out,

@@ -15,7 +15,7 @@ from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.detectors.view import in_sensor_frame
 from lidar_perception.geometry import centre_distances, points_in_boxes, within
 from lidar_perception.ground.params import SensorPoseParams
-from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError
+from lidar_perception.types import SENSOR_HEIGHT, Detections
 
 LEAST = 0.05       # score from which on a detection is looked at
 CLUSTERS = 0.3     # score of a cluster where PointPillars proposes nothing
@@ -59,10 +59,13 @@ class Looker:
         self._detector = detector.with_min_score(LEAST)
 
     def __call__(self, frame: Frame, pose: np.ndarray) -> FrameLook:
-        """InputError naming the file that cannot be read."""
+        """Nothing is detected in a cloud without points. InputError naming the file that cannot be
+        read."""
         cloud = frame.load()
         if len(cloud) == 0:
-            raise InputError(f"{frame.name} has no point")
+            nothing = np.zeros(0, np.float32)
+            return FrameLook(replace(Detections.none(), sources=dict.fromkeys(SOURCES, nothing)),
+                             np.zeros(0, int), np.zeros(0), pose)
         mount = SensorPoseParams(height=frame.sensor_height)
         detector = self._detector.mounted_at(frame.sensor_height)
         classifier = detector.classifier.with_min_score(CLUSTERS).mounted_at(frame.sensor_height)

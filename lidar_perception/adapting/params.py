@@ -26,8 +26,9 @@ class AdaptParams(Params):
     scans: int = param(0, "Simulated scans that are mixed in, which also give objects to be pasted "
                        "into real ones. 0: as many as there are frames.", low=0, high=10**6)
     val_scans: int = param(24, "Simulated scans by which a round is judged.", low=1, high=10**5)
-    scene: str = param("street", "Where the simulated scans are taken: street, campus or indoor, "
-                       "or several in turn, such as street,campus.")
+    scene: str = param("", "Where the simulated scans are taken: street, campus or indoor, or "
+                       "several in turn, such as street,campus. Empty: where those were that the "
+                       "weights were trained on.")
     sensor: str = param("", "Sensor of the simulated scans: a sensor.yaml, or the name of a "
                         "preset. Empty: the one that the weights were trained for.")
     mount_height: float = param(0.0, "Its height above the ground. 0: as the recording says, or "

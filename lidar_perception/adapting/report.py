@@ -45,7 +45,8 @@ def pictures(seen: Sequence[Seen], frames: Sequence[Frame], low: np.ndarray,
     for piece, k in (places[i] for i in chosen):
         frame = frames[piece.piece.numbers[k]]
         png = drawn(frame.load().xyz, piece.labels[k], low, high)
-        found[frame.name] = data_url(png)
+        title = f"{piece.piece.name}, frame {piece.piece.numbers[k]}: {frame.name}"
+        found[title] = data_url(png)
     return found
 
 

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.adapting.judging import AGREE, IGNORED, KEPT
+from lidar_perception.adapting.hearing import AGREE, Heard
+from lidar_perception.adapting.judging import IGNORED, KEPT
 from lidar_perception.adapting.labels import ConcludedLabels
 from lidar_perception.adapting.looking import FrameLook
 from lidar_perception.adapting.params import AdaptParams
-from lidar_perception.classes import CLASSES, DETECTED, PEDESTRIAN
+from lidar_perception.classes import CLASSES, DETECTED
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.params import ScoreParams
@@ -61,7 +62,7 @@ def agreement_of(detector: Detector, frames: Sequence[Frame], labels: Sequence[C
     boxes there were of each; what touches a region that is ignored is not counted. 1 where there is
     nothing."""
     right = found = kept = 0
-    for frame, own in track(zip(frames, labels), "comparing", len(frames)):
+    for frame, own in track(zip(frames, labels), "judging the network alone", len(frames)):
         boxes = detector.mounted_at(frame.sensor_height)(frame.load()).detections
         counts = _compared(boxes, own, low, high)
         right, found, kept = right + counts[0], found + counts[1], kept + counts[2]
@@ -86,15 +87,15 @@ def _compared(boxes: Detections, labels: ConcludedLabels, low: np.ndarray,
     return right, found, int(kept.sum())
 
 
-def confirmed_share(looks: Sequence[FrameLook]) -> float:
+def confirmed_share(looks: Sequence[FrameLook], heard: Heard) -> float:
     """0..1: of the detections of all sources together, at the usual threshold, those that no
-    source is against; silhouettes are asked about people on foot only. 1 without detections."""
+    source that is heard is against. 1 without detections."""
     agreed = []
     for look in looks:
         found = look.detections[ScoreParams().passed(look.detections)]
         against = np.zeros(len(found), bool)
         for name, said in found.sources.items():
-            asked = (found.class_ids == PEDESTRIAN) | (name != "silhouette")
+            asked = np.isin(found.class_ids, [k for k, own in heard.items() if name in own])
             against |= asked & (said < AGREE)
         agreed.append(~against)
     together = np.concatenate(agreed) if agreed else np.zeros(0, bool)

@@ -12,7 +12,7 @@ from lidar_perception.adapting.params import RECORD, AdaptParams
 from lidar_perception.cli.data import WHAT, a_path, device_option
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.runs.machine import cores
-from lidar_perception.runs.terminal import console
+from lidar_perception.runs.terminal import console, errors
 from lidar_perception.types import InputError
 
 
@@ -65,6 +65,9 @@ def adapt(data: Path, weights: Path, out: Path, budget: float, resume: bool, for
             if run.seen:  # so that one sees why
                 write_report(run)
             raise
+        except KeyboardInterrupt:
+            errors.print(f"stopped; what is in {out} is kept, --resume goes on", soft_wrap=True)
+            raise
         write_report(run)
     tell(run)
 
@@ -100,12 +103,15 @@ def tell(run: Any) -> None:
     from lidar_perception.scoring.tables import narrow_table
     table = narrow_table("Before and after", "", "simulated AP", "agreement", "confirmed", "")
     rows = [("before", run.before, "")] + [
-        (f"round {n}", each.after, f"not taken: {each.refused}" if each.refused else "taken")
+        (f"round {n}", each.after, "not taken" if each.refused else "taken")
         for n, each in enumerate(run.rounds, 1)]
     for name, seen, taken in rows:
         table.add_row(name, f"{seen.simulated:.1f}", f"{seen.agreement:.2f}",
                       f"{seen.confirmed:.2f}", taken)
     console.print(table)
+    for n, each in enumerate(run.rounds, 1):
+        if each.refused:
+            console.print(f"round {n}: {each.refused}", soft_wrap=True)
     if run.best == run.weights:
         console.print("no round was taken: best.safetensors is the file that it began with",
                       soft_wrap=True)

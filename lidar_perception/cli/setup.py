@@ -60,8 +60,8 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
     from lidar_perception.sensor_setup.scans import scan_of
 
     clouds = open_clouds(data, topic)
-    errors.print(escape(f"{data}: {clouds.layout}, {clouds.count} clouds"), soft_wrap=True,
-                 style="dim")
+    count = f"{clouds.count} cloud{'s' * (clouds.count != 1)}"
+    errors.print(escape(f"{data}: {clouds.layout}, {count}"), soft_wrap=True, style="dim")
     numbers, found, skipped = [], [], []
     chosen = spread(clouds.count, scans)
     with progress() as bar:

@@ -29,7 +29,7 @@ from lidar_perception.data.nuscenes.boxes import (
 from lidar_perception.data.nuscenes.folder import CHANNEL, FULL_REFLECTION
 from lidar_perception.data.nuscenes.results import places
 from lidar_perception.geometry import points_in_boxes
-from lidar_perception.labeling.formats.nuscenes import OURS, RIDDEN, WRITTEN
+from lidar_perception.labeling.formats.nuscenes import OURS, RIDDEN, WRITTEN, rotation_read
 from lidar_perception.labeling.labels import NO_TRACK, FrameLabels
 from lidar_perception.runs.files import write_bytes, write_text
 
@@ -40,7 +40,6 @@ CATEGORY_OF = {name: next(c for c, n in CATEGORIES.items() if n == name) for nam
 TABLES = ("category", "attribute", "visibility", "instance", "sensor", "calibrated_sensor",
           "ego_pose", "log", "scene", "sample", "sample_data", "sample_annotation", "map")
 MAP = "maps/none.png"  # nuscenes-devkit opens nothing without one
-VISIBLE = {"token": "4", "level": "v80-100", "description": "not looked at"}
 
 
 def token(*of: object) -> str:
@@ -55,7 +54,6 @@ class NuscenesTables:
         self.folder = folder
         self.rows: dict[str, list[dict[str, Any]]] = {name: [] for name in TABLES}
         self.rows["sensor"] = [{"token": token(CHANNEL), "channel": CHANNEL, "modality": "lidar"}]
-        self.rows["visibility"] = [VISIBLE]
         self.rows["log"] = [{"token": token("log"), "logfile": "", "vehicle": "", "location": "",
                              "date_captured": ""}]
         self.rows["map"] = [{"token": token("map"), "log_tokens": [token("log")],
@@ -107,6 +105,11 @@ class NuscenesTables:
         placed = places(sample, *in_global(labels.boxes, pose))
         for k, place in enumerate(placed):
             track, name, extra = labels.track_ids[k], labels.class_names[k], labels.extra[k]
+            lidar, radar = int(inside[k]), 0
+            if rotation := rotation_read(labels, k, pose):  # as it was, and so are its points
+                place["rotation"] = rotation
+                lidar = extra.get("lidar_points", lidar)
+                radar = extra.get("points", lidar) - lidar
             instance = token(scene, "track", track) if track != NO_TRACK else token(sample, k)
             kind = WRITTEN.get(name, name)
             category = extra.get("category")
@@ -122,9 +125,9 @@ class NuscenesTables:
             row |= {"nbr_annotations": row["nbr_annotations"] + 1,
                     "last_annotation_token": token(sample, instance)}
             self._chain("sample_annotation", instance, token(sample, instance), **place,
-                        instance_token=instance, visibility_token=VISIBLE["token"],
+                        instance_token=instance, visibility_token="",
                         attribute_tokens=[token(said)] if said in ATTRIBUTES else [],
-                        num_lidar_pts=int(inside[k]), num_radar_pts=0)
+                        num_lidar_pts=lidar, num_radar_pts=radar)
 
     def _category(self, name: str) -> str:
         if name not in self.categories:

@@ -21,6 +21,9 @@ from lidar_perception.labeling.results import (
     tracks_of,
     with_sources,
 )
+from lidar_perception.robot.poses import moved_points
+from lidar_perception.robot.tree import Missing, TransformTree
+from lidar_perception.tracking.ego import moved_boxes
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_truth
 from lidar_perception.wire.track_markers import drawn_trails
@@ -45,7 +48,7 @@ class Heard:
     came: int = 0
     late: int = 0
     alone: int = 0
-    elsewhere: str = ""  # the frame its boxes are in, where that is another than the cloud's
+    elsewhere: str = ""  # why its boxes cannot be taken to the cloud's frame
     early: OrderedDict[int, tuple[Any, Any]] = field(default_factory=OrderedDict)
     delays: deque[float] = field(default_factory=lambda: deque(maxlen=50))
 
@@ -66,8 +69,10 @@ class LiveFrame:
 class Live:
     """May be called from several threads. listeners: told of every frame that is to be shown, as
     /api/events has it; lines: what is wrong with the topics, by whoever listens; values: what is
-    known of the clouds' arrival. Frames are numbered as they come; the oldest ones are dropped
-    once there are more than MOST_FRAMES, or MOST_BYTES of them."""
+    known of the clouds' arrival; tree: of the frames, for boxes in another one than their cloud's,
+    filled by whoever calls cloud() and boxes(), in the same thread. Frames are numbered as they
+    come; the oldest ones are dropped once there are more than MOST_FRAMES, or MOST_BYTES of them.
+    """
 
     def __init__(self, name: str, most_bytes: int = MOST_BYTES,
                  most_frames: int = MOST_FRAMES) -> None:
@@ -76,11 +81,13 @@ class Live:
         self.lines: list[str] = []
         self.values: Mapping[str, Any] = {}
         self.topics: dict[str, Heard] = {}
+        self.tree = TransformTree()
         self.passed = 0          # frames that came while somebody had paused
         self._frames: dict[int, LiveFrame] = {}
         self._by_stamp: dict[int, LiveFrame] = {}
         self._next = self._bytes = 0
         self._holding: set[int] = set()
+        self._unplaced: list[tuple[LiveFrame, str, MarkedObjects, Any]] = []  # until TF has come
         self._numbers: dict[tuple[str, str], int] = {}  # of each topic among those of its kind
         self._said: dict[str, Any] = {}
         self._lock = threading.RLock()
@@ -148,38 +155,51 @@ class Live:
                     heard.early.popitem(last=False)
                     heard.alone += not self._holding
                 return
-            self._add(frame, topic, objects, message)
             heard.delays.append(1e3 * (monotonic() - frame.came))
-            if frame.shown:
-                # Labels come when they like; nobody knew that the first of a topic was to come.
-                heard.late += heard.kind != LABELS and heard.came > 1
-                self._tell(self._event(frame))
+            self._add(frame, topic, objects, message)
         self.tick()
 
     def _add(self, frame: LiveFrame, topic: str, objects: MarkedObjects, message: Any) -> None:
+        """In the frame of its cloud, at its stamp; once TF has come, where that is late."""
         heard, own = self.topics[topic], frame.cloud.header.frame_id
-        heard.elsewhere = "" if objects.frame_id in ("", own) else objects.frame_id
-        if heard.elsewhere:
-            return
-        frame.objects[topic] = objects
-        if message is not None and heard.kind == TRACKS:
-            frame.trails[topic] = drawn_trails(message)
+        trails = drawn_trails(message) if message is not None and heard.kind == TRACKS else {}
+        if objects.frame_id.lstrip("/") not in ("", own.lstrip("/")):
+            try:
+                pose = self.tree.lookup(own, objects.frame_id, frame.stamp_ns)
+            except Missing as error:
+                if error.late and monotonic() - frame.came <= PATIENCE:
+                    self._unplaced.append((frame, topic, objects, message))
+                else:
+                    heard.elsewhere = str(error)
+                return
+            objects = replace(objects, boxes=moved_boxes(objects.boxes, pose))
+            trails = {number: moved_points(trail, pose) for number, trail in trails.items()}
+        heard.elsewhere = ""
+        frame.objects[topic], frame.trails[topic] = objects, trails
+        if frame.shown:
+            # Labels come when they like; nobody knew that the first of a topic was to come.
+            heard.late += heard.kind != LABELS and heard.came > 1
+            self._tell(self._event(frame))
 
     def tick(self) -> None:
         """Show the newest frame that has all its boxes, or has waited for them long enough; to be
         called again and again. Also what is known of the topics is told when it has changed."""
         with self._lock:
             now = monotonic()
+            unplaced, self._unplaced = self._unplaced, []
+            for each in unplaced:
+                if each[1] in self.topics:
+                    self._add(*each)
             wanted = {t for t, h in self.topics.items() if h.came and h.kind != LABELS
                       and not h.elsewhere}
             for frame in reversed(self._frames.values()):
                 if frame.shown:
                     break
                 if wanted <= frame.objects.keys() or now - frame.came > PATIENCE:
-                    for each in self._frames.values():
-                        if not each.shown and each.number <= frame.number:
-                            each.shown = True
-                            self._tell(self._event(each))
+                    for older in self._frames.values():
+                        if not older.shown and older.number <= frame.number:
+                            older.shown = True
+                            self._tell(self._event(older))
                     break
             if (status := self.status()) != self._said:
                 self._said = status
@@ -193,8 +213,8 @@ class Live:
         """What is wrong, in lines for a person; of each topic how many arrays came, came late or
         without a cloud, and how far behind; of the clouds what `values` says."""
         lines = [*self.lines, *(
-            f"boxes of {topic} are in the frame '{heard.elsewhere}', not in the cloud's: they are "
-            "not shown" for topic, heard in self.topics.items() if heard.elsewhere)]
+            f"boxes of {topic} are not shown: {heard.elsewhere}"
+            for topic, heard in self.topics.items() if heard.elsewhere)]
         return {"lines": lines, "clouds": {**self.values, "passed": self.passed},
                 "topics": [{"topic": topic, "kind": heard.kind, "came": heard.came,
                             "late": heard.late, "alone": heard.alone,

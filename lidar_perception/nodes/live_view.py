@@ -7,6 +7,7 @@ import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from time import monotonic
 from typing import Any
 
@@ -14,10 +15,19 @@ from lidar_perception.labeling.live import Live
 from lidar_perception.labeling.live_topics import box_topics, clouds_topic
 from lidar_perception.nodes.reception import Reception
 from lidar_perception.nodes.runtime import CLOUD, MARKERS, decoded
+from lidar_perception.nodes.transforms import (
+    NO_TF,
+    STATIC_QOS,
+    TF_MESSAGE,
+    TF_QOS,
+    add_transforms,
+    has_tf,
+)
 from lidar_perception.nodes.watch import Outside
 from lidar_perception.params import ReceptionParams
 from lidar_perception.runs.files import short
 from lidar_perception.types import InputError
+from lidar_perception.wire.topics import TF, TF_STATIC
 from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
 from msg_utils.messages import message_class
@@ -39,6 +49,12 @@ class LiveView(Outside):
         self.receptions: dict[str, Reception] = {}
         self.broken: dict[str, str] = {}  # topic -> what was wrong with its last message
         self.clouds, self.problem, self._looked = "", "", -math.inf
+        if has_tf():
+            for topic, qos in ((TF, TF_QOS), (TF_STATIC, STATIC_QOS)):
+                self.node.create_subscription(
+                    message_class(TF_MESSAGE), topic, self._taking(
+                        topic, TF_MESSAGE, partial(add_transforms, live.tree,
+                                                   static=topic == TF_STATIC)), qos, raw=True)
 
     def run(self, stop: threading.Event) -> None:
         """Listen until it is told to stop; what goes wrong in that is said on the page."""
@@ -86,16 +102,21 @@ class LiveView(Outside):
             self.live.forget(topic)
 
     def _open(self, topic: str, kind: str, take: Callable[[Any], None]) -> None:
-        def deliver(data: bytes, patient: bool) -> None:
+        taking = self._taking(topic, kind, take)
+        reception = self.receptions[topic] = Reception(
+            self.node, message_class(kind), topic, lambda data, patient: taking(data),
+            lambda: RECEIVED, "cloud" if kind == CLOUD else "array")
+        reception.open()
+
+    def _taking(self, topic: str, kind: str,
+                take: Callable[[Any], None]) -> Callable[[bytes], None]:
+        def taking(data: bytes) -> None:
             try:
                 take(decoded(data, kind))
                 self.broken.pop(topic, None)
             except Exception as error:  # of whatever anybody sends: it is said, and the next taken
                 self.broken[topic] = f"{topic}: {short(error)}"
-        reception = self.receptions[topic] = Reception(
-            self.node, message_class(kind), topic, deliver, lambda: RECEIVED,
-            "cloud" if kind == CLOUD else "array")
-        reception.open()
+        return taking
 
     def _boxes(self, topic: str, kind: str) -> Callable[[Any], None]:
         if kind == MARKERS:
@@ -115,6 +136,8 @@ class LiveView(Outside):
             lost = reception.arrivals.lost + reception.arrivals.dropped
             if topic != self.clouds and lost:
                 lines.append(f"{lost} of {reception.arrivals.sent} arrays on {topic} were lost")
+        if not has_tf() and any(heard.elsewhere for heard in self.live.topics.values()):
+            lines.append(NO_TF)
         self.live.lines = [*lines, *self.broken.values()]
 
 

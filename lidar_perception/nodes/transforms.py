@@ -32,7 +32,29 @@ from msg_utils.stamps import SECOND, to_ns
 TF_QOS = QoSProfile(depth=100)
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 ODOMETRY_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # takes any
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+NO_TF = "tf2_msgs is not installed, so nothing is known of TF; install ROS 2's tf2_msgs"
 MOVING, STILL = "moving", "still"  # frames of the odometry, whatever the message calls them
+
+
+def has_tf() -> bool:
+    """Whether TF can be listened to: the wheels of ROS lack its messages."""
+    return importlib.util.find_spec("tf2_msgs") is not None
+
+
+def add_transforms(tree: TransformTree, msg: Any, static: bool) -> None:
+    """Add those of a tf2_msgs/TFMessage to a tree. InputError at the end where one of them is no
+    transform, which is left out."""
+    wrong = None
+    for each in msg.transforms:
+        t, q = each.transform.translation, each.transform.rotation
+        try:
+            tree.set(each.header.frame_id, each.child_frame_id, to_ns(each.header.stamp),
+                     (t.x, t.y, t.z), (q.x, q.y, q.z, q.w), static)
+        except InputError as error:
+            wrong = error
+    if wrong is not None:
+        raise wrong
 
 
 class Transforms:
@@ -52,14 +74,13 @@ class Transforms:
         self.known: dict[str, Any] = {}  # for the diagnostics
         self._last: tuple[tuple[str, int], Placing] = (("", -1), Placing(""))
         self._listening = self._hearing = False
-        self._installed = importlib.util.find_spec("tf2_msgs") is not None
+        self._installed = has_tf()
         if self._installed:
             self._subscribe(TF_STATIC, STATIC_QOS, static=True)
         if self.base_frame or self.target_frame or robot.input.deskew == "tf":
             self.listen()
             if not self._installed:
-                self.lacking["TF"] = ("tf2_msgs is not installed, so nothing is known of TF; "
-                                      "install ROS 2's tf2_msgs")
+                self.lacking["TF"] = NO_TF
         if robot.input.deskew == "odometry":
             self.hear_odometry()
 
@@ -84,22 +105,15 @@ class Transforms:
             self.node.input("odometry", ODOMETRY, self.on_odometry, ODOMETRY_QOS)
 
     def _subscribe(self, topic: str, qos: QoSProfile, static: bool) -> None:
-        self.node.input(topic, "tf2_msgs/msg/TFMessage", lambda m: self.on_tf(m, static), qos,
+        self.node.input(topic, TF_MESSAGE, lambda m: self.on_tf(m, static), qos,
                         private=False)
 
     def on_tf(self, msg: Any, static: bool) -> None:
         """A tf2_msgs/TFMessage; what is no transform in it is left out and named."""
-        wrong = None
-        for each in msg.transforms:
-            t, q = each.transform.translation, each.transform.rotation
-            try:
-                self.tree.set(each.header.frame_id, each.child_frame_id, to_ns(each.header.stamp),
-                              (t.x, t.y, t.z), (q.x, q.y, q.z, q.w), static)
-            except InputError as error:
-                wrong = error
-        self._changed()
-        if wrong is not None:
-            raise wrong
+        try:
+            add_transforms(self.tree, msg, static)
+        finally:
+            self._changed()
 
     def on_odometry(self, msg: Any) -> None:
         """A nav_msgs/Odometry: where its child frame is at its stamp."""

@@ -16,12 +16,11 @@ from lidar_perception.sensor_setup.beams import Beams, azimuth_steps, beams_of, 
 from lidar_perception.sensor_setup.coverage import Coverage, coverage_of
 from lidar_perception.sensor_setup.motion import heading_of, shift_between
 from lidar_perception.sensor_setup.mount import Mount, mount_of
-from lidar_perception.sensor_setup.scans import Intensity, Scan, intensity_of
+from lidar_perception.sensor_setup.scans import Intensity, Scan, intensity_of, require_space
 from lidar_perception.sensor_setup.timing import Timing, timing_of
 from lidar_perception.simulation.sensor import NAMES, Sensor, sensor_named
 from lidar_perception.types import InputError
 
-FLAT = 1.0          # degrees: a sensor whose returns are within this sees in one plane
 SAME_MODEL = 0.15   # degrees between beams, the median, of sensors of one model
 FEW_SCANS = 5       # fewer say little of what is the robot's and what is the place's
 SMALL_ROOM = 30.0   # metres: where nothing is farther, the room ends the range and not the sensor
@@ -84,10 +83,7 @@ def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: 
     if len({scan.columns for scan in scans}) > 1:
         raise InputError(f"{source} has clouds of several layouts ({', '.join(scans[0].columns)} "
                          "and others), as of several sensors; give those of one")
-    up = np.concatenate([scan.elevation for scan in scans])
-    if np.subtract(*np.percentile(up, [99, 1])) < FLAT:
-        raise InputError(f"{source}: all points lie in one plane, as those of a 2D scanner; give "
-                         "clouds of a 3D LiDAR")
+    require_space(np.concatenate([scan.elevation for scan in scans]), source)
     beams = beams_of(scans)
     step, twice, noise, pieces = np.nan, 0.0, np.nan, 0
     if beams is not None:

@@ -17,6 +17,7 @@ from msg_utils.point_cloud2 import to_array
 RINGS = ("ring", "channel", "line", "laser_id", "laser_number", "row")
 SCALES = (1.0, 100.0, 255.0, 65535.0)  # what drivers mean by a full reflection
 FAR = 250.0         # metres; a cloud whose middle range is farther is in millimetres
+FLAT = 1.0          # degrees: a sensor whose returns are within this sees in one plane
 MIN_POINTS = 100    # usable ones, of a cloud that says anything
 RETROREFLECTOR = 0.9  # of the full intensity, from which on returns count as a retroreflector's
 
@@ -55,10 +56,7 @@ def scan_of(msg: Any, name: str = "the cloud") -> Scan:
                          "record while it turns, in a place with walls or ground in sight")
     xyz = frame.xyz.astype(np.float64)
     ranges = np.linalg.norm(xyz, axis=1)
-    middle = float(np.median(ranges))
-    if middle > FAR:
-        raise InputError(f"{name}: half of its points are farther than {middle:.0f} m, so its "
-                         "coordinates seem to be millimetres; divide x y z by 1000 in the driver")
+    require_metres(ranges, name)
     points = to_array(msg)
     columns = points.dtype.names or ()
     seconds, problem = None, ""
@@ -69,10 +67,30 @@ def scan_of(msg: Any, name: str = "the cloud") -> Scan:
             problem = str(error)
     ground_range = np.hypot(xyz[:, 0], xyz[:, 1])
     return Scan(xyz, np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) % 360.0,
-                np.degrees(np.arctan2(xyz[:, 2], ground_range)), ranges, ground_range,
+                elevations_of(xyz), ranges, ground_range,
                 _column(points, indices, INTENSITY_FIELDS, float),
                 _column(points, indices, RINGS, np.int64), seconds, frame.stamp_ns, frame.frame_id,
                 columns, problem)
+
+
+def elevations_of(xyz: np.ndarray) -> np.ndarray:
+    """(N,) degrees above the sensor's own horizon of points (N, 3)."""
+    return np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
+
+
+def require_metres(ranges: np.ndarray, name: str) -> None:
+    """InputError where the ranges (N,) of a cloud's points, N > 0, cannot be metres."""
+    middle = float(np.median(ranges))
+    if middle > FAR:
+        raise InputError(f"{name}: half of its points are farther than {middle:.0f} m, so its "
+                         "coordinates seem to be millimetres; divide x y z by 1000 in the driver")
+
+
+def require_space(elevations: np.ndarray, name: str) -> None:
+    """InputError where points with these elevations (N,), N > 0, degrees, are all in one plane."""
+    if np.subtract(*np.percentile(elevations, [99, 1])) < FLAT:
+        raise InputError(f"{name}: all points lie in one plane, as those of a 2D scanner; give "
+                         "clouds of a 3D LiDAR")
 
 
 def _column(points: np.ndarray, indices: np.ndarray, names: Sequence[str],

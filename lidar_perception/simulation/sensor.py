@@ -17,6 +17,8 @@ from lidar_perception.types import SENSOR_HEIGHT, InputError
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where it was built
 MAX_BYTES = 1 << 20  # of a file that describes a sensor
 GOLDEN = 0.6180339887498949
+MAX_RATE = 1000.0  # turns a second
+MAX_NOISE = 1.0    # metres
 MAX_RAYS = 5_000_000  # in a turn; the densest sensors have 0.5 million. Each takes some 100 bytes
 
 
@@ -67,12 +69,13 @@ class Sensor:
                 (not 0 < self.height < np.inf, "height must be positive"),
                 (not 0 <= self.min_range < self.max_range < np.inf,
                  "max_range must exceed min_range, which must not be negative"),
-                (not 0 < self.rate < np.inf, "rate must be positive"),
+                (not 0 < self.rate <= MAX_RATE, f"rate must be above 0, at most {MAX_RATE:g}"),
                 (not 0 < self.reach <= np.inf, "reach must be positive"),
                 (not all(0 <= x <= 1 for x in (self.dropout, self.silent, self.floor)),
                  "dropout, silent and floor must be in 0 .. 1"),
                 (not all(0 <= x < np.inf for x in (self.range_noise, self.divergence, self.pulse)),
                  "range_noise, divergence and pulse must not be negative"),
+                (self.range_noise > MAX_NOISE, f"range_noise must be up to {MAX_NOISE:g} m"),
                 (len(up) and not (0 <= self.wander < np.pi / 2 + up.min()),
                  "wander must not be negative, nor take beams beyond straight down")):
             if wrong:

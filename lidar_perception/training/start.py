@@ -275,8 +275,10 @@ def _say(network: Network, params: Any, sensor: Sensor, chosen: Plan, speed: Spe
         (data.recorded, f"{data.recorded} recorded scenes")) if count)
     part = network.part(params) if chosen.part else {}
     where = f" up to {part['ahead']:g} m ahead and {part['aside']:g} m aside" if part else ""
+    often = (f"every {chosen.validate_steps} steps" if chosen.validate_steps < chosen.steps
+             else "at the end")
     errors.print(f"{network.name}: {scenes}, {chosen.steps} steps of {data.batch} scenes{where}, "
-                 f"validated every {chosen.validate_steps} steps on "
+                 f"validated {often} on "
                  f"{chosen.val_scans + data.val_recorded} other scenes", soft_wrap=True)
     steps, validating = training(chosen, speed, data)
     only_cut = replace(chosen, scans=0, val_scans=0)

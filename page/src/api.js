@@ -125,9 +125,11 @@ function hear(event) {
   if (event.seq <= store.seq) return; // the state that was loaded has it already
   if (event.seq === store.seq + 1) applyEvent(event);
   else loadState().catch((error) => sayError(error.message)); // something was missed
-  if (event.by !== PAGE && event.action) {
+  if (event.by && event.by !== PAGE && event.action) {
     say(`Another page: ${event.action.do.replace("_", " ")}`
       + (event.action.track ? ` of track ${event.action.track}` : ""));
+  } else if (["propose", "import"].includes(event.action?.do) && event.tracks?.length) {
+    say(`${event.tracks.length} tracks ${event.action.do === "import" ? "imported" : "proposed or followed"}.`);
   }
   const woken = waiting;
   waiting = [];

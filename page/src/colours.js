@@ -10,7 +10,7 @@ const RAMPS = {
 const MUTED = { dark: "#4a5568", light: "#b3bccb" };
 const GROUND = { dark: "#333e52", light: "#cdd5e0" };
 const THING = { dark: "#d7dee9", light: "#2d3a4f" };
-const SEEN = { dark: "#ffffff", light: "#000000" };
+export const SEEN = { dark: "#ffffff", light: "#000000" };
 const ROAD = { dark: "#5b6f93", light: "#7d8fb0" };
 const BRIGHT = 150; // of 255: brighter colours are darkened on a light page
 const SPAN = 4; // metres above the ground over which height is coloured
@@ -52,11 +52,11 @@ export function colourOfClass(name) {
   return `#${parts.map((c) => Math.round(c * BRIGHT / bright).toString(16).padStart(2, "0")).join("")}`;
 }
 
-/** Fill colours, four bytes a point, for a cloud; the cluster `marked`, if any, stands out. */
-export function paint(bytes, cloud, how, marked = 0) {
+/** Fill colours, four bytes a point, for a cloud. */
+export function paint(bytes, cloud, how) {
   const colours = new Uint32Array(bytes.buffer), which = theme();
   const { count, xyz, intensity, ground, cluster, floor } = cloud, table = TABLES[which];
-  const [muted, flat, thing, seen] = [MUTED, GROUND, THING, SEEN].map((c) => packed(rgb(c[which])));
+  const [muted, flat, thing] = [MUTED, GROUND, THING].map((c) => packed(rgb(c[which])));
   if (how === "height") {
     for (let i = 0; i < count; i++) {
       const share = Math.min(1, Math.max(0, (xyz[3 * i + 2] - floor) / SPAN));
@@ -78,7 +78,6 @@ export function paint(bytes, cloud, how, marked = 0) {
     for (let i = 0; i < count; i++) colours[i] = ground[i] ? flat : muted;
     paintClasses(colours, cloud);
   }
-  if (marked) for (let i = 0; i < count; i++) if (cluster[i] === marked) colours[i] = seen;
 }
 
 function paintClasses(colours, { xyz, count }) {

@@ -3,7 +3,7 @@
 
 import { act, nextUncertain } from "./api.js";
 import { moveAlong, turnBy } from "./boxmath.js";
-import { goTo } from "./cloud.js";
+import { cloudOf, goTo } from "./cloud.js";
 import { say, sayError } from "./messages.js";
 import { boxOf, changed, classOf, select, selectedBox, selectedTrack, store } from "./store.js";
 
@@ -75,6 +75,8 @@ export async function next() {
     if (!store.tracks.get(track)?.byFrame.has(store.frame)) await goTo(frame);
     select(track);
     changed("focus");
+    const then = await nextUncertain(track, store.only); // while this one is looked at
+    if (then.track !== null) cloudOf(then.frame).catch(() => null); // said when it is shown
   } catch (error) {
     sayError(error.message);
   }

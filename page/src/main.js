@@ -3,13 +3,14 @@
 import { getJson, listen, loadState } from "./api.js";
 import "./boxes3d.js";
 import { show } from "./cloud.js";
+import { leftIn } from "./edits.js";
 import { openInspector } from "./inspector.js";
 import { listKeys, openKeys } from "./keys.js";
 import { openLive, takeDrive } from "./live.js";
 import { sayError } from "./messages.js";
 import { loadResults } from "./results.js";
 import { openResults } from "./resultpanel.js";
-import { drawn, focus, fly, limits, lookAt, openScene } from "./scene.js";
+import { draw, drawn, focus, fly, limits, lookAt, openScene } from "./scene.js";
 import { openSideViews } from "./sideviews.js";
 import { changed, on, select, store } from "./store.js";
 import { openTimeline } from "./timeline.js";
@@ -35,6 +36,7 @@ async function open() {
     listKeys();
     changed("drive", "tool", "colour", "playing");
     await loadState();
+    if (store.mode === "label" && store.tracks.size && leftIn(null) === 0) store.filter = "all";
   } catch (error) {
     sayError(`The drive cannot be opened: ${error.message}`);
     return;
@@ -54,5 +56,5 @@ async function open() {
 }
 
 // For measurements and for pictures from a script; nothing on the page uses it.
-globalThis.page = { store, drawn, pointAt, project, fly, limits, lookAt };
+globalThis.page = { store, draw, drawn, pointAt, project, fly, limits, lookAt };
 open();

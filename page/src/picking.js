@@ -28,27 +28,28 @@ export function project(x, y, z) {
 }
 
 /** Index of the point of the cloud that is seen under the pointer, or -1. All points are put
- * through the camera's matrix, which costs less than a tree of a cloud that is new each frame; of
- * those within reach the nearest to the eye wins, unless one little behind is nearer to the
- * pointer. */
+ * through the camera's matrix, which costs less than a tree of a cloud that is new each frame, and
+ * are not divided by their depth; of those within reach the nearest to the eye wins, unless one
+ * little behind is nearer to the pointer. */
 export function pointAt(clientX, clientY) {
   const { cloud } = store;
   if (!cloud) return -1;
   const area = renderer.domElement.getBoundingClientRect();
-  const px = (clientX - area.left) / area.width * 2 - 1, py = 1 - (clientY - area.top) / area.height * 2;
   const m = matrix.multiplyMatrices(camera.projectionMatrix, camera.matrixWorldInverse).elements;
-  const { xyz, count } = cloud, halfWidth = area.width / 2, halfHeight = area.height / 2;
+  const [a, b, c, d] = [m[3], m[7], m[11], m[15]]; // gives the depth
+  const aside = (row, at, half) => [0, 1, 2, 3].map((k) =>
+    (m[row + 4 * k] - at * m[3 + 4 * k]) * half / REACH); // gives depth x reaches from the pointer
+  const [ax, bx, cx, dx] = aside(0, (clientX - area.left) / area.width * 2 - 1, area.width / 2);
+  const [ay, by, cy, dy] = aside(1, 1 - (clientY - area.top) / area.height * 2, area.height / 2);
+  const { xyz, count, ground } = cloud, { near } = camera;
   let best = -1, least = Infinity;
   for (let i = 0, k = 0; i < count; i++, k += 3) {
-    const x = xyz[k], y = xyz[k + 1], z = xyz[k + 2];
-    const w = m[3] * x + m[7] * y + m[11] * z + m[15];
-    if (w < camera.near) continue;
-    const dx = ((m[0] * x + m[4] * y + m[8] * z + m[12]) / w - px) * halfWidth;
-    if (dx > REACH || dx < -REACH) continue;
-    const dy = ((m[1] * x + m[5] * y + m[9] * z + m[13]) / w - py) * halfHeight;
-    const off = dx * dx + dy * dy;
-    if (off > REACH * REACH) continue;
-    const cost = w * (1 + off / (REACH * REACH)) * (cloud.ground[i] ? 1.15 : 1);
+    const x = xyz[k], y = xyz[k + 1], z = xyz[k + 2], depth = a * x + b * y + c * z + d;
+    const right = ax * x + bx * y + cx * z + dx;
+    if (right > depth || right < -depth) continue;
+    const up = ay * x + by * y + cy * z + dy, off = right * right + up * up;
+    if (off > depth * depth || depth < near) continue;
+    const cost = (depth + off / depth) * (ground[i] ? 1.15 : 1);
     if (cost < least) { least = cost; best = i; }
   }
   return best;

@@ -2,7 +2,8 @@
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
-import { paint, theme } from "./colours.js";
+import { theme } from "./colours.js";
+import { markPoints, openPoints, pointCount, render, setPointSize, setPoints, thinTo } from "./points.js";
 import { on, selectedBox, store } from "./store.js";
 
 // Points drawn while the camera moves; their order is random.
@@ -11,8 +12,8 @@ const REST_MS = 160;
 const BACKGROUND = { dark: 0x11151c, light: 0xf5f7fa };
 const RINGS = [10, 20, 40, 60, 80];
 
-const canvas = document.getElementById("scene");
-export const renderer = new THREE.WebGLRenderer({ canvas, antialias: !drawsInSoftware() });
+const canvas = document.getElementById("scene"), software = drawsInSoftware();
+export const renderer = new THREE.WebGLRenderer({ canvas, antialias: !software });
 export const scene = new THREE.Scene();
 export const camera = new THREE.PerspectiveCamera(50, 1, 0.3, 600);
 camera.up.set(0, 0, 1);
@@ -23,16 +24,7 @@ controls.maxPolarAngle = Math.PI * 0.495;
 controls.minDistance = 1;
 controls.maxDistance = 250;
 
-const material = new THREE.ShaderMaterial({
-  uniforms: { size: { value: 2 } },
-  vertexShader: `attribute vec4 colour; uniform float size; varying vec3 shade;
-    void main() { shade = colour.rgb; gl_Position = projectionMatrix * modelViewMatrix
-      * vec4(position, 1.0); gl_PointSize = size * clamp(28.0 / gl_Position.w, 1.0, 2.5); }`,
-  fragmentShader: "varying vec3 shade; void main() { gl_FragColor = vec4(shade, 1.0); }",
-});
-const points = new THREE.Points(new THREE.BufferGeometry(), material);
-points.frustumCulled = false;
-scene.add(points);
+openPoints(scene);
 const rings = new THREE.LineSegments(new THREE.BufferGeometry(),
                                      new THREE.LineBasicMaterial({ transparent: true }));
 rings.frustumCulled = false;
@@ -51,7 +43,7 @@ function drawsInSoftware() {
 export const afterDrawing = [];
 export const drawn = { ms: 0, pictures: 0, points: 0 }; // the last picture, for measuring
 
-let asked = false, resting = 0, still = true, shownCloud = null, marked = 0;
+let asked = false, resting = 0, still = true;
 
 export function draw() {
   if (asked) return;
@@ -59,11 +51,11 @@ export function draw() {
   requestAnimationFrame(() => {
     asked = false;
     const start = performance.now();
-    renderer.render(scene, camera);
+    render(renderer, scene, camera, software && still && !store.playing);
     for (const then of afterDrawing) then();
     drawn.ms = performance.now() - start;
     drawn.pictures += 1;
-    drawn.points = Math.min(points.geometry.drawRange.count, store.cloud?.count ?? 0);
+    drawn.points = pointCount();
   });
 }
 
@@ -78,40 +70,26 @@ controls.addEventListener("change", moving);
 function thin(yes) {
   still = !yes;
   const all = store.cloud?.count ?? 0;
-  points.geometry.setDrawRange(0, yes || store.playing ? Math.min(limits.thinned, all) : all);
+  thinTo(yes || store.playing ? Math.min(limits.thinned, all) : all);
   draw();
 }
 
 function setCloud() {
-  const { cloud } = store;
-  if (!cloud) return;
-  if (cloud !== shownCloud) {
-    shownCloud = cloud;
-    marked = 0;
-    points.geometry.dispose();
-    points.geometry = new THREE.BufferGeometry();
-    points.geometry.setAttribute("position", new THREE.BufferAttribute(cloud.xyz, 3));
-    points.geometry.setAttribute("colour", new THREE.BufferAttribute(
-      new Uint8Array(4 * cloud.count), 4, true));
-  }
-  repaint();
-  setRings(cloud.floor);
+  if (!store.cloud) return;
+  setPoints();
+  setRings(store.cloud.floor);
   moving(); // a thinned picture at once, then all
 }
 
 function repaint() {
-  const colour = points.geometry.getAttribute("colour");
-  if (!colour || !store.cloud) return;
-  paint(colour.array, store.cloud, store.colour, marked);
-  colour.needsUpdate = true;
+  if (!store.cloud) return;
+  setPoints();
   draw();
 }
 
 /** Show one cluster of the cloud apart from the others; 0 for none. */
 export function mark(cluster) {
-  if (cluster === marked) return;
-  marked = cluster;
-  repaint();
+  if (store.cloud && markPoints(cluster)) draw();
 }
 
 function setRings(floor) {
@@ -143,7 +121,7 @@ function resize() {
   const ratio = Math.min(devicePixelRatio, 2);
   renderer.setPixelRatio(ratio);
   renderer.setSize(width, height, false);
-  material.uniforms.size.value = 1.6 * ratio;
+  setPointSize(1.6 * ratio);
   camera.aspect = width / height;
   camera.updateProjectionMatrix();
   draw();

@@ -105,15 +105,18 @@ function grab(view, event) {
   });
 }
 
-function inside(point, box) {
+/** Whether each of the points near is in a box. */
+function within(box) {
   const c = Math.cos(box[6] - anchor[6]), s = Math.sin(box[6] - anchor[6]);
-  const centre = toLocal(anchor, box[0], box[1], box[2]);
-  const u = point[0] - centre[0], v = point[1] - centre[1];
-  return Math.abs(c * u + s * v) <= box[3] / 2 && Math.abs(-s * u + c * v) <= box[4] / 2
-    && Math.abs(point[2] - centre[2]) <= box[5] / 2;
+  const centre = toLocal(anchor, box[0], box[1], box[2]), [l, w, h] = box.slice(3, 6).map((v) => v / 2);
+  return near.map((point) => {
+    const u = point[0] - centre[0], v = point[1] - centre[1];
+    return Math.abs(c * u + s * v) <= l && Math.abs(-s * u + c * v) <= w
+      && Math.abs(point[2] - centre[2]) <= h;
+  });
 }
 
-function drawView(view, box) {
+function drawView(view, box, isIn) {
   const { clientWidth: width, clientHeight: height } = view.panel;
   const ratio = Math.min(devicePixelRatio, 2), { canvas } = view;
   if (canvas.width !== width * ratio || canvas.height !== height * ratio) {
@@ -126,18 +129,19 @@ function drawView(view, box) {
   view.size.textContent = box ? sizes(view, box) : "";
   if (!box) return;
   const scale = scaleOf(view, width, height), depth = 3 - view.right - view.up;
-  const [outside, within, ground] = POINTS[theme()], dot = (near.length > 3000 ? 1.2 : 1.8) * ratio;
-  const lists = [[], [], []];
-  for (const point of near) {
-    const isIn = inside(point, box);
-    if (depth !== 2 && Math.abs(point[depth]) > anchor[3 + depth] / 2 + 0.3 && !isIn) continue;
-    lists[isIn ? 2 : point[3] ? 0 : 1].push(point);
+  const colours = POINTS[theme()], dot = (near.length > 3000 ? 1.2 : 1.8) * ratio;
+  const places = [[], [], []]; // of points outside, inside, on the ground: x, y in turn
+  for (const [k, point] of near.entries()) {
+    const x = (width / 2 + point[view.right] * scale * view.flip) * ratio - dot / 2;
+    const y = (height / 2 - point[view.up] * scale) * ratio - dot / 2;
+    if (x < -dot || y < -dot || x > canvas.width || y > canvas.height) continue;
+    if (depth !== 2 && Math.abs(point[depth]) > anchor[3 + depth] / 2 + 0.3 && !isIn[k]) continue;
+    places[isIn[k] ? 1 : point[3] ? 2 : 0].push(x, y);
   }
-  for (const [k, colour] of [ground, outside, within].entries()) {
-    pen.fillStyle = colour;
-    for (const point of lists[k]) {
-      pen.fillRect((width / 2 + point[view.right] * scale * view.flip) * ratio - dot / 2,
-                   (height / 2 - point[view.up] * scale) * ratio - dot / 2, dot, dot);
+  for (const kind of [2, 0, 1]) {
+    pen.fillStyle = colours[kind];
+    for (let k = 0; k < places[kind].length; k += 2) {
+      pen.fillRect(places[kind][k], places[kind][k + 1], dot, dot);
     }
   }
   placeHandles(view, box, width, height, scale);
@@ -181,9 +185,10 @@ function redraw() {
       anchor = box.slice();
       gather();
     }
+    const shown = anchor ? box : null, isIn = shown ? within(shown) : [];
     for (const view of VIEWS) {
       view.panel.classList.toggle("empty", !box);
-      drawView(view, anchor ? box : null);
+      drawView(view, shown, isIn);
     }
   });
 }

@@ -43,7 +43,7 @@ function row(track) {
   element("i", { class: "dot", style: `background:${colourOfClass(track.class)}` }),
   element("span", { class: "who" }, element("b", {}, `${track.id}`), ` ${track.class}`),
   element("span", { class: "what" }, `${track.byFrame.size} frame${track.byFrame.size === 1 ? "" : "s"}`,
-          ` · ${percent} % ${track.source}`),
+          track.source === "imported" ? " · imported" : ` · ${percent} % ${track.source}`),
   ...(store.mode === "label" ? [
     verdict(track, "accept", "check", "accepted"), verdict(track, "reject", "reject", "rejected"),
   ] : []));

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from cli_samples import error_line, exit_of
 from format_samples import CALIBRATION, drive, labels_of, pose, same
+from nuscenes_folder import made_tables, save
 from samples import DATA, needs_data
 
 from lidar_perception.data.bag import BagWriter
@@ -15,6 +17,7 @@ from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labeling.datasets import write_dataset
+from lidar_perception.labeling.exchange import export_labels
 from lidar_perception.labeling.formats import bag as bag_format
 from lidar_perception.labeling.labels import DriveLabels, of_truth
 from lidar_perception.simulation.sensor import generic
@@ -113,6 +116,30 @@ def frames_at(seconds, **more):
     return [Frame.of(str(i), LidarFrame.of(np.full((3, 3), 5.0 + i), None,
                                            1_700_000_000_000_000_000 + round(s * 1e9), "top"),
                      **more) for i, s in enumerate(seconds)]
+
+
+@pytest.mark.parametrize("kind", ["tables", "results"])
+def test_labels_of_a_vehicle_that_leans_come_back_from_nuscenes_as_they_were(kind, tmp_path):
+    """Its boxes are upright in the global frame, ours in the vehicle's; what was not moved is
+    written as it was read."""
+    tables = made_tables(frames=2, objects=8, scenes=("scene-0001",))
+    recording = open_recording(save(tmp_path / "there", tables))
+    if kind == "tables":
+        write_dataset("nuscenes", recording, tmp_path / "back")
+        written = json.loads(next(tmp_path.glob("back/*/sample_annotation.json")).read_text())
+    else:
+        labels = DriveLabels([of_truth(f.name, f.stamp_ns, f.truth()) for f in recording])
+        export_labels(labels, "nuscenes_detection", tmp_path / "r.json", recording.frames)
+        results = json.loads((tmp_path / "r.json").read_text())["results"]
+        written = [row for rows in results.values() for row in rows]
+    counts = ("num_lidar_pts", "num_radar_pts")
+    there = {tuple(np.round(row["translation"], 3)): row for row in tables["sample_annotation"]}
+    assert len(written) == len(there) > 8
+    for row in written:
+        like = there[tuple(np.round(row["translation"], 3))]
+        np.testing.assert_allclose(row["rotation"], like["rotation"], atol=1e-9)
+        np.testing.assert_allclose(row["size"], like["size"], atol=1e-6)
+        assert kind == "results" or [row[key] for key in counts] == [like[key] for key in counts]
 
 
 def test_without_a_camera_one_is_assumed_and_numbers_follow_the_time(tmp_path):

@@ -10,9 +10,12 @@ from hypothesis import strategies as st
 from lidar_perception.labeling import live as rooms
 from lidar_perception.labeling.live import BOXES, LABELS, TRACKS, Live
 from lidar_perception.labeling.live_topics import box_topics, clouds_topic
-from lidar_perception.types import InputError
+from lidar_perception.robot.poses import moved_points, pose_of
+from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import bag_message
-from msg_utils.markers import MarkedObjects
+from lidar_perception.wire.track_markers import track_markers
+from msg_utils.markers import MarkedObjects, from_marker_array
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import header_message
 
@@ -126,16 +129,52 @@ def test_labels_that_come_before_their_cloud_do_so_when_a_bag_begins_again_too(l
     assert live.status()["topics"][1]["alone"] == 0
 
 
-def test_boxes_in_another_frame_are_said_and_broken_ones_left_out(live):
+def test_boxes_that_tf_does_not_connect_are_said_and_broken_ones_left_out(live):
     live.cloud(cloud(1))
     live.boxes(FOUND, boxes(1, "base_link"), None)
-    assert any("base_link" in line for line in live.status()["lines"])
+    line, = live.status()["lines"]
+    assert FOUND in line and "TF does not connect 'base_link' with 'velodyne'" in line
     assert live.layers(0, 0.0)["detections"] == {}
     wrong = boxes(1, ids=(1, 2, 3, 4))
     wrong.boxes[0, 0], wrong.boxes[1, 4], wrong.scores[2] = np.nan, 0.0, np.inf
     live.boxes(FOUND, wrong, None)
     assert len(live.layers(0, 0.0)["detections"]["fused_detector"]) == 1
-    assert not any("base_link" in line for line in live.status()["lines"])
+    assert live.status()["lines"] == []
+
+
+def test_boxes_in_another_frame_are_those_of_the_clouds_once_tf_has_come(live, monkeypatch):
+    """What is fixed and what moves between them; with trails; each at its own stamp."""
+    live.hear(TRACKED, TRACKS)
+    second = 10**9
+    mounted, turned = [1.0, 0.5, 1.7], [0.0, 0.0, np.sin(0.2), np.cos(0.2)]  # by 0.4 rad
+    trail = np.array([[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
+    live.tree.set("base", "velodyne", 0, mounted, turned, static=True)
+    live.tree.set("odom", "base", 10 * second, [0, 0, 0], [0, 0, 0, 1])
+    live.boxes(FOUND, boxes(10 * second), None)
+    for i, stamp in enumerate((10 * second, 10 * second + second // 2)):
+        live.cloud(cloud(stamp))
+        pose = pose_of(np.array([4.0 * i / 2, 0, 0]), [0, 0, 0, 1]) @ pose_of(mounted, turned)
+        found = Detections.of(moved_boxes(boxes(stamp).boxes, pose), [0], [0.5])
+        tracks = track_markers(np.array([3]), found, np.zeros((1, 2)), np.zeros(1),
+                               [moved_points(trail, pose)],
+                               header_message(stamp, "odom", bag_message), bag_message)
+        live.boxes(TRACKED, from_marker_array(tracks), tracks)
+        if i:
+            live.boxes(FOUND, boxes(stamp), None)
+    assert frames_told(live)[-1] == 0 and live.status()["lines"] == []  # the other waits for TF
+    live.tree.set("odom", "base", 11 * second, [4, 0, 0], [0, 0, 0, 1])
+    live.tick()
+    assert frames_told(live)[-1] == 1
+    track, = live.tracks()
+    for row, frame in zip(track["boxes"], (0, 1), strict=True):
+        np.testing.assert_allclose(row[1:8], boxes(0).boxes[0], atol=1e-6)
+        np.testing.assert_allclose(track["trails"][frame], trail, atol=1e-3)
+    monkeypatch.setattr(rooms, "PATIENCE", 0.0)
+    live.cloud(cloud(11 * second + second // 2))
+    live.boxes(TRACKED, boxes(11 * second + second // 2, "odom"), None)
+    assert any("the newest transform" in line for line in live.status()["lines"])
+    live.boxes(FOUND, boxes(11 * second + second // 2), None)
+    assert frames_told(live)[-1] == 2  # shown without
 
 
 def test_tracks_of_two_trackers_keep_apart_and_labels_say_what_is_missed(live):

@@ -13,9 +13,15 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from test_robot_frames import mounted, transforms
+
 from lidar_perception.nodes.graph import SINGLE
+from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, TF_MESSAGE, has_tf
+from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import to_detections
-from msg_utils.markers import from_marker_array
+from msg_utils.markers import from_marker_array, to_marker_array
+from msg_utils.stamps import header_message
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 FOUND = "/perception/output/detections"
@@ -128,6 +134,44 @@ def test_the_newest_frame_appears_and_one_can_pause_and_step_back(looking, heard
         page.keyboard.press(" ")
         page.wait_for_function("n => page.store.playing && page.store.frame > n + 1", arg=held)
         assert page.locator("#errors .toast").count() == 0
+
+
+def test_boxes_in_another_frame_are_shown_where_tf_says(looking, heard, shared_peer):
+    """Those of the detector again, as a node publishes them whose target_frame is the robot's."""
+    talker, place = shared_peer.talker("/robot/output/detections", MARKERS), mounted(
+        0.5, 0.2, 1.7, 0.0, 0.0, 0.3)
+    sent = 0
+
+    def send():
+        nonlocal sent
+        if len(heard) > sent:
+            sent, found = len(heard), from_marker_array(heard[-1])
+            talker.publish(encode(to_marker_array(
+                moved_boxes(found.boxes, place), found.labels, found.scores, make=bag_message,
+                header=header_message(found.stamp_ns, "base", bag_message))))
+
+    def lines():
+        send()
+        return looking.json("api/drive")["status"]["lines"]
+    shared_peer.wait(lambda: any(
+        "/robot/output/detections are not shown: TF does not connect 'base'" in line
+        for line in lines()), "a line that names the frames")
+    if not has_tf():
+        shared_peer.wait(lambda: NO_TF in lines(), "a line that says what is not installed")
+        pytest.skip("the wheels of the pip environment lack tf2_msgs")
+    static = shared_peer.talker("/tf_static", TF_MESSAGE, STATIC_QOS)
+    static.publish(encode(transforms(("base", "velodyne", place, 0))))
+
+    def same():
+        send()
+        for frame in looking.json("api/drive")["frames"][-20:]:
+            found = looking.json(f"api/labels/{frame['frame']}")["detections"]
+            ours, theirs = (np.array([row[:7] for row in found.get(name, [])])
+                            for name in ("robot", "perception"))
+            if len(ours) and ours.shape == theirs.shape and np.allclose(ours, theirs, atol=1e-6):
+                return True
+        return False
+    shared_peer.wait(same, "boxes of both, in one place")
 
 
 def test_it_ends_cleanly_at_sigint(looking, heard, shared_processes):

@@ -113,6 +113,13 @@ def in_frame(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
     return np.column_stack([(boxes.centres - origin) @ turn, boxes.sizes, yaws])
 
 
+def leaning(boxes: GlobalBoxes, pose: np.ndarray) -> np.ndarray:
+    """(K,) bool: which boxes in_frame sets upright."""
+    upright = in_global(in_frame(boxes, pose), pose)[2]
+    along = np.abs((upright * boxes.rotations).sum(axis=1))
+    return along < (1 - 1e-12) * np.linalg.norm(boxes.rotations, axis=1)
+
+
 def in_global(boxes: np.ndarray, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Centres (K, 3), sizes (K, 3) and rotations (K, 4) in the global frame of boxes (K, 7); the
     other way round of in_frame."""

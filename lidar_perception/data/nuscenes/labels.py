@@ -14,6 +14,7 @@ from lidar_perception.data.nuscenes.boxes import (
     WITH_RIDER,
     GlobalBoxes,
     in_frame,
+    leaning,
 )
 from lidar_perception.data.nuscenes.tables import Tables
 from lidar_perception.types import CLASSES, GroundTruth, InputError
@@ -55,8 +56,9 @@ class NuscenesLabels:
         """The labels of one frame in its own coordinates; pose (4, 4) leads to the global frame.
         extras: detection_name (None where the category is of no class of the task), category,
         lidar_points, points (LiDAR and radar), velocity (2,) m/s in the global frame, attribute,
-        track_id."""
+        track_id; rotation (4,) [w x y z] in the global frame of a box that is set upright."""
         boxes, extras, ids = self.boxes, [], []
+        leans = leaning(boxes, pose)
         for i in range(len(self)):
             name = NAMES[boxes.class_ids[i]] if boxes.class_ids[i] >= 0 else None
             attribute = boxes.attributes[i]
@@ -66,7 +68,8 @@ class NuscenesLabels:
                 "detection_name": name, "category": self.category_names[self.categories[i]],
                 "lidar_points": int(self.lidar_points[i]), "points": int(boxes.points[i]),
                 "velocity": boxes.velocities[i].tolist(), "track_id": int(self.instances[i]),
-                "attribute": ATTRIBUTES[attribute] if attribute >= 0 else None})
+                "attribute": ATTRIBUTES[attribute] if attribute >= 0 else None,
+                **({"rotation": boxes.rotations[i].tolist()} if leans[i] else {})})
         return GroundTruth.of(in_frame(boxes, pose), ids, extras)
 
 

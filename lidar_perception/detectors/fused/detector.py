@@ -68,6 +68,10 @@ class FusedDetector(NetworkDetector):
         """Its own group of params."""
         return self.params.fused
 
+    def seeing(self, where: str) -> FusedDetector:
+        """The same detector with one of the RANGES, whatever PointPillars was trained for."""
+        return FusedDetector(self.proposer.seeing(where), self.classifier, self.params)
+
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:
         """Ground and PointPillars' clusters are computed where they are None."""

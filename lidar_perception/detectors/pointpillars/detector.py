@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -20,6 +21,7 @@ from lidar_perception.detectors.devices import CPU, chosen_device
 from lidar_perception.detectors.nms import best_of_each, suppressed
 from lidar_perception.detectors.pointpillars.anchors import make_anchors
 from lidar_perception.detectors.pointpillars.box_coder import decode
+from lidar_perception.detectors.pointpillars.config import RANGES
 from lidar_perception.detectors.pointpillars.expert import NetworkInput, network_input
 from lidar_perception.detectors.pointpillars.network import (
     PointPillars,
@@ -143,6 +145,11 @@ class PointPillarsDetector(NetworkDetector):
         if frame.intensity is None and self.settings.intensity_scale:
             return "the cloud has no intensity, which the network was trained with; it reads zeros"
         return None
+
+    def seeing(self, where: str) -> PointPillarsDetector:
+        """The same network with one of the RANGES: what it knows of a place it knows of all."""
+        header = replace(self.header, config=replace(self.config, **RANGES[where]))
+        return PointPillarsDetector(self.network, header, self.device, self.params)
 
     def bring_to(self, device: torch.device) -> None:
         """Bring network and anchors to a device."""

@@ -19,7 +19,7 @@ import numpy as np
 
 from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.nuscenes.boxes import GlobalBoxes, in_frame, in_global
+from lidar_perception.data.nuscenes.boxes import GlobalBoxes, in_frame, in_global, leaning
 from lidar_perception.data.nuscenes.labels import CLASS_OF
 from lidar_perception.data.nuscenes.results import DETECTED, META, places
 from lidar_perception.labeling.formats.files import (
@@ -117,9 +117,17 @@ def _in_frame(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], bool]
     """The box, and whether it leans there."""
     width, length, height = row["size"]
     one = GlobalBoxes.of([row["translation"]], [[length, width, height]], [row["rotation"]], 0)
-    box = in_frame(one, pose)
-    upright = in_global(box, pose)[2] @ one.rotations[0] / np.linalg.norm(one.rotations[0])
-    return box[0].tolist(), bool(abs(upright[0]) < 1 - 1e-12)
+    return in_frame(one, pose)[0].tolist(), bool(leaning(one, pose)[0])
+
+
+def rotation_read(labels: FrameLabels, k: int, pose: np.ndarray) -> list[float] | None:
+    """[w x y z] with which a box that leans was read, where it is still there; else None."""
+    rotation, box = labels.extra[k].get("rotation"), labels.boxes[k]
+    if not isinstance(rotation, list) or len(rotation) != 4:
+        return None
+    centre, size, _ = in_global(box[None], pose)
+    place = {"translation": centre[0], "size": size[0][[1, 0, 2]], "rotation": rotation}
+    return rotation if unchanged(box, _in_frame(place, pose)[0]) else None
 
 
 def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
@@ -159,14 +167,9 @@ def _columns(task: str, labels: FrameLabels, k: int, pose: np.ndarray,
                                  else NO_SCORE)}
     if task == "tracking" or track != NO_TRACK:
         columns["tracking_id"] = "" if track == NO_TRACK else names.get(track, str(track))
-    rotation = extra.get("rotation")
-    if isinstance(rotation, list) and len(rotation) == 4:
-        del extra["rotation"]
-        box = labels.boxes[k].tolist()
-        centre, size, _ = in_global(np.array([box]), pose)
-        place = {"translation": centre[0], "size": size[0][[1, 0, 2]], "rotation": rotation}
-        if unchanged(box, _in_frame(place, pose)[0]):
-            columns["rotation"] = rotation
+    if rotation := rotation_read(labels, k, pose):
+        columns["rotation"] = rotation
+    extra.pop("rotation", None)
     return {**beside(extra, OWN | columns.keys()), **columns}
 
 

@@ -1,0 +1,55 @@
+"""Laws of the drives of a recording: where one ends, and what is refused at once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lidar_perception.adapting.drives import FEWEST, checked, pieces_of
+from lidar_perception.data.frame import Frame
+from lidar_perception.types import InputError, LidarFrame
+
+BAG = Path("drive.bag")
+
+
+def test_a_gap_of_the_stamps_ends_a_drive():
+    def frames(*stamps: float) -> list[Frame]:
+        return [Frame(str(s), int(s * 1e9), lambda: None) for s in stamps]
+
+    first, second = np.arange(12) / 10, np.arange(15) / 10
+    for later in (30.0, -0.5):  # a pause, and a clock that was put back
+        pieces = pieces_of(frames(*first, *(second + later)), 100)
+        assert [len(p.numbers) for p in pieces] == [12, 15]
+        assert [n for p in pieces for n in p.numbers] == list(range(27))
+        assert len({p.name for p in pieces}) == 2
+    assert [len(p.numbers) for p in pieces_of(frames(*np.arange(200) / 10), 25)] == [25]
+    assert len(pieces_of(frames(*np.zeros(20)), 100)) == 1  # a data set without stamps
+    with pytest.raises(InputError, match=f"{FEWEST} frames"):
+        pieces_of(frames(*range(0, 100, 5)), 100)
+
+
+def clouds(scale: tuple[float, float, float], count: int = 500) -> list[Frame]:
+    """Frames of points all around within 20 m, their coordinates times scale."""
+    xyz = np.random.default_rng(0).uniform(-20, 20, (count, 3)) * scale
+    scan = LidarFrame(xyz.astype(np.float32), np.full(count, 0.3, np.float32))
+    return [Frame.of(str(i), scan) for i in range(12)]
+
+
+@pytest.mark.parametrize("frames, named", [
+    (clouds((1000, 1000, 1000)), "millimetres"), (clouds((1, 1, 0)), "2D scanner"),
+    (clouds((1, 1, 1), count=0), "no points")])
+def test_clouds_that_no_detector_can_read_are_refused(frames, named):
+    with pytest.raises(InputError, match=f"^{BAG}.*{named}") as error:
+        checked(frames, BAG)
+    assert "\n" not in str(error.value)
+
+
+def test_clouds_without_intensity_are_taken_and_it_is_said():
+    frames = clouds((1, 1, 0.1))
+    assert checked(frames, BAG) == []
+    dark = [Frame.of(f.name, LidarFrame(f.load().xyz, None)) for f in frames]
+    assert "no intensity" in checked(dark, BAG)[0]
+    one_empty = [Frame.of("0", LidarFrame(np.zeros((0, 3), np.float32), None)), *frames[1:]]
+    assert checked(one_empty, BAG) == []
