@@ -23,6 +23,15 @@ def pytest_itemcollected(item):
         item.add_marker("no_cover")
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """no_cover holds for processes that the test starts, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        if item.get_closest_marker("no_cover"):
+            patch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)
+        return (yield)
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_sessionfinish():
     """What multiprocessing runs beside us ends now and not some time after us: else coverage would

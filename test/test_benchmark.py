@@ -25,6 +25,7 @@ from lidar_perception.clustering.params import EuclideanParams
 from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.types import LidarFrame
 
+pytestmark = pytest.mark.no_cover  # benchmark/ is not in the package
 SKLEARN = [p.name for p in peers.SKLEARN]
 OPTIONAL = ("dbscan", "open3d", "CSF", "pypatchworkpp")
 

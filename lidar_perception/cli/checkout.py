@@ -42,8 +42,8 @@ def test(arguments: tuple[str, ...]) -> None:
     Without ARGUMENTS ruff, mypy, and all tests: those of the core on all cores, and beside them,
     one by one, those with processes that talk to each other. What Numba compiles is compiled before
     them, once, while ruff and mypy run. The lines that the tests run are measured, in all
-    processes, but for tests of Hypothesis, which would take twice as long; at least as many as
-    setup.cfg says must be.
+    processes, but for long tests that run the lines of others, such as those of Hypothesis, as
+    they would take twice as long; at least as many as setup.cfg says must be.
 
     \b
     Examples:
@@ -80,6 +80,7 @@ def _everything(folder: Path) -> list[str]:
     """Run all that is tested. What failed; the measured coverage lies in folder for a while."""
     one_thread_each()  # as many processes as cores
     environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # compiled once, not in each process
     if sys.version_info >= (3, 12):
         environment["COVERAGE_CORE"] = "sysmon"  # lines are noticed once, and then cost nothing
     pytest = ("-m", "pytest", "--cov", "--cov-report=", "--cov-fail-under=0")

@@ -108,6 +108,7 @@ def whole(bag, weights, tmp_path_factory) -> Path:
     return out
 
 
+@pytest.mark.no_cover
 def test_a_killed_run_ends_as_if_it_had_not_been(bag, weights, whole, tmp_path):
     out = tmp_path / "out"
     perfect_looks(bag, out)

@@ -50,6 +50,7 @@ def outcome_of(node, name, message, then_good=False):
 
 
 @pytest.mark.parametrize("name", OF_CLOUDS)
+@pytest.mark.no_cover
 def test_no_value_of_a_column_costs_memory_or_goes_unchecked(tried, name):
     plain = cloud("columns")
     turn = np.arange(len(to_array(plain))) % 7

@@ -78,6 +78,7 @@ def room():
     resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, hard))
 
 
+@pytest.mark.no_cover
 def test_on_a_full_disk_what_found_room_can_be_read(tmp_path, monkeypatch, room):
     """Wherever it gets full: in a chunk, in the index, in metadata.yaml."""
     monkeypatch.setattr(bag_module, "CHUNK_BYTES", 20_000)
@@ -158,6 +159,7 @@ def test_a_bag_without_its_file_is_damaged(written, tmp_path):
 
 
 @pytest.mark.parametrize("folder", [True, False])
+@pytest.mark.no_cover
 def test_a_bag_that_was_cut_anywhere_is_damaged(written, tmp_path, folder):
     raw = (written / "drive.mcap").read_bytes()
     if folder:
@@ -189,6 +191,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+@pytest.mark.no_cover
 def test_a_damaged_byte_never_changes_what_is_read_without_a_word(written, tmp_path, damage):
     """In the data, at the head of a chunk, and in the index, from which readers take where the
     messages are."""

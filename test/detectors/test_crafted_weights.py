@@ -79,6 +79,7 @@ SMALL = {
 
 
 @pytest.mark.parametrize("kind", SMALL)
+@pytest.mark.no_cover
 def test_a_mutated_header_is_used_or_refused_with_one_line(kind, tmp_path):
     """What passes has the tensors' shapes, so it takes no more memory than the file says."""
     make_header, make, load, params = SMALL[kind]

@@ -223,6 +223,7 @@ def test_only_files_of_the_page_are_served(served):
     asked(served, questions)
 
 
+@pytest.mark.no_cover
 def test_a_killed_server_has_lost_nothing_and_a_second_one_is_refused(written, tmp_path):
     async def edit(page):
         await page.do(**ADD)
@@ -266,6 +267,7 @@ def test_a_full_disk_is_said_and_the_labels_stay_as_the_journal_has_them(written
         assert asked(url, lambda page: page.json("/api/state")) == before
 
 
+@pytest.mark.no_cover
 def test_labels_go_out_and_come_back_as_they_were(written, tmp_path):
     async def make(page):
         await page.do(**ADD)

@@ -1,8 +1,10 @@
 """Laws of a run: however it is spread or stopped, the records are the same, and bad input costs the
-frames that it hits and no others."""
+frames that it hits and no others. Every number is in every format of its report."""
 
 from __future__ import annotations
 
+import csv
+import html
 import json
 import os
 import re
@@ -28,7 +30,8 @@ from samples import object_folder, write
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.reproduction import journal, runner
-from lidar_perception.reproduction.report import write_report
+from lidar_perception.reproduction.experiment import Cell
+from lidar_perception.reproduction.report import parts, write_report
 from lidar_perception.reproduction.stm_cpa import STM_CPA
 from lidar_perception.scoring import run as scoring_run
 from lidar_perception.types import InputError
@@ -60,6 +63,7 @@ def content(folder):
 # However it is spread and stopped
 
 
+@pytest.mark.no_cover
 def test_a_cluster_of_two_workers_measures_what_one_process_does(crowds, whole, tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs the extra [distributed]")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
@@ -84,6 +88,7 @@ def test_without_distributed_the_extra_is_named(few, tmp_path, monkeypatch):
         runner.run(SMALL, open_recording(few), tmp_path / "out", dask="tcp://127.0.0.1:9")
 
 
+@pytest.mark.no_cover
 def test_a_killed_run_of_two_processes_goes_on_where_it_was(crowds, whole, tmp_path):
     out = tmp_path / "out"
     process = subprocess.Popen(
@@ -288,6 +293,7 @@ def test_a_split_leaves_out_all_else(few, tmp_path):
     assert [r["frame"] for r in runner.run(SMALL, whole, tmp_path / "all")][-1] == "000004"
 
 
+@pytest.mark.no_cover
 def test_a_folder_without_scans_or_pedestrians_is_an_error(tmp_path):
     for argument, words in ((tmp_path / "none", "there is no "),
                             (tmp_path, "is no recording that can be read")):
@@ -298,3 +304,60 @@ def test_a_folder_without_scans_or_pedestrians_is_an_error(tmp_path):
     with pytest.raises(InputError, match=r"no frame could be measured.*no Pedestrian"):
         command("--data", nobody, "--out", tmp_path / "out", "--jobs", 1)
     assert json.loads((tmp_path / "out/report.json").read_text())["skipped"] == 2
+
+
+# The report and the summary
+
+
+@pytest.mark.no_cover
+def test_every_table_and_figure_is_in_every_format(whole):
+    report = json.loads((whole / "report.json").read_text())
+    page = html.unescape((whole / "report.html").read_text())
+    markdown = (whole / "report.md").read_text()
+    tables = [t for section in report["sections"] for t in section["tables"]]
+    assert {t["name"] for t in tables} >= {"table_1", "table_3_6", "table_4", "table_5", "table_8",
+                                           "table_9", "search", "search_best", "figure_8"}
+    assert {p.stem for p in (whole / "tables").iterdir()} == {t["name"] for t in tables}
+    for table in tables:
+        assert table["title"] in page and f"**{table['title']}**" in markdown
+        rows = [[Cell(**c) if isinstance(c, dict) else c for c in row] for row in table["rows"]]
+        read = list(csv.DictReader((whole / f"tables/{table['name']}.csv").open()))
+        assert len(read) == len(rows)
+        for row, there in zip(rows, read):
+            for name, cell in zip(table["header"], row):
+                if isinstance(cell, str):
+                    assert there[name] == cell
+                    continue
+                for key, value in ((name, cell.value), (f"{name} low", cell.low),
+                                   (f"{name} high", cell.high), (f"{name} paper", cell.paper)):
+                    assert there[key] == ("" if value is None else str(value))
+                value, interval, published = parts(cell)
+                assert value in page and interval in page and interval in markdown
+                assert not published or (f"paper {published}" in page
+                                         and f"(paper {published})" in markdown)
+    for figure in (f for section in report["sections"] for f in section["figures"]):
+        picture = whole / f"figures/{figure['name']}.png"
+        assert picture.read_bytes().startswith(b"\x89PNG")
+        assert figure["title"] in page and f"(figures/{figure['name']}.png)" in markdown
+    assert {p.relative_to(whole).as_posix() for p in whole.rglob("*") if p.is_file()} == {
+        p.relative_to(whole).as_posix() for pattern in journal.OURS for p in whole.glob(pattern)}
+
+
+def test_the_page_needs_no_other_file_and_says_what_was_run(whole, crowds):
+    page = (whole / "report.html").read_text()
+    assert not re.findall(r'(?:src|href|srcset)="(?!data:|#)', page) and "<script" not in page
+    assert str(crowds) in page and "11 measured, 1 skipped" in page and "lidar_perception" in page
+    assert "no Pedestrian is labelled" in page
+    report = json.loads((whole / "report.json").read_text())
+    assert (report["measured"], report["skipped"]) == (11, 1)
+    assert [r["frame"] for r in report["skipped_frames"]] == ["000011"]
+
+
+def test_the_summary_shows_the_scores_beside_the_papers(whole):
+    text = (whole.parent / "said").read_text()
+    report = json.loads((whole / "report.json").read_text())
+    row = next(t for s in report["sections"] for t in s["tables"]
+               if t["name"] == "table_3_6")["rows"][2]
+    assert f"{row[1]['value']:.1f} (46.7)" in text and f"{row[3]['value']:.1f} (52.1)" in text
+    assert f"report: {whole}/report.html" in text.replace("\n", "")
+    assert "skipped 1: no Pedestrian" in text

@@ -68,7 +68,8 @@ def test_lines_give_back_what_scores_were_before_they_were_bent(seed):
     found = true.copy()
     found[rng.random(3000) >= share] += [1e6, 0, 0, 0, 0, 0, 0]
     bent = expit((logit(share) + 0.7) / 1.6)
-    slope, offset = lines(Comparison.of([frame(true, found, bent)]))["Car"]
+    slope, offset = lines(Comparison.of([frame(true[i::30], found[i::30], bent[i::30])
+                                         for i in range(30)]))["Car"]
     assert slope == pytest.approx(1.6, abs=0.25) and offset == pytest.approx(-0.7, abs=0.25)
     assert lines(Comparison.of([frame(true[:5], found[:5], bent[:5])])) == {}
 

@@ -69,6 +69,7 @@ def together(*lines):
 
 @pytest.mark.parametrize("seed, count, noise", [(0, 30, 0.12), (1, 60, 0.05), (2, 12, 0.1),
                                                 (3, 20, 0.3), (4, 2, 0.1)])
+@pytest.mark.no_cover
 def test_a_second_reading_of_the_protocol_gives_the_same(seed, count, noise):
     rng = np.random.default_rng(seed)
     frames = [reference.random_frame(rng, noise=noise) for _ in range(count)]

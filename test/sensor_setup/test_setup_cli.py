@@ -61,6 +61,7 @@ def test_every_file_is_written_and_can_be_read(robot):
     assert yaml.safe_load((robot / "lidar_perception.rviz").read_text())
 
 
+@pytest.mark.no_cover
 def test_nothing_is_overwritten_unasked(robot, bag):
     before = {p.name: p.read_bytes() for p in robot.iterdir()}
     with pytest.raises(InputError, match="--force"):

@@ -66,6 +66,7 @@ def test_same_seed_same_street():
 
 
 @pytest.mark.parametrize("kind, seed", EVERY)
+@pytest.mark.no_cover
 def test_nothing_ever_overlaps(kind, seed):
     """Labels, everything else, and the ego vehicle, in the plane; but people sit on benches, and
     plants grow into one another and into walls."""
@@ -163,6 +164,7 @@ def test_what_stands_between_the_directions_is_at_crossings_and_leaves_the_lanes
     assert found > 10
 
 
+@pytest.mark.no_cover
 def test_streets_hold_what_kitti_labels():
     """In the forward camera's view and within 30 m, the 57 labelled frames beside the checkout
     have 1.7 cars, 0.19 pedestrians and 0.14 cyclists, fewer than stand there: what is hidden has
@@ -185,6 +187,7 @@ def test_streets_hold_what_kitti_labels():
     assert (found.sum(axis=0)[:len(CLASSES) - 1] > 0).sum() >= 6
 
 
+@pytest.mark.no_cover
 def test_as_many_people_as_asked_for():
     def people(factor):
         labels = [a.thing.label for a in scene_of("residential", 0, factor).actors]

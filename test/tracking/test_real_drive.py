@@ -8,6 +8,7 @@ import pytest
 
 
 @pytest.mark.parametrize("ego", ["none", "auto"])
+@pytest.mark.no_cover
 def test_no_identity_switches_on_a_real_drive(data, ego):
     """Which has no poses: auto takes them from the scans."""
     from lidar_perception.data.frame import POSES

@@ -62,6 +62,7 @@ def _weights(out):
     return {name: value.tolist() for name, value in network.state_dict().items()}
 
 
+@pytest.mark.no_cover
 def test_every_row_of_the_ablation_is_trained_and_shown(cache, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     result = train(cache, tmp_path / "all", "--ablation", **{"--steps": 1, "--validate-steps": 1})

@@ -223,6 +223,7 @@ def street_with(*walls: np.ndarray) -> TrainingScene:
 
 @few
 @given(seeds)
+@pytest.mark.no_cover
 def test_what_is_behind_an_object_goes_and_none_is_put_behind_something(seed):
     params, rng = AugmentParams(cars=0, pedestrians=1, cyclists=0), np.random.default_rng(seed)
     behind = wall(12.0, (-14, 14), (-1.7, 1.0))
