@@ -60,7 +60,7 @@ setup(
     extras_require={
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "test": ["pytest>=7.4", "hypothesis>=6.90", "mypy>=1.15", "opencv-python-headless>=4.8",
-                 "playwright>=1.50", "pytest-cov>=7.0", "pytest-xdist>=3.5", "ruff>=0.9",
+                 "playwright>=1.50", "pytest-cov>=7.0", "pytest-xdist>=3.7", "ruff>=0.9",
                  "setuptools>=70.1", "shapely>=2.0"],
         "distributed": ["distributed>=2024.1"],
         "odometry": ["kiss-icp>=1.2"],
