@@ -84,7 +84,8 @@ def recognised(path: Path) -> str:
         file for file in path.rglob("*") if file.suffix in (".txt", ".json")
         and not file.name.startswith(("_", ".")))
     if not path.exists():
-        raise InputError(f"there is no {path}; give labels, one of {', '.join(FORMATS)}")
+        raise InputError(f"there is no file or folder {path}; give one with labels: "
+                         f"{', '.join(FORMATS)}")
     if path.suffix in (".mcap", ".db3") or (path.is_dir() and is_bag(path)):
         return "bag"
     for file in files:
