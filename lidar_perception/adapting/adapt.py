@@ -119,7 +119,6 @@ class Adapting:
         self.seen: list[Seen] = []
         self.first_seen: list[Seen] = []
         self.recognised: Counts = {}
-        self.not_asked: list[str] = []
         self.before: Watched | None = None
         self.rounds: list[Round] = []
         self.best = weights
@@ -192,6 +191,11 @@ class Adapting:
         """Which sources are asked."""
         return heard_of(self.recognised)
 
+    @property
+    def not_asked(self) -> list[str]:
+        """What to say of those that are not."""
+        return unheard(self.recognised)
+
     def _recognised(self) -> Counts:
         path = self.out / HEARD
         if not path.is_file():
@@ -200,8 +204,7 @@ class Adapting:
             write_text(path, json.dumps(recognised(looker, track(frames, "looking at simulated "
                                                                  "scans", len(frames)))))
         counts: Counts = json.loads(read_text(path, 10**6))
-        self.not_asked = unheard(counts)
-        for line in self.not_asked:
+        for line in unheard(counts):
             errors.print(line, soft_wrap=True)
         return counts
 
@@ -246,7 +249,8 @@ class Adapting:
         seconds = seconds_of(self.frames, piece)
         tracks = tracks_of(looks, (1e9 + seconds * 1e9).astype(np.int64).tolist())
         way = np.linalg.inv(self.poses[i][0]) @ self.poses[i]
-        verdicts = [judged(each, way[:, :2, 3], self.heard) for each in tracks]
+        heard = self.heard
+        verdicts = [judged(each, way[:, :2, 3], heard) for each in tracks]
         return Seen(piece, looks, tracks, verdicts, labels_of(tracks, verdicts, way, seconds))
 
     def _learn(self, folder: Path, begun: float) -> Path:

@@ -136,7 +136,7 @@ class LiveView(Outside):
             lost = reception.arrivals.lost + reception.arrivals.dropped
             if topic != self.clouds and lost:
                 lines.append(f"{lost} of {reception.arrivals.sent} arrays on {topic} were lost")
-        if not has_tf() and any(heard.elsewhere for heard in self.live.topics.values()):
+        if any(heard.elsewhere for heard in self.live.topics.values()) and not has_tf():
             lines.append(NO_TF)
         self.live.lines = [*lines, *self.broken.values()]
 
