@@ -20,6 +20,11 @@ def horizontal_range(xyz: np.ndarray) -> np.ndarray:
     return np.sqrt(xyz[:, 0] * xyz[:, 0] + xyz[:, 1] * xyz[:, 1])
 
 
+def elevations(xyz: np.ndarray) -> np.ndarray:
+    """(N,) radians above the horizon of the origin, of points (N, >=3)."""
+    return np.asarray(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
+
+
 def within(at: np.ndarray, low: ArrayLike, high: ArrayLike) -> np.ndarray:
     """(N,) bool: whether x and y of points, or of boxes, (N, >=2) are at least low and less than
     high, of which x and y count, too; not what is NaN."""

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.geometry import elevations
 from lidar_perception.labeling.interpolation import Motion
-from lidar_perception.sensor_setup.scans import elevations_of, require_metres, require_space
+from lidar_perception.sensor_setup.scans import require_metres, require_space
 from lidar_perception.tracking.ego import Odometry, recorded_source, usable
 from lidar_perception.types import InputError
 
@@ -59,7 +60,7 @@ def checked(frames: Sequence[Frame], source: Path) -> list[str]:
     if len(xyz) == 0:
         raise InputError(f"{source}: its clouds have no points; record while the sensor turns")
     require_metres(np.linalg.norm(xyz, axis=1), str(source))
-    require_space(elevations_of(xyz), str(source))
+    require_space(np.degrees(elevations(xyz)), str(source))
     if any(cloud.intensity is not None and cloud.intensity.any() for cloud in clouds):
         return []
     return [f"{source} has no intensity, which the networks were trained with, so that they may "

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lidar_perception.geometry import elevations
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import INTENSITY_FIELDS, to_frame
 from lidar_perception.wire.point_times import NAMES as TIMES
@@ -67,15 +68,10 @@ def scan_of(msg: Any, name: str = "the cloud") -> Scan:
             problem = str(error)
     ground_range = np.hypot(xyz[:, 0], xyz[:, 1])
     return Scan(xyz, np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) % 360.0,
-                elevations_of(xyz), ranges, ground_range,
+                np.degrees(elevations(xyz)), ranges, ground_range,
                 _column(points, indices, INTENSITY_FIELDS, float),
                 _column(points, indices, RINGS, np.int64), seconds, frame.stamp_ns, frame.frame_id,
                 columns, problem)
-
-
-def elevations_of(xyz: np.ndarray) -> np.ndarray:
-    """(N,) degrees above the sensor's own horizon of points (N, 3)."""
-    return np.degrees(np.arctan2(xyz[:, 2], np.hypot(xyz[:, 0], xyz[:, 1])))
 
 
 def require_metres(ranges: np.ndarray, name: str) -> None:
@@ -86,9 +82,9 @@ def require_metres(ranges: np.ndarray, name: str) -> None:
                          "coordinates seem to be millimetres; divide x y z by 1000 in the driver")
 
 
-def require_space(elevations: np.ndarray, name: str) -> None:
+def require_space(degrees: np.ndarray, name: str) -> None:
     """InputError where points with these elevations (N,), N > 0, degrees, are all in one plane."""
-    if np.subtract(*np.percentile(elevations, [99, 1])) < FLAT:
+    if np.subtract(*np.percentile(degrees, [99, 1])) < FLAT:
         raise InputError(f"{name}: all points lie in one plane, as those of a 2D scanner; give "
                          "clouds of a 3D LiDAR")
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lidar_perception.geometry import bev_iou, to_box_frame, within, wrap_angle
+from lidar_perception.geometry import bev_iou, elevations, to_box_frame, within, wrap_angle
 from lidar_perception.training.params import AugmentParams, NoiseParams, ThingParams
 from lidar_perception.training.putting import TOUCH, inside
 from lidar_perception.types import SENSOR_HEIGHT
@@ -151,8 +151,7 @@ def blurred(points: np.ndarray, beam: float, point: float, rng: np.random.Genera
     means of its beams by 0.035 to 0.07; a pole that was simulated is as thin as it is.
     """
     ranges = np.maximum(np.linalg.norm(points[:, :3], axis=1), TOUCH)
-    elevations = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
-    beams = np.floor(elevations / STEP).astype(np.int64)
+    beams = np.floor(elevations(points) / STEP).astype(np.int64)
     first = beams.min(initial=0)
     offsets = rng.normal(0, beam, int(beams.max(initial=0) - first) + 1)
     shift = offsets[beams - first] + rng.normal(0, point, len(points))
