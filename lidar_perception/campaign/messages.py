@@ -98,10 +98,11 @@ class Attempt:
 class Tried:
     """A node whose messages come from here and go nowhere."""
 
-    def __init__(self, name: str, context: Context):
+    def __init__(self, name: str, context: Context, **values: Any):
         module = importlib.import_module(f"lidar_perception.nodes.{name}")
         self.node = getattr(module, NODES[name][0])(
-            context=context, enable_rosout=False, start_parameter_services=False)
+            context=context, enable_rosout=False, start_parameter_services=False,
+            parameter_overrides=[Parameter(k, value=v) for k, v in values.items()])
         self.node.start()
         self.inputs = TRIED[name][1]
         self.calls = {s.topic_name.removeprefix(f"/{name}").lstrip("/"): s.callback

@@ -4,14 +4,18 @@ a good cloud takes. All nodes in this process, by their callbacks."""
 from __future__ import annotations
 
 import numpy as np
+import pointnet_samples
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from detection_samples import lively, tiny
 
 from lidar_perception.campaign.case import FAILED, REFUSED, Case
 from lidar_perception.campaign.good import cloud
 from lidar_perception.campaign.messages import TRIED, Tried
 from lidar_perception.campaign.worker import memory_mb
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.watch import new_context
 from lidar_perception.wire.codec import bag_message, encode
@@ -25,10 +29,20 @@ MEGABYTES = 64.0  # a table with a byte for each number up to 2^31 has 2048
 
 
 @pytest.fixture(scope="module")
-def tried(domain):
-    """name -> the node."""
-    context = new_context(domain)
-    nodes = {name: Tried(name, context) for name in TRIED}
+def tried(domain, tmp_path_factory):
+    """name -> the node; networks are small ones, as what they read is checked before them."""
+    context, folder = new_context(domain), tmp_path_factory.mktemp("weights")
+    pillars, clusters = str(folder / "v4.safetensors"), str(folder / "pointnet.safetensors")
+    config = tiny("v4", low=(0.0, -10.24, -3.0), high=(20.48, 10.24, 1.0))
+    save_checkpoint(pillars, lively(config), Header(config))
+    config = pointnet_samples.small()
+    save_checkpoint(clusters, pointnet_samples.lively(config), Header(config))
+    values = {
+        "pointpillars_detector": {"pointpillars.weights": pillars, "pointpillars.threads": 1},
+        "pointnet_detector": {"pointnet.weights": clusters, "pointnet.threads": 1},
+        "fused_detector": {"fused.weights": pillars, "fused.classifier": clusters,
+                           "fused.threads": 1}}
+    nodes = {name: Tried(name, context, **values.get(name, {})) for name in TRIED}
     yield nodes
     for each in nodes.values():
         each.node.destroy_node()
