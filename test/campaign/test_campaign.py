@@ -126,8 +126,10 @@ def messages_of(seed, count):
 
 
 @pytest.mark.no_cover
-def test_the_same_seed_gives_the_same_cases_and_another_one_others():
-    for cases in (messages_of, lambda seed, n: [files.case_of(seed, i) for i in range(8)],
+def test_the_same_seed_gives_the_same_cases_and_another_one_others(monkeypatch):
+    # What the sound files hold does not matter here, and to write them takes seconds.
+    monkeypatch.setattr(files, "sound", lambda name: {f"{name}/{i}.bin": bytes(99) for i in "ab"})
+    for cases in (messages_of, lambda seed, n: [files.case_of(seed, i) for i in range(n)],
                   lambda seed, n: [shapes.case_of(seed, i) for i in range(n)]):
         assert cases(5, 30) == cases(5, 30)
         assert cases(5, 30) != cases(6, 30)
