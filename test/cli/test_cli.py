@@ -195,6 +195,7 @@ def test_without_core_points_there_are_no_candidates(bag, tmp_path):
         assert row["centre_error_m"] is None
 
 
+@pytest.mark.no_cover
 def test_a_config_says_the_same_as_flags_and_flags_win(bag, tmp_path):
     flag = "--clustering-dbscan-min-samples"
     file = write(tmp_path / "p.yaml",
@@ -313,12 +314,14 @@ def test_a_command_that_cannot_be_used_is_exit_code_2(arguments, words, monkeypa
 
 @pytest.mark.parametrize("arguments, code, words", [
     (["--version"], 0, ""), (["info", "none"], 2, "Error: there is no bag none\n")])
+@pytest.mark.no_cover
 def test_the_process_ends_with_the_code(arguments, code, words, tmp_path):
     done = subprocess.run([sys.executable, "-m", "lidar_perception.cli.main", *arguments],
                           cwd=tmp_path, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (code, words)
 
 
+@pytest.mark.no_cover
 def test_real_scans_are_scored_alike_from_folder_and_bag(data, tmp_path):
     root = data / "kitti_object"
     run("convert", root, "--out", tmp_path / "bag", "--limit", 6)
@@ -330,6 +333,7 @@ def test_real_scans_are_scored_alike_from_folder_and_bag(data, tmp_path):
 
 
 @pytest.mark.parametrize("command", [["demo"], ["run", "perception"]])
+@pytest.mark.no_cover
 def test_without_rclpy_the_remedy_is_said_before_any_work(command, tmp_path):
     blocked = tmp_path / "rclpy"
     blocked.mkdir()

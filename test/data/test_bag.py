@@ -147,6 +147,7 @@ def test_a_bag_without_messages_can_be_written_and_has_no_frame(tmp_path):
         open_recording(tmp_path / "bag")
 
 
+@pytest.mark.no_cover
 def test_bags_of_sqlite_are_read_alike(written, tmp_path):
     copy_bag(written, tmp_path / "sql", "sqlite3")
     for a, b in zip(open_recording(written), open_recording(tmp_path / "sql"), strict=True):

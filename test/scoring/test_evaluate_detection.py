@@ -288,6 +288,7 @@ def test_real_labels_as_their_own_results_score_100(data, tmp_path):
     assert content["diagnosis"] == [] and content["skipped"] == []
 
 
+@pytest.mark.no_cover
 def test_real_boxes_without_2d_boxes_are_projected_onto_the_labels(data, detector, tmp_path):
     """Boxes, and nothing else, score 100 from above and in space. In the image a person's limbs
     and what hides him make his label differ from the projection of his box."""

@@ -185,6 +185,7 @@ def close_to_reference(content, by_class, over):
 
 @pytest.mark.parametrize("seed, frames, objects, noise", [
     (0, 2, 20, 0.1), (1, 3, 60, 0.4), (2, 5, 150, 0.4), (3, 4, 90, 1.0)])
+@pytest.mark.no_cover
 def test_the_same_as_a_second_reading(tmp_path, seed, frames, objects, noise):
     tables = folder.made_tables(seed, frames, objects)
     results = folder.made_results(tables, CATEGORIES, seed + 10, noise)
