@@ -6,7 +6,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import lru_cache, partial
 from hashlib import sha1
 from pathlib import Path
 from typing import Any
@@ -111,9 +111,10 @@ class Adapting:
         for line in checked(self.frames, data):
             errors.print(line, soft_wrap=True)
         self.network = network_to_train(self.header)
-        detector = opened_with(weights, self.header, device)
-        self.low, self.high = (np.array(end[:2]) for end in (detector.config.low,
-                                                             detector.config.high))
+        # All sources with weights, opened once while these are looked with.
+        self.opened = lru_cache(maxsize=1)(partial(opened_with, header=self.header, device=device))
+        config = self.opened(weights).config
+        self.low, self.high = np.array(config.low[:2]), np.array(config.high[:2])
         self.pieces: list[Piece] = []
         self.poses: list[np.ndarray] = []
         self.seen: list[Seen] = []
@@ -166,7 +167,7 @@ class Adapting:
 
     def _affordable(self) -> int:
         errors.print("measuring this machine with a few frames ...")
-        looker = Looker(opened_with(self.weights, self.header, self.device))
+        looker = Looker(self.opened(self.weights))
         looker(self.frames[0], np.eye(4))
         begun = time.monotonic()
         for frame in self.frames[1:1 + MEASURED]:
@@ -200,7 +201,7 @@ class Adapting:
         path = self.out / HEARD
         if not path.is_file():
             frames = simulated_frames(self._training(self.out), self._params(1), self.sensor)
-            looker = Looker(opened_with(self.weights, self.header, self.device))
+            looker = Looker(self.opened(self.weights))
             write_text(path, json.dumps(recognised(looker, track(frames, "looking at simulated "
                                                                  "scans", len(frames)))))
         counts: Counts = json.loads(read_text(path, 10**6))
@@ -212,7 +213,7 @@ class Adapting:
         """One round; whether its weights were taken."""
         folder = self.out / f"round{number}"
         errors.print(f"round {number} of {self.params.rounds}", style="bold")
-        looker = Looker(opened_with(self.best, self.header, self.device))
+        looker = Looker(self.opened(self.best))
         self.seen = [self._look(i, folder / "looks", looker) for i in range(len(self.pieces))]
         if number == 1:
             self.first_seen = self.seen
@@ -288,7 +289,7 @@ class Adapting:
         frames = [self.frames[seen.piece.numbers[k]] for seen, k in held]
         f1, found, kept = agreement_of(open_detector(weights, self.device), frames,
                                        [seen.labels[k] for seen, k in held], self.low, self.high)
-        looker = Looker(opened_with(weights, self.header, self.device))
+        looker = Looker(self.opened(weights))
         looks = [looker(frame, np.eye(4)) for frame in track(frames, "judging all sources",
                                                              len(frames))]
         watched = Watched(

@@ -149,7 +149,11 @@ def test_a_round_that_makes_simulated_validation_worse_is_not_taken(bag, weights
         (out / name).unlink()
     scores = iter([{"score": 50.0}, {"score": 40.0}])
     monkeypatch.setattr(adapt_module, "simulated_score", lambda *_: next(scores))
+    opened, really = [], adapt_module.opened_with
+    monkeypatch.setattr(adapt_module, "opened_with", lambda weights, header, device: (
+        opened.append(weights) or really(weights, header, device)))
     run = adapted(bag, weights, out)
+    assert opened == [weights, out / "round1" / LAST]  # each once, whoever looks with them
     assert "simulated AP fell from 50.0 to 40.0" in run.rounds[0].refused
     assert (out / BEST).read_bytes() == weights.read_bytes()
     assert json.loads((out / "adapt.json").read_text())["rounds"][0]["refused"]
