@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
 from hashlib import sha1
@@ -15,6 +17,7 @@ import numpy as np
 
 from lidar_perception.adapting.drives import (
     Piece,
+    Refused,
     checked,
     frames_of,
     pieces_of,
@@ -55,7 +58,7 @@ from lidar_perception.training.start import start
 from lidar_perception.types import InputError
 
 BEST, LAST, JUDGED = "best.safetensors", "last.safetensors", "judged.json"
-HEARD = "heard.json"
+HEARD, POSES, SCANS, ROUND = "heard.json", "poses", "scans", "round{}"
 LOOKING = 0.3     # of the budget, to look at frames
 LEARNING = 0.5    # of it, to learn; what is left is for the poses and to judge
 MEASURED = 3      # frames that are looked at to know how long one takes
@@ -138,6 +141,16 @@ class Adapting:
         write_bytes(self.out / BEST, self.best.read_bytes())
         self._record()
 
+    def clear(self) -> None:
+        """Remove what a refused run has made, and the folder if nothing else is in it."""
+        for path in (self.out / name for name in (RECORD, HEARD, POSES, SCANS, ROUND.format(1))):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+        with suppress(OSError):
+            self.out.rmdir()
+
     def asked(self) -> dict[str, Any]:
         """What a resumed run must have in common."""
         return {"data": str(self.data), "weights": sha1(self.weights.read_bytes()).hexdigest(),
@@ -184,7 +197,7 @@ class Adapting:
         def made() -> np.ndarray:
             return np.array(list(track(poses_of(self.frames, piece), f"poses of {piece.name}",
                                        len(piece.numbers))))
-        return made_once(self.out / "poses" / f"{i:03}.npz", made, lambda a: a["poses"],
+        return made_once(self.out / POSES / f"{i:03}.npz", made, lambda a: a["poses"],
                          lambda poses: {"poses": poses})
 
     @property
@@ -211,7 +224,7 @@ class Adapting:
 
     def _round(self, number: int, begun: float) -> bool:
         """One round; whether its weights were taken."""
-        folder = self.out / f"round{number}"
+        folder = self.out / ROUND.format(number)
         errors.print(f"round {number} of {self.params.rounds}", style="bold")
         looker = Looker(self.opened(self.best))
         self.seen = [self._look(i, folder / "looks", looker) for i in range(len(self.pieces))]
@@ -221,10 +234,14 @@ class Adapting:
         for state in STATES:
             errors.print(f"{state}: " + (", ".join(f"{count} {name}" for name, count in
                                                    counts[state].items()) or "nothing"))
-        if sum(counts[KEPT].values()) < FEWEST_KEPT:
-            raise InputError(
-                f"{self.data}: the detectors agree on {sum(counts[KEPT].values())} objects only, "
-                f"too few to learn from ({FEWEST_KEPT}); record more, give --mount-height if it is "
+        if (agreed := sum(counts[KEPT].values())) < FEWEST_KEPT:
+            few = f"the detectors agree on {agreed} objects only, too few to learn from"
+            if self.rounds:
+                errors.print(f"round {number} is not made: {few}; {self.best} stays",
+                             soft_wrap=True)
+                return False
+            raise Refused(
+                f"{self.data}: {few} ({FEWEST_KEPT}); record more, give --mount-height if it is "
                 "not right, or train for the sensor first (train --sensor)")
         if self.before is None:
             self.before = self._watch(self.out / JUDGED, self.weights)
@@ -276,7 +293,7 @@ class Adapting:
                      hours)
 
     def _params(self, count: int) -> Any:
-        return training_params(self.header, self.params, count, self.height, self.out / "scans")
+        return training_params(self.header, self.params, count, self.height, self.out / SCANS)
 
     def _watch(self, path: Path, weights: Path) -> Watched:
         """How good weights are, from the file if it is known."""
