@@ -314,7 +314,6 @@ def test_a_command_that_cannot_be_used_is_exit_code_2(arguments, words, monkeypa
 
 @pytest.mark.parametrize("arguments, code, words", [
     (["--version"], 0, ""), (["info", "none"], 2, "Error: there is no bag none\n")])
-@pytest.mark.no_cover
 def test_the_process_ends_with_the_code(arguments, code, words, tmp_path):
     done = subprocess.run([sys.executable, "-m", "lidar_perception.cli.main", *arguments],
                           cwd=tmp_path, capture_output=True, text=True)
@@ -333,7 +332,6 @@ def test_real_scans_are_scored_alike_from_folder_and_bag(data, tmp_path):
 
 
 @pytest.mark.parametrize("command", [["demo"], ["run", "perception"]])
-@pytest.mark.no_cover
 def test_without_rclpy_the_remedy_is_said_before_any_work(command, tmp_path):
     blocked = tmp_path / "rclpy"
     blocked.mkdir()
