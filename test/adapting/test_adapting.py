@@ -222,7 +222,7 @@ def test_regions_give_no_gradient_and_change_none_elsewhere():
 
 # bad input: one line, and nothing is made or replaced
 
-def standing(path: Path, count: int) -> Path:
+def standing(path: Path, count: int = 16) -> Path:
     stamps, points = drive()[1][:count], two_objects()
     frames = [Frame.of(str(i), LidarFrame(points[:, :3], points[:, 3], stamps[i], "velodyne"),
                        pose=partial(np.eye, 4)) for i in range(count)]
@@ -243,7 +243,7 @@ def test_bad_input_is_refused_in_one_line(bag, weights, tmp_path):
     out = tmp_path / "out"
     assert "5 frames" in refused(out, "--data", standing(tmp_path / "short", 5), "--weights",
                                  weights)
-    assert "stands still" in refused(tmp_path / "still", "--data", standing(tmp_path / "bag", 16),
+    assert "stands still" in refused(tmp_path / "still", "--data", standing(tmp_path / "bag"),
                                      "--weights", weights)
     assert "--budget" in refused(out, "--data", bag, "--weights", weights, "--budget", "0")
     other = write(tmp_path / "other.onnx", "no weights")
