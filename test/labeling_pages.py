@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import json
 import math
-import subprocess
+import multiprocessing
+import os
+import sys
 import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep
+from typing import TextIO
 
 import numpy as np
 
 from lidar_perception.classes import PEDESTRIAN
+from lidar_perception.cli import label, view  # noqa: F401  loaded once, for all servers
+from lidar_perception.cli.main import main
 from lidar_perception.geometry import points_in_box
+from lidar_perception.labeling import results, served, server, session  # noqa: F401
 
 PATIENCE = 60.0  # seconds
 NEAR = 20.0      # metres
@@ -27,10 +35,47 @@ def labelled_person(frame) -> np.ndarray:
 
 
 @dataclass
+class Server:
+    """The process of a command, the address that it printed, and what it says of problems."""
+
+    process: multiprocessing.Process
+    url: str
+    errors: TextIO
+
+
+@contextmanager
+def serving(*arguments: object, before: Callable[[], None] = lambda: None) -> Iterator[Server]:
+    """label or view as a copy of this process, which has loaded what they need; before: what the
+    copy does first. It is killed in the end."""
+    (out, said), (errors, wrong) = os.pipe(), os.pipe()
+    process = multiprocessing.get_context("fork").Process(
+        target=_command, args=([str(a) for a in arguments], said, wrong, before))
+    process.start()
+    os.close(said)
+    os.close(wrong)
+    with open(out) as lines, open(errors) as problems:
+        try:
+            url = lines.readline().strip()
+            assert url.startswith("http://127.0.0.1:"), (url, problems.read())
+            yield Server(process, url, problems)
+        finally:
+            process.kill()
+            process.join()
+
+
+def _command(arguments: list[str], said: int, wrong: int, before: Callable[[], None]) -> None:
+    """In the copy."""
+    sys.argv = ["lidar-perception", *arguments]
+    sys.stdout, sys.stderr = open(said, "w", 1), open(wrong, "w", 1)
+    before()
+    main()
+
+
+@dataclass
 class Label:
     """A running labelling, asked over HTTP beside the page."""
 
-    process: subprocess.Popen
+    process: multiprocessing.Process
     url: str
     out: Path
     arguments: tuple[str, ...]

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
+import multiprocessing
 import shutil
-import signal
-import subprocess
-import sys
 import time
 from dataclasses import replace
 from functools import partial
@@ -22,7 +19,8 @@ from detection_samples import BOXES, lively, tiny, two_objects
 from samples import write
 
 from lidar_perception.adapting import adapt as adapt_module
-from lidar_perception.adapting.adapt import BEST, LAST, Adapting
+from lidar_perception.adapting.adapt import BEST, HEARD, LAST, Adapting
+from lidar_perception.adapting.drives import FEWEST
 from lidar_perception.adapting.judging import IGNORED, KEPT, REJECTED, STATES
 from lidar_perception.adapting.labels import ConcludedLabels
 from lidar_perception.adapting.looking import SOURCES, FrameLook
@@ -59,10 +57,10 @@ pytestmark = pytest.mark.usefixtures("one_thread_for_all")
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory) -> Path:
-    """A simulated drive of 12 frames, with poses."""
+    """A simulated drive of the fewest frames, with poses."""
     path = tmp_path_factory.mktemp("drive") / "bag"
-    made = CliRunner().invoke(cli, ["simulate", "--out", str(path), "--frames", "12", "--seed", "3",
-                                    "--sensor", SENSOR, "--people", "3"])
+    made = CliRunner().invoke(cli, ["simulate", "--out", str(path), "--frames", str(FEWEST),
+                                    "--seed", "3", "--sensor", SENSOR, "--people", "3"])
     assert made.exit_code == 0, made.exception
     return path
 
@@ -112,20 +110,15 @@ def whole(bag, weights, tmp_path_factory) -> Path:
 def test_a_killed_run_ends_as_if_it_had_not_been(bag, weights, whole, tmp_path):
     out = tmp_path / "out"
     perfect_looks(bag, out)
-    code = ("import sys; from pathlib import Path; sys.path.insert(0, 'test');"
-            "sys.path.insert(0, 'test/adapting'); from test_adapting import adapted;"
-            "adapted(*map(Path, sys.argv[1:]))")
-    process = subprocess.Popen([sys.executable, "-c", code, str(bag), str(weights), str(out)],
-                               env={**os.environ, "OMP_NUM_THREADS": "1"},
-                               cwd=Path(__file__).parents[2], text=True,
-                               stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    process = multiprocessing.get_context("fork").Process(target=adapted, args=(bag, weights, out))
+    process.start()
     end = time.monotonic() + 240
     while not (out / "round1" / "objects.npz").exists():
-        assert process.poll() is None, process.stderr.read()
+        assert process.is_alive(), f"it ended with code {process.exitcode}"
         assert time.monotonic() < end
         time.sleep(0.002)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
+    process.kill()
+    process.join()
     assert not (out / BEST).exists()
     before = weights.read_bytes()
     run = adapted(bag, weights, out)
@@ -159,9 +152,11 @@ def test_a_round_that_makes_simulated_validation_worse_is_not_taken(bag, weights
     assert json.loads((out / "adapt.json").read_text())["rounds"][0]["refused"]
 
 
-def test_the_cluster_network_is_adapted_in_the_same_way(bag, tmp_path):
+def test_the_cluster_network_is_adapted_in_the_same_way(bag, whole, tmp_path):
     old, out = weights_file(PointNetParams()), tmp_path / "out"
     perfect_looks(bag, out)
+    shutil.copy(whole / HEARD, out)
+    shutil.copytree(whole / "scans", out / "scans")
     run = adapted(bag, old, out, replace(SMALL, steps=1, worse_simulated=100.0,
                                          worse_agreement=1.0))
     assert isinstance(open_detector(out / BEST, "cpu"), PointNetDetector)
@@ -227,26 +222,27 @@ def test_regions_give_no_gradient_and_change_none_elsewhere():
 
 # bad input: one line, and nothing is made or replaced
 
-def standing(path: Path) -> Path:
-    looks, stamps, _ = drive()
-    points = two_objects()
+def standing(path: Path, count: int = 16) -> Path:
+    stamps, points = drive()[1][:count], two_objects()
     frames = [Frame.of(str(i), LidarFrame(points[:, :3], points[:, 3], stamps[i], "velodyne"),
-                       pose=partial(np.eye, 4)) for i in range(len(looks))]
+                       pose=partial(np.eye, 4)) for i in range(count)]
     write_bag(path, frames)
     return path
 
 
 def refused(out: Path, *words: str) -> str:
     said = CliRunner().invoke(cli, ["adapt", "--out", str(out), "--device", "cpu", "--jobs", "0",
-                                    "--frames", "100", "--sensor", SENSOR, *map(str, words)])
+                                    "--frames", "100", "--val-scans", "1", "--sensor", SENSOR,
+                                    *map(str, words)])
     assert isinstance(said.exception, InputError), said.exception
     assert "\n" not in str(said.exception)
     return str(said.exception)
 
 
-def test_bad_input_is_refused_in_one_line(bag, weights, made, tmp_path):
+def test_bad_input_is_refused_in_one_line(bag, weights, tmp_path):
     out = tmp_path / "out"
-    assert "5 frames" in refused(out, "--data", made / "kitti-tracking", "--weights", weights)
+    assert "5 frames" in refused(out, "--data", standing(tmp_path / "short", 5), "--weights",
+                                 weights)
     assert "stands still" in refused(tmp_path / "still", "--data", standing(tmp_path / "bag"),
                                      "--weights", weights)
     assert "--budget" in refused(out, "--data", bag, "--weights", weights, "--budget", "0")

@@ -254,8 +254,8 @@ def test_a_tiny_network_learns_two_objects():
     targets = assign(anchors, config, BOXES, LABELS)
     points = torch.from_numpy(two_objects())
     optimizer = torch.optim.AdamW(network.parameters())
-    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 0.02, total_steps=400)
-    for _ in range(400):
+    rate = torch.optim.lr_scheduler.OneCycleLR(optimizer, 0.02, total_steps=200)
+    for _ in range(200):
         losses = detection_loss(network(make_pillars([points], config)), targets, kinds)
         optimizer.zero_grad()
         losses.total.backward()

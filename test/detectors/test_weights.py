@@ -160,12 +160,11 @@ def test_weights_that_do_not_come_with_the_package_are_asked_for(tmp_path, monke
 # export
 
 @needs_onnx
-@pytest.mark.parametrize("version, changes", [  # the versions between have parts of the last
-    ("v0", dict(max_points=3, zero_row=True, middle_z=True)), ("v2", {}), ("v4", {})])
 @pytest.mark.no_cover
-def test_an_exported_network_finds_the_same(version, changes, tmp_path):
+def test_an_exported_network_finds_the_same(tmp_path):
+    """The first version; the command exports the last, of which those between have parts."""
     from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork, export_onnx
-    config = tiny(version, anchors=tiny().anchors[:1 + int(version[1])][-2:], **changes)
+    config = tiny("v0", anchors=tiny().anchors[:1], max_points=3, zero_row=True, middle_z=True)
     network, header = lively(config), Header(config, {"steps": 3})
     export_onnx(network, header, tmp_path / "n.onnx")
     exported = load_detector(tmp_path / "n.onnx", "auto", eager(score=0.1))

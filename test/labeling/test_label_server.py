@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import re
 import resource
 import signal
 import socket
 import subprocess
 import sys
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager
 
 import aiohttp
 import numpy as np
 import pytest
+from labeling_pages import serving
 from samples import WALKER
 from yarl import URL
 
@@ -22,23 +24,14 @@ BOX = [*WALKER[:6].tolist(), 0.3]
 ADD = {"do": "add", "frame": 0, "class": "Pedestrian", "box": BOX}
 
 
-def command(data, out, *more):
+def label(data, out, *more):
     """To label with a server that proposes nothing by itself."""
-    return [sys.executable, "-m", "lidar_perception.cli.main", "label", "--data", str(data),
-            "--out", str(out), "--no-open", "--no-propose", *more]
+    return ["label", "--data", str(data), "--out", str(out), "--no-open", "--no-propose", *more]
 
 
-@contextmanager
-def serving(data, out, *more, **how):
-    """The process, and the address it prints."""
-    with subprocess.Popen(command(data, out, *more), text=True, stdout=subprocess.PIPE,
-                          stderr=subprocess.PIPE, **how) as process:
-        try:
-            url = process.stdout.readline().strip()
-            assert url.startswith("http://127.0.0.1:"), (url, process.stderr.read())
-            yield process, url
-        finally:
-            process.kill()
+def alone(*arguments):
+    """As a program of its own."""
+    return [sys.executable, "-m", "lidar_perception.cli.main", *arguments]
 
 
 class Page:
@@ -88,8 +81,8 @@ def asked(url, questions):
 @pytest.fixture(scope="module")
 def served(written, tmp_path_factory):
     """One server for the tests that leave its labels as they like."""
-    with serving(written, tmp_path_factory.mktemp("labels")) as (_, url):
-        yield url
+    with serving(*label(written, tmp_path_factory.mktemp("labels"))) as server:
+        yield server.url
 
 
 def test_a_cloud_says_all_that_the_page_draws(served, written):
@@ -230,19 +223,20 @@ def test_a_killed_server_has_lost_nothing_and_a_second_one_is_refused(written, t
         await page.do(do="box", track=1, frame=2, box=BOX)
         await page.do(do="undo")
         return await page.json("/api/state")
-    with serving(written, tmp_path) as (process, url):
-        before = asked(url, edit)
-        second = subprocess.run(command(written, tmp_path), text=True, capture_output=True)
+    with serving(*label(written, tmp_path)) as server:
+        before = asked(server.url, edit)
+        second = subprocess.run(alone(*label(written, tmp_path)), text=True, capture_output=True)
         assert second.returncode == 2 and "another process" in second.stderr
-        process.send_signal(signal.SIGKILL)
+        server.process.kill()
     with open(tmp_path / "journal.jsonl", "a") as journal:
         journal.write('{"seq": 4, "do": "re')
-    with serving(written, tmp_path) as (process, url):
-        assert asked(url, lambda page: page.json("/api/state")) == before
-        assert asked(url, lambda page: page.do(do="redo")) == {"seq": 4}
-        process.send_signal(signal.SIGINT)
-        assert process.wait(60) == 0
-        assert "cut off" in re.sub(r"\s+", " ", process.stderr.read())
+    with serving(*label(written, tmp_path)) as server:
+        assert asked(server.url, lambda page: page.json("/api/state")) == before
+        assert asked(server.url, lambda page: page.do(do="redo")) == {"seq": 4}
+        os.kill(server.process.pid, signal.SIGINT)
+        server.process.join(60)
+        assert server.process.exitcode == 0
+        assert "cut off" in re.sub(r"\s+", " ", server.errors.read())
 
 
 def limited():
@@ -260,11 +254,11 @@ def test_a_full_disk_is_said_and_the_labels_stay_as_the_journal_has_them(written
                     assert await page.json("/api/state") == before
                     return before
         raise AssertionError("the disk was never full")
-    with serving(written, tmp_path, preexec_fn=limited) as (_, url):
-        before = asked(url, fill)
+    with serving(*label(written, tmp_path), before=limited) as server:
+        before = asked(server.url, fill)
     assert len(before["tracks"]) > 3
-    with serving(written, tmp_path) as (_, url):
-        assert asked(url, lambda page: page.json("/api/state")) == before
+    with serving(*label(written, tmp_path)) as server:
+        assert asked(server.url, lambda page: page.json("/api/state")) == before
 
 
 @pytest.mark.no_cover
@@ -286,25 +280,25 @@ def test_labels_go_out_and_come_back_as_they_were(written, tmp_path):
             async with page.http.post(f"{page.base}/api/export", json=bad) as answer:
                 assert answer.status == 400 and (await answer.json())["error"]
         return first, await page.json("/api/state")
-    with serving(written, tmp_path / "one") as (_, url):
-        written_to, state = asked(url, make)
+    with serving(*label(written, tmp_path / "one")) as server:
+        written_to, state = asked(server.url, make)
     assert written_to["boxes"] == 4 and written_to["frames"] == 3
     again = ["--import", f"openlabel:{written_to['path']}"]
-    with serving(written, tmp_path / "two", *again) as (_, url):
-        back = asked(url, lambda page: page.json("/api/state"))
+    with serving(*label(written, tmp_path / "two", *again)) as server:
+        back = asked(server.url, lambda page: page.json("/api/state"))
         assert {(t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"]))))
                 for t in back["tracks"]} == {
             (t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"])))) for t in state["tracks"]}
-        asked(url, lambda page: page.do(do="undo"))
-        assert asked(url, lambda page: page.json("/api/state"))["tracks"] == []
+        asked(server.url, lambda page: page.do(do="undo"))
+        assert asked(server.url, lambda page: page.json("/api/state"))["tracks"] == []
 
 
 def test_labels_of_the_drive_are_shown_only_when_asked_for(served, written, tmp_path):
     assert asked(served, lambda page: page.json("/api/labels/0"))["labels"] == []
-    with serving(written, tmp_path, "--show-labels") as (_, url):
-        (*box, name, _), = asked(url, lambda page: page.json("/api/labels/0"))["labels"]
+    with serving(*label(written, tmp_path, "--show-labels")) as server:
+        (*box, name, _), = asked(server.url, lambda page: page.json("/api/labels/0"))["labels"]
         assert np.allclose(box, WALKER) and name == "Pedestrian"
-        assert asked(url, lambda page: page.json("/api/labels/1"))["labels"] == []
+        assert asked(server.url, lambda page: page.json("/api/labels/1"))["labels"] == []
 
 
 def test_the_drive_is_looked_at_beside_the_page_and_only_once(written, tmp_path):
@@ -316,10 +310,10 @@ def test_the_drive_is_looked_at_beside_the_page_and_only_once(written, tmp_path)
                 assert "error" not in event, event
                 state["progress"] = event["progress"]
         return await page.json("/api/state")
-    arguments = [a for a in command(written, tmp_path) if a != "--no-propose"]
     before = None
     for _ in range(2):  # the second one finds the proposals in the journal
-        with subprocess.Popen(arguments, text=True, stdout=subprocess.PIPE) as process:
+        with subprocess.Popen(alone(*label(written, tmp_path, "--propose")), text=True,
+                              stdout=subprocess.PIPE) as process:
             try:
                 state = asked(process.stdout.readline().strip(), wait)
             finally:

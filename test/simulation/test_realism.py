@@ -17,6 +17,7 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.cli.main import cli
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
+from lidar_perception.simulation.realism import report
 from lidar_perception.simulation.realism.compare import (
     MAX_SCANS,
     MIN_SAMPLES,
@@ -327,8 +328,15 @@ def test_of_a_large_folder_an_even_choice_is_compared(tmp_path):
     assert (numbers[0], numbers[-1]) == (0, len(many) - 1) and set(np.diff(numbers)) <= {3, 4}
 
 
-def test_the_command_compares(tmp_path):
+def test_the_command_compares(tmp_path, monkeypatch):
     import matplotlib.pyplot as plt
+
+    def few_drawn(path, content):
+        """One panel of each kind: to draw all takes long."""
+        kinds = {(CURVES[name].histogram, CURVES[name].log): name for name in CURVES}
+        draw_realism(path, {**content, "curves": {
+            name: content["curves"][name] for name in kinds.values()}})
+    monkeypatch.setattr(report, "draw_realism", few_drawn)
     root, made = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "made"
     result = CliRunner().invoke(cli, [
         "simulate", "--compare", str(root), "--frames", "1", "--json", str(made / "realism.json"),
@@ -337,7 +345,8 @@ def test_the_command_compares(tmp_path):
     content = json.loads((made / "realism.json").read_text())
     assert set(content["curves"]) == set(CURVES)
     picture = plt.imread(made / "realism.png")
-    assert min(picture.shape[:2]) > 1000 and picture[..., :3].std() > 0.05
+    panels = picture[2 * len(picture) // 5:3 * len(picture) // 4, :, :3]  # below the title
+    assert min(picture.shape[:2]) >= 300 and panels.std() > 0.05
     assert content["real"]["scans"] == content["simulated"]["scans"] == 1
 
 

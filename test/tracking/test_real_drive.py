@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import pytest
+
+FRAMES = 20
+
+
+@pytest.fixture(scope="module")
+def detector(data):
+    """What the detector finds, once for all tests."""
+    from lidar_perception.data.open import open_recording
+    from lidar_perception.detectors.open import open_detector
+    from lidar_perception.detectors.params import MIN_SCORE
+    found, detect = {}, open_detector("pointpillars", min_score=MIN_SCORE)
+    for frame in open_recording(data / "kitti_tracking").frames[:FRAMES]:
+        scan = frame.load()
+        found[scan.stamp_ns] = detect(scan)
+    assert len(found) == FRAMES
+    return lambda scan: found[scan.stamp_ns]
 
 
 @pytest.mark.parametrize("ego", ["none", "auto"])
 @pytest.mark.no_cover
-def test_no_identity_switches_on_a_real_drive(data, ego):
+def test_no_identity_switches_on_a_real_drive(data, detector, ego):
     """Which has no poses: auto takes them from the scans."""
     from lidar_perception.data.frame import POSES
     from lidar_perception.data.open import open_recording
-    from lidar_perception.detectors.open import open_detector
-    from lidar_perception.detectors.params import MIN_SCORE
     from lidar_perception.scoring.run import fill
     from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, ego_of
     from lidar_perception.tracking.ego import has_odometry
@@ -22,7 +34,6 @@ def test_no_identity_switches_on_a_real_drive(data, ego):
     report, drive = TrackingReport(), open_recording(data / "kitti_tracking")
     if ego == "auto" and POSES not in drive.has:
         assert ego_of(drive) == ("kiss_icp" if has_odometry() else "none")
-    fill(report, drive,
-         by_tracker(partial(open_detector, "pointpillars", min_score=MIN_SCORE), ego=ego), limit=20)
+    fill(report, drive, by_tracker(lambda: detector, ego=ego), limit=FRAMES)
     cars = report.compute()["classes"]["Car"]
     assert cars["switches"] == 0 and cars["HOTA"] > 0.7

@@ -20,7 +20,8 @@ from lidar_perception.training.loop import STATE
 from lidar_perception.training.start import RUN
 from lidar_perception.types import InputError
 
-SENSOR = "generic:16,-20,5,1,10"
+pytestmark = pytest.mark.usefixtures("streets")
+SENSOR = "generic:16,-20,5,2,10"
 
 
 def words(out: Path, *more: str) -> list[str]:

@@ -19,7 +19,7 @@ from lidar_perception.training.params import PointNetTraining
 from lidar_perception.types import InputError
 
 pytestmark = pytest.mark.usefixtures("one_thread", "streets")
-SENSOR = "generic:32,-24,5,0.8,10"
+SENSOR = "generic:16,-20,5,1.5,10"
 
 
 @pytest.fixture(scope="module")

@@ -201,9 +201,10 @@ def test_objects_that_are_put_in_touch_nothing_and_keep_their_points(seed):
     assert np.array_equal(again.points, fuller.points)
 
 
-def wall(x: float, y: tuple[float, float], z: tuple[float, float]) -> np.ndarray:
-    """(N, 4) points 2 cm apart."""
-    sides, heights = np.meshgrid(np.arange(*y, 0.02), np.arange(*z, 0.02))
+def wall(x: float, y: tuple[float, float], z: tuple[float, float], apart: float = 0.02
+         ) -> np.ndarray:
+    """(N, 4) points."""
+    sides, heights = np.meshgrid(np.arange(*y, apart), np.arange(*z, apart))
     return np.column_stack([np.full(sides.size, x), sides.ravel(), heights.ravel(),
                             np.zeros(sides.size)]).astype(np.float32)
 
@@ -216,7 +217,7 @@ def one_walker(x: float) -> Database:
 
 
 def street_with(*walls: np.ndarray) -> TrainingScene:
-    ground = wall(-1.73, (-15, 15), (0, 15))[::7][:, [2, 1, 0, 3]]
+    ground = wall(-1.73, (-15, 15), (0, 15), 0.1)[:, [2, 1, 0, 3]]
     return TrainingScene(np.concatenate([ground, *walls]), np.zeros((0, 7)), np.zeros(0, int),
                  np.zeros(0, bool))
 
@@ -226,7 +227,7 @@ def street_with(*walls: np.ndarray) -> TrainingScene:
 @pytest.mark.no_cover
 def test_what_is_behind_an_object_goes_and_none_is_put_behind_something(seed):
     params, rng = AugmentParams(cars=0, pedestrians=1, cyclists=0), np.random.default_rng(seed)
-    behind = wall(12.0, (-14, 14), (-1.7, 1.0))
+    behind = wall(12.0, (-14, 14), (-1.7, 1.0), 0.06)
     scene = street_with(behind)
     fuller = with_objects(scene, one_walker(8.0), params, *AREA, rng)
     assert len(fuller.boxes) == 1
