@@ -70,8 +70,8 @@ class BagWriter:
             for old in self.partial.iterdir():
                 shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
             self.file = stack.enter_context(RecordFile(self.partial / f"{self.path.name}.mcap"))
-            self.mcap = Writer(cast(IO[bytes], self.file),  # it only writes, tells and flushes
-                               chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+            stream = cast(IO[bytes], self.file)  # mcap only writes, tells and flushes
+            self.mcap = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
             self.mcap.start(profile="ros2", library="lidar_perception")
             self.open = stack.pop_all()
         return self

@@ -7,10 +7,10 @@ from typing import Any
 
 import yaml
 from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
-from launch.launch_description import LaunchDescription
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
+from launch import LaunchDescription
 from lidar_perception.nodes.graph import (
     ALONE,
     BEHIND,

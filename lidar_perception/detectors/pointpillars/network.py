@@ -31,6 +31,7 @@ PRIOR = 0.01           # score of every anchor before training
 # What a detector asks of a network, torch's or an exported one: logits (A, K) of one cloud, and
 # codes (M, 7) and directions (M, 2) at anchors (M,).
 Prediction = tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]
+Conv = nn.Conv2d | nn.ConvTranspose2d
 
 
 class Outputs(NamedTuple):
@@ -44,7 +45,7 @@ class Outputs(NamedTuple):
 class ConvNormRelu(nn.Sequential):
     """A convolution, batch norm, ReLU."""
 
-    def __init__(self, conv: nn.Conv2d | nn.ConvTranspose2d):
+    def __init__(self, conv: Conv):
         super().__init__(conv, nn.BatchNorm2d(conv.out_channels, EPS, MOMENTUM),
                          nn.ReLU(inplace=True))
 
@@ -240,8 +241,7 @@ def fused(network: PointPillars) -> PointPillars:
         if isinstance(module, ConvNormRelu):
             conv, norm, _ = module
             transposed = isinstance(conv, nn.ConvTranspose2d)
-            if isinstance(conv, (nn.Conv2d, nn.ConvTranspose2d)) and isinstance(norm,
-                                                                                nn.BatchNorm2d):
+            if isinstance(conv, Conv) and isinstance(norm, nn.BatchNorm2d):
                 module[0], module[1] = fuse_conv_bn_eval(conv, norm, transposed), nn.Identity()
     net = network.pillar_net
     if isinstance(net.norm, nn.BatchNorm1d):
