@@ -20,9 +20,8 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.fused import model as module
 from lidar_perception.detectors.fused.detector import Look, load_fused_detector
-from lidar_perception.detectors.fused.evidence import distances
 from lidar_perception.detectors.fused.model import KNOTS
-from lidar_perception.geometry import bev_iou
+from lidar_perception.geometry import bev_iou, centre_distances
 from lidar_perception.runs.files import write_text
 from lidar_perception.types import CLASSES
 
@@ -41,7 +40,7 @@ def samples(frame: Frame, look: Look) -> list[tuple[int, bool, dict[str, float]]
         boxes = truth.of_class(class_id)
         hits = bev_iou(found.boxes[own], boxes) > DETECTED[CLASSES[class_id]].relaxed
         if class_id != CAR:
-            hits |= distances(found.boxes[own], boxes) < NEAR
+            hits |= centre_distances(found.boxes[own], boxes) < NEAR
         taken = np.zeros(len(boxes), bool)
         for i, hit in zip(own, hits):
             if hit.any() and not (hit & ~taken).any():

@@ -260,6 +260,17 @@ def test_no_source_is_longer_than_a_reader_can_hold(name):
     assert len((ROOT / name).read_text(encoding="utf-8").splitlines()) <= MAX_LINES
 
 
+def test_a_number_of_clustering_goes_by_a_name_of_its_own():
+    """Its modules take each other's, and a reader must not take one for the other."""
+    homes = {}
+    for name in files_in("lidar_perception/clustering"):
+        for node in tree_of(name).body:
+            if isinstance(node, ast.Assign) and isinstance(node.value, (ast.Constant, ast.BinOp)):
+                for target in node.targets:
+                    homes.setdefault(ast.unparse(target), []).append(name)
+    assert len(homes) > 10 and {n: w for n, w in homes.items() if len(w) > 1} == {}
+
+
 # What modules do without. Those of one list are imported one after the other by one interpreter,
 # which a second takes to start; each must do without what the ones after it load.
 LIGHT = [

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import shutil
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
-from functools import partial
+from functools import lru_cache, partial
 from hashlib import sha1
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ import numpy as np
 
 from lidar_perception.adapting.drives import (
     Piece,
+    Refused,
     checked,
     frames_of,
     pieces_of,
@@ -55,7 +58,7 @@ from lidar_perception.training.start import start
 from lidar_perception.types import InputError
 
 BEST, LAST, JUDGED = "best.safetensors", "last.safetensors", "judged.json"
-HEARD = "heard.json"
+HEARD, POSES, SCANS, ROUND = "heard.json", "poses", "scans", "round{}"
 LOOKING = 0.3     # of the budget, to look at frames
 LEARNING = 0.5    # of it, to learn; what is left is for the poses and to judge
 MEASURED = 3      # frames that are looked at to know how long one takes
@@ -111,9 +114,10 @@ class Adapting:
         for line in checked(self.frames, data):
             errors.print(line, soft_wrap=True)
         self.network = network_to_train(self.header)
-        detector = opened_with(weights, self.header, device)
-        self.low, self.high = (np.array(end[:2]) for end in (detector.config.low,
-                                                             detector.config.high))
+        # All sources with weights, opened once while these are looked with.
+        self.opened = lru_cache(maxsize=1)(partial(opened_with, header=self.header, device=device))
+        config = self.opened(weights).config
+        self.low, self.high = np.array(config.low[:2]), np.array(config.high[:2])
         self.pieces: list[Piece] = []
         self.poses: list[np.ndarray] = []
         self.seen: list[Seen] = []
@@ -136,6 +140,16 @@ class Adapting:
                 break
         write_bytes(self.out / BEST, self.best.read_bytes())
         self._record()
+
+    def clear(self) -> None:
+        """Remove what a refused run has made, and the folder if nothing else is in it."""
+        for path in (self.out / name for name in (RECORD, HEARD, POSES, SCANS, ROUND.format(1))):
+            if path.is_dir():
+                shutil.rmtree(path, ignore_errors=True)
+            else:
+                path.unlink(missing_ok=True)
+        with suppress(OSError):
+            self.out.rmdir()
 
     def asked(self) -> dict[str, Any]:
         """What a resumed run must have in common."""
@@ -166,7 +180,7 @@ class Adapting:
 
     def _affordable(self) -> int:
         errors.print("measuring this machine with a few frames ...")
-        looker = Looker(opened_with(self.weights, self.header, self.device))
+        looker = Looker(self.opened(self.weights))
         looker(self.frames[0], np.eye(4))
         begun = time.monotonic()
         for frame in self.frames[1:1 + MEASURED]:
@@ -183,7 +197,7 @@ class Adapting:
         def made() -> np.ndarray:
             return np.array(list(track(poses_of(self.frames, piece), f"poses of {piece.name}",
                                        len(piece.numbers))))
-        return made_once(self.out / "poses" / f"{i:03}.npz", made, lambda a: a["poses"],
+        return made_once(self.out / POSES / f"{i:03}.npz", made, lambda a: a["poses"],
                          lambda poses: {"poses": poses})
 
     @property
@@ -200,7 +214,7 @@ class Adapting:
         path = self.out / HEARD
         if not path.is_file():
             frames = simulated_frames(self._training(self.out), self._params(1), self.sensor)
-            looker = Looker(opened_with(self.weights, self.header, self.device))
+            looker = Looker(self.opened(self.weights))
             write_text(path, json.dumps(recognised(looker, track(frames, "looking at simulated "
                                                                  "scans", len(frames)))))
         counts: Counts = json.loads(read_text(path, 10**6))
@@ -210,9 +224,9 @@ class Adapting:
 
     def _round(self, number: int, begun: float) -> bool:
         """One round; whether its weights were taken."""
-        folder = self.out / f"round{number}"
+        folder = self.out / ROUND.format(number)
         errors.print(f"round {number} of {self.params.rounds}", style="bold")
-        looker = Looker(opened_with(self.best, self.header, self.device))
+        looker = Looker(self.opened(self.best))
         self.seen = [self._look(i, folder / "looks", looker) for i in range(len(self.pieces))]
         if number == 1:
             self.first_seen = self.seen
@@ -220,10 +234,14 @@ class Adapting:
         for state in STATES:
             errors.print(f"{state}: " + (", ".join(f"{count} {name}" for name, count in
                                                    counts[state].items()) or "nothing"))
-        if sum(counts[KEPT].values()) < FEWEST_KEPT:
-            raise InputError(
-                f"{self.data}: the detectors agree on {sum(counts[KEPT].values())} objects only, "
-                f"too few to learn from ({FEWEST_KEPT}); record more, give --mount-height if it is "
+        if (agreed := sum(counts[KEPT].values())) < FEWEST_KEPT:
+            few = f"the detectors agree on {agreed} objects only, too few to learn from"
+            if self.rounds:
+                errors.print(f"round {number} is not made: {few}; {self.best} stays",
+                             soft_wrap=True)
+                return False
+            raise Refused(
+                f"{self.data}: {few} ({FEWEST_KEPT}); record more, give --mount-height if it is "
                 "not right, or train for the sensor first (train --sensor)")
         if self.before is None:
             self.before = self._watch(self.out / JUDGED, self.weights)
@@ -275,7 +293,7 @@ class Adapting:
                      hours)
 
     def _params(self, count: int) -> Any:
-        return training_params(self.header, self.params, count, self.height, self.out / "scans")
+        return training_params(self.header, self.params, count, self.height, self.out / SCANS)
 
     def _watch(self, path: Path, weights: Path) -> Watched:
         """How good weights are, from the file if it is known."""
@@ -288,7 +306,7 @@ class Adapting:
         frames = [self.frames[seen.piece.numbers[k]] for seen, k in held]
         f1, found, kept = agreement_of(open_detector(weights, self.device), frames,
                                        [seen.labels[k] for seen, k in held], self.low, self.high)
-        looker = Looker(opened_with(weights, self.header, self.device))
+        looker = Looker(self.opened(weights))
         looks = [looker(frame, np.eye(4)) for frame in track(frames, "judging all sources",
                                                              len(frames))]
         watched = Watched(

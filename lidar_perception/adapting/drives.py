@@ -24,6 +24,10 @@ WENT = 1.0        # metres that the sensor must go
 GAP = 2.0         # seconds without a frame, after which another drive begins
 
 
+class Refused(InputError):
+    """Drives of which nothing can be learned, so that there is nothing to resume either."""
+
+
 @dataclass(frozen=True)
 class Piece:
     """Consecutive frames of one drive, their numbers in the recording; name: of the drive."""
@@ -69,8 +73,8 @@ def checked(frames: Sequence[Frame], source: Path) -> list[str]:
 
 def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
     """All frames by drive; where there are more than `most`, pieces of PIECE, or of `most` if that
-    is less, spread over all. A drive ends where the stamps leave a GAP, or go back. InputError
-    where none has FEWEST."""
+    is less, spread over all. A drive ends where the stamps leave a GAP, or go back. Refused where
+    none has FEWEST."""
     drives: dict[str, list[list[int]]] = {}
     for number, frame in enumerate(frames):
         runs = drives.setdefault(frame.sequence, [])
@@ -78,8 +82,8 @@ def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
             runs.append([])
         runs[-1].append(number)
     if max(len(run) for runs in drives.values() for run in runs) < FEWEST:
-        raise InputError(f"no {FEWEST} frames follow each other within {GAP:g} s, so that nothing "
-                         "can be followed; record every scan")
+        raise Refused(f"no {FEWEST} frames follow each other within {GAP:g} s, so that nothing "
+                      "can be followed; record every scan")
     whole, size = len(frames) <= most, max(FEWEST, min(PIECE, most))
     pieces: list[Piece] = []
     for name, runs in drives.items():
@@ -113,9 +117,9 @@ def poses_of(frames: Sequence[Frame], piece: Piece) -> Iterator[Any]:
 
 
 def require_motion(poses: Sequence[np.ndarray], source: Path) -> None:
-    """InputError where the sensor goes nowhere in any piece; poses: by piece, (F, 4, 4)."""
+    """Refused where the sensor goes nowhere in any piece; poses: by piece, (F, 4, 4)."""
     went = [np.linalg.norm(each[:, :2, 3] - each[0, :2, 3], axis=1).max() for each in poses]
     if max(went) < WENT:
-        raise InputError(f"{source}: the sensor stands still ({max(went):.1f} m in all), and from "
-                         "one place people that stand cannot be told from posts; record a drive of "
-                         "some metres at least")
+        raise Refused(f"{source}: the sensor stands still ({max(went):.1f} m in all), and from one "
+                      "place people that stand cannot be told from posts; record a drive of some "
+                      "metres at least")

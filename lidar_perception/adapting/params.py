@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from lidar_perception.param_fields import Params, param
 
-RECORD = "adapt.json"  # in the folder of a run: what was asked for, and how it went
+# In the folder of a run: what was asked for, and how it went; and for people, under this title.
+RECORD, REPORT, TITLE = "adapt.json", "report.html", "A detector, adapted"
 
 
 @dataclass(frozen=True)

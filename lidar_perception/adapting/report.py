@@ -10,6 +10,7 @@ import numpy as np
 from lidar_perception.adapting.adapt import Adapting, Seen
 from lidar_perception.adapting.figures import COLORS, drawn
 from lidar_perception.adapting.judging import KEPT, STATES
+from lidar_perception.adapting.params import REPORT, TITLE
 from lidar_perception.data.frame import Frame
 from lidar_perception.labeling.exchange import export_labels
 from lidar_perception.labeling.labels import DriveLabels, FrameLabels, Row, of_rows
@@ -17,13 +18,14 @@ from lidar_perception.runs.files import write_text
 from lidar_perception.runs.page import data_url, render
 from lidar_perception.types import CLASSES
 
-REPORT, LABELS = "report.html", "labels"
+LABELS = "labels"
 FORMAT = "openlabel"
 PICTURES = 6   # of all pieces
 
 
 def write_report(run: Adapting) -> None:
-    """Write REPORT and LABELS into the run's folder; also of one that found too little."""
+    """Write REPORT into the run's folder, also of one that found too little, and of one that
+    learned something LABELS."""
     rows = [{"piece": seen.piece.name, "number": number, "name": CLASSES[one.class_id],
              "state": verdict.state, "reason": verdict.reason, "score": one.score,
              "seen": f"{len(one)} of {one.frames[-1] - one.frames[0] + 1} frames"}
@@ -31,9 +33,10 @@ def write_report(run: Adapting) -> None:
                 zip(seen.tracks, seen.verdicts))]
     rows.sort(key=lambda row: (STATES.index(str(row["state"])), -float(str(row["score"]))))
     write_text(run.out / REPORT, render(
-        "adapting/report.html", title="A detector, adapted", run=run, rows=rows, colors=COLORS,
+        "adapting/report.html", title=TITLE, run=run, rows=rows, colors=COLORS,
         pictures=pictures(run.seen, run.frames, run.low, run.high)))
-    write_labels(run.seen, run.frames, run.out / LABELS)
+    if run.rounds:
+        write_labels(run.seen, run.frames, run.out / LABELS)
 
 
 def pictures(seen: Sequence[Seen], frames: Sequence[Frame], low: np.ndarray,

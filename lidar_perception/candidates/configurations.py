@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.clustering.params import DENSE
+from lidar_perception.clustering.params import FULL_DENSITY
 from lidar_perception.param_fields import with_values
 
 # Paper A's protocol: points in the camera's view, the nearest labelled pedestrian as seed. The
@@ -13,7 +13,7 @@ PAPER_VALUES = {"view.enabled": True, "seed.source": "ground_truth"}
 # What found most pedestrians on frames that it was not tuned on, with any source of the seed.
 # docs/reproduce.md has the figures.
 BEST_VALUES = {
-    "clustering.density": DENSE,
+    "clustering.density": FULL_DENSITY,
     "clustering.dbscan.range_limits": (15.0, 30.0, 45.0),
     "clustering.dbscan.eps": (0.15, 0.30, 0.50, 0.70),
     "clustering.dbscan.min_samples": 5,

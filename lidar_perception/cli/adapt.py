@@ -8,9 +8,10 @@ from typing import Any
 
 import click
 
-from lidar_perception.adapting.params import RECORD, AdaptParams
+from lidar_perception.adapting.params import RECORD, REPORT, TITLE, AdaptParams
 from lidar_perception.cli.data import WHAT, a_path, device_option
 from lidar_perception.cli.options import parameter_options
+from lidar_perception.runs.files import read_text
 from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console, errors
 from lidar_perception.types import InputError
@@ -53,15 +54,20 @@ def adapt(data: Path, weights: Path, out: Path, budget: float, resume: bool, for
     begin(out, weights, resume, force)
     console.print(f"adapting {weights} to {data}", soft_wrap=True, style="dim")
     from lidar_perception.adapting.adapt import Adapting
+    from lidar_perception.adapting.drives import Refused
     from lidar_perception.adapting.report import write_report
     run = Adapting(data, weights, out, budget, params, device, jobs)
     with locked(out):
         if force and (out / RECORD).exists():
             shutil.rmtree(out)
             out.mkdir()
+        if not (out / RECORD).exists():
+            (out / REPORT).unlink(missing_ok=True)
         try:
             run.run()
-        except InputError:
+        except InputError as error:
+            if isinstance(error, Refused):
+                run.clear()
             if run.seen:  # so that one sees why
                 write_report(run)
             raise
@@ -74,8 +80,10 @@ def adapt(data: Path, weights: Path, out: Path, budget: float, resume: bool, for
 
 def begin(out: Path, weights: Path, resume: bool, force: bool) -> None:
     """InputError where out holds something that is neither to be resumed nor replaced."""
-    if not out.exists() or (out.is_dir() and not any(out.iterdir())):
-        return
+    there = [path.name for path in out.iterdir()] if out.is_dir() else []
+    if not out.exists() or (out.is_dir() and not there) or (
+            there == [REPORT] and TITLE in read_text(out / REPORT, 10**9)):
+        return  # at most the report of a run that was refused
     ours = (out / RECORD).is_file()
     if not ours:
         raise InputError(f"{out} exists and is no run of adapt; give another name")

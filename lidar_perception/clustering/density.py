@@ -11,7 +11,7 @@ from lidar_perception.geometry import horizontal_range
 from lidar_perception.types import usable_returns
 
 CELL = 2.0       # degrees: the gap between the beams of a VLP-16
-ENOUGH = 30_000  # points that are looked at
+LOOKED_AT = 30_000  # points, of a larger cloud
 WIDEST = 4.0     # times as wide are neighbourhoods at most
 FEWEST = 3       # points of a cluster, at least, and one less within eps
 # So many distances between points on a surface that faces the sensor are within a widened radius of
@@ -24,7 +24,7 @@ def density(xyz: np.ndarray) -> float:
     """Points a square degree of view: how many others lie in the direction of a usable return of
     (N, 3) float32, metres from the sensor, in the mean. 0 where none has another beside it; N may
     be 0. KITTI's HDL-64E has 13 to 16, however its clouds are cropped."""
-    step = max(len(xyz) // ENOUGH, 1)
+    step = max(len(xyz) // LOOKED_AT, 1)
     looked_at = xyz[::step]
     x, y, z = looked_at.compress(usable_returns(looked_at), axis=0).T
     away = np.hypot(x, y)

@@ -17,9 +17,9 @@ The equations are missing from the text of the paper; this is our reading of wha
 So the clusters do not depend on the order of the points. No pairs are stored: memory grows with
 the number of points only. Where the grid takes more than PATIENCE distances a point, because it
 is crowded with points out of reach of each other, a tree finds the same. Only the local threshold
-has to look at every pair: it is exact up to DENSE distances a point, where scans of KITTI take
-less than 1,700 and one of a Pandar64 among near surfaces 21,000, and WORK a cloud, twice what the
-densest scan known takes; of denser clouds it takes a sample of each cell, the same of the same
+has to look at every pair: it is exact up to WORK_A_POINT distances a point, where scans of KITTI
+take less than 1,700 and one of a Pandar64 among near surfaces 21,000, and WORK a cloud, twice what
+the densest scan known takes; of denser clouds it takes a sample of each cell, the same of the same
 points.
 """
 
@@ -47,7 +47,7 @@ from lidar_perception.clustering.tree import crowded as count_crowded
 SAMPLE, SIDES = 64, 5  # the first cells are 5 medians of a sample's nearest distances wide
 BUDGET = 20_000_000    # distances that are rather computed than to sort points into larger cells
 WORK = 2**32           # distances for local thresholds
-DENSE = 2**15          # of them a point
+WORK_A_POINT = 2**15   # of them a point
 
 
 def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
@@ -68,7 +68,7 @@ def euclidean(xyz: np.ndarray, params: EuclideanParams = EuclideanParams(),
     else:
         radii = np.full(n, params.radius) if radii is None else radii
         cells, reach = cells_of(xyz, float(radii.max())), np.empty(n)
-        radii2, work = radii[cells.order] ** 2, min(work, DENSE * n)
+        radii2, work = radii[cells.order] ** 2, min(work, WORK_A_POINT * n)
         means = (_means(cells, radii2) if around(cells) * n <= work else
                  _means_of_sample(cells, sample_of(cells, work), radii2))
         reach[cells.order] = np.float32(params.alpha * means)

@@ -50,7 +50,7 @@ class EuclideanParams(Params):
 
 
 CLUSTERING_METHODS = ("dbscan", "euclidean")
-DENSE = 10.0  # points a square degree; KITTI's HDL-64E has 13 to 16
+FULL_DENSITY = 10.0  # points a square degree that our numbers need; the HDL-64E has 13 to 16
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,8 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import header_message
 
+APART = 8  # clouds between those of a pair in which a slow robot moves: see spread
+
 
 @dataclass(frozen=True)
 class RawClouds:
@@ -75,10 +77,12 @@ def _of_frame(frame: Frame) -> Any:
 
 
 def spread(count: int, wanted: int) -> list[int]:
-    """Which clouds to look at: up to wanted numbers below count in ascending order, pairs of
-    neighbours evenly over all, so that motion shows within a pair and places differ between
-    them."""
+    """Which clouds to look at: up to wanted numbers below count in ascending order, pairs evenly
+    over all, so that motion shows within a pair and places differ between them: of a fast robot in
+    those of neighbours, of a slow one in every second, whose clouds are APART."""
     if count <= wanted:
         return list(range(count))
-    starts = np.linspace(0, count - 2, max(wanted // 2, 1)).astype(int)
-    return sorted({int(i) + k for i in starts for k in (0, 1)})
+    pairs = max(wanted // 2, 1)
+    gaps = np.where(np.arange(pairs) % 2 == 1, min(APART, count - 1), 1)
+    starts = np.linspace(0, count - 1 - gaps[-1], pairs).astype(int)
+    return sorted({*starts.tolist(), *np.minimum(starts + gaps, count - 1).tolist()})

@@ -18,6 +18,7 @@ from lidar_perception.labeling.results import (
     scan_in,
     shown_layers,
     source_name,
+    track_id,
     tracks_of,
     with_sources,
 )
@@ -35,7 +36,6 @@ BOXES, TRACKS, LABELS = "detections", "tracks", "labels"  # kinds of topics besi
 MOST_BYTES, MOST_FRAMES = 300 * 10**6, 300  # of clouds that are kept: 30 s at 10 Hz
 PATIENCE = 0.5   # seconds that a cloud waits for its boxes before it is shown without
 EARLY = 50       # arrays that wait for their cloud
-APART = 10**6    # between the ids of one tracker's tracks and those of the next
 
 
 @dataclass
@@ -62,7 +62,7 @@ class LiveFrame:
     cloud: Any
     came: float
     objects: dict[str, MarkedObjects] = field(default_factory=dict)
-    trails: dict[str, dict[int, Array]] = field(default_factory=dict)
+    trails: dict[str, dict[int, Array]] = field(default_factory=dict)  # by the page's ids
     shown: bool = False
 
 
@@ -175,7 +175,8 @@ class Live:
             objects = replace(objects, boxes=moved_boxes(objects.boxes, pose))
             trails = {number: moved_points(trail, pose) for number, trail in trails.items()}
         heard.elsewhere = ""
-        frame.objects[topic], frame.trails[topic] = objects, trails
+        frame.objects[topic] = objects
+        frame.trails[topic] = {track_id(heard.number, n): trail for n, trail in trails.items()}
         if frame.shown:
             # Labels come when they like; nobody knew that the first of a topic was to come.
             heard.late += heard.kind != LABELS and heard.came > 1
@@ -231,11 +232,10 @@ class Live:
             if heard.kind != TRACKS:
                 continue
             with_them = {f.number: f.objects[topic] for f in frames if topic in f.objects}
-            for track in tracks_of(with_them, topic, heard.number * APART):
-                own = track["id"] - heard.number * APART
+            for track in tracks_of(with_them, topic, heard.number):
                 track["trails"] = {
-                    f.number: np.round(f.trails[topic][own], 3).tolist() for f in frames
-                    if own in f.trails.get(topic, ())}
+                    f.number: np.round(f.trails[topic][track["id"]], 3).tolist() for f in frames
+                    if track["id"] in f.trails.get(topic, ())}
                 made.append(track)
         return made
 

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -44,40 +45,57 @@ ALONG = 0.4
 
 class Proposer:
     """Proposals for a drive. weights: of a detector, as open_detector takes them; "": none. kept:
-    the file that keeps the survey, None for none. looks: of all frames, once they were surveyed,
-    else None; problem: what was wrong with that file, or None."""
+    the folder that keeps the survey, None for none. looks: of all frames, once they were surveyed,
+    else None; problem: what is wrong with what is kept, or ""."""
 
     def __init__(self, drive: Drive, weights: str = FUSED, kept: Path | None = None) -> None:
         self.drive, self.weights, self.kept = drive, weights, kept
         self.looks: list[Look] | None = None
-        self.problem: str | None = None
+        self.problem = ""
+        self._seen: list[Look] = []  # of the first frames
         self._seeds: dict[tuple[int, tuple[float, ...]], Seed | None] = {}
+
+    @cached_property
+    def _key(self) -> str:
+        return survey_cache.key_of(self.drive, self.weights)
 
     def remember(self) -> None:
         """Take the looks that were kept, where they are of this drive and these weights."""
-        if self.kept is None or self.looks is not None:
+        if self.kept is None or self._seen or not self.kept.is_dir():
             return
         try:
-            self.looks = survey_cache.read(self.kept, survey_cache.key_of(self.drive, self.weights))
+            self._seen, self.problem = survey_cache.read(self.kept, self._key)
         except InputError as error:
             self.problem = str(error)
+        if len(self._seen) == len(self.drive.frames):
+            self.looks = self._seen
 
     def survey(self, done: Callable[[int], bool], here: bool = False) -> bool:
-        """Look at all frames, in a process of its own or here, and keep that; done is told how many
-        there are, and says whether to go on. Whether all were."""
-        looks: list[Look] = []
-        with closing(surveyed(self.drive, self.weights, here)) as survey:
+        """Look at all frames that were not yet, in a process of its own or here, and keep that;
+        done is told how many are, and says whether to go on. Whether all were."""
+        looks = self._seen
+        if self.kept is not None and not looks:
+            survey_cache.clear(self.kept)
+        with closing(surveyed(self.drive, self.weights, here, len(looks))) as survey:
             for look in survey:
-                looks.append(look)
+                if look is not None:
+                    looks.append(look)
+                    self._keep(looks)
                 if not done(len(looks)):
                     return False
         self.looks = looks
-        if self.kept is not None:
-            try:
-                survey_cache.write(self.kept, survey_cache.key_of(self.drive, self.weights), looks)
-            except InputError as error:
-                self.problem = str(error)
         return True
+
+    def _keep(self, looks: list[Look]) -> None:
+        """The last piece, once it is whole."""
+        whole = len(looks) % survey_cache.PIECE == 0 or len(looks) == len(self.drive.frames)
+        if self.kept is None or not whole:
+            return
+        first = (len(looks) - 1) // survey_cache.PIECE * survey_cache.PIECE
+        try:
+            survey_cache.write(self.kept, self._key, first, looks[first:])
+        except InputError as error:
+            self.problem = str(error)
 
     def poses(self) -> list[list[float]] | None:
         """Of the frames, by the scans, where the drive has none; None where they are unknown."""

@@ -34,6 +34,7 @@ FOUND, TRACKS = "/output/detections", "/output/tracks"  # the end of a topic, of
 CLUSTERED = ("/clustering/output/points", "/perception/output/points")
 MOST_SOURCES = 8                             # of one detection that are shown
 KEPT = 2000                                  # frames whose detections are kept
+APART = 10**10  # between the ids of one tracker's tracks and the next's; a marker's have 32 bits
 
 
 def with_recorded_scans(drive: Drive) -> Drive:
@@ -161,10 +162,11 @@ def recorded(path: Path, stamps: list[int]) -> Results:
     numbers = {stamp: i for i, stamp in enumerate(stamps)}
     sources: dict[str, Source] = {}
     tracks: list[dict[str, Any]] = []
+    trackers = [topic for topic in found if topic.endswith(TRACKS)]
     for topic, marked in found.items():
         frames = {numbers[stamp]: each for stamp, each in marked.items() if stamp in numbers}
-        if topic.endswith(TRACKS):
-            tracks += tracks_of(frames, topic, len(tracks))
+        if topic in trackers:
+            tracks += tracks_of(frames, topic, trackers.index(topic))
         else:
             sources[source_name(topic)] = _given({i: with_sources(f) for i, f in frames.items()})
     return Results(sources, tuple(tracks))
@@ -210,17 +212,23 @@ def scan_in(message: Any) -> Scan:
                    np.zeros(len(cloud), np.int32) if clusters is None else clusters[0])
 
 
+def track_id(tracker: int, number: int) -> int:
+    """The page's id of a track: what its tracker calls it, as far as that fits, set apart from
+    those of all other trackers; these count from 0."""
+    return tracker * APART + number % APART
+
+
 def tracks_of(frames: Mapping[int, MarkedObjects], topic: str,
-              before: int) -> list[dict[str, Any]]:
-    """What a tracker published, by frame, as the page has tracks; numbered from before + 1 on
-    where there are several trackers."""
+              tracker: int) -> list[dict[str, Any]]:
+    """What a tracker published, by frame, as the page has tracks; which one of them, see
+    track_id."""
     made: dict[int, dict[str, Any]] = {}
     for i in sorted(frames):
         objects = frames[i]
         for box, label, number, score in zip(objects.boxes, objects.labels, objects.ids.tolist(),
                                              objects.scores):
             track = made.setdefault(number, {
-                "id": before + number, "class": label, "state": "accepted", "score": 0.0,
+                "id": track_id(tracker, number), "class": label, "state": "accepted", "score": 0.0,
                 "source": topic.strip("/").split("/")[0], "boxes": [], "uncertainty": 0.0})
             track["score"] = max(track["score"], float(score))
             track["boxes"].append([i, *map(float, box), "proposed"])

@@ -59,7 +59,7 @@ class Session:
 
     def __init__(self, drive: Drive, journal: Journal, weights: str = FUSED) -> None:
         self.drive, self.journal, self.state = drive, journal, State()
-        self.proposer = Proposer(drive, weights, journal.path.with_name(survey_cache.NAME))
+        self.proposer = Proposer(drive, weights, journal.path.with_name(survey_cache.FOLDER))
         self.listeners: list[Listener] = []
         self.busy: dict[str, Any] | None = None
         self.was_proposed = any(line.get("do") == "propose" for line in journal.lines)
@@ -140,15 +140,23 @@ class Session:
             told(count)
             return self._done(count)
         self.proposer.remember()
-        if self.proposer.problem:
-            self.tell({"error": self.proposer.problem})
-        if self.proposer.looks is None and not self.proposer.survey(done, here):
-            return
+        self._tell_problem()
+        if self.proposer.looks is None:
+            whole = self.proposer.survey(done, here)
+            self._tell_problem()
+            if not whole:
+                return
         with self._lock:
             if not self.state.poses and (poses := self.proposer.poses()) is not None:
                 self._record({"do": "poses", "poses": poses}, by)
         if anew:
             self._propose_all(by, None)
+
+    def _tell_problem(self) -> None:
+        """What is wrong with what is kept of the survey, once."""
+        if self.proposer.problem:
+            self.tell({"error": self.proposer.problem})
+            self.proposer.problem = ""
 
     def _done(self, count: int) -> bool:
         """So many frames of what goes on; whether to go on."""

@@ -90,30 +90,42 @@ def _described(xyz: Array, cluster_ids: Array, boxes: Array, numbers: Array,
     return images, shape_features(points, start, boxes, params)
 
 
-def surveyed(drive: Drive, weights: str,
-             here: bool = False) -> Generator[Look, None, None]:
-    """The looks of all frames, in their order, with the detector of these weights, "" for none; in
-    a process of its own, which ends with the iterator, or with `here` in this one. InputError where
+def surveyed(drive: Drive, weights: str, here: bool = False,
+             first: int = 0) -> Generator[Look | None, None, None]:
+    """The looks of all frames from `first` on, in their order, with the detector of these weights,
+    "" for none; in a process of its own, which ends with the iterator, or with `here` in this one.
+    Before them None for each earlier frame that the poses by the scans need again. InputError where
     a frame or the weights cannot be read."""
-    reopen, frames = drive.recording.reopen, list(range(len(drive.frames)))
+    reopen = drive.recording.reopen
+    frames = list(range(0 if _by_scans(drive) else first, len(drive.frames)))
     if here or reopen is None:
-        yield from map(_here(drive, weights), frames)
+        yield from map(_here(drive, weights, first), frames)
         return
     sequence = drive.frames[0].sequence
-    yield from in_processes(partial(_elsewhere, reopen, weights, sequence), frames, 1,
+    yield from in_processes(partial(_elsewhere, reopen, weights, sequence, first), frames, 1,
                             "looked for proposals", apart=True)
 
 
-def _here(drive: Drive, weights: str) -> Callable[[int], Look]:
+def _by_scans(drive: Drive) -> bool:
+    return recorded_source(drive.motion.poses is not None) == "kiss_icp"
+
+
+def _here(drive: Drive, weights: str, first: int) -> Callable[[int], Look | None]:
     from lidar_perception.detectors.open import open_detector  # loads torch; a page need not
     detector = None if weights == "" else open_detector(
         weights, sensor_height=drive.frames[0].sensor_height, min_score=LEAST_SCORE)
-    by_scans = recorded_source(drive.motion.poses is not None) == "kiss_icp"
-    odometry = Odometry() if by_scans else None
-    return lambda i: look_at(drive.frames[i], detector, odometry)
+    odometry = Odometry() if _by_scans(drive) else None
+
+    def look(i: int) -> Look | None:
+        if i >= first:
+            return look_at(drive.frames[i], detector, odometry)
+        if odometry is not None:
+            odometry(drive.frames[i].load().xyz)
+        return None
+    return look
 
 
-def _elsewhere(reopen: Callable[[], Recording], weights: str,
-               sequence: str) -> Callable[[int], Look]:
+def _elsewhere(reopen: Callable[[], Recording], weights: str, sequence: str,
+               first: int) -> Callable[[int], Look | None]:
     os.nice(10)  # the page comes first
-    return _here(one_drive(reopen(), sequence), weights)
+    return _here(one_drive(reopen(), sequence), weights, first)

@@ -1,10 +1,12 @@
-"""The survey of a drive in a file, so that a server that is started again has it at once."""
+"""The survey of a drive in files, a piece each, so that a server that is started again has it at
+once, or goes on where the other one ended."""
 
 from __future__ import annotations
 
 import hashlib
 import io
 import json
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -17,26 +19,37 @@ from lidar_perception.labeling.drive import Drive
 from lidar_perception.labeling.journal import header
 from lidar_perception.labeling.survey import Look
 from lidar_perception.runs.files import short, write_bytes
+from lidar_perception.runs.resuming import differences
 from lidar_perception.types import Detections, InputError
 
 Array = np.ndarray[Any, Any]
-NAME, LAYOUT = "survey.npz", 1
-MOST_BYTES = 300 * 10**6  # of such a file; the looks of 1,000 frames take a tenth of it
+FOLDER, LAYOUT = "survey", 2
+PIECE = 20                # frames of a file
+MOST_BYTES = 300 * 10**6  # of all; the looks of 1,000 frames take a tenth of it
 PARTS = "detections", "classes", "scores", "boxes", "images", "features", "things"
 
 
 def key_of(drive: Drive, weights: str) -> str:
-    """What a survey depends on: the drive, the weights, the version of the package."""
-    head = header(drive.name, [f.name for f in drive.frames], [f.stamp_ns for f in drive.frames])
-    file = Path(weights)
+    """What a survey depends on: the drive, the weights, the version of the package. InputError
+    where the first or the last cloud cannot be read."""
+    frames, file = drive.frames, Path(weights)
+    head = header(drive.name, [f.name for f in frames], [f.stamp_ns for f in frames])
+    clouds = hashlib.sha256(b"".join(frames[i].load().xyz.tobytes() for i in (0, -1)))
     content = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
-    return json.dumps({**head, "layout": LAYOUT, "weights": weights, "content": content,
-                       "version": __version__, "posed": drive.motion.poses is not None})
+    return json.dumps({**head, "clouds": clouds.hexdigest()[:16], "layout": LAYOUT,
+                       "weights": weights, "content": content[:16], "version": __version__,
+                       "posed": drive.motion.poses is not None})
 
 
-def write(path: Path, key: str, looks: Sequence[Look]) -> None:
-    """Keep the looks of a drive's frames. InputError where they cannot be written, or are more than
-    MOST_BYTES."""
+def clear(folder: Path) -> None:
+    """Remove all pieces."""
+    for path in folder.glob("*.npz"):
+        path.unlink(missing_ok=True)
+
+
+def write(folder: Path, key: str, first: int, looks: Sequence[Look]) -> None:
+    """Keep a piece, the looks of a drive's frames from `first` on, PIECE of them but at the end.
+    InputError where it cannot be written, or all are more than MOST_BYTES."""
     columns: list[list[Array]] = [[] for _ in PARTS]
     names = sorted({name for look in looks for name in look.features})
     for look in looks:
@@ -54,29 +67,46 @@ def write(path: Path, key: str, looks: Sequence[Look]) -> None:
     content = io.BytesIO()
     np.savez_compressed(content, key=np.array(key), names=np.array(names, str),
                         poses=np.array(poses), **arrays)
-    if content.getbuffer().nbytes > MOST_BYTES:
-        raise InputError(f"the survey has more than {MOST_BYTES / 1e6:.0f} MB and is not kept")
-    write_bytes(path, content.getbuffer())
+    size = content.getbuffer().nbytes + sum(p.stat().st_size for p in folder.glob("*.npz"))
+    if size > MOST_BYTES:
+        raise InputError(f"what is seen has more than {MOST_BYTES / 1e6:.0f} MB, and is kept up to "
+                         f"frame {first} only")
+    write_bytes(folder / _named(first), content.getbuffer())
 
 
-def read(path: Path, key: str) -> list[Look] | None:
-    """The looks that were kept; None where there are none, or they are of something else.
-    InputError for a file that is damaged."""
-    if not path.is_file():
-        return None
-    try:
-        with np.load(path) as file:
-            if str(file["key"]) != key:
-                return None
-            names = [str(name) for name in file["names"]]
-            poses = file["poses"]
-            parts = [np.split(file[name], np.cumsum(file[f"{name}_counts"])[:-1])
-                     for name in PARTS]
-        return [Look(Detections(boxes, classes, scores), clusters, images,
-                     dict(zip(names, features.T)) if len(clusters) else {}, things,
-                     poses[i] if len(poses) else None)
-                for i, (boxes, classes, scores, clusters, images, features, things)
-                in enumerate(zip(*parts, strict=True))]
-    except (OSError, ValueError, TypeError, KeyError, EOFError, BadZipFile) as error:
-        raise InputError(f"{path} is damaged ({short(error)}); the drive is looked at "
-                         "again") from None
+def _named(first: int) -> str:
+    return f"{first:06}.npz"
+
+
+def read(folder: Path, key: str) -> tuple[list[Look], str]:
+    """The looks that were kept, from the first frame on, and why they are not all of those that
+    are there, or ""."""
+    looks: list[Look] = []
+    first = 0
+    while (path := folder / _named(first)).is_file():
+        try:
+            with np.load(path) as file:
+                found = str(file["key"])
+                looks += _looks(file) if found == key else []
+            if found != key:
+                other = "; ".join(differences(json.loads(found), json.loads(key)))
+                return [], (f"{folder} is of something else ({other}); the drive is looked at "
+                            "again")
+        except (OSError, ValueError, TypeError, KeyError, AttributeError, EOFError, BadZipFile,
+                zlib.error) as error:
+            return looks, (f"{path} is damaged ({short(error)}); the drive is looked at again from "
+                           f"frame {first} on")
+        first += PIECE
+    return looks, ""
+
+
+def _looks(file: Any) -> list[Look]:
+    """Of a piece."""
+    names, poses = [str(name) for name in file["names"]], file["poses"]
+    parts = [np.split(file[name], np.cumsum(file[f"{name}_counts"])[:-1]) for name in PARTS]
+    return [Look(Detections(boxes, classes, scores), clusters, images,
+                 dict(zip(names, features.T)) if len(clusters) else {}, things,
+                 poses[i] if len(poses) else None)
+            for i, (boxes, classes, scores, clusters, images, features, things)
+            in enumerate(zip(*parts, strict=True))]
+

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.clustering.density import followed
-from lidar_perception.clustering.params import DENSE, ClusteringParams
+from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.sensor_setup.findings import body_fits, doubts
 from lidar_perception.sensor_setup.measure import SMALL_ROOM, Measured, sensor_of
@@ -132,7 +132,7 @@ def _of_resolution(m: Measured) -> dict[str, tuple[Any, str]]:
     samples = int(np.clip(round(default["clustering.dbscan.min_samples"] * density), MIN_SAMPLES,
                           default["clustering.dbscan.min_samples"]))
     seen = 1.0 / (up * aside)
-    made = followed(ClusteringParams(density=DENSE), seen).euclidean
+    made = followed(ClusteringParams(density=FULL_DENSITY), seen).euclidean
     return {
         "clustering.dbscan.range_limits": (LIMITS, "a fourth band, as the resolution allows"),
         "clustering.dbscan.eps": (eps, f"{EPS_BEAMS} times the distance of the beams at the end "
@@ -141,9 +141,9 @@ def _of_resolution(m: Measured) -> dict[str, tuple[Any, str]]:
         "clustering.dbscan.join_bands": (True, "no cluster is cut at the end of a band"),
         "clustering.dbscan.min_samples": (samples, "10 for the HDL-64E; the sensor has "
                                           f"{density:.2f} times as many points on a surface"),
-        "clustering.density": (round(min(DENSE, RESERVE * seen), 2), "the numbers here are made "
-                               f"for {seen:.1f} points a square degree; in thinner clouds they "
-                               "follow the density"),
+        "clustering.density": (round(min(FULL_DENSITY, RESERVE * seen), 2), "the numbers here are "
+                               f"made for {seen:.1f} points a square degree; in thinner clouds "
+                               "they follow the density"),
         "clustering.euclidean.min_size": (samples, "likewise"),
         "clustering.euclidean.radius": (round(made.radius, 2), "likewise"),
         "clustering.euclidean.beta": (round(made.beta, 2), "likewise"),

@@ -17,7 +17,7 @@ from lidar_perception.wire.point_times import NAMES as TIMES
 SURE, FAIR, DOUBTFUL = "sure", "fair", "doubtful"
 SLOPE = 1.0         # degrees by which the ground leans from scan to scan, from which on it slopes
 STEEP_MOUNT = 6.0   # degrees of roll or pitch: either mounted so, or all of it on a slope
-NOT_AHEAD = 20.0    # degrees between x and where the robot drives
+NOT_AHEAD = 10.0    # degrees between x and where the robot drives, beyond twice the error
 MANY_LOST = 0.01    # share of missing clouds
 SHORTEST_TURN = 0.02  # s; times that span less are no turn
 MAX_OTHERS = 0.2    # share of other points in the box of the robot's body
@@ -75,7 +75,7 @@ def findings(m: Measured) -> list[Finding]:
     out.append(Finding("range", f"{m.least:.2f} to {m.greatest:.1f} m", "of what is not the body",
                        FAIR if m.greatest > SMALL_ROOM else DOUBTFUL))
     out += _columns(m)
-    out += _mount(m)
+    out += [*_mount(m), _heading(m)]
     t = m.timing
     out.append(Finding("rate", "not known" if np.isnan(t.rate) else
                        f"{t.rate:.2f} turns a second", f"from {t.by}",
@@ -131,6 +131,15 @@ def _mount(m: Measured) -> list[Finding]:
                     f"{how}; from scan to scan {np.degrees(q.spread[2]):.2f} deg", sure)]
 
 
+def _heading(m: Measured) -> Finding:
+    h = m.heading
+    if h is None or h.unknown:
+        return Finding("ahead", "not known", h.unknown if h else "no ground in sight", DOUBTFUL)
+    return Finding("ahead", f"{h.degrees:.0f} +- {h.error:.0f} deg from x", "where the robot "
+                   f"drives, by how what stands around shifts in {h.pairs} pairs of clouds",
+                   FAIR if abs(h.degrees) - 2 * h.error <= NOT_AHEAD else DOUBTFUL)
+
+
 def _three(values: np.ndarray) -> str:
     return "(" + ", ".join(f"{v:.2f}" for v in values) + ")"
 
@@ -158,10 +167,7 @@ def doubts(m: Measured) -> list[str]:
     else:
         out += _beam_doubts(m)
     out += _mount_doubts(m)
-    if m.heading is not None and abs(m.heading[0]) > NOT_AHEAD and m.heading[1] > 0.8:
-        out.append(f"the robot drives towards {m.heading[0]:.0f} deg of the cloud's x axis, which "
-                   "should look ahead: the frame is turned about z; publish the clouds with x "
-                   "ahead, or use base_frame with a transform of that yaw")
+    out += _heading_doubts(m)
     if m.intensity is None:
         out.append("there is no intensity, or always the same: detectors that were trained with it "
                    "lose accuracy; turn it on in the driver, or train with --augment-intensity")
@@ -237,6 +243,22 @@ def _mount_doubts(m: Measured) -> list[str]:
         out.append(f"the sensor leans by {np.abs(lean).max():.0f} deg against the ground, which "
                    "may be a slope as well as its mount; record in several places")
     return out
+
+
+def _heading_doubts(m: Measured) -> list[str]:
+    h = m.heading
+    if h is None or len(m.scans) == 1:
+        return []  # that there is no ground, or no motion, is said
+    if h.unknown:
+        return [f"yaw not known: {h.unknown}; record while it drives some metres straight ahead, "
+                "or check that x of the clouds looks ahead"]
+    if abs(h.degrees) - 2 * h.error <= NOT_AHEAD:
+        return []
+    back = ", unless it was driven backwards" if abs(h.degrees) > 180 - 2 * NOT_AHEAD else ""
+    return [f"the robot drives towards {h.degrees:.0f} deg of the cloud's x axis, which should "
+            f"look ahead: the frame is turned about z{back}; turn the clouds by "
+            f"{-h.degrees:.0f} deg in the driver (base_frame does not turn them), or use detectors "
+            "that look all around (train --range around)"]
 
 
 def body_fits(m: Measured) -> bool:

@@ -14,7 +14,7 @@ from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import moved_points
 from lidar_perception.sensor_setup.beams import Beams, azimuth_steps, beams_of, range_noise
 from lidar_perception.sensor_setup.coverage import Coverage, coverage_of
-from lidar_perception.sensor_setup.motion import heading_of, shift_between
+from lidar_perception.sensor_setup.motion import Ahead, ahead_of, pictures_of, shifts_of
 from lidar_perception.sensor_setup.mount import Mount, mount_of
 from lidar_perception.sensor_setup.scans import Intensity, Scan, intensity_of, require_space
 from lidar_perception.sensor_setup.timing import Timing, timing_of
@@ -32,9 +32,9 @@ AROUND = (-15.0, 5.0)  # degrees: where people are, in which the distance of bea
 class Measured:
     """All of it. beams None where there are none, then step and noise are NaN; step: degrees;
     twice: share of second returns; noise: m, of noise_pieces; least, greatest: m, of what is not
-    the robot's own; heading: degrees from x to where the robot drives, and how much scans agree,
-    None where it is not known; model: the sensor of config/sensors with such beams, "" for none;
-    model_error: degrees, the median over the beams."""
+    the robot's own; heading: where the robot drives, None without ground; model: the sensor
+    of config/sensors with such beams, "" for none; model_error: degrees, the median over the
+    beams."""
 
     source: str
     scans: tuple[Scan, ...]
@@ -47,7 +47,7 @@ class Measured:
     noise_pieces: int
     coverage: Coverage
     mount: Mount | None
-    heading: tuple[float, float] | None
+    heading: Ahead | None
     least: float
     greatest: float
     timing: Timing
@@ -96,23 +96,19 @@ def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: 
         body=tuple(coverage.box.tolist())))]
     least, greatest = np.percentile(away if len(away) else ranges, [0.02, 99.995])
     model, error = model_of(beams)
+    heading = _heading(scans, numbers, mount, coverage.still)
     return Measured(source, tuple(scans), total, intensity_of(scans), beams, step, twice, noise,
-                    pieces, coverage, mount, _heading(scans, numbers, mount), float(least),
-                    float(greatest), timing_of(scans, stamps_ns), model, error)
+                    pieces, coverage, mount, heading, float(least), float(greatest),
+                    timing_of(scans, stamps_ns), model, error)
 
 
-def _heading(scans: Sequence[Scan], numbers: Sequence[int],
-             mount: Mount | None) -> tuple[float, float] | None:
-    """Of scans that follow each other; None without ground."""
+def _heading(scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None,
+             still: bool | None) -> Ahead | None:
     if mount is None:
         return None
-    shifts, pose = [], tilted(mount.roll, mount.pitch, mount.height)
-    for i in range(len(scans) - 1):
-        if numbers[i + 1] - numbers[i] == 1:
-            before, after = (moved_points(scan.xyz, pose) for scan in scans[i:i + 2])
-            shift = shift_between(before, after)
-            shifts += [shift] if shift is not None else []
-    return heading_of(shifts)
+    pose = tilted(mount.roll, mount.pitch, mount.height)
+    levelled = [moved_points(scan.xyz, pose) for scan in scans]
+    return ahead_of(shifts_of(pictures_of(levelled, moves=still is False), numbers))
 
 
 def model_of(beams: Beams | None) -> tuple[str, float]:

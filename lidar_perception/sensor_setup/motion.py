@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from scipy.fft import irfft2, rfft2
 
 CELL, HALF = 0.2, 40.0   # metres: of the picture from above
 LOW, HIGH = 0.3, 3.0     # metres above the ground of what stands there
 MIN_SHIFT = 0.3          # metres; less says no direction
-MIN_PEAK = 2.0           # times as high as what is elsewhere
+CLEAR, BESIDE = 1.2, 5   # times as high is a peak as what is more than so many cells beside it
+LOCKED, FEW_SCANS = 0.7, 5  # share of the scans, if there are so many, in which a cell is occupied
+                         # that moves with the robot, as lines of a beam on a straight wall do
+GAPS = (1, 2, 4, 8, 16)  # clouds from one to the one that it is compared with
+AGREED = 0.8             # so long is the mean of the directions at least, 0 .. 1
+ONE = 8.0                # degrees: error of one shift's direction, at least
 
 
 class Shift(NamedTuple):
@@ -19,42 +26,88 @@ class Shift(NamedTuple):
     y: float
 
 
+class Ahead(NamedTuple):
+    """Where the robot drives: degrees from x, counter-clockwise, NaN where that is not known, and
+    the error of that; pairs: of scans that tell; went: the longest shift, metres; unknown: why it
+    is not known, "" where it is."""
+
+    degrees: float
+    error: float
+    pairs: int
+    went: float
+    unknown: str
+
+
 def shift_between(before: np.ndarray, after: np.ndarray) -> Shift | None:
-    """Of levelled points (N, 3), (M, 3) whose z is the height above the ground: the shift of what
-    stands there under which both pictures agree best (correlation by FFT), to a cell; None where
-    no shift agrees clearly. A turn of a few degrees blurs it and does no harm."""
-    images = [_picture(xyz) for xyz in (before, after)]
-    size = images[0].shape[0]
-    product = np.fft.rfft2(images[0], (2 * size, 2 * size)) * np.conj(
-        np.fft.rfft2(images[1], (2 * size, 2 * size)))
-    match = np.fft.irfft2(product)
+    """Of two pictures (see pictures_of): the shift of what stands there under which they agree best
+    (correlation by FFT); None where no shift agrees clearly. A turn of a few degrees blurs it and
+    does no harm: the shift is then that of the way between."""
+    size = 2 * len(before)
+    match = irfft2(rfft2(before, (size, size)) * np.conj(rfft2(after, (size, size))))
     best = np.unravel_index(match.argmax(), match.shape)
-    peak = match[best]
-    around = match.copy()
-    rows = (np.arange(-5, 6) + best[0]) % match.shape[0]
-    columns = (np.arange(-5, 6) + best[1]) % match.shape[1]
-    around[np.ix_(rows, columns)] = 0.0
-    if peak <= 0 or peak < MIN_PEAK * np.percentile(around, 99.9):
+    peak, elsewhere = match[best], match.copy()
+    rows, columns = ((np.arange(-BESIDE, BESIDE + 1) + b) % size for b in best)
+    elsewhere[np.ix_(rows, columns)] = 0.0
+    if peak <= 0 or peak < CLEAR * elsewhere.max():
         return None
-    moved = [(int(b) + size) % (2 * size) - size for b in best]
-    return Shift(moved[0] * CELL, moved[1] * CELL)
+    x, y = ((int(b) + size // 2) % size - size // 2 + _summit(match, best, axis)
+            for axis, b in enumerate(best))
+    return Shift(x * CELL, y * CELL)
 
 
-def _picture(xyz: np.ndarray) -> np.ndarray:
-    """(cells, cells) float32, 1 where something stands."""
-    stands = (xyz[:, 2] > LOW) & (xyz[:, 2] < HIGH) & (np.abs(xyz[:, :2]) < HALF).all(axis=1)
-    cells = ((xyz[stands, :2] + HALF) / CELL).astype(int)
-    image = np.zeros((int(2 * HALF / CELL),) * 2, np.float32)
-    image[cells[:, 0], cells[:, 1]] = 1.0
-    return image
+def _summit(match: np.ndarray, best: tuple[np.intp, ...], axis: int) -> float:
+    """Of the parabola through a peak and its neighbours, cells beside the peak, -0.5 .. 0.5."""
+    around = [list(best) for _ in range(3)]
+    for cell, step in zip(around, (-1, 0, 1)):
+        cell[axis] = (cell[axis] + step) % len(match)
+    low, top, high = (float(match[tuple(cell)]) for cell in around)
+    return 0.5 * (high - low) / bend if (bend := 2 * top - low - high) > 0 else 0.0
 
 
-def heading_of(shifts: list[Shift]) -> tuple[float, float] | None:
-    """Degrees from x to where the robot drives, as the mean over shifts, and how much they agree,
-    0 .. 1; None where no shift says a direction."""
-    ways = np.array([[s.x, s.y] for s in shifts if np.hypot(s.x, s.y) >= MIN_SHIFT])
-    if not len(ways):
-        return None
-    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
-    mean = ways.mean(axis=0)
-    return float(np.degrees(np.arctan2(mean[1], mean[0]))), float(np.linalg.norm(mean))
+def pictures_of(scans: Sequence[np.ndarray], moves: bool) -> np.ndarray:
+    """Of levelled points (N, 3) each, whose z is the height above the ground: (S, cells, cells)
+    float32, 1 where something stands, but for what is LOCKED where the robot is known to move."""
+    images = np.zeros((len(scans), *[int(2 * HALF / CELL)] * 2), np.float32)
+    for image, xyz in zip(images, scans):
+        stands = (xyz[:, 2] > LOW) & (xyz[:, 2] < HIGH) & (np.abs(xyz[:, :2]) < HALF).all(axis=1)
+        cells = ((xyz[stands, :2] + HALF) / CELL).astype(int)
+        image[cells[:, 0], cells[:, 1]] = 1.0
+    if moves and len(scans) >= FEW_SCANS:
+        images *= images.mean(axis=0) < LOCKED
+    return images
+
+
+def shifts_of(pictures: np.ndarray, numbers: Sequence[int]) -> list[Shift | None]:
+    """Of pictures and their numbers in the recording: from each to the next of GAPS by which the
+    robot has gone MIN_SHIFT, or as far as it went; None where that is not clear."""
+    found: list[Shift | None] = []
+    place = {number: i for i, number in enumerate(numbers)}
+    for i, number in enumerate(numbers):
+        others = [place[number + gap] for gap in GAPS if number + gap in place]
+        for other in others:
+            shift = shift_between(pictures[i], pictures[other])
+            if shift is None or np.hypot(*shift) >= MIN_SHIFT:
+                break
+        found += [shift] if others else []
+    return found
+
+
+def ahead_of(shifts: Sequence[Shift | None]) -> Ahead:
+    """The mean direction of the shifts that tell one."""
+    every = np.array([shift for shift in shifts if shift is not None]).reshape(-1, 2)
+    length = np.hypot(*every.T)
+    went, far = float(length.max(initial=0.0)), length >= MIN_SHIFT
+    if not far.any() and 2 * len(every) <= len(shifts):
+        return Ahead(np.nan, np.nan, 0, went, "what stands around is too little, or too much "
+                     "alike, to see how the robot moved")
+    if not far.any():
+        return Ahead(np.nan, np.nan, 0, went, f"the robot moved only {went:.1f} m between the "
+                     "clouds that were compared")
+    pairs = int(far.sum())
+    x, y = (every[far] / length[far, None]).mean(axis=0)
+    agree = min(float(np.hypot(x, y)), 1.0)
+    if agree < AGREED:
+        return Ahead(np.nan, np.nan, pairs, went, "the robot turned, or drove to and fro: "
+                     f"{pairs} shifts have different directions")
+    error = max(float(np.degrees(np.sqrt(-2 * np.log(agree)))), ONE) / np.sqrt(pairs)
+    return Ahead(float(np.degrees(np.arctan2(y, x))), error, pairs, went, "")

@@ -149,7 +149,11 @@ def test_a_round_that_makes_simulated_validation_worse_is_not_taken(bag, weights
         (out / name).unlink()
     scores = iter([{"score": 50.0}, {"score": 40.0}])
     monkeypatch.setattr(adapt_module, "simulated_score", lambda *_: next(scores))
+    opened, really = [], adapt_module.opened_with
+    monkeypatch.setattr(adapt_module, "opened_with", lambda weights, header, device: (
+        opened.append(weights) or really(weights, header, device)))
     run = adapted(bag, weights, out)
+    assert opened == [weights, out / "round1" / LAST]  # each once, whoever looks with them
     assert "simulated AP fell from 50.0 to 40.0" in run.rounds[0].refused
     assert (out / BEST).read_bytes() == weights.read_bytes()
     assert json.loads((out / "adapt.json").read_text())["rounds"][0]["refused"]
@@ -263,5 +267,23 @@ def test_too_little_agreement_is_said_with_a_report(bag, weights, tmp_path):
     out = tmp_path / "out"
     line = refused(out, "--data", bag, "--weights", weights)
     assert "agree on" in line and "train --sensor" in line
-    assert (out / "report.html").is_file() and not (out / BEST).exists()
-    assert "--resume or --force" in refused(out, "--data", bag, "--weights", weights)
+    assert [p.name for p in out.iterdir()] == ["report.html"]
+    page = (out / "report.html").read_text()
+    again = "--data", standing(tmp_path / "bag"), "--weights", weights, "--mount-height", 1.2
+    assert "stands still" in refused(out, *again)  # the same folder will do
+    assert not out.exists()
+    out.mkdir()
+    assert "stands still" in refused(write(out / "report.html", page).parent, *again, "--resume")
+    theirs = write(tmp_path / "theirs" / "report.html", "<title>Sales</title>")
+    assert "no run of adapt" in refused(theirs.parent, *again)
+    assert theirs.read_text() == "<title>Sales</title>"
+
+
+def test_a_later_round_with_too_little_agreement_leaves_what_was_learned(bag, weights, whole,
+                                                                         tmp_path):
+    out, params = tmp_path / "out", replace(SMALL, rounds=2, worse_simulated=100.0,
+                                            worse_agreement=1.0)
+    shutil.copytree(whole / "round1", out / "round1")
+    run = adapted(bag, weights, out, params)
+    assert len(run.rounds) == 1 and not run.rounds[0].refused  # of a network that learned nothing
+    assert (out / BEST).read_bytes() == (out / "round1" / LAST).read_bytes()

@@ -15,7 +15,7 @@ from lidar_perception.classes import DETECTED
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.density import FEWEST, WIDEST, density, followed, radii
 from lidar_perception.clustering.euclidean import euclidean
-from lidar_perception.clustering.params import DENSE, ClusteringParams, EuclideanParams
+from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams, EuclideanParams
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING
@@ -73,12 +73,12 @@ def test_clouds_that_say_nothing_of_density_change_no_number():
     for xyz in (np.zeros((0, 3), np.float32), lonely, unusable):
         assert density(xyz) == 0.0
     for params in FOLLOWING:
-        for seen in (0.0, DENSE, 15.0, 1e9):
+        for seen in (0.0, FULL_DENSITY, 15.0, 1e9):
             assert followed(params, seen) is params
     assert followed(ClusteringParams(), 0.1) == ClusteringParams()
 
 
-@given(st.floats(1e-9, DENSE), st.floats(1e-9, DENSE))
+@given(st.floats(1e-9, FULL_DENSITY), st.floats(1e-9, FULL_DENSITY))
 def test_the_thinner_the_wider_and_the_fewer(a, b):
     thin, dense = sorted([a, b])
     for params in FOLLOWING:
@@ -126,7 +126,7 @@ def test_clusters_of_an_hdl_64e_are_as_if_nothing_followed(params, scan):
                                     "semantickitti"])
 def test_no_real_scan_of_an_hdl_64e_counts_as_thin(layout):
     for frame in list(open_recording(DATA / layout))[:5]:
-        assert density(frame.load().xyz) > 1.2 * DENSE
+        assert density(frame.load().xyz) > 1.2 * FULL_DENSITY
 
 
 @pytest.mark.parametrize("params", FOLLOWING[::2], ids=["PointNet", "people"])

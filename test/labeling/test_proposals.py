@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -132,24 +133,85 @@ def test_what_is_as_large_as_the_seed_is_most_alike(length, width, height, share
     assert larger == sorted(larger, reverse=True) and larger[-1] < 0.1
 
 
+def frames_looked_at(drive, folder, until=FRAMES):
+    """Of a session that is ended once so many frames are looked at; what it says, its labels."""
+    looked_at, said = [], []
+    with session(drive, folder, weights="") as made:
+        made.listeners.append(lambda event: said.append(event.get("error", "")))
+
+        def told(count):
+            looked_at.append(count)
+            if count == until < FRAMES:
+                made.cancel()
+        made.propose(here=True, told=told)
+        if until == FRAMES:
+            click(made)
+    return looked_at, "".join(said), boxes_of(made)
+
+
+def kept_in(folder):
+    return {p.name: p.read_bytes() for p in (folder / survey_cache.FOLDER).iterdir()}
+
+
+@pytest.mark.parametrize("posed", [True, False])
+def test_a_survey_that_was_ended_goes_on_where_it_was(drive, tmp_path, monkeypatch, posed):
+    monkeypatch.setattr(survey_cache, "PIECE", 2)
+    if not posed:  # then KISS-ICP finds the poses, scan after scan
+        pytest.importorskip("kiss_icp")
+        frames = [replace(frame, pose=lambda: None) for frame in drive.frames]
+        drive = Drive("simulated", Recording(Path("simulated"), "simulated", frames))
+    whole = frames_looked_at(drive, tmp_path / "whole")
+    assert whole[:2] == ([1, 2, 3, 4, 5, 6], "")
+    ended = frames_looked_at(drive, tmp_path / "ended", until=5)
+    assert ended == ([1, 2, 3, 4, 5], "", set())
+    assert kept_in(tmp_path / "ended").items() < kept_in(tmp_path / "whole").items()
+    looked_at, said, labels = frames_looked_at(drive, tmp_path / "ended")
+    assert not said and looked_at == ([5, 6] if posed else [4, 4, 4, 4, 5, 6])
+    assert kept_in(tmp_path / "ended") == kept_in(tmp_path / "whole") and labels == whole[2]
+
+
+def test_a_survey_of_something_else_is_begun_anew_and_that_is_said(drive, tmp_path, monkeypatch):
+    monkeypatch.setattr(survey_cache, "PIECE", 2)
+    other = Drive("simulated", Recording(Path("simulated"), "simulated", [
+        replace(frame, load=drive.frames[0].load) for frame in drive.frames]))  # other clouds only
+    frames_looked_at(drive, tmp_path, until=5)
+    looked_at, said, _ = frames_looked_at(other, tmp_path, until=3)
+    assert looked_at == [1, 2, 3] and "something else (clouds " in said
+    assert kept_in(tmp_path).keys() == {"000000.npz"}
+    looked_at, said, _ = frames_looked_at(drive, tmp_path)
+    assert looked_at == [1, 2, 3, 4, 5, 6] and "looked at again" in said
+    found, why = survey_cache.read(tmp_path / survey_cache.FOLDER,
+                                   survey_cache.key_of(drive, "pointpillars"))
+    assert found == [] and "weights '', not 'pointpillars'" in why
+
+
+def test_a_survey_takes_no_more_room_than_it_may(drive, tmp_path, monkeypatch):
+    monkeypatch.setattr(survey_cache, "PIECE", 2)
+    monkeypatch.setattr(survey_cache, "MOST_BYTES", 60_000)
+    looked_at, said, labels = frames_looked_at(drive, tmp_path)
+    assert len(looked_at) == FRAMES and labels and "kept up to frame" in said
+    sizes = [len(content) for content in kept_in(tmp_path).values()]
+    assert 0 < len(sizes) < FRAMES / 2 and sum(sizes) <= 60_000
+
+
 def test_the_survey_is_kept_over_a_restart_and_made_again_where_it_is_damaged(drive, tmp_path):
     with session(drive, tmp_path, weights="") as made:
         made.propose(here=True)
-    kept, key = tmp_path / survey_cache.NAME, survey_cache.key_of(drive, "")
-    looks = survey_cache.read(kept, key)
+    folder, key = tmp_path / survey_cache.FOLDER, survey_cache.key_of(drive, "")
+    looks, _ = survey_cache.read(folder, key)
     for old, new in zip(made.proposer.looks, looks, strict=True):
         for name in ("boxes", "images", "things"):
             assert np.array_equal(getattr(old, name), getattr(new, name))
         assert np.array_equal(old.detections.boxes, new.detections.boxes)
         assert old.features.keys() == new.features.keys()
         assert all(np.array_equal(old.features[n], new.features[n]) for n in old.features)
-    assert survey_cache.read(kept, survey_cache.key_of(drive, "fused")) is None
+    kept, = folder.iterdir()
     content = kept.read_bytes()
     for damaged in (content[:len(content) // 2], content[:-30], b"",
                     content[:3000] + bytes(100) + content[3100:]):
         kept.write_bytes(damaged)
-        with pytest.raises(InputError, match="damaged"):
-            survey_cache.read(kept, key)
+        found, why = survey_cache.read(folder, key)
+        assert found == [] and "damaged" in why
     with session(drive, tmp_path, weights="") as again:
         said = []
         again.listeners.append(lambda event: said.append(event.get("error", "")))
@@ -220,7 +282,6 @@ def straight(x, y, frames, **more):
 
 def with_id(track, number, **more):
     """The same under its number."""
-    from dataclasses import replace
     return replace(track, id=number, **more)
 
 

@@ -7,9 +7,12 @@ import shutil
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
 
 from lidar_perception.classes import CAR, CLASSES, PEDESTRIAN
 from lidar_perception.cli.main import cli
+from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.open import open_recording
 from lidar_perception.labeling.drive import one_drive, scanned
 from lidar_perception.labeling.results import (
@@ -18,10 +21,15 @@ from lidar_perception.labeling.results import (
     by_files,
     compared,
     points_topic,
+    recorded,
     recorded_scan,
+    tracks_of,
     with_recorded_scans,
 )
 from lidar_perception.types import Detections, GroundTruth, InputError
+from lidar_perception.wire.codec import bag_message
+from msg_utils.markers import MarkedObjects, to_marker_array
+from msg_utils.stamps import header_message
 
 VAN = CLASSES.index("Van")
 CARS = np.array([[10.0, 0, -1, 4, 1.6, 1.5, 0.3], [20.0, 4, -1, 4, 1.6, 1.5, 2.0]])
@@ -74,6 +82,40 @@ def test_the_ground_and_clusters_of_a_bag_without_them_are_our_own(drive_bag):
     for name in ("xyz", "ground", "cluster_ids"):
         assert np.array_equal(getattr(ours, name), getattr(theirs, name))
     assert with_recorded_scans(drive).clouds(1).encoded() == ours.encoded()
+
+
+NUMBERS = st.lists(st.integers(-2**31, 2**31 - 1), min_size=1, max_size=6, unique=True)
+
+
+@given(st.lists(NUMBERS, min_size=2, max_size=4), st.integers(1, 10**6))
+def test_no_two_trackers_have_a_track_of_the_same_id(trackers, far):
+    """Whatever they call them, also where one counts on from the other's numbers."""
+    trackers[1] = [*{*trackers[1], *(n + far for n in trackers[0] if n + far < 2**31)}]
+    made = [[t["id"] for t in tracks_of({0: marked(numbers)}, "/a/output/tracks", k)]
+            for k, numbers in enumerate(trackers)]
+    every = [number for each in made for number in each]
+    assert len(set(every)) == len(every) == sum(map(len, trackers))
+    assert all(0 <= number < 2**53 for number in every)  # what a page can count
+    assert set(made[0]) >= {n for n in trackers[0] if n >= 0}
+
+
+def marked(numbers):
+    count = len(numbers)
+    return MarkedObjects(np.tile([5.0, 0, 0, 1, 1, 1, 0], (count, 1)), ["Car"] * count,
+                         np.full(count, 0.5), np.array(numbers), [{}] * count)
+
+
+def test_tracks_of_all_trackers_in_a_bag_keep_apart(tmp_path):
+    numbers = {"/a/tracker/output/tracks": [1, 7], "/b/tracker/output/tracks": [1, 5]}
+    with BagWriter(tmp_path / "bag") as made:
+        for topic, ids in numbers.items():
+            made.add_topic(topic, "visualization_msgs/msg/MarkerArray")
+            made.write(topic, 10, to_marker_array(
+                np.tile([5.0, 0, 0, 1, 1, 1, 0], (2, 1)), ["Car"] * 2, ids=ids,
+                header=header_message(10, "velodyne", bag_message), make=bag_message))
+    found = recorded(tmp_path / "bag", [10]).tracks
+    assert len({t["id"] for t in found}) == len(found) == 4
+    assert {t["source"] for t in found} == {"a", "b"}
 
 
 def test_result_files_that_are_not_there_are_named(tmp_path):

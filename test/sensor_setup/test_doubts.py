@@ -7,10 +7,14 @@ import numpy as np
 import pytest
 from tilted_samples import clouds_of
 
-from lidar_perception.sensor_setup.findings import body_fits, doubts
+from lidar_perception.data.raw_clouds import _of_frame
+from lidar_perception.sensor_setup.findings import body_fits, doubts, findings
 from lidar_perception.sensor_setup.measure import measured, sensor_of
 from lidar_perception.sensor_setup.scans import intensity_of, scan_of
 from lidar_perception.sensor_setup.timing import timing_of
+from lidar_perception.simulation.scene import Scenes
+from lidar_perception.simulation.sensor import sensor_named
+from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from msg_utils.point_cloud2 import from_array, to_array
@@ -92,10 +96,37 @@ def test_a_sector_that_never_returns_is_the_end_of_the_view():
 
 def test_a_frame_with_y_ahead_or_z_down_is_said():
     ahead = of(all_changed(turned([[0, -1, 0], [1, 0, 0], [0, 0, 1]])))
-    assert ahead.heading[0] == pytest.approx(90, abs=10) and said(ahead, "90 deg", "base_frame")
+    assert abs(ahead.heading.degrees - 90) < 3 and said(ahead, "90 deg", "by -90 deg in the driver")
     down = of(all_changed(turned(np.diag([1, -1, -1]))))
     assert abs(np.degrees(down.mount.roll)) == pytest.approx(175, abs=0.3)
     assert said(down, "upside down") and down.mount.height == pytest.approx(0.6, abs=0.02)
+
+
+DRIVES = {"at a robot's speed": (501, "campus", 0.92, 14), "at a car's": (502, "street", 11.15, 8),
+          "not at all": (504, "campus", 0.0, 6)}
+
+
+@pytest.mark.parametrize("name", DRIVES)
+def test_which_way_is_ahead_is_told_however_slowly_the_robot_drives(name):
+    """Turned by an angle, it is that angle, and said; as it is, nothing is."""
+    seed, scene, speed, count = DRIVES[name]
+    sensor = replace(sensor_named("vlp-16"), height=0.6)
+    frames = list(simulated_scans(seed, count, sensor, 40, Scenes(scene=scene)))
+    way = np.linalg.norm(frames[-1].pose()[:2, 3] - frames[0].pose()[:2, 3])
+    assert way == pytest.approx(speed * (count - 1) / sensor.rate, abs=0.1)
+    for degrees in (0, 90, 180, -25):
+        a = np.radians(degrees)
+        turn = turned([[np.cos(a), -np.sin(a), 0], [np.sin(a), np.cos(a), 0], [0, 0, 1]])
+        m = of([scan_of(changed(_of_frame(frame), turn)) for frame in frames], range(count))
+        row = next(finding for finding in findings(m) if finding.what == "ahead")
+        if not speed:
+            assert said(m, "yaw not known: the robot moved only 0.0 m", "record")
+            assert row.value == "not known"
+            continue
+        assert abs((m.heading.degrees - degrees + 180) % 360 - 180) < 5
+        assert said(m, "drives towards", "in the driver") == (degrees != 0)
+        assert said(m, "backwards") == (degrees == 180) and row.sure == (
+            "doubtful" if degrees else "fair") and not said(m, "yaw not known")
 
 
 def test_a_frame_that_is_turned_against_the_sensor_has_no_beams_and_gets_a_grid():

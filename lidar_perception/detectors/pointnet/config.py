@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any, ClassVar, TypedDict
 
 from lidar_perception.classes import DETECTED
-from lidar_perception.clustering.params import DENSE, ClusteringParams, EuclideanParams
+from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams, EuclideanParams
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.types import CLASSES, InputError
 
@@ -104,7 +104,7 @@ class PointNetConfig:
         euclidean = EuclideanParams(
             threshold="local" if self.dynamic_threshold else "fixed", gamma=0.0,
             beta=EuclideanParams().beta if self.log_point_count else 0.0)
-        return ClusteringParams(method="euclidean", density=DENSE, euclidean=euclidean)
+        return ClusteringParams(method="euclidean", density=FULL_DENSITY, euclidean=euclidean)
 
     @property
     def ground(self) -> GroundParams:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lidar_perception.clustering.params import DENSE, ClusteringParams, DbscanParams
+from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams, DbscanParams
 from lidar_perception.detectors.params import NetworkParams
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
@@ -31,8 +31,8 @@ class PointPillarsParams(NetworkParams):
 # The experts of paper B: Patchwork++ and DBSCAN, of which it gives no numbers. Ours, chosen on
 # simulated scans, keep cars in one piece; paper A's, which are for pedestrians, break them up.
 EXPERT_GROUND = GroundParams(method="patchwork")
-EXPERT_CLUSTERING = ClusteringParams(density=DENSE, dbscan=DbscanParams(eps=(0.5, 0.7, 1.0),
-                                                                        min_samples=5))
+EXPERT_CLUSTERING = ClusteringParams(density=FULL_DENSITY, dbscan=DbscanParams(
+    eps=(0.5, 0.7, 1.0), min_samples=5))
 INPUT = InputParams()
 
 
