@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import subprocess
 import sys
+from configparser import ConfigParser
 from functools import cache
 from pathlib import Path
 
@@ -235,6 +236,16 @@ def test_every_function_of_the_core_says_its_types_but_those_that_numba_compiles
     assert [node.name for node in ast.walk(tree_of(name)) if isinstance(node, ast.FunctionDef)
             and not any("njit" in ast.unparse(d) for d in node.decorator_list)
             and not typed(node)] == []
+
+
+def test_mypy_ignores_no_module():
+    settings = ConfigParser()
+    settings.read(ROOT / "setup.cfg")
+    asked = {name: dict(settings[name]) for name in settings if name.startswith("mypy")}
+    assert asked["mypy"]["packages"] == "lidar_perception, msg_utils"
+    assert {name for name, options in asked.items()
+            if {"ignore_errors", "exclude", "follow_imports"} & set(options)} == {"mypy-launch"}
+    assert [name for name in SOURCES if "# mypy:" in (ROOT / name).read_text()] == []
 
 
 @for_all(SOURCES)

@@ -80,7 +80,8 @@ def convert(source: Path, format: str, out: Path, data: Path | None, given: str 
 def _bag(source: Path, recording: Any, out: Path, images: bool, limit: int | None,
          force: bool) -> None:
     from lidar_perception.data.to_bag import write_bag
-    count, skipped = min(len(recording), limit or len(recording)), []
+    count = min(len(recording), limit or len(recording))
+    skipped: list[str] = []
     frames = track(islice(recording, count), f"converting {source}", count)
     written = write_bag(out, frames, images=images, force=force, skipped=skipped)
     console.print(f"{out}: {written} scans of {count}")
@@ -99,9 +100,9 @@ def _dataset(source: Path, recording: Any, format: str, out: Path, detections: s
              limit: int | None, force: bool) -> None:
     from lidar_perception.labeling.datasets import write_dataset
     from lidar_perception.labeling.exchange import export_labels
-    labels = _on_topic(source, recording, detections) if detections else None
+    labels = None if detections is None else _on_topic(source, recording, detections)
     count = min(len(recording), limit or len(recording))
-    if format == BAG:
+    if labels is not None and format == BAG:
         export_labels(labels.first(count), format, out, recording.frames[:count], force)
         console.print(f"{out}: {count} scans")
         return

@@ -80,6 +80,7 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
         raise click.UsageError("--json and --png go with --compare")
     if resume and force:
         raise click.UsageError("--resume resumes, --force starts over: give one of them")
+    assert out is not None  # as there is no --compare
     sensor = sensor_named(sensor_name, mount_height)
     plan = Plan(layout, sensor, seed, frames,
                 streets_of or (1 if layout == "kitti" else longest_drive(sensor)), scenes)

@@ -7,10 +7,11 @@ import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import yaml
 from mcap.writer import CompressionType, Writer
+from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader
 
 from lidar_perception.data.mcap_index import NO_INDEX, check_index
@@ -69,7 +70,8 @@ class BagWriter:
             for old in self.partial.iterdir():
                 shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
             self.file = stack.enter_context(RecordFile(self.partial / f"{self.path.name}.mcap"))
-            self.mcap = Writer(self.file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+            stream = cast(IO[bytes], self.file)  # mcap only writes, tells and flushes
+            self.mcap = Writer(stream, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
             self.mcap.start(profile="ros2", library="lidar_perception")
             self.open = stack.pop_all()
         return self
@@ -188,7 +190,7 @@ class Bag:
 
     def qos(self, topic: str) -> list:
         """The profiles the topic was recorded with, as rosbags has them; maybe none."""
-        return next(c.ext.offered_qos_profiles for c in self.connections if c.topic == topic)
+        return next(offered_qos(c) for c in self.connections if c.topic == topic)
 
     def require(self, topic: str) -> None:
         """InputError that lists what there is, if the bag has no such topic."""
@@ -223,6 +225,11 @@ class Bag:
                 yield topic, stamp, decode(data, self.topics[topic])
             except InputError as error:
                 raise InputError(f"{self.path}, topic {topic} at {stamp} ns: {error}") from None
+
+
+def offered_qos(connection: Connection) -> list:
+    """The profiles of a topic of a rosbag2 bag, as rosbags has them; maybe none."""
+    return cast(ConnectionExtRosbag2, connection.ext).offered_qos_profiles
 
 
 def _storage(path: Path) -> Path:

@@ -90,15 +90,15 @@ class BagFrames(Sequence):
 
     def __init__(self, path: Path, points: str, kind: str, count: int,
                  sensor_height: float = SENSOR_HEIGHT):
-        self.path, self.points, self.kind, self.count = path, points, kind, count
+        self.path, self.points, self.kind, self.clouds = path, points, kind, count
         self.sensor_height = sensor_height
 
     def mounted_at(self, sensor_height: float) -> BagFrames:
         """The frames of a sensor at that height."""
-        return BagFrames(self.path, self.points, self.kind, self.count, sensor_height)
+        return BagFrames(self.path, self.points, self.kind, self.clouds, sensor_height)
 
     def __len__(self) -> int:
-        return self.count
+        return self.clouds
 
     def __iter__(self) -> Iterator[Frame]:
         names: Counter[int] = Counter()
@@ -106,7 +106,7 @@ class BagFrames(Sequence):
             for i, (_, time, data) in enumerate(bag.raw({self.points})):
                 stamp = _stamp(data, time)
                 names[stamp] += 1
-                yield self._frame(i, time, stamp, names[stamp], lambda data=data: data)
+                yield self._frame(i, time, stamp, names[stamp], partial(bytes, data))
 
     def stamps(self) -> np.ndarray:
         """(count,) int64 ns: the stamps of all clouds, after one look through the bag."""
@@ -119,10 +119,10 @@ class BagFrames(Sequence):
 
     def __getitem__(self, i):
         if isinstance(i, slice):
-            return [self[k] for k in range(*i.indices(self.count))]
-        if not -self.count <= i < self.count:
+            return [self[k] for k in range(*i.indices(self.clouds))]
+        if not -self.clouds <= i < self.clouds:
             raise IndexError(i)
-        i %= self.count
+        i %= self.clouds
         time, before, stamp, which = self._index[i]
         return self._frame(i, time, stamp, which, partial(self._read, time, before))
 
@@ -205,6 +205,7 @@ class BagFrames(Sequence):
             classes, instances = (column(msg, name, indices) for name in (SEMANTIC, INSTANCE))
         except InputError as error:
             raise InputError(f"{self.path}, topic {self.points} at {time} ns: {error}") from None
+        assert classes is not None and instances is not None  # labelled() has seen both
         return PointTruth(classes.astype(np.uint16), instances.astype(np.uint16))
 
     def _truth(self, stamp: int) -> GroundTruth | None:

@@ -59,7 +59,8 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
             bag.add_topic(TRUTH_3D, "vision_msgs/msg/Detection3DArray")
         if clouds:
             bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
-        count, shown, written = 0, frozenset(), None
+        shown: frozenset[tuple[str, int]] = frozenset()
+        count, written = 0, None
         for frame in frames:
             try:
                 scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
@@ -106,8 +107,8 @@ def points_of(scan: LidarFrame, labels: PointTruth | None = None) -> np.ndarray:
 def _detections(markers: Any, header: Any) -> Any:
     """Detection3DArray of the labels as markers have them; the id is that of the track, if any."""
     objects = from_marker_array(markers)
-    tracks = [extra.get("track_id") for extra in objects.extras]
-    numbered = None not in tracks and len(set(tracks)) == len(tracks)
+    tracks = [track for extra in objects.extras if (track := extra.get("track_id")) is not None]
+    numbered = len(set(tracks)) == len(objects)
     return to_detection_array(objects.boxes, objects.labels, objects.scores.tolist(),
                               header=header, make=bag_message, ids=tracks if numbered else None)
 

@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -23,6 +23,9 @@ KEY = "lidar_perception"  # of the metadata, whose values are strings
 FORMAT = 1
 MOST = 100.0  # of a calibration's slopes and offsets
 HEIGHT_APART = 0.3  # m between mounts from which on a cloud looks another
+
+
+Net = TypeVar("Net", bound=torch.nn.Module)
 
 
 class Config(Protocol):
@@ -165,8 +168,8 @@ def read(path: str | Path, kind: type[Config]) -> tuple[Header, dict[str, torch.
     return Header.of_text(text, str(path), kind), tensors
 
 
-def load(path: str | Path, kind: type[Config], make: Callable[[Any], torch.nn.Module],
-         expected: Any = None) -> tuple[Header, torch.nn.Module]:
+def load(path: str | Path, kind: type[Config], make: Callable[[Any], Net],
+         expected: Any = None) -> tuple[Header, Net]:
     """Header, and the network that make(config) gives with the weights of the file: float32 on the
     CPU, in training mode. InputError as read_header, where the weights do not fit, and where the
     config is another than expected."""

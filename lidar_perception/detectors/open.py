@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, Protocol
 
 from lidar_perception.detectors.checkpoint import POINTNET, POINTPILLARS, network_of
 from lidar_perception.detectors.contract import FUSED, Detector
@@ -11,9 +12,16 @@ from lidar_perception.detectors.fused.detector import load_fused_detector
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointpillars.detector import load_detector
 
+
+class Configured(Detector, Protocol):
+    """A detector with a dataclass of parameters, those of its node."""
+
+    params: Any
+
+
 # Each opens its detector: load(path, device), where an empty path means its own weights, if it has
 # any. A new detector is one line here.
-LOAD: dict[str, Callable[..., Detector]] = {
+LOAD: dict[str, Callable[..., Configured]] = {
     POINTPILLARS: load_detector,
     POINTNET: load_pointnet_detector,
     FUSED: load_fused_detector,
@@ -22,7 +30,7 @@ LOAD: dict[str, Callable[..., Detector]] = {
 
 def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
                   sensor_height: float | None = None,
-                  min_score: float | None = None) -> Detector:
+                  min_score: float | None = None) -> Configured:
     """A detector by its name, a key of LOAD, with what comes with the package; or by its weights: a
     checkpoint of any network, or an exported one (.onnx). Parameters are the defaults.
 

@@ -16,17 +16,16 @@ def visible(frame: LidarFrame, config: NetworkConfig,
             pose: SensorPoseParams = SensorPoseParams()) -> tuple[np.ndarray, LidarFrame]:
     """indices (M,) int64 of the frame's points in the network's range, and the frame of these, its
     coordinates levelled and as from SENSOR_HEIGHT. Points that are not finite are left out."""
-    shift = np.float32(pose.height - SENSOR_HEIGHT)
+    up = np.array([0, 0, pose.height - SENSOR_HEIGHT], np.float32)
     xyz = level(frame.xyz, pose)
     with np.errstate(invalid="ignore"):
         inside = np.ones(len(xyz), bool)
-        for axis, offset in enumerate((0, 0, shift)):
-            values = xyz[:, axis]
-            inside &= (values >= config.low[axis] - offset) & (values < config.high[axis] - offset)
+        for axis in range(3):
+            low, high = config.low[axis] - up[axis], config.high[axis] - up[axis]
+            inside &= (xyz[:, axis] >= low) & (xyz[:, axis] < high)
     indices = np.flatnonzero(inside)
     seen = frame.take(indices)
-    moved = xyz.take(indices, axis=0) + np.array([0, 0, shift], np.float32)
-    return indices, replace(seen, xyz=moved)
+    return indices, replace(seen, xyz=xyz.take(indices, axis=0) + up)
 
 
 def levelled(frame: LidarFrame, pose: SensorPoseParams) -> LidarFrame:

@@ -6,7 +6,7 @@ import importlib.util
 from time import monotonic
 from typing import Any
 
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import Executor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
@@ -82,7 +82,7 @@ class BagPlayer(LidarNode):
     def _latched(self, topic: str) -> bool:
         return any(q.durability.name == "TRANSIENT_LOCAL" for q in self.bag.qos(topic))
 
-    def spin(self, executor: SingleThreadedExecutor) -> None:
+    def spin(self, executor: Executor) -> None:
         """Play; services and parameters are served between messages."""
         self.serve = executor.spin_once
         self._wait_for_subscribers()

@@ -34,8 +34,8 @@ from lidar_perception.wire.topics import ODOMETRY, POINTS
 CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet",
            "fused": "fused"}
 
-SWITCHES = dict(default_value="false", choices=["true", "false"])
-ARGUMENTS = {
+SWITCHES: dict[str, Any] = dict(default_value="false", choices=["true", "false"])
+ARGUMENTS: dict[str, dict[str, Any]] = {
     "namespace": dict(default_value="", description="Of all nodes and topics, for one of several "
                       "sensors; /diagnostics, /tf and /clock stay outside."),
     "name_prefix": dict(default_value="", description="Before the name of each node."),

@@ -141,8 +141,9 @@ class Reception:
         kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH]
         look = SubscriptionEventCallbacks(matched=lambda _: self.look_again.trigger(),
                                           incompatible_qos=lambda _: self.look_again.trigger())
+        received: Any = self._received  # rclpy's annotation forgets that it may ask for the info
         return self.node.create_subscription(
-            self.kind, self.topic, self._received,
+            self.kind, self.topic, received,
             QoSProfile(depth=DEPTH, reliability=self.reliability), raw=True, event_callbacks=look,
             qos_overriding_options=QoSOverridingOptions(
                 [*kinds, QoSPolicyKind.RELIABILITY] if self.fixed else kinds))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -99,9 +100,11 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
                 before = watch.frames
                 watch.until(finished, SILENCE_TIMEOUT, lambda: processes.check("bag_player"))
         # These are behind the results by as much as their own work takes.
+        def caught_up(node: str) -> bool:
+            return int(watch.value_of(node, "frames") or 0) >= watch.frames
+
         for node in {"evaluator", TRACKER} & nodes.keys():
-            watch.until(lambda n=node: int(watch.value_of(n, "frames") or 0) >= watch.frames,
-                        SILENCE_TIMEOUT)
+            watch.until(partial(caught_up, node), SILENCE_TIMEOUT)
         memory = processes.memory_mb()
         codes = processes.stop(timeout=30)
     if failed := {node: code for node, code in codes.items() if code}:

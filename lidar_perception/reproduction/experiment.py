@@ -23,6 +23,9 @@ class Cell:
     digits: int = 1
 
 
+Row = tuple[str | Cell, ...]
+
+
 @dataclass(frozen=True)
 class Table:
     """name becomes a file name; header names the columns, with units; a cell is text or a Cell."""
@@ -30,7 +33,7 @@ class Table:
     name: str
     title: str
     header: tuple[str, ...]
-    rows: tuple[tuple[str | Cell, ...], ...]
+    rows: tuple[Row, ...]
     note: str = ""
 
 

@@ -64,13 +64,14 @@ def cells(estimates: np.ndarray, paper: Iterable[float | None] = (),
     count = estimates.shape[1]
     paper = [*paper] or [None] * count
     digits = [digits] * count if isinstance(digits, int) else [*digits]
-    return tuple(Cell(*numbers, paper=there, digits=shown) for numbers, there, shown in
+    return tuple(Cell(value, low, high, there, shown) for (value, low, high), there, shown in
                  zip(map(known, estimates.T), paper, digits, strict=True))
 
 
 def curve(label: str, x: Iterable[float], estimates: np.ndarray) -> Line:
     """A line of a figure, with its interval, of estimates (3, X) from bootstrap()."""
-    return Line(label, tuple(x), *(known(row) for row in estimates))
+    value, low, high = map(known, estimates)
+    return Line(label, tuple(x), value, low, high)
 
 
 def stack(rows: list, *shape: int) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.candidates.refine import STAGES
-from lidar_perception.reproduction.experiment import Cell, Figure, Line, Panel, Section, Table
+from lidar_perception.reproduction.experiment import Cell, Figure, Line, Panel, Row, Section, Table
 from lidar_perception.reproduction.params import StmCpaParams
 from lidar_perception.reproduction.search_tables import COUNTS, RATES, search_section
 from lidar_perception.reproduction.statistics import (
@@ -40,9 +40,10 @@ def _truth(records: list[dict]) -> Section:
     counts = stack([r["pedestrians"] for r in records], len(RANGE_NAMES))
     shares = bootstrap(counts, lambda sums: 100 * ratio(sums, sums.sum(axis=-1, keepdims=True)))
     published = list(paper.TABLE_1.values())
-    rows = [(name, Cell(float(count), paper=there, digits=0), share) for name, count, there, share
-            in zip(RANGE_NAMES, counts.sum(axis=0), published,
-                   cells(shares, [100 * n / paper.PEDESTRIANS for n in published]))]
+    rows: list[Row] = [
+        (name, Cell(float(count), paper=there, digits=0), share) for name, count, there, share
+        in zip(RANGE_NAMES, counts.sum(axis=0), published,
+               cells(shares, [100 * n / paper.PEDESTRIANS for n in published]))]
     rows.append(("all", Cell(float(counts.sum()), paper=paper.PEDESTRIANS, digits=0), ""))
     without = [r for r in records if r["no_seed"]]
     frames = Table(
@@ -59,7 +60,8 @@ def _truth(records: list[dict]) -> Section:
 
 
 def _stages(records: list[dict]) -> Section:
-    overall, by_range = [], []
+    overall: list[Row] = []
+    by_range: list[Row] = []
     for stage in STAGES:
         counts = _counts(records, [r["stages"][stage] for r in records])
         estimates, sums = bootstrap(counts, _scores), counts.sum(axis=0)
@@ -81,12 +83,13 @@ def _stages(records: list[dict]) -> Section:
 
 def _cpa(records: list[dict]) -> Section:
     steps = range(NUMBERS.cpa_steps + 1)
-    rows, estimates = [], []
+    rows: list[Row] = []
+    estimates = []
     for k in steps:
         counts = _counts(records, [r["cpa"][k] for r in records])
         estimates.append(bootstrap(counts, _scores))
-        there = paper.TABLE_5[k] if k < len(paper.TABLE_5) else ()
-        rows.append((str(k), *_score_cells(estimates[-1][:, -1], there),
+        published = paper.TABLE_5[k] if k < len(paper.TABLE_5) else ()
+        rows.append((str(k), *_score_cells(estimates[-1][:, -1], published),
                      *_numbers(counts.sum(axis=(0, 2)))))
     drawn = np.stack(estimates, axis=1)  # (3, steps, groups, scores)
     ranges = f"{NUMBERS.cpa_min_range:g} to {NUMBERS.cpa_max_range:g} m"
@@ -98,8 +101,9 @@ def _cpa(records: list[dict]) -> Section:
             there = {k: values[m] for k, values in points.items() if values[m] is not None}
             lines.append(Line(f"{name} m, paper", tuple(there), tuple(there.values()), dashed=True))
         panels.append(Panel(label.removesuffix(" [%]"), "CPA steps", "%", tuple(lines)))
-    by_range = [(name, str(k), *_score_cells(drawn[:, k, RANGE_NAMES.index(name)], ()))
-                for name in paper.FIGURE_8 for k in steps]
+    by_range: list[Row] = [
+        (name, str(k), *_score_cells(drawn[:, k, RANGE_NAMES.index(name)], ()))
+        for name in paper.FIGURE_8 for k in steps]
     return Section(
         "CPA steps (Table 5, Figure 8)", f"Copies are added to clusters at {ranges}. The scores of "
         "Table 5 are those of all ranges. Of Figure 8 the paper gives numbers for no steps, and "
@@ -114,11 +118,11 @@ def _overlap(records: list[dict]) -> Section:
     limits = len(NUMBERS.iou_limits)
     header = ["stage", *(f"{kind} IoU >= {limit:.2f} [%]" for kind in ("3D", "BEV")
                          for limit in NUMBERS.iou_limits), "mean 3D IoU", "mean BEV IoU", "hits"]
-    rows = []
+    scale = np.array([100.0] * 2 * limits + [1.0] * 2)
+    rows: list[Row] = []
     for stage in STAGES:
         counts = stack([r["overlap"][stage] for r in records], 3 + 2 * limits)
-        scale = np.array([100.0] * 2 * limits + [1.0] * 2)
-        estimates = bootstrap(counts, lambda s, scale=scale: scale * ratio(s[..., 1:], s[..., :1]))
+        estimates = bootstrap(counts, lambda sums: scale * ratio(sums[..., 1:], sums[..., :1]))
         rows.append((STAGE_TITLES[stage], *cells(estimates, paper.TABLE_8[stage],
                                                  [1] * 2 * limits + [3, 3]),
                      str(int(counts[:, 0].sum()))))
@@ -129,7 +133,8 @@ def _overlap(records: list[dict]) -> Section:
 
 def _runtime(records: list[dict]) -> Section:
     timed = [r for r in records if r["ms"]]
-    means, medians = [], []
+    means: list[Row] = []
+    medians: list[Row] = []
     for name, published in paper.TABLE_9.items():
         ms = stack([_steps(r["ms"], name) for r in timed], len(STEPS))
         estimates = bootstrap(np.column_stack([np.ones(len(ms)), ms]),

@@ -22,13 +22,13 @@ from lidar_perception.reproduction.experiment import (
     Cell,
     Experiment,
     Figure,
-    Line,
     Panel,
+    Row,
     Section,
     Table,
 )
 from lidar_perception.reproduction.labelled import Labelled, load_labelled, nearest_seed
-from lidar_perception.reproduction.statistics import bootstrap, cells, known, rates, stack
+from lidar_perception.reproduction.statistics import bootstrap, cells, curve, rates, stack
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, counts_by_range, match_centres
 from lidar_perception.types import InputError
 
@@ -173,7 +173,8 @@ def sections(title: str, names: Sequence[str], records: list[dict[str, Any]], ke
     counts = {name: stack([[r["variants"][name][k] for k in COUNTS] for r in records],
                           3, len(RANGE_NAMES)) for name in names}
     scores = {name: bootstrap(c, _scores) for name, c in counts.items()}
-    overall, by_range = [], []
+    overall: list[Row] = []
+    by_range: list[Row] = []
     for name in names:
         both = np.stack([counts[name], counts[names[0]]], axis=1)
         gain = bootstrap(both, _gain)[:, None]
@@ -185,8 +186,7 @@ def sections(title: str, names: Sequence[str], records: list[dict[str, Any]], ke
         by_range.append((name, *cells(scores[name][:, :len(SHOWN), 2])))
     truth = stack([np.add(r["variants"][names[0]]["tp"], r["variants"][names[0]]["fn"])
                    for r in records], len(RANGE_NAMES)).sum(axis=0)
-    lines = tuple(Line(name, MIDDLES,
-                       *(known(row) for row in scores[name][:, :len(SHOWN), 2]))
+    lines = tuple(curve(name, MIDDLES, scores[name][:, :len(SHOWN), 2])
                   for name in _most_telling(scores))
     return [Section(title, f"{len(records)} frames with {int(truth.sum())} pedestrians; a hit is a "
                     "3D centre within 1.0 m, one to one. Intervals: 95 %, bootstrap by frame.",

@@ -5,18 +5,19 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
-from typing import Any
+from multiprocessing.context import ForkServerProcess
+from typing import Any, cast
 
 from lidar_perception.types import InputError
 
 
 def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, jobs: int,
-                 what: str, *, apart: bool = False) -> Iterator:
+                 what: str, *, apart: bool = False) -> Generator:
     """start()(item) of all items, in the order in which they are done.
 
     start is called once in each of `jobs` new processes, and can be pickled; with one job or one
@@ -32,7 +33,7 @@ def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, job
         return
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload([*_modules(start)])
-    running: dict[Connection, multiprocessing.process.BaseProcess] = {}
+    running: dict[Connection, ForkServerProcess] = {}
     try:
         for j in range(jobs):
             receiver, sender = context.Pipe(duplex=False)
@@ -43,7 +44,7 @@ def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, job
             sender.close()
             running[receiver] = process
         while running:
-            for receiver in wait(list(running)):
+            for receiver in cast(list[Connection], wait(list(running))):
                 yield from _receive(receiver, running, what)
     finally:
         for process in running.values():
@@ -59,7 +60,8 @@ def _modules(work: Any) -> set[str]:
     return {getattr(work, "__module__", "builtins")}
 
 
-def _receive(receiver: Connection, running: dict, what: str) -> Iterator:
+def _receive(receiver: Connection, running: dict[Connection, ForkServerProcess],
+             what: str) -> Iterator:
     try:
         result, error = receiver.recv()
     except EOFError:

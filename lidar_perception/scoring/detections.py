@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from typing import Generic, TypeVar
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame, Recording
@@ -15,23 +16,25 @@ from lidar_perception.scoring.run import RunError
 from lidar_perception.scoring.thinning import thinned
 from lidar_perception.types import Detections, GroundTruth, InputError
 
+Boxes = TypeVar("Boxes", bound=Detections | GroundTruth)
+
 
 @dataclass(frozen=True)
-class Detected:
+class Detected(Generic[Boxes]):
     """One frame. detections: of a detector, or labels with a score in extras (a result file); ms:
     of the detector, None where none ran; problem: why it refused the frame, whose objects are then
     missed, or None. truth is None where the frame has no labels, calibration without a camera."""
 
     name: str
     truth: GroundTruth | None
-    detections: Detections | GroundTruth
+    detections: Boxes
     calibration: Calibration | None = None
     ms: float | None = None
     problem: str | None = None
 
 
 def detected(detector: Detector, frame: Frame, truth: GroundTruth | None,
-             calibration: Calibration | None, keep: float = 1.0) -> Detected:
+             calibration: Calibration | None, keep: float = 1.0) -> Detected[Detections]:
     """Run a detector on a frame, of which it sees a share `keep` of the points. InputError where
     the scan cannot be read."""
     scan = thinned(frame.load(), keep, frame.name)
@@ -45,13 +48,13 @@ def detected(detector: Detector, frame: Frame, truth: GroundTruth | None,
 
 
 def by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
-                recording: Recording) -> Callable[[Frame], Detected | None]:
+                recording: Recording) -> Callable[[Frame], Detected[Detections] | None]:
     """Runs the detector that open_() gives on every frame with labels; with a folder on all frames,
     and writes what it says there as KITTI result files. All but the recording given, a Start of
     scoring.run."""
     detector = open_()
 
-    def measure(frame: Frame) -> Detected | None:
+    def measure(frame: Frame) -> Detected[Detections] | None:
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None and folder is None:
             return None
@@ -68,10 +71,11 @@ def by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
     return measure
 
 
-def by_files(folder: Path, recording: Recording) -> Callable[[Frame], Detected | None]:
+def by_files(folder: Path, recording: Recording
+             ) -> Callable[[Frame], Detected[GroundTruth] | None]:
     """Reads KITTI result files, folder/NAME.txt, of every frame with labels. With a folder a Start
     of scoring.run."""
-    def measure(frame: Frame) -> Detected | None:
+    def measure(frame: Frame) -> Detected[GroundTruth] | None:
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None:
             return None

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import closing
 from itertools import islice
@@ -68,7 +68,7 @@ def fill(report: Report, recording: Recording, start: Start, *, limit: int | Non
 
 
 def results(recording: Recording, start: Start, numbers: Sequence[int] | None = None, *,
-            jobs: int = 1, dask: str | None = None) -> Iterator[tuple[int, Any]]:
+            jobs: int = 1, dask: str | None = None) -> Generator[tuple[int, Any]]:
     """(i, what measure gave for frame i, or Skipped) of the frames with these numbers, ascending,
     or of all, in their order.
 
@@ -80,13 +80,13 @@ def results(recording: Recording, start: Start, numbers: Sequence[int] | None = 
     if dask is not None:
         return in_order(_on_dask(dask, recording, start, numbers), numbers)
     if jobs > 1 and len(numbers) > 1:
-        work = functools.partial(_worker, recording.reopen, start)
+        work = functools.partial(_worker, _reopening(recording), start)
         return in_order(in_processes(work, numbers, jobs, "measured frames"), numbers)
     return _here(recording, start, numbers)
 
 
 def in_order(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]
-             ) -> Iterator[tuple[int, Any]]:
+             ) -> Generator[tuple[int, Any]]:
     """The pairs (number, value) in the order of these numbers, each as soon as it can be."""
     waiting: dict[int, Any] = {}
     wanted = iter(numbers)
@@ -98,7 +98,8 @@ def in_order(pairs: Iterable[tuple[int, Any]], numbers: Sequence[int]
             following = next(wanted, None)
 
 
-def _here(recording: Recording, start: Start, numbers: Sequence[int]) -> Iterator[tuple[int, Any]]:
+def _here(recording: Recording, start: Start,
+          numbers: Sequence[int]) -> Generator[tuple[int, Any]]:
     measure, wanted = start(recording), set(numbers)
     for i, frame in enumerate(islice(recording, max(wanted, default=-1) + 1)):
         if i in wanted:
@@ -115,6 +116,12 @@ def _measured(measure: Callable[[Frame], Any], frame: Frame) -> Any:
     except Exception as error:
         error.add_note(f"while frame {frame.name} was measured")
         raise
+
+
+def _reopening(recording: Recording) -> Callable[[], Recording]:
+    if recording.reopen is None:
+        raise InputError(f"{recording.path} cannot be opened by other processes; use one job")
+    return recording.reopen
 
 
 def _worker(reopen: Callable[[], Recording], start: Start) -> Callable[[int], tuple[int, Any]]:
@@ -145,7 +152,7 @@ def _on_dask(address: str, recording: Recording, start: Start,
     except ImportError:
         raise InputError("--dask needs the package distributed; pip install "
                          "'lidar_perception[distributed]'") from None
-    work = functools.partial(_on_cluster, uuid4().hex, recording.reopen, start)
+    work = functools.partial(_on_cluster, uuid4().hex, _reopening(recording), start)
     try:
         client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
         client.wait_for_workers(1, timeout=CONNECT_S)

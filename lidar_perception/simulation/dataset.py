@@ -7,7 +7,7 @@ between changes a byte.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,7 +90,7 @@ def _semantic(folder: Path, plan: Plan, sequence: int, moment: int, scan: Simula
     return shares
 
 
-def write_frames(folder: Path, plan: Plan, numbers: list[int], jobs: int) -> Iterator[int]:
+def write_frames(folder: Path, plan: Plan, numbers: list[int], jobs: int) -> Generator[int]:
     """Write the frames of these numbers with so many processes; yields each when it is there.
     InputError, and the end of all processes, where one fails; they end with the iterator too."""
     return in_processes(functools.partial(_writer, folder, plan), numbers, jobs, "wrote frames")

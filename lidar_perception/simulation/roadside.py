@@ -155,10 +155,10 @@ def _furniture(rng, side: Side, kind: Kind) -> Iterator[Actor]:
     for along in (0.6, side.length - 0.6):  # at the corners
         if not rural and rng.random() < 0.5:
             yield side.put(furniture.traffic_light(rng), along, edge + 0.3, -np.pi / 2)
-    for rate, made in ((kind.lamp, furniture.lamp), (kind.tree, _street_tree)):
+    for rate, make in ((kind.lamp, furniture.lamp), (kind.tree, _street_tree)):
         if rate and rng.random() < 0.8:
             for along in evenly_spaced(rng, side.length, 100 / rate):
-                yield side.put(made(rng), along, edge + rng.uniform(0.2, 0.4), -np.pi / 2)
+                yield side.put(make(rng), along, edge + rng.uniform(0.2, 0.4), -np.pi / 2)
     for along in scattered(rng, side.length, 2.2 * kind.clutter):
         made = clutter(rng, rural)
         low, high = extents(made)

@@ -163,7 +163,7 @@ def rays(sensor: Sensor, motion: Motion = STILL) -> Rays:
 
 
 def generic(beams: int, lowest: float, highest: float, azimuth_step: float, rate: float,
-            **fields: float) -> Sensor:
+            **fields: Any) -> Sensor:
     """A sensor of evenly spaced beams; angles in degrees, rate in turns per second, and any other
     field of Sensor by name. InputError for impossible values."""
     if beams > MAX_RAYS:  # before there is a list of them

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import TypedDict
 
 import numpy as np
 from numba import njit
@@ -21,6 +22,13 @@ RETROREFLECTOR = 1.0
 PART = np.dtype([("kind", np.int8), ("centre", np.float64, 3), ("half", np.float64, 3),
                  ("pitch", np.float64), ("yaw", np.float64), ("reflectance", np.float64),
                  ("semantic", np.uint16), ("density", np.float64), ("transmission", np.float64)])
+
+
+class Surface(TypedDict, total=False):
+    """What several parts are made of, see PART: arguments of part()."""
+
+    reflectance: float
+    transmission: float
 
 
 def part(kind: int, centre: tuple, half: tuple, *, pitch: float = 0.0, yaw: float = 0.0,

@@ -103,8 +103,8 @@ def lay_out(rng: np.random.Generator, kind: Kind, seconds: float) -> Street:
     # aside. Heights of grass and litter are such that cells of 1 m beside the road scatter about
     # their planes as on KITTI: 5 to 40 m away 3 to 5 cm at the upper quartile, 36 to 52 % of them
     # more than 1 cm (real: 42 to 49). Wave, camber and reflectances are guesses.
-    ground = Ground(*np.tan(np.radians(rng.normal((0.6, 0.05), (0.25, 0.4)))),
-                    wave=rng.uniform(0.03, 0.16), wavelength=rng.uniform(25, 60),
+    slope_x, slope_y = np.tan(np.radians(rng.normal((0.6, 0.05), (0.25, 0.4))))
+    ground = Ground(slope_x, slope_y, wave=rng.uniform(0.03, 0.16), wavelength=rng.uniform(25, 60),
                     camber=rng.uniform(0.01, 0.035), curb_left=left, curb_right=right,
                     curb_height=kind.curb * rng.uniform(0.6, 1.2), walk=walk, crossings=crossings,
                     parking=parking, rough=rng.uniform(0.2, 0.8),

@@ -70,8 +70,8 @@ def shine(reflectance, cosine):
 
 def compiled(ground: Ground) -> Ground:
     """The same for compiled code: numbers, and crossings as an array (C, 2)."""
-    crossings = np.array(ground.crossings, np.float64).reshape(-1, 2)
-    return Ground(*map(float, ground._replace(crossings=0.0)))._replace(crossings=crossings)
+    return Ground._make(np.array(value, np.float64).reshape(-1, 2) if name == "crossings"
+                        else float(value) for name, value in ground._asdict().items())
 
 
 def surface_height(ground: Ground, x, y) -> np.ndarray:

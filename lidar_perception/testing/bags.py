@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
+from lidar_perception.data.bag import offered_qos
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.testing.detections import objects_of
@@ -70,7 +71,7 @@ def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = 
                                           storage_plugin=STORAGES[storage]) as bag:
         copies = {c.id: bag.add_connection(
             names.get(c.topic, c.topic), c.msgtype, typestore=typestore(),
-            offered_qos_profiles=c.ext.offered_qos_profiles) for c in reader.connections}
+            offered_qos_profiles=offered_qos(c)) for c in reader.connections}
         for connection, stamp, data in reader.messages():
             bag.write(copies[connection.id], stamp, data)
     return path

@@ -6,10 +6,10 @@ frame of a level sensor.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidar_perception.geometry import bev_iou, elevations, to_box_frame, within, wrap_angle
 from lidar_perception.training.params import AugmentParams, NoiseParams, ThingParams
@@ -161,9 +161,9 @@ def blurred(points: np.ndarray, beam: float, point: float, rng: np.random.Genera
 
 
 def raised(scene: TrainingScene, height: float,
-           slopes: Sequence[float] = (0.0, 0.0)) -> TrainingScene:
+           slopes: ArrayLike = (0.0, 0.0)) -> TrainingScene:
     """As from a sensor mounted lower by height, metres, on ground that rises by slopes, along x and
-    y. Boxes stay upright, so that points in a box stay in it if the slopes are 0."""
+    y (2,). Boxes stay upright, so that points in a box stay in it if the slopes are 0."""
     points, boxes = scene.points.copy(), scene.boxes.copy()
     points[:, 2] += (height + scene.points[:, :2] @ np.asarray(slopes)).astype(np.float32)
     boxes[:, 2] += height + scene.boxes[:, :2] @ np.asarray(slopes)

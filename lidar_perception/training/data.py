@@ -52,7 +52,7 @@ class Stream:
     def __getitem__(self, n: int) -> Item:
         epoch, first = divmod(n, len(self))
         order = np.random.default_rng([self.seed, epoch]).permutation(len(self))
-        skipped = []
+        skipped: list[str] = []
         for offset in range(len(self)):
             rng = np.random.default_rng([self.seed, n, offset])
             try:
@@ -123,7 +123,7 @@ class Batches:
             yield [item.sample for item in items]
 
 
-def loaded(items: Any, numbers: Iterator[Sequence[int]], jobs: int) -> Iterator[list[Any]]:
+def loaded(items: Any, numbers: Iterator[list[int]], jobs: int) -> Iterator[list[Any]]:
     """[items[n] for n in each], in order, made by so many processes; 0 makes them here."""
     if jobs == 0:
         yield from ([items[n] for n in each] for each in numbers)
@@ -145,5 +145,7 @@ def _begin_work(_: int) -> None:
 def _end_with_parent() -> None:
     """torch's workers ask whether their parent lives, which here is the fork server, and would
     outlive a main process that was killed."""
-    multiprocessing.parent_process().join()
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this is a worker
+    parent.join()
     os._exit(1)

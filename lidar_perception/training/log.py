@@ -81,8 +81,8 @@ class Log:
     def add(self, kind: str, step: int, values: dict[str, float]) -> None:
         """kind: loss or validation."""
         self.tables[kind].add(step, values)
-        for name, value in values.items() if self.board is not None else ():
-            if value is not None:
+        for name, value in values.items():
+            if self.board is not None and value is not None:
                 self.board.add_scalar(f"{kind}/{name}", value, step)
 
     def close(self) -> None:

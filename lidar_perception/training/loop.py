@@ -134,11 +134,11 @@ def may_begin(out: Path, resume: bool, name: str = STATE) -> Path:
 
 
 def _validate(run: Run, log: Log | None) -> None:
-    """Score the averaged weights, in rank 0, and keep them if they are the best so far, or the
-    last."""
+    """Score the averaged weights, in rank 0, which has the log, and keep them if they are the best
+    so far, or the last."""
     progress = run.progress
     progress.validated = progress.step
-    if rank() == 0:
+    if log is not None:
         metrics, calibration = run.task.validate(run.average.module)
         log.add("validation", progress.step, metrics)
         shown = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
@@ -183,7 +183,7 @@ def _signals() -> Iterator[threading.Event]:
     if threading.current_thread() is not threading.main_thread():
         yield event
         return
-    numbers = (signal.SIGINT, signal.SIGTERM)
+    numbers: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.getsignal(number) for number in numbers}
 
     def note(number: int, _: Any) -> None:

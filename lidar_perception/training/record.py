@@ -11,7 +11,7 @@ import numpy as np
 from torch import nn
 
 from lidar_perception import __version__
-from lidar_perception.detectors.checkpoint import Config, Header, adopt, save_checkpoint
+from lidar_perception.detectors.checkpoint import Config, Header, Net, adopt, save_checkpoint
 from lidar_perception.param_fields import flatten
 from lidar_perception.runs.terminal import errors
 from lidar_perception.scoring.kitti.protocol import Comparison
@@ -19,6 +19,7 @@ from lidar_perception.scoring.kitti.reliability import lines
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.data import Batches
 from lidar_perception.training.params import LoopParams
+from lidar_perception.training.run import Judged
 
 
 def record_of(params: LoopParams, batches: Batches, record: dict[str, Any],
@@ -42,7 +43,7 @@ def keeper(out: Path, config: Any, params: LoopParams, batches: Batches,
     return keep
 
 
-def begun_with(network: nn.Module, init: Path | None, kind: type[Config]) -> nn.Module:
+def begun_with(network: Net, init: Path | None, kind: type[Config]) -> Net:
     """The network, with the weights of init as far as they fit; what does not is said."""
     if init is not None:
         taken, count = adopt(network, init, kind)
@@ -57,8 +58,7 @@ def rounded(metrics: dict[str, float]) -> dict[str, float | None]:
     return {key: None if math.isnan(value) else round(value, 3) for key, value in metrics.items()}
 
 
-def judged(report: DetectionReport, score: str, classes: Sequence[str]
-           ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+def judged(report: DetectionReport, score: str, classes: Sequence[str]) -> Judged:
     """What Task.validate gives of a report of the network's own scores."""
     return (metrics_of(report.compute(), score, classes),
             lines(Comparison.of(report.frames)) if report.frames else {})

@@ -6,22 +6,24 @@ import math
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Generic
 
 import torch
 from torch import Tensor, nn
 
+from lidar_perception.detectors.checkpoint import Net
 from lidar_perception.runs.machine import has_bf16
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.ranks import any_of, world
 from lidar_perception.training.schedule import Average, one_cycle
 from lidar_perception.types import InputError
 
+Judged = tuple[dict[str, float], dict[str, tuple[float, float]]]  # see Task.validate
 FORMATS = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 @dataclass(frozen=True)
-class Task:
+class Task(Generic[Net]):
     """What is trained.
 
     module: on its device. loss(module, batch): the scalar to lower, and the parts to log; module is
@@ -33,10 +35,10 @@ class Task:
     resumed run must have in common with what was begun.
     """
 
-    module: nn.Module
+    module: Net
     loss: Callable[[nn.Module, Any], tuple[Tensor, dict[str, Tensor]]]
     batches: Callable[[int], Iterable[Any]]
-    validate: Callable[[nn.Module], tuple[dict[str, float], dict[str, tuple[float, float]]]]
+    validate: Callable[[Net], Judged]
     keep: Callable[[str, nn.Module, dict[str, Any]], None]
     epoch: int
     about: dict[str, Any] = field(default_factory=dict)

@@ -57,8 +57,8 @@ class RecordedScenes:
 
     def scene(self, i: int) -> TrainingScene:
         """InputError naming the file that cannot be used."""
-        frame = self.frame(i)
-        scan, truth, camera = frame.load(), frame.truth(), frame.camera()
+        frame, truth = self._labelled(i)
+        scan, camera = frame.load(), frame.camera()
         points = scan.points()
         if self.view and camera is not None:
             points = points[camera.in_view(scan.xyz)]
@@ -67,10 +67,14 @@ class RecordedScenes:
 
     def frame(self, i: int) -> Frame:
         """To validate on: the whole scan. InputError if it has no labels."""
+        return self._labelled(i)[0]
+
+    def _labelled(self, i: int) -> tuple[Frame, GroundTruth]:
         frame = self._frames[self.names[i]]
-        if frame.truth() is None:
+        truth = frame.truth()
+        if truth is None:
             raise InputError(f"{frame.points or frame.name} has no labels")
-        return frame
+        return frame, truth
 
 
 def random_split(names: tuple[str, ...], share: float,
@@ -156,6 +160,7 @@ EXTRAS = ("track_id", "truncated", "occluded", "num_points", "visible")
 
 def _scan_arrays(scan: tuple[LidarFrame, GroundTruth]) -> dict[str, np.ndarray]:
     frame, truth = scan
+    assert frame.intensity is not None  # as of all simulated scans
     extras = {name: np.array([e[name] for e in truth.extras]) for name in EXTRAS}
     return dict(xyz=frame.xyz, intensity=frame.intensity, boxes=truth.boxes,
                 class_ids=truth.class_ids, **extras)

@@ -33,7 +33,9 @@ def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | N
         raise InputError("--split names frames of one recording in --data; give one")
     if val_split is not None and len(val_folders) != 1:
         raise InputError("--val-split names frames of one recording; give one in --val")
-    train_on, judge_on = [], []
+    train_on: list[RecordedScenes | SimulatedScenes] = []
+    judge_on: list[RecordedScenes | SimulatedScenes] = []
+    held: tuple[str, ...]
     for folder in folders:
         names, held = names_of(folder, split), ()
         if val_split is not None and folder in val_folders:

@@ -70,6 +70,7 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
     from lidar_perception.scoring.kitti.reliability import print_reliability, reliability
     from lidar_perception.scoring.kitti.report import DetectionReport
     from lidar_perception.scoring.kitti.tables import print_detection_report, print_intervals
+    from lidar_perception.scoring.run import Start
 
     if results is None:
         weights = weights or Path("fused")
@@ -83,11 +84,13 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
                                "none")
     recording = walk.opened(BOXES if write_results is None else None, scans=weights is not None,
                             sensor_height=mount_height or None)
+    start: Start
     if results is not None:
         if not results.is_dir():
             raise InputError(f"{results} is not a folder; give the folder of the result files")
         start = partial(by_files, results)
     else:
+        assert weights is not None  # as there are no --results
         height = recording.frames[0].sensor_height
         if weights.suffix == ".safetensors" and (other := read_header(weights).unlike(height)):
             terminal_errors.print(f"{weights}: {other}", soft_wrap=True)

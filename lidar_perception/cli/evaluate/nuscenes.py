@@ -62,6 +62,7 @@ def nuscenes(walk: Walk, results: Path | None, weights: Path | None, device: str
     if results is not None:
         start = partial(by_file, results)
     else:
+        assert weights is not None  # as there are no --results
         open_ = partial(open_detector, weights, device, sensor_height=first.sensor_height)
         start = partial(by_detector, open_, write_results is not None)
     report = NuscenesReport()

@@ -86,6 +86,7 @@ def segmentation(walk: Walk, methods: tuple, png: Path | None, params: Segmentat
         from lidar_perception.scoring.points.report import ground_of_methods
         for frame in islice(labelled[0], walk.limit):
             scan, labels, found = ground_of_methods(frame, params, grounds)
-            draw_ground(png, frame.name, scan, labels.classes, found)
-            break
+            if labels is not None:
+                draw_ground(png, frame.name, scan, labels.classes, found)
+                break
         console.print(f"picture: {png}")

@@ -110,8 +110,8 @@ def _tracking(folder: Path) -> list[Frame]:
         calibration = functools.cache(partial(
             read_calibration, folder / f"calib/{name}.txt",
             images / f"{scans[0].stem}.png" if scans else None))
-        truth = _truth_by_number(folder / f"label_02/{name}.txt", lambda path, c=calibration:
-                                 read_tracking_labels(path, c().lidar_to_camera))
+        truth = _truth_by_number(folder / f"label_02/{name}.txt",
+                                 partial(_tracking_truth, calibration))
         for points in scans:
             number = _number(points)
             stamp = start + (number - _number(scans[0])) * PERIOD_NS
@@ -121,6 +121,11 @@ def _tracking(folder: Path) -> list[Frame]:
                                 points=points, image=images / f"{points.stem}.png"))
         start = frames[-1].stamp_ns + GAP_NS if frames else start
     return frames
+
+
+def _tracking_truth(calibration: Callable[[], Calibration], label: Path
+                    ) -> dict[int, GroundTruth]:
+    return read_tracking_labels(label, calibration().lidar_to_camera)
 
 
 def _raw(root: Path) -> list[Frame]:

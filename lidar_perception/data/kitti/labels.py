@@ -153,23 +153,33 @@ def format_label(label: dict, decimals: int = 2, whole: bool = True) -> str:
 def read_tracklets(path: Path) -> dict[int, GroundTruth]:
     """Frame number -> objects, of a raw recording's tracklet_labels.xml (LiDAR frame already)."""
     try:
-        tracklets = ElementTree.parse(regular(path)).getroot().find("tracklets")
-        items = [t for t in tracklets if t.tag == "item"]
+        tracklets = _child(ElementTree.parse(regular(path)).getroot(), "tracklets")
         frames: dict[int, list] = {}
-        for track, item in enumerate(items):
-            name = RAW_NAMES.get(item.findtext("objectType"), item.findtext("objectType"))
-            h, w, length = (float(item.findtext(k)) for k in "hwl")
-            first = int(item.findtext("first_frame"))
-            poses = [p for p in item.find("poses") if p.tag == "item"]
-            for i, pose in enumerate(poses):
-                x, y, z, yaw = (float(pose.findtext(k)) for k in ("tx", "ty", "tz", "rz"))
+        for track, item in enumerate(tracklets.iterfind("item")):
+            name = _text(item, "objectType")
+            h, w, length = (float(_text(item, k)) for k in "hwl")
+            first = int(_text(item, "first_frame"))
+            for i, pose in enumerate(_child(item, "poses").iterfind("item")):
+                x, y, z, yaw = (float(_text(pose, k)) for k in ("tx", "ty", "tz", "rz"))
                 extra = {"track_id": track, "occluded": int(float(pose.findtext("occlusion", "0"))),
                          "truncated": float(pose.findtext("truncation", "0"))}
                 frames.setdefault(first + i, []).append(
-                    ([x, y, z + h / 2, length, w, h, yaw], CLASSES.index(name), extra))
-    except (OSError, ElementTree.ParseError, TypeError, ValueError, AttributeError) as error:
+                    ([x, y, z + h / 2, length, w, h, yaw], CLASSES.index(RAW_NAMES.get(name, name)),
+                     extra))
+    except (OSError, ElementTree.ParseError, ValueError) as error:
         raise InputError(f"cannot read the tracklets {path}: {error}") from None
     return {k: GroundTruth.of(*map(list, zip(*objects))) for k, objects in frames.items()}
+
+
+def _child(element: ElementTree.Element, name: str) -> ElementTree.Element:
+    found = element.find(name)
+    if found is None:
+        raise ValueError(f"<{element.tag}> has no <{name}>")
+    return found
+
+
+def _text(element: ElementTree.Element, name: str) -> str:
+    return _child(element, name).text or ""
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:

@@ -131,9 +131,10 @@ def _sweeps(tables: Tables, times: dict[str, int]) -> dict[str, tuple[str, int, 
                if channel == CHANNEL}
     mounts = {token for token, sensor in tables.rows("calibrated_sensor", "token", "sensor_token")
               if sensor in sensors}
-    sweeps = {sample: row for sample, key, *row in tables.rows(
-        "sample_data", "sample_token", "is_key_frame", "filename", "timestamp", "ego_pose_token",
-        "calibrated_sensor_token") if key and row[3] in mounts and sample in times}
+    sweeps = {sample: (file, time, pose, mount) for sample, key, file, time, pose, mount
+              in tables.rows("sample_data", "sample_token", "is_key_frame", "filename", "timestamp",
+                             "ego_pose_token", "calibrated_sensor_token")
+              if key and mount in mounts and sample in times}
     if without := times.keys() - sweeps.keys():
         raise InputError(f"{tables.path('sample_data')} has no {CHANNEL} of {len(without)} of "
                          f"{len(times)} key frames, such as {min(without)}; download it again")

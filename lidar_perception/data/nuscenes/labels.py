@@ -63,7 +63,7 @@ class NuscenesLabels:
             name = NAMES[boxes.class_ids[i]] if boxes.class_ids[i] >= 0 else None
             attribute = boxes.attributes[i]
             rides = name == "bicycle" and attribute == WITH_RIDER
-            ids.append(CLASSES.index("Cyclist" if rides else CLASS_OF.get(name, "Misc")))
+            ids.append(CLASSES.index("Cyclist" if rides else CLASS_OF.get(name or "", "Misc")))
             extras.append({
                 "detection_name": name, "category": self.category_names[self.categories[i]],
                 "lidar_points": int(self.lidar_points[i]), "points": int(boxes.points[i]),
@@ -86,7 +86,7 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
                   for token, name in tables.rows("attribute", "token", "name")}
     instances = {token: (number, number_of.get(category, -1)) for number, (token, category)
                  in enumerate(tables.rows("instance", "token", "category_token"))}
-    own, links, frames, objects, categories = (array("q") for _ in range(5))
+    own, links, in_frames, of_objects, of_categories = (array("q") for _ in range(5))
     tokens: dict[str, int] = {}  # a number for each label, in the order in which they are named
     fields = ("translation", "size", "rotation")
     block, blocks = [], []
@@ -102,9 +102,9 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
         own.append(tokens.setdefault(token, len(tokens)))
         links.extend([tokens.setdefault(other, len(tokens)) if other else -1
                       for other in (before, after)])
-        frames.append(frame_of[sample])
-        objects.append(number)
-        categories.append(category)
+        in_frames.append(frame_of[sample])
+        of_objects.append(number)
+        of_categories.append(category)
         block.append((*box, (lidar, radar, attributes.get(labels[0], -1) if labels else -1)))
         if len(block) == BLOCK:
             blocks.append(_columns(tables, block))
@@ -113,15 +113,15 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
         return None
     numbers = np.concatenate([*blocks, _columns(tables, block)])
     centres, sizes, rotations, counts = np.split(numbers, (3, 6, 10), axis=1)
-    frames, neighbours = np.array(frames), _neighbours(tables, tokens, own, links)
+    frames, neighbours = np.array(in_frames), _neighbours(tables, tokens, own, links)
     seconds = np.fromiter(times.values(), np.int64, len(times))[frames] * 1e-6
-    categories, classes = np.array(categories), [CATEGORIES.get(name) for name in names.values()]
+    categories, classes = np.array(of_categories), [CATEGORIES.get(name) for name in names.values()]
     class_ids = np.array([NAMES.index(name) if name else -1 for name in classes])[categories]
     boxes = GlobalBoxes.of(centres, sizes[:, [1, 0, 2]], rotations, class_ids, counts[:, 2],
                            _velocities(centres, seconds, neighbours),
                            points=counts[:, 0] + counts[:, 1])
     everything = NuscenesLabels(boxes, categories, tuple(names.values()),
-                                counts[:, 0].astype(np.int32), np.array(objects))
+                                counts[:, 0].astype(np.int32), np.array(of_objects))
     order = np.argsort(frames, kind="stable")
     bounds = np.searchsorted(frames[order], np.arange(1, len(times)))
     return [everything[rows] for rows in np.split(order, bounds)]
@@ -130,12 +130,12 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
 def _neighbours(tables: Tables, tokens: dict[str, int], own: array, links: array) -> np.ndarray:
     """(K, 2) rows of the labels of the same object before and after, -1 = none, from the numbers
     of the labels themselves (K,) and of those that they name (2 K,)."""
-    links = np.array(links).reshape(-1, 2)
+    named = np.array(links).reshape(-1, 2)
     row_of = np.full(len(tokens) + 1, -1)  # the last one is of link -1, to none
     row_of[own] = np.arange(len(own))
-    neighbours = row_of[links]
-    if (wrong := (neighbours < 0) & (links >= 0)).any():
-        token = next(token for token, number in tokens.items() if number == links[wrong][0])
+    neighbours = row_of[named]
+    if (wrong := (neighbours < 0) & (named >= 0)).any():
+        token = next(token for token, number in tokens.items() if number == named[wrong][0])
         raise InputError(f"{tables.path(TABLE)}: the label {token} is named before or after "
                          "another, but is not there; download it again")
     return neighbours

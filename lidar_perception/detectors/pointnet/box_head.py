@@ -7,7 +7,7 @@ in halves of a bin, -1 .. 1.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -23,17 +23,20 @@ BOX_WEIGHT, YAW_BIN_WEIGHT = 1.0, 0.3  # lambda of Eq. 18, of boxes and of yaw b
 SMOOTH = 0.2       # m, and like numbers: from here on the box loss is linear
 
 
-class BoxTargets(NamedTuple):
+Array = TypeVar("Array", np.ndarray, Tensor)
+
+
+class BoxTargets(NamedTuple, Generic[Array]):
     """centres (K, 3), sizes (K, 3), yaw_residuals (K,) float32, yaw_bins (K,) int64."""
 
-    centres: np.ndarray
-    sizes: np.ndarray
-    yaw_bins: np.ndarray
-    yaw_residuals: np.ndarray
+    centres: Array
+    sizes: Array
+    yaw_bins: Array
+    yaw_residuals: Array
 
 
 def encode(boxes: np.ndarray, labels: np.ndarray, centres: np.ndarray, azimuths: np.ndarray,
-           config: PointNetConfig) -> BoxTargets:
+           config: PointNetConfig) -> BoxTargets[np.ndarray]:
     """Targets of boxes (K, 7) of classes labels (K,) into config.classes, for clusters with these
     centres (K, 3) and azimuths (K,)."""
     offset = boxes[:, :3] - centres
@@ -76,15 +79,15 @@ class Losses(NamedTuple):
     yaw_bins: Tensor
 
 
-def cluster_loss(outputs: Outputs, labels: Tensor, targets: BoxTargets, has_box: Tensor,
+def cluster_loss(outputs: Outputs, labels: Tensor, targets: BoxTargets[Tensor], has_box: Tensor,
                  weights: Tensor | None = None) -> Losses:
     """Cross entropy of labels (B,), K for background and -1 for those of which nothing is said,
     with a weight (K + 1,) for each class; smooth L1 of the boxes of those that have one (B,) bool,
-    and cross entropy of their yaw bins. targets: tensors of B rows."""
+    and cross entropy of their yaw bins. targets: of B rows."""
     classes = functional.cross_entropy(outputs.logits.float(), labels, weight=weights,
                                        ignore_index=-1)
     if not has_box.any():
-        zero = sum(x.sum() for x in outputs) * 0.0
+        zero = sum((x.sum() for x in outputs), classes.new_zeros(())) * 0.0
         return Losses(classes + zero, classes, zero, zero)
     bins = targets.yaw_bins[has_box]
     residuals = outputs.yaw_residuals[has_box].gather(1, bins[:, None])[:, 0]

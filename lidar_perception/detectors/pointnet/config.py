@@ -8,7 +8,7 @@ A checkpoint holds the dataclass as JSON, so that weights always come with their
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypedDict
 
 from lidar_perception.classes import DETECTED
 from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams, EuclideanParams
@@ -111,21 +111,33 @@ class PointNetConfig:
         return GroundParams(method="cloth")
 
 
-PLAIN = dict(msg=False, mrg=False, skip=False, grouped=False)
-ABLATIONS = {  # paper C, Table 5; where it does not say how clusters are made, as it proposes
-    "base": dict(dynamic_threshold=False, log_point_count=False, **PLAIN),
-    "dynamic-threshold": dict(log_point_count=False, **PLAIN),
-    "log-point-count": dict(dynamic_threshold=False, **PLAIN),
-    "skip": dict(msg=False, mrg=False, grouped=False),
-    "msg-mrg": dict(skip=False),
-    "msg-skip": dict(mrg=False),
-    "mrg-skip": dict(msg=False),
-    "improved": {},
+class Switches(TypedDict, total=False):
+    """Those fields of PointNetConfig that differ between the networks of paper C."""
+
+    dynamic_threshold: bool
+    log_point_count: bool
+    msg: bool
+    mrg: bool
+    skip: bool
+    grouped: bool
+
+
+PLAIN = Switches(msg=False, mrg=False, skip=False, grouped=False)
+# Paper C, Table 5; where it does not say how clusters are made, as it proposes.
+ABLATIONS: dict[str, Switches] = {
+    "base": {"dynamic_threshold": False, "log_point_count": False, **PLAIN},
+    "dynamic-threshold": {"log_point_count": False, **PLAIN},
+    "log-point-count": {"dynamic_threshold": False, **PLAIN},
+    "skip": Switches(msg=False, mrg=False, grouped=False),
+    "msg-mrg": Switches(skip=False),
+    "msg-skip": Switches(mrg=False),
+    "mrg-skip": Switches(msg=False),
+    "improved": Switches(),
 }
-NETWORKS = {
+NETWORKS: dict[str, Switches] = {
     **ABLATIONS,
     "pointnet": PLAIN,
-    "pointnet2": dict(msg=False, mrg=False, skip=False),  # PointNet++, single-scale grouping
+    "pointnet2": Switches(msg=False, mrg=False, skip=False),  # PointNet++, single-scale grouping
 }
 
 

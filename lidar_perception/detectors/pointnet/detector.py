@@ -41,6 +41,11 @@ class PointNetDetector(NetworkDetector):
         super().__init__(header, device, params)
         self.network = fused(network).to(device)
 
+    @property
+    def settings(self) -> PointNetParams:
+        """The detector's own group of params."""
+        return self.params.pointnet
+
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:
         """Ground and clusters are computed where they are None."""
@@ -73,7 +78,8 @@ class PointNetDetector(NetworkDetector):
 
     def _detections(self, predicted: Predictions) -> tuple:
         """Detections, and what nothing_passed gives."""
-        settings, best, broken = self.settings, {}, None
+        settings, broken = self.settings, None
+        best: dict[str, float] = {}
         sound = np.isfinite(np.column_stack([predicted.probabilities, predicted.boxes])).all(axis=1)
         if not sound.all():
             broken = ("the network's outputs are not numbers (NaN) for "

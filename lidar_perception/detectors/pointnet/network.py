@@ -119,13 +119,19 @@ class CoarseNet(nn.Module):
 class PointNet(nn.Module):
     """One cluster each: points (B, N, 5), valid (B, N) bool, context (B, 6) to Outputs."""
 
+    temperature: Tensor
+    offsets: Tensor
+
     def __init__(self, config: PointNetConfig):
         super().__init__()
         self.config = config
         shallow, local, wide = (config.point_channels[-1], config.local_channels,
                                 config.global_channels)
         self.points = mlp(POINT, *config.point_channels)
-        self.local = self.coarse = self.raw = self.fine = None
+        self.local: LocalNet | None = None
+        self.coarse: CoarseNet | None = None
+        self.raw: nn.Module | None = None
+        self.fine: nn.Module | None = None
         found = 0
         if config.groups:
             self.local = LocalNet(config.groups, config.group_channels, shallow, local)
@@ -153,7 +159,7 @@ class PointNet(nn.Module):
         found, shallow = [], [features.amax(dim=1)]
         # Where points lie densely grouped features say more, else those of single points (Eq. 17).
         dense = valid.float().mean(dim=1, keepdim=True)                    # (B, 1)
-        if self.local is not None:
+        if self.local is not None and self.fine is not None:
             local = self.local(points, features, valid, config.centroids)  # (B, M, C)
             found.append(self.fine(local).amax(dim=1))                     # (B, C)
             shallow.append(local.amax(dim=1))
@@ -186,8 +192,10 @@ def fused(network: PointNet) -> PointNet:
     """A copy for inference, with every batch norm inside the layer before it."""
     network = copy.deepcopy(network).eval()
     for module in network.modules():
-        if isinstance(module, LinearNormRelu) and isinstance(module[1], nn.BatchNorm1d):
-            module[0], module[1] = fuse_linear_bn_eval(module[0], module[1]), nn.Identity()
+        if isinstance(module, LinearNormRelu):
+            linear, norm, _ = module
+            if isinstance(linear, nn.Linear) and isinstance(norm, nn.BatchNorm1d):
+                module[0], module[1] = fuse_linear_bn_eval(linear, norm), nn.Identity()
     return network
 
 

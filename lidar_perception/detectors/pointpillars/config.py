@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypedDict
 
 from lidar_perception.classes import DETECTED
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError
@@ -30,8 +30,17 @@ SIZES = {
                     block_layers=(1, 3, 3), deconv_channels=32, fpn_channels=32),
 }
 
-RANGES = {"ahead": {},  # as in KITTI, where labels are only there
-          "around": dict(low=(-51.2, -51.2, -3.0), high=(51.2, 51.2, 1.0))}
+
+
+class Range(TypedDict, total=False):
+    """What a network sees, fields of NetworkConfig."""
+
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+
+
+RANGES = {"ahead": Range(),  # as in KITTI, where labels are only there
+          "around": Range(low=(-51.2, -51.2, -3.0), high=(51.2, 51.2, 1.0))}
 
 XY_SCALE = 0.02  # of networks that are trained here
 CHOICES = {"neck": ("deconv", "fpn"), "fusion": ("add", "concat"), "anchors_at": ("cells", "ends")}

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -41,6 +41,16 @@ from lidar_perception.detectors.view import (
 from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError, LidarFrame
 
 
+class Network(Protocol):
+    """What runs in the detector: torch's network, or an exported one."""
+
+    def to(self, device: torch.device) -> None:
+        """Move to another device, where it can."""
+
+    def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
+        """See Prediction; maps as in PointPillars.features."""
+
+
 class TorchNetwork:
     """A network on a device, its norms folded into its layers."""
 
@@ -60,7 +70,7 @@ class TorchNetwork:
 class PointPillarsDetector(NetworkDetector):
     """EG-PointPillars of any version as a detector, see contract.py."""
 
-    def __init__(self, network: Any, header: Header, device: torch.device,
+    def __init__(self, network: Network, header: Header, device: torch.device,
                  params: DetectorParams = DetectorParams()):
         super().__init__(header, device, params)
         self.network = network
@@ -105,7 +115,8 @@ class PointPillarsDetector(NetworkDetector):
         return begun, ended, *self._detections(logits, boxes_at)
 
     def _detections(self, logits: Tensor, boxes_at: Callable) -> tuple:
-        settings, best_scores, broken = self.settings, {}, None
+        settings, broken = self.settings, None
+        best_scores: dict[str, float] = {}
         limits = logits.new_tensor([*map(_logit, self.raw_min_scores())])
         chosen = torch.nonzero((logits >= limits).any(dim=1))[:, 0]
         if len(logits) > 1 and (logits == logits[0]).all():
@@ -121,8 +132,8 @@ class PointPillarsDetector(NetworkDetector):
         codes, directions = boxes_at(chosen)
         boxes = decode(codes.float(), directions.argmax(dim=1), self.anchors[chosen],
                        self.config.direction_offset).cpu().numpy()
-        scores, labels = torch.sigmoid(best).cpu().numpy(), labels.cpu().numpy()
-        detections = best_of_each(boxes, scores, labels, self.config.classes, settings.nms)
+        detections = best_of_each(boxes, torch.sigmoid(best).cpu().numpy(), labels.cpu().numpy(),
+                                  self.config.classes, settings.nms)
         return calibrated(detections, self.header.calibration), best_scores, broken
 
     def out_of_sight(self, frame: LidarFrame, seen: LidarFrame) -> str | None:
@@ -176,6 +187,7 @@ def load_detector(path: str | Path = "", device: str = "auto",
     path = Path(path) if str(path) not in ("", ".") else weights_file(params.pointpillars)
     if params.pointpillars.threads:
         torch.set_num_threads(params.pointpillars.threads)
+    network: Network
     if path.suffix == ".onnx":
         from lidar_perception.detectors.pointpillars.onnx import OnnxNetwork
         header, network = OnnxNetwork.load(path)

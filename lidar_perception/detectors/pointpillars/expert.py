@@ -45,20 +45,24 @@ def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | 
     they are None. The ids that are left are numbered anew from 1, in their order.
     """
     needs_clusters = config.cluster_ids or config.pseudo_map
-    if ground is None and (config.remove_ground or (needs_clusters and cluster_ids is None)):
-        ground = levelled_ground(seen, ground_params)
-    if needs_clusters and cluster_ids is None:
-        cluster_ids = cluster_obstacles(seen.xyz, ground, clustering)
-    if config.remove_ground:
-        obstacles = np.flatnonzero(~np.asarray(ground, bool))
-        seen = seen.take(obstacles)
-        cluster_ids = None if cluster_ids is None else cluster_ids.take(obstacles)
+    if not needs_clusters:
+        cluster_ids = None
+    if config.remove_ground or (needs_clusters and cluster_ids is None):
+        if ground is None:
+            ground = levelled_ground(seen, ground_params)
+        if needs_clusters and cluster_ids is None:
+            cluster_ids = cluster_obstacles(seen.xyz, ground, clustering)
+        if config.remove_ground:
+            obstacles = np.flatnonzero(~np.asarray(ground, bool))
+            seen = seen.take(obstacles)
+            cluster_ids = None if cluster_ids is None else cluster_ids.take(obstacles)
     points = np.zeros((len(seen), config.point_columns), np.float32)
     points[:, :3] = seen.xyz
     if seen.intensity is not None:
         points[:, 3] = seen.intensity
-    if needs_clusters:
-        cluster_ids, _ = renumbered(cluster_ids)
+    if cluster_ids is None:
+        return NetworkInput(points)
+    cluster_ids, _ = renumbered(cluster_ids)
     if config.cluster_ids:
         points[:, 4] = cluster_ids
     return NetworkInput(points, draw_clusters(seen.xyz, cluster_ids, config)

@@ -13,24 +13,25 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval, fuse_linear_bn_eval
 
-from lidar_perception.detectors.checkpoint import Header, load
+from lidar_perception.detectors.checkpoint import Header, Net, load
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.pillars import Pillars
 
-NORM = dict(eps=1e-3, momentum=0.01)
+EPS, MOMENTUM = 1e-3, 0.01  # of batch norms
 CODE, BINS = 7, 2      # numbers that describe a box, and halves of the circle of headings
 PRIOR = 0.01           # score of every anchor before training
 
 # What a detector asks of a network, torch's or an exported one: logits (A, K) of one cloud, and
 # codes (M, 7) and directions (M, 2) at anchors (M,).
 Prediction = tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]
+Conv = nn.Conv2d | nn.ConvTranspose2d
 
 
 class Outputs(NamedTuple):
@@ -44,8 +45,9 @@ class Outputs(NamedTuple):
 class ConvNormRelu(nn.Sequential):
     """A convolution, batch norm, ReLU."""
 
-    def __init__(self, conv: nn.Module):
-        super().__init__(conv, nn.BatchNorm2d(conv.out_channels, **NORM), nn.ReLU(inplace=True))
+    def __init__(self, conv: Conv):
+        super().__init__(conv, nn.BatchNorm2d(conv.out_channels, EPS, MOMENTUM),
+                         nn.ReLU(inplace=True))
 
 
 def conv3x3(channels: int, out: int, stride: int = 1) -> ConvNormRelu:
@@ -61,7 +63,7 @@ class PillarNet(nn.Module):
         self.config = config
         self.linear = nn.Linear(config.point_columns + config.offset_columns,
                                 config.pillar_channels, bias=False)
-        self.norm = nn.BatchNorm1d(config.pillar_channels, **NORM)
+        self.norm: nn.Module = nn.BatchNorm1d(config.pillar_channels, EPS, MOMENTUM)
 
     @torch.autocast("cuda", enabled=False)
     @torch.autocast("cpu", enabled=False)  # where x is 60 m, 16 bits would leave 25 cm of it
@@ -148,7 +150,7 @@ class Head(nn.Module):
         self.scores = nn.Conv2d(channels, per_cell * classes, 1)
         self.codes = nn.Conv2d(channels, per_cell * CODE, 1)
         self.directions = nn.Conv2d(channels, per_cell * BINS, 1)
-        nn.init.constant_(self.scores.bias, -math.log((1 - PRIOR) / PRIOR))
+        nn.init.constant_(_bias(self.scores), -math.log((1 - PRIOR) / PRIOR))
         for layer, std in ((self.scores, 0.01), (self.codes, 0.001)):
             if not layer.weight.is_meta:  # there it would load torch's compiler: 2 s, no numbers
                 nn.init.normal_(layer.weight, std=std)
@@ -169,10 +171,15 @@ class Head(nn.Module):
 
         def one(conv: nn.Conv2d, width: int) -> Tensor:
             weight = conv.weight.view(self.per_cell, width, -1)[numbers]  # (M, width, C)
-            bias = conv.bias.view(self.per_cell, width)[numbers]
+            bias = _bias(conv).view(self.per_cell, width)[numbers]
             return torch.baddbmm(bias[:, :, None], weight, rows[:, :, None])[:, :, 0]
 
         return one(self.codes, CODE), one(self.directions, BINS)
+
+
+def _bias(conv: nn.Conv2d) -> Tensor:
+    assert conv.bias is not None  # the head's have one
+    return conv.bias
 
 
 def _by_anchor(x: Tensor, width: int) -> Tensor:
@@ -183,8 +190,8 @@ def _by_anchor(x: Tensor, width: int) -> Tensor:
 class PointPillars(nn.Module):
     """The network of parts that fit together; make_network builds them from a config."""
 
-    def __init__(self, pillar_net: nn.Module, map_net: nn.Module | None,
-                 blocks: Sequence[nn.Module], neck: nn.Module, head: nn.Module):
+    def __init__(self, pillar_net: PillarNet, map_net: MapNet | None,
+                 blocks: Sequence[nn.Module], neck: DeconvNeck | FpnNeck, head: Head):
         super().__init__()
         self.pillar_net, self.map_net = pillar_net, map_net
         self.blocks, self.neck, self.head = nn.ModuleList(blocks), neck, head
@@ -219,8 +226,12 @@ def make_network(config: NetworkConfig) -> PointPillars:
             FpnNeck(config.block_channels, config.block_strides, config.fpn_channels,
                     config.fusion))
     head = Head(neck.channels, len(config.anchors) * len(config.yaws), len(config.anchors))
-    network = PointPillars(PillarNet(config), map_net, blocks, neck, head)
-    return network.to(memory_format=torch.channels_last)
+    return channels_last(PointPillars(PillarNet(config), map_net, blocks, neck, head))
+
+
+def channels_last(network: Net) -> Net:
+    """The network itself, its weights in the order in which its images are in memory."""
+    return cast(Any, network).to(memory_format=torch.channels_last)  # torch's types forget it
 
 
 def fused(network: PointPillars) -> PointPillars:
@@ -228,12 +239,14 @@ def fused(network: PointPillars) -> PointPillars:
     network = copy.deepcopy(network).eval()
     for module in network.modules():
         if isinstance(module, ConvNormRelu):
-            module[0] = fuse_conv_bn_eval(module[0], module[1],
-                                          transpose=isinstance(module[0], nn.ConvTranspose2d))
-            module[1] = nn.Identity()
+            conv, norm, _ = module
+            transposed = isinstance(conv, nn.ConvTranspose2d)
+            if isinstance(conv, Conv) and isinstance(norm, nn.BatchNorm2d):
+                module[0], module[1] = fuse_conv_bn_eval(conv, norm, transposed), nn.Identity()
     net = network.pillar_net
-    net.linear, net.norm = fuse_linear_bn_eval(net.linear, net.norm), nn.Identity()
-    return network.to(memory_format=torch.channels_last)
+    if isinstance(net.norm, nn.BatchNorm1d):
+        net.linear, net.norm = fuse_linear_bn_eval(net.linear, net.norm), nn.Identity()
+    return channels_last(network)
 
 
 def load_network(path: str | Path,

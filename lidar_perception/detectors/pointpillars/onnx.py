@@ -80,6 +80,7 @@ def export_onnx(network: PointPillars, header: Header, path: str | Path) -> None
             OneCloud(fused(network), config.grid).eval(), tuple(inputs.values()), dynamo=True,
             verbose=False, opset_version=OPSET, input_names=list(inputs), output_names=OUTPUTS,
             dynamic_shapes=free)
+    assert program is not None  # as dynamo is True
     model = program.model_proto
     onnx.helper.set_model_props(model, {KEY: header.text()})
     onnx.checker.check_model(model)
@@ -131,7 +132,8 @@ class OnnxNetwork:
                      cluster_map=maps)
         try:
             logits, codes, directions = map(torch.from_numpy, self.session.run(
-                OUTPUTS, {name: given[name].numpy() for name in self.inputs}))
+                OUTPUTS, {name: value.numpy() for name, value in given.items()
+                          if name in self.inputs and value is not None}))
         except Exception as error:  # its errors have no common base
             raise InputError(f"ONNX Runtime cannot run {self.source}: "
                              f"{str(error).splitlines()[0]}") from None

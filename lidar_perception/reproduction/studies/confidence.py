@@ -22,6 +22,7 @@ from lidar_perception.reproduction.experiment import (
     Figure,
     Line,
     Panel,
+    Row,
     Section,
     Table,
 )
@@ -64,7 +65,9 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     """The report: ranking by each score, and calibration of the confidences."""
     records = [r for r in records if "skipped" not in r]
     truth = np.array([r["pedestrians"] for r in records], float)
-    rows, curves, calibration, lines = [], [], [], []
+    rows: list[Row] = []
+    calibration: list[Row] = []
+    curves, lines = [], []
     for name in NAMES:
         scores, hits, frame = _flat([r["scored"][name] for r in records])
         estimates = _intervals(scores, hits, frame, truth)

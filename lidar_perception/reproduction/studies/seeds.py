@@ -33,6 +33,7 @@ CLICK_ERROR = 0.3   # metres, standard deviation in x and y of a click beside th
 CLICK_RADIUS = 2.0  # metres
 HEIGHTS = (1.2, 2.1)  # metres, of a random cluster that one would call a person
 SEVERAL = 3
+COMBINED: dict[str, Callable[..., np.ndarray]] = {"maximum": np.max, "mean": np.mean}
 
 
 def _one(segmented: Segmented, labelled: Labelled, rng: np.random.Generator
@@ -70,7 +71,7 @@ def _one(segmented: Segmented, labelled: Labelled, rng: np.random.Generator
 def _several(segmented: Segmented, labelled: Labelled) -> list[Seed]:
     """Seeds of the nearest pedestrians that have enough points."""
     order = np.argsort(np.hypot(*labelled.pedestrians[:, :2].T))
-    seeds = []
+    seeds: list[Seed] = []
     for box in labelled.pedestrians[order]:
         inside = points_in_box(segmented.xyz, box) & ~segmented.ground
         if inside.sum() >= MIN_POINTS and len(seeds) < SEVERAL:
@@ -79,7 +80,7 @@ def _several(segmented: Segmented, labelled: Labelled) -> list[Seed]:
 
 
 def _found_with_several(segmented: Segmented, seeds: list[Seed], params: PipelineParams,
-                        combine: Callable[[np.ndarray], np.ndarray]) -> Found:
+                        combine: Callable[..., np.ndarray]) -> Found:
     """Candidates by what their similarities to the seeds (T, K) combine to; the height may be that
     of any of them."""
     if not seeds:
@@ -87,7 +88,7 @@ def _found_with_several(segmented: Segmented, seeds: list[Seed], params: Pipelin
     boxes, points, start = clusters_as_tall(segmented, seeds, params)
     images = with_copies(boxes, points, start, params)
     alike = np.stack([similarity(images, seed.silhouette(params), params.stm) for seed in seeds])
-    return Found(boxes, combine(alike), params.stm.threshold)
+    return Found(boxes, combine(alike, axis=0), params.stm.threshold)
 
 
 def _banked(segmented: Segmented, seed: Seed, params: PipelineParams, views: tuple[float, ...]
@@ -120,9 +121,9 @@ def find(labelled: Labelled, segments: Callable[[PipelineParams], Segmented]
                                                     params)
     segmented = segments(PAPER)
     several = _several(segmented, labelled)
-    for label, combine in (("maximum", np.max), ("mean", np.mean)):
+    for label, combine in COMBINED.items():
         found[f"paper, {SEVERAL} nearest truths, {label}"] = _found_with_several(
-            segmented, several, PAPER, functools.partial(combine, axis=0))
+            segmented, several, PAPER, combine)
     for label, views in (("front", (FRONT,)), ("side", (SIDE,)), ("front and side", (FRONT, SIDE))):
         try:
             found[f"paper, simulated by range, {label}"] = _banked(

@@ -6,6 +6,8 @@ nothing. Ranges are named as in evaluation/matching.py, stages as in candidates/
 
 from __future__ import annotations
 
+Scores = tuple[float | None, ...]
+
 FRAMES = 1779       # with a Pedestrian label, of KITTI's 7481 training frames (Section 3.1)
 PEDESTRIANS = 4487
 TABLE_1 = {"0-15": 2093, "15-30": 1771, "30-45": 468, "45-60": 118, "60+": 37}
@@ -21,7 +23,7 @@ TABLE_6 = {"stage1": (55.5, 27.6, 36.8, None, 0.15),
            "final": (46.7, 58.8, 52.1, 83.7, 0.16)}
 
 # Table 4 by range, the same columns. The F1 of `final` is from Section 4.5.
-TABLE_4 = {
+TABLE_4: dict[str, dict[str, Scores]] = {
     "0-15": {"stage1": (76.2, 53.7, 63.0, None, 0.12), "stage2": (73.0, 69.4, 71.2, 95.8, 0.12)},
     "15-30": {"stage1": (43.5, 24.2, 31.1, None, 0.18), "stage2": (24.7, 48.4, 32.7, 56.8, 0.20),
               "final": (None, None, 35.6, None, None)},
@@ -38,7 +40,7 @@ TABLE_5 = (
 )
 
 # Figure 8 where the text or Table 4 gives a point: steps -> recall, precision, F1.
-FIGURE_8 = {"15-30": {0: (24.7, 48.4, 32.7), 2: (None, None, 35.6)},
+FIGURE_8: dict[str, dict[int, Scores]] = {"15-30": {0: (24.7, 48.4, 32.7), 2: (None, None, 35.6)},
             "30-45": {0: (8.5, 22.1, 12.3)}, "45-60": {0: (0.8, 4.3, 1.4)}}
 
 # Table 8: share of hits with a 3D IoU of .10, .25 or more, the same from above, mean 3D, mean BEV.

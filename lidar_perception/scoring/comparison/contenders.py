@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from lidar_perception.candidates.configurations import BEST, PAPER
@@ -14,13 +15,14 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.candidates import CandidateDetector
-from lidar_perception.detectors.checkpoint import NETWORKS, POINTNET, POINTPILLARS
+from lidar_perception.detectors.checkpoint import NETWORKS, POINTPILLARS
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.hybrid.candidates import RescoredCandidates
 from lidar_perception.detectors.hybrid.params import ConfirmingParams, RescoringParams
 from lidar_perception.detectors.hybrid.proposals import ConfirmedProposals
 from lidar_perception.detectors.open import FUSED, open_detector
 from lidar_perception.detectors.params import MIN_SCORE
+from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file as pointnet_file
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS
@@ -79,6 +81,8 @@ def contenders(weights: Sequence[Path] = (), device: str = "auto",
     opened: list[Opened] = []
     for path in [*files, *weights]:
         detector = open_detector(path, device, sensor_height=sensor_height)
+        if not isinstance(detector, NetworkDetector):
+            raise InputError(f"{path} takes part anyway; give files of weights")
         opened.append(Opened(_name(detector, [each.name for each in opened]), detector, path))
     found = [each.contender() for each in opened]
     missing = [Missing(name, reason) for name, reason in absent.items()
@@ -101,10 +105,10 @@ def opened_in_a_process(weights: Sequence[Path], device: str,
 def _own_files() -> tuple[list[Path], dict[str, str]]:
     """The weights that come with the package, and of others name and reason why not."""
     wanted: dict[str, Callable[[], Path]] = {
-        f"PointPillars {version} {size}": lambda params=PointPillarsParams(
-            version=version, size=size): pointpillars_file(params)
+        f"PointPillars {version} {size}": partial(
+            pointpillars_file, PointPillarsParams(version=version, size=size))
         for size in SIZES for version in VERSIONS}
-    wanted["PointNet"] = lambda: pointnet_file(PointNetParams())
+    wanted["PointNet"] = partial(pointnet_file, PointNetParams())
     files, absent = [], {}
     for name, place in wanted.items():
         try:
@@ -139,24 +143,27 @@ def _candidates(sensor_height: float) -> list[Contender]:
 def _hybrids(opened: Sequence[Opened], best: PipelineParams
              ) -> tuple[list[Contender], list[Missing]]:
     """STM-CPA and PointPillars, each with the first PointNet."""
-    classifier = next((each for each in opened if each.network == POINTNET), None)
+    classifiers = [(each.detector, str(each.source)) for each in opened
+                   if isinstance(each.detector, PointNetDetector)]
     proposers = {each.name: each for each in reversed(opened) if each.network == POINTPILLARS}
     proposer = proposers.get(PROPOSER, next(reversed(proposers.values()), None))
     names = "STM-CPA + PointNet", "STM-CPA + PointNet, auto", "PointPillars + PointNet"
-    if classifier is None:
+    if not classifiers:
         return [], [Missing(name, "no PointNet has weights") for name in names]
 
+    classifier, source = classifiers[0]
+
     def rescored(seed, camera, pipeline):
-        return RescoredCandidates(classifier.detector, seed, camera, RescoringParams(), pipeline)
+        return RescoredCandidates(classifier, seed, camera, RescoringParams(), pipeline)
     own = rescored(_no_seed, None, best).pipeline
-    found = [_seeded(names[0], rescored, best, _labelled, str(classifier.source)),
-             _seeded(names[1], rescored, best, _own_seed(own), str(classifier.source))]
+    found = [_seeded(names[0], rescored, best, _labelled, source),
+             _seeded(names[1], rescored, best, _own_seed(own), source)]
     if proposer is None:
         return found, [Missing(names[2], "there is no PointPillars to propose")]
-    confirmed = ConfirmedProposals(proposer.detector.with_min_score(PROPOSED), classifier.detector,
+    confirmed = ConfirmedProposals(proposer.detector.with_min_score(PROPOSED), classifier,
                                    ConfirmingParams())
     return [*found, always(proposer.name.replace("PointPillars", "PP") + " + PointNet", confirmed,
-                           f"{proposer.source} {classifier.source}")], []
+                           f"{proposer.source} {source}")], []
 
 
 def _seeded(name: str, make: Callable[..., Detector], params: PipelineParams,

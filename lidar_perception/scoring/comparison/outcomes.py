@@ -38,13 +38,13 @@ class Contender:
 
 
 def by_contenders(open_: Callable[[], list[Contender]], recording: Recording
-                  ) -> Callable[[Frame], dict[str, Detected] | None]:
+                  ) -> Callable[[Frame], dict[str, Detected[Detections]] | None]:
     """Runs every contender that open_() gives on every frame with labels, in turns; gives their
     Detected by name. The first frame is run once more before it counts, as a first run also loads
     what was compiled. With open_ a Start of scoring.run."""
     contenders, state = open_(), {"turn": 0}
 
-    def measure(frame: Frame) -> dict[str, Detected] | None:
+    def measure(frame: Frame) -> dict[str, Detected[Detections]] | None:
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None:
             return None
@@ -58,7 +58,7 @@ def by_contenders(open_: Callable[[], list[Contender]], recording: Recording
     return measure
 
 
-def _one(contender: Contender, frame: Frame) -> Detected:
+def _one(contender: Contender, frame: Frame) -> Detected[Detections]:
     """What a contender says of a frame, without boxes that are not finite."""
     detector = contender.detector_of(frame)
     if detector is None:
@@ -96,7 +96,7 @@ class ComparisonReport:
         """Whose frames and labels are those of all."""
         return next(iter(self.reports.values()))
 
-    def update(self, results: dict[str, Detected]) -> None:
+    def update(self, results: dict[str, Detected[Detections]]) -> None:
         """One frame."""
         for name, result in results.items():
             self.reports[name].update(result)
@@ -142,10 +142,9 @@ def objects(report: DetectionReport) -> dict[str, dict[str, int]]:
 
 def mean_moderate(precision: dict[str, dict | None], row: str) -> float | None:
     """The mean over the classes with objects; None where a class is not known, or without any."""
-    if None in precision.values():
-        return None
-    values = [value for rows in precision.values() if (value := rows[row]["moderate"]) is not None]
-    return float(np.mean(values)) if values else None
+    known = [rows[row]["moderate"] for rows in precision.values() if rows is not None]
+    values = [value for value in known if value is not None]
+    return float(np.mean(values)) if values and len(known) == len(precision) else None
 
 
 def _r40(level: dict | None) -> float | None:

@@ -95,7 +95,7 @@ class NuscenesReport:
             self.skipped.append(result.problem)
         if result.ms is not None:
             self.ms.append(result.ms)
-        if result.truth is not None:
+        if result.truth is not None and result.counted is not None:
             self.truth.append(result.truth)
             self.detections.append(result.counted)
 

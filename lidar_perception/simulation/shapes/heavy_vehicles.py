@@ -19,7 +19,7 @@ from lidar_perception.simulation.shapes.thing import (
     upright_pane,
 )
 from lidar_perception.simulation.shapes.vehicles import paint
-from lidar_perception.simulation.solids import ELLIPSOID, part, parts
+from lidar_perception.simulation.solids import ELLIPSOID, Surface, part, parts
 
 TRUCK, ON_RAILS, OTHER_VEHICLE = 18, 16, 20
 
@@ -39,7 +39,7 @@ def _truck(length: float, width: float, load: float, cab: float, colour: float,
     """load, cab: heights in metres of the load and the cab above the road."""
     x, y, radius, floor = length / 2, width / 2, 0.48, 1.15
     back, belt, roof = x - min(2.2, 0.24 * length), 0.62 * cab, cab - 0.25
-    shell, pane = dict(reflectance=colour), dict(reflectance=GLASS, transmission=0.75)
+    shell, pane = Surface(reflectance=colour), Surface(reflectance=GLASS, transmission=0.75)
     rows = [
         block((-x, -y, floor), (back - 0.35, y, load), reflectance=cargo),
         block((0.3 - x, -0.45, 0.6), (back, 0.45, floor), reflectance=0.1),
@@ -89,17 +89,17 @@ def _coach(size: tuple[float, float, float], colour: float, semantic: int, radiu
     length, width, height = size
     x, y = length / 2, width / 2
     belt, top, floor = 0.38 * height, 0.82 * height, 0.45
-    shell, pane = dict(reflectance=colour), dict(reflectance=GLASS, transmission=0.7)
+    shell, pane = Surface(reflectance=colour), Surface(reflectance=GLASS, transmission=0.7)
     rows = [
         block((0.4 - x, -0.97 * y, top), (x - 0.4, 0.97 * y, height), **shell),
         block((0.3 - x, -0.95 * y, 0.25), (x - 0.3, 0.95 * y, floor), reflectance=0.15)]
     for end in (-1, 1):
+        screen = (end * (x - 0.15), belt), (end * (x - 0.4), top + 0.1)
         rows += [
             part(ELLIPSOID, (end * (x - 0.6), 0, 0.22 + belt / 2), (0.6, 0.98 * y, belt / 2),
                  **shell),
             block((end * (x - 0.7), -0.93 * y, 0.25), (end * (x - 0.2), 0.93 * y, belt), **shell),
-            slope(*sorted([(end * (x - 0.15), belt), (end * (x - 0.4), top + 0.1)], reverse=True),
-                  0.93 * y, **pane)]
+            slope(max(screen), min(screen), 0.93 * y, **pane)]
     for side in (-1, 1):
         rows += [
             block((0.6 - x, side * y, 0.28), (x - 0.6, side * (y - 0.06), belt), **shell),

@@ -21,7 +21,7 @@ from lidar_perception.simulation.shapes.thing import (
     slope,
     upright_pane,
 )
-from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, part, parts
+from lidar_perception.simulation.solids import CYLINDER, ELLIPSOID, Surface, part, parts
 
 CAR = 10
 PILLAR = 0.035   # radius, m
@@ -122,8 +122,8 @@ def body(size: tuple[float, float, float], style: Style, colour: float, glass: f
     load = (style.load - 0.5) * length if style.load else rear - radius
     deck = height if style.load else TAIL_TOP * height
     top, narrow = height - DOME, 0.86 * y if not style.load else 0.92 * y
-    shell = dict(reflectance=colour)
-    pane = dict(reflectance=GLASS, transmission=glass)
+    shell = Surface(reflectance=colour)
+    pane = Surface(reflectance=GLASS, transmission=glass)
     rows = [
         block((rear, -0.98 * y, clear), (front, 0.98 * y, arch), **shell),
         *_bonnet((low, bonnet), x, 0.97 * y, height, shell),
@@ -161,19 +161,19 @@ def body(size: tuple[float, float, float], style: Style, colour: float, glass: f
         block((TAIL - 0.02 - x, -0.26, 0.4 * height), (TAIL - x, 0.26, 0.4 * height + 0.11),
               reflectance=PLATE),
         *_corners(TAIL - 0.005 - x, y + 0.005, (0.38 * height, 0.44 * height),
-                  dict(reflectance=LIGHTS))]
+                  Surface(reflectance=LIGHTS))]
     rows += _seats(0.5 * (low + high) - 0.75, load, 0.75 * y, arch, 0.45 * belt + 0.55 * top,
                    driver)
     return parts(rows, CAR)
 
 
-def _bumper(x: float, y: float, height: float, surface: dict) -> tuple:
+def _bumper(x: float, y: float, height: float, surface: Surface) -> tuple:
     """What reaches x in its middle, rounded seen from above and from the side."""
     return part(ELLIPSOID, (x - copysign(0.5, x), 0.0, BUMPER * height), (0.5, y, 0.17 * height),
                 **surface)
 
 
-def _corners(x: float, y: float, heights: tuple, surface: dict) -> list[tuple]:
+def _corners(x: float, y: float, heights: tuple, surface: Surface) -> list[tuple]:
     """The two corners of a tail at x, round seen from above, between two heights."""
     low, high = heights
     return [part(CYLINDER, (x + TAIL_ROUND, side * TAIL_FLAT * y, (low + high) / 2),
@@ -181,7 +181,7 @@ def _corners(x: float, y: float, heights: tuple, surface: dict) -> list[tuple]:
             for side in (-1, 1)]
 
 
-def _bonnet(foot: tuple, x: float, y: float, height: float, surface: dict) -> list[tuple]:
+def _bonnet(foot: tuple, x: float, y: float, height: float, surface: Surface) -> list[tuple]:
     """A bonnet and its crown, from the foot (x, z) of the windscreen down to the nose at x. At its
     edge is a step of 0.2 m down; the crown is 0.04 of the height above the foot."""
     low, top = foot
@@ -194,7 +194,7 @@ def _seats(x: float, rear: float, y: float, low: float, high: float, driver: boo
     """Backs of the front seats at x, of the bench ahead of rear if there is room, the driver.
     Most beams end on none of them: what comes back through two panes is weak. On KITTI's cars seen
     from behind, 2 % of the points are where the bench is, with these 1 to 2 %."""
-    cloth = dict(reflectance=0.02, transmission=0.75)
+    cloth = Surface(reflectance=0.02, transmission=0.75)
     rows = [block((x - 0.08, -y, low), (x + 0.04, y, high), **cloth)]
     if x - rear > LEGS:
         rows.append(block((rear + 0.1, -y, low), (rear + 0.25, y, high - 0.05), **cloth))

@@ -36,7 +36,7 @@ from lidar_perception.training.data import Batches, ReadScenes, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes
 from lidar_perception.training.record import begun_with, judged, keeper
-from lidar_perception.training.run import Task
+from lidar_perception.training.run import Judged, Task
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
 FEWEST = 3          # points that are left of a cluster, at least
@@ -49,7 +49,7 @@ class ClusterSample:
 
     inputs: ClusterInput
     labels: np.ndarray
-    targets: BoxTargets
+    targets: BoxTargets[np.ndarray]
     has_box: np.ndarray
 
 
@@ -171,7 +171,7 @@ class ValidationClusters:
     name: str
     clusters: Clusters
     labels: np.ndarray
-    truth: GroundTruth
+    truth: GroundTruth | None
     calibration: Calibration | None
     height: float = SENSOR_HEIGHT
 
@@ -185,8 +185,7 @@ def clusters_to_validate(source: CutScenes, i: int) -> ValidationClusters:
                               frame.truth(), frame.calibration(), frame.sensor_height)
 
 
-def validated(network: PointNet, scenes: Sequence[ValidationClusters]
-              ) -> tuple[dict[str, float], dict[str, tuple[float, float]]]:
+def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> Judged:
     """Calibrate the network on the scenes and score it, see Task: score, the mean AP from above at
     the relaxed overlaps (moderate, R40), and each class's; accuracy, the share of clusters of
     SCORED_POINTS or more, and of the objects among them, whose class is right."""
@@ -215,13 +214,13 @@ def validated(network: PointNet, scenes: Sequence[ValidationClusters]
 
 def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches,
               validation: ReadScenes, out: Path, device: torch.device, about: dict[str, Any],
-              commit: str = "", init: Path | None = None) -> Task:
+              commit: str = "", init: Path | None = None) -> Task[PointNet]:
     """The task of training a network of a config; see training.pointpillars.make_task."""
     torch.manual_seed(params.seed)
     network = begun_with(make_pointnet(config), init, PointNetConfig).to(device)
     scenes: list[ValidationClusters] = []
 
-    def validate(module: PointNet) -> tuple:
+    def validate(module: PointNet) -> Judged:
         if not scenes:
             for item, in loaded(validation, ([n] for n in range(len(validation))), batches.jobs):
                 if item.sample is not None:

@@ -15,7 +15,7 @@ import torch
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
-from lidar_perception.detectors.pointpillars.network import make_network
+from lidar_perception.detectors.pointpillars.network import channels_last, make_network
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.training.augment import TrainingScene
@@ -78,7 +78,7 @@ class PointPillarsStart:
         cut(scenes[0], self.config.classes, params.data.min_points)  # compiles
         cutting, parts = timed(objects)
         network = make_network(self.config).to(device)
-        network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        channels_last(network)
         with tempfile.TemporaryDirectory() as folder:
             joined(parts).save(Path(folder) / OBJECTS)
             prepare = Preparation(seen, params.augment, params.data.min_points,

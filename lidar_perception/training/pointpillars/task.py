@@ -22,7 +22,11 @@ from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
 from lidar_perception.detectors.pointpillars.expert import network_input
 from lidar_perception.detectors.pointpillars.losses import detection_loss
-from lidar_perception.detectors.pointpillars.network import PointPillars, make_network
+from lidar_perception.detectors.pointpillars.network import (
+    PointPillars,
+    channels_last,
+    make_network,
+)
 from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
 from lidar_perception.detectors.pointpillars.pillars import make_pillars
 from lidar_perception.detectors.pointpillars.targets import (
@@ -47,7 +51,7 @@ from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
 from lidar_perception.training.putting import inside
 from lidar_perception.training.record import begun_with, judged, keeper
-from lidar_perception.training.run import Task
+from lidar_perception.training.run import Judged, Task
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError, LidarFrame
 
 # Boxes of low score cost precision only where recall has ended; fewer of them are quicker.
@@ -130,13 +134,13 @@ def narrowed(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig
         return float(np.ceil(round(length / step, 6)) * step)
 
     x, y = whole(ahead), whole(aside)
-    low, high = list(config.low), list(config.high)
+    (back, right, bottom), (front, left, top) = config.low, config.high
     if ahead:
-        high[0] = min(high[0], max(low[0], 0.0) + x)
-        low[0] = max(low[0], -x) if low[0] < 0 else low[0]
+        front = min(front, max(back, 0.0) + x)
+        back = max(back, -x) if back < 0 else back
     if aside:
-        low[1], high[1] = max(low[1], -y), min(high[1], y)
-    return replace(config, low=tuple(low), high=tuple(high))
+        right, left = max(right, -y), min(left, y)
+    return replace(config, low=(back, right, bottom), high=(front, left, top))
 
 
 def targets_of(sample: Sample, anchors: Tensor, config: NetworkConfig) -> Targets:
@@ -164,9 +168,8 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
 
     def loss(network: nn.Module, samples: Sequence[Sample]) -> tuple[Tensor, dict[str, Tensor]]:
         pillars = make_pillars([torch.from_numpy(s.points).to(device) for s in samples], config)
-        maps = None
-        if config.pseudo_map:
-            maps = torch.from_numpy(np.stack([s.cluster_map for s in samples])).to(device)
+        drawn = [s.cluster_map for s in samples if s.cluster_map is not None]
+        maps = torch.from_numpy(np.stack(drawn)).to(device) if drawn else None
         targets = stacked([targets_of(sample, anchors, config) for sample in samples])
         losses = detection_loss(network(pillars, maps), targets, classes)
         return losses.total, {"classes": losses.classes.detach(), "boxes": losses.boxes.detach(),
@@ -198,15 +201,15 @@ def validation_report(detector: Detector, scenes: ReadScenes, jobs: int = 0) -> 
 
 def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batches,
               validation: ReadScenes, out: Path, device: torch.device, about: dict[str, Any],
-              commit: str = "", init: Path | None = None) -> Task:
+              commit: str = "", init: Path | None = None) -> Task[PointPillars]:
     """The task of training a network of a config. about: what the header says of the data; a
     resumed run must have the same. init: checkpoint to begin with, see checkpoint.adopt. Weights
     are written to out/best.safetensors and out/last.safetensors."""
     torch.manual_seed(params.seed)
     network = begun_with(make_network(config), init, NetworkConfig)
-    network = network.to(device, memory_format=torch.channels_last)
+    network = channels_last(network.to(device))
 
-    def validate(module: PointPillars) -> tuple:
+    def validate(module: PointPillars) -> Judged:
         detector = PointPillarsDetector(TorchNetwork(module, device), Header(config), device,
                                         VALIDATED)
         return judged(validation_report(detector, validation, batches.jobs), params.score,
