@@ -13,6 +13,8 @@ from benchmark.plain_euclidean import euclidean as plain
 from lidar_perception.clustering.euclidean import euclidean
 from lidar_perception.clustering.params import EuclideanParams
 
+pytestmark = pytest.mark.no_cover  # others run these lines
+
 LOCAL = EuclideanParams()
 SETTINGS = [LOCAL, replace(LOCAL, gamma=0.0), replace(LOCAL, threshold="global", gamma=0.0),
             replace(LOCAL, threshold="global", min_size=3), replace(LOCAL, beta=0.0, min_size=1)]

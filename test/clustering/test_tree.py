@@ -27,6 +27,8 @@ from lidar_perception.clustering.tree import (
     tree_of,
 )
 
+pytestmark = pytest.mark.no_cover  # others run these lines
+
 
 def on_a_sphere(rng, n):
     normal = rng.normal(size=(n, 3))

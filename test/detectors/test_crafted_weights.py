@@ -27,7 +27,9 @@ from lidar_perception.detectors.pointpillars.detector import (
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import InputError
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+# Others run these lines.
+pytestmark = [pytest.mark.no_cover,
+              pytest.mark.usefixtures("one_thread")]
 
 ODD = [None, True, 0, 1, -1, 2, 3, 63, 64, 1e-9, 0.5, -1e308, 1e308, math.nan, math.inf, 2**31,
        2**63, 10**400, "", "1", "Car", "v9", "\x00", "x" * 10_000, [], [1], [1, 2, 3], [0] * 1000,
@@ -79,7 +81,6 @@ SMALL = {
 
 
 @pytest.mark.parametrize("kind", SMALL)
-@pytest.mark.no_cover
 def test_a_mutated_header_is_used_or_refused_with_one_line(kind, tmp_path):
     """What passes has the tensors' shapes, so it takes no more memory than the file says."""
     make_header, make, load, params = SMALL[kind]

@@ -30,7 +30,9 @@ from lidar_perception.types import InputError
 
 few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
-pytestmark = pytest.mark.usefixtures("one_thread")
+# Others run these lines.
+pytestmark = [pytest.mark.no_cover,
+              pytest.mark.usefixtures("one_thread")]
 each_version = pytest.mark.parametrize("version", VERSIONS)
 
 
@@ -242,7 +244,6 @@ def test_boxes_at_some_anchors_are_those_of_all():
     assert torch.equal(network.head.logits(features), out.logits)
 
 
-@pytest.mark.no_cover
 def test_a_tiny_network_learns_two_objects():
     config = tiny("v0", block_channels=(16, 24, 24), deconv_channels=16, pillar_channels=16)
     torch.manual_seed(0)

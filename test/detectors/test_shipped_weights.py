@@ -14,7 +14,9 @@ from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.sensor import HDL64E
 from lidar_perception.types import CLASSES
 
-pytestmark = pytest.mark.usefixtures("one_thread", "streets")
+# Others run these lines.
+pytestmark = [pytest.mark.no_cover,
+              pytest.mark.usefixtures("one_thread", "streets")]
 FILES = [*sorted(WEIGHTS.glob("*.safetensors")), POINTNET]
 MOST = {"pointpillars": 30e6, "pointnet": 6e6}  # bytes of all files
 

@@ -23,6 +23,8 @@ from lidar_perception.scoring.points.segmentation import (
     true_ground,
 )
 
+pytestmark = pytest.mark.no_cover  # others run these lines
+
 few = settings(max_examples=25, database=None)
 
 

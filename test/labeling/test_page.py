@@ -17,7 +17,9 @@ from lidar_perception.geometry import wrap_angle
 
 BROWSER = shutil.which("chromium")
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="chromium is not installed")
+# Others run these lines.
+pytestmark = [pytest.mark.no_cover,
+              pytest.mark.skipif(BROWSER is None, reason="chromium is not installed")]
 FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
          "--disable-background-networking --disable-component-update --disable-sync").split()
 

@@ -25,6 +25,8 @@ from msg_utils.markers import (
     to_marker_array,
 )
 
+pytestmark = pytest.mark.no_cover  # others run these lines
+
 metres = st.floats(-200, 200)
 yaws = st.floats(-math.pi, math.pi, exclude_min=True) | st.sampled_from([math.pi, 0.0])
 boxes = st.tuples(metres, metres, metres, *[st.floats(0.01, 30)] * 3, yaws)

@@ -37,6 +37,8 @@ from lidar_perception.reproduction.stm_cpa import STM_CPA
 from lidar_perception.scoring import run as scoring_run
 from lidar_perception.types import InputError
 
+pytestmark = pytest.mark.no_cover  # others run these lines
+
 ROOT = Path(__file__).resolve().parents[2]
 TIMED = {"table_9", "table_9_median"}
 
@@ -64,7 +66,6 @@ def content(folder):
 # However it is spread and stopped
 
 
-@pytest.mark.no_cover
 def test_a_cluster_of_two_workers_measures_what_one_process_does(crowds, whole, tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs the extra [distributed]")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
@@ -89,7 +90,6 @@ def test_without_distributed_the_extra_is_named(few, tmp_path, monkeypatch):
         runner.run(SMALL, open_recording(few), tmp_path / "out", dask="tcp://127.0.0.1:9")
 
 
-@pytest.mark.no_cover
 def test_a_killed_run_of_two_processes_goes_on_where_it_was(crowds, whole, tmp_path):
     out = tmp_path / "out"
     process = subprocess.Popen(
@@ -295,7 +295,6 @@ def test_a_split_leaves_out_all_else(few, tmp_path):
     assert [r["frame"] for r in runner.run(SMALL, whole, tmp_path / "all")][-1] == "000004"
 
 
-@pytest.mark.no_cover
 def test_a_folder_without_scans_or_pedestrians_is_an_error(tmp_path):
     for argument, words in ((tmp_path / "none", "there is no "),
                             (tmp_path, "is no recording that can be read")):
@@ -311,7 +310,6 @@ def test_a_folder_without_scans_or_pedestrians_is_an_error(tmp_path):
 # The report and the summary
 
 
-@pytest.mark.no_cover
 def test_every_table_and_figure_is_in_every_format(whole):
     report = json.loads((whole / "report.json").read_text())
     page = html.unescape((whole / "report.html").read_text())

@@ -23,6 +23,8 @@ from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED, Compar
 from lidar_perception.scoring.kitti.report import ROWS, DetectionReport, mean_3d
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
 
+pytestmark = pytest.mark.no_cover  # others run these lines
+
 few = settings(max_examples=15, database=None)
 seeds = st.integers(0, 2**32 - 1)
 
@@ -69,7 +71,6 @@ def together(*lines):
 
 @pytest.mark.parametrize("seed, count, noise", [(0, 30, 0.12), (1, 60, 0.05), (2, 12, 0.1),
                                                 (3, 20, 0.3), (4, 2, 0.1)])
-@pytest.mark.no_cover
 def test_a_second_reading_of_the_protocol_gives_the_same(seed, count, noise):
     rng = np.random.default_rng(seed)
     frames = [reference.random_frame(rng, noise=noise) for _ in range(count)]

@@ -15,6 +15,8 @@ from lidar_perception.simulation.sensor import HDL64E, STILL, Motion, generic, r
 from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID, Solids
 from lidar_perception.simulation.terrain import Ground, cast_ground, compiled, surface_height, tufts
 
+pytestmark = pytest.mark.no_cover  # others run these lines
+
 SENSOR = generic(24, -24.0, 12.0, 1.0, 10.0, height=1.7, max_range=60.0, divergence=0.0,
                  lifts=tuple(np.linspace(0.2, 0.0, 24)))
 WIDE = replace(SENSOR, divergence=8e-3)

@@ -14,6 +14,8 @@ from lidar_perception.simulation.street import KINDS
 from lidar_perception.simulation.terrain import surface_height
 from lidar_perception.types import CLASSES, InputError
 
+pytestmark = pytest.mark.no_cover  # others run these lines
+
 SEEDS = range(3)
 EVERY = [(kind, seed) for kind in KINDS for seed in SEEDS]
 SIGN = 81  # of SemanticKITTI
@@ -66,7 +68,6 @@ def test_same_seed_same_street():
 
 
 @pytest.mark.parametrize("kind, seed", EVERY)
-@pytest.mark.no_cover
 def test_nothing_ever_overlaps(kind, seed):
     """Labels, everything else, and the ego vehicle, in the plane; but people sit on benches, and
     plants grow into one another and into walls."""
@@ -164,7 +165,6 @@ def test_what_stands_between_the_directions_is_at_crossings_and_leaves_the_lanes
     assert found > 10
 
 
-@pytest.mark.no_cover
 def test_streets_hold_what_kitti_labels():
     """In the forward camera's view and within 30 m, the 57 labelled frames beside the checkout
     have 1.7 cars, 0.19 pedestrians and 0.14 cyclists, fewer than stand there: what is hidden has
@@ -187,7 +187,6 @@ def test_streets_hold_what_kitti_labels():
     assert (found.sum(axis=0)[:len(CLASSES) - 1] > 0).sum() >= 6
 
 
-@pytest.mark.no_cover
 def test_as_many_people_as_asked_for():
     def people(factor):
         labels = [a.thing.label for a in scene_of("residential", 0, factor).actors]

@@ -23,6 +23,8 @@ from lidar_perception.simulation.solids import extents, parts, place
 from lidar_perception.simulation.terrain import Ground
 from lidar_perception.types import CLASSES
 
+pytestmark = pytest.mark.no_cover  # others run these lines
+
 SEEDS = range(12)
 LABELLED = {
     "walker": (partial(people.pedestrian, speed=1.3), 16),
@@ -219,7 +221,6 @@ def test_as_much_of_a_cyclist_is_low_as_of_those_of_kitti():
 
 @pytest.mark.parametrize("distance, low, high", [(20.0, 0.22, 0.32), (33.0, 0.20, 0.32),
                                                  (48.0, 0.08, 0.25)])
-@pytest.mark.no_cover
 def test_little_of_a_car_is_above_its_belt_and_the_farther_the_less(distance, low, high):
     """Above 0.65 of the height lie 38, 31 and 16 % of the points of 22, 17 and 15 cars that are
     seen from behind, 12 to 25, 25 to 40 and 40 to 70 m away, in streets, which hide what is low."""
@@ -242,7 +243,6 @@ def cars_from_the_front():
 
 @pytest.mark.parametrize("zone, low, high", [((0.15, 0.35), 0.04, 0.10), ((0.35, 0.55), 0.12, 0.24),
                                              ((0.55, 0.65), 0.45, 0.75)])
-@pytest.mark.no_cover
 def test_only_the_bumper_of_a_car_is_as_far_in_front_as_its_box(zone, low, high):
     """A quarter of the points of a zone of heights, shares of the car's, are less than 0.07, 0.17
     and 0.60 m behind the end of the box: medians over 42 to 59 of KITTI's, seen from the front."""

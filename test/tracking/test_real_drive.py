@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+pytestmark = pytest.mark.no_cover  # others run these lines
+
 FRAMES = 20
 
 
@@ -22,7 +24,6 @@ def detector(data):
 
 
 @pytest.mark.parametrize("ego", ["none", "auto"])
-@pytest.mark.no_cover
 def test_no_identity_switches_on_a_real_drive(data, detector, ego):
     """Which has no poses: auto takes them from the scans."""
     from lidar_perception.data.frame import POSES

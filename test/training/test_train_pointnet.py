@@ -18,7 +18,9 @@ from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.params import PointNetTraining
 from lidar_perception.types import InputError
 
-pytestmark = pytest.mark.usefixtures("one_thread", "streets")
+# Others run these lines.
+pytestmark = [pytest.mark.no_cover,
+              pytest.mark.usefixtures("one_thread", "streets")]
 SENSOR = "generic:16,-20,5,1.5,10"
 
 
@@ -62,7 +64,6 @@ def _weights(out):
     return {name: value.tolist() for name, value in network.state_dict().items()}
 
 
-@pytest.mark.no_cover
 def test_every_row_of_the_ablation_is_trained_and_shown(cache, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     result = train(cache, tmp_path / "all", "--ablation", **{"--steps": 1, "--validate-steps": 1})
