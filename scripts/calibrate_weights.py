@@ -31,7 +31,9 @@ LEAST = 0.02  # score of the boxes that count
 
 def uncalibrated(weights: Path) -> NetworkDetector:
     """The detector of a checkpoint with its network's own scores."""
-    return open_detector(weights, "cpu").raw().with_min_score(LEAST)
+    detector = open_detector(weights, "cpu")
+    assert isinstance(detector, NetworkDetector)
+    return detector.raw().with_min_score(LEAST)
 
 
 @click.command()

@@ -42,7 +42,7 @@ def fit(features: Mapping[str, np.ndarray], hit: np.ndarray, weight: np.ndarray,
 
     x = minimize(loss, np.zeros(design.shape[1] + 1), jac=True, method="L-BFGS-B",
                  bounds=[(None, None), *bounds], options={"maxiter": 5000, "maxfun": 10000}).x
-    curves = {}
+    curves: dict[str, dict] = {}
     for (name, own), steps in zip(knots.items(), np.split(x[1:], np.cumsum(parts)[:-1])):
         rises = steps[:len(own) - 1]
         curves[name] = {"knots": own, "values": [0.0, *np.round(np.cumsum(rises), 3).tolist()]}

@@ -37,10 +37,17 @@ RISING = {"similarity": 1, "height_difference_m": -1}  # more likeness is never 
 OUT = Path(module.__file__).with_name("confidence.json")
 
 
+def pedestrians(frame: Frame) -> np.ndarray:
+    """(P, 7) the labelled boxes of a simulated scan."""
+    truth = frame.truth()
+    assert truth is not None
+    return truth.of_class(PEDESTRIAN)
+
+
 def samples(frame: Frame, seed: Seed, params: PipelineParams) -> dict | None:
     """Features of the clusters of one frame, against a seed of another frame, as one's own cluster
     says nothing; hit (K,) bool; bins of range of the clusters and of the pedestrians."""
-    truth = frame.truth().of_class(PEDESTRIAN)
+    truth = pedestrians(frame)
     segmented = segment(frame.load(), frame.camera(), params)
     boxes, ids = segmented.boxes, np.arange(1, len(segmented.boxes) + 1)
     if len(boxes) == 0:
@@ -61,7 +68,7 @@ def seed_of(job: tuple[str, int]) -> Seed | None:
     frame = open_recording(job[0]).frames[job[1]]
     try:
         segmented = segment(frame.load(), frame.camera(), BEST)
-        return truth_seed(frame.truth().of_class(PEDESTRIAN))(segmented)
+        return truth_seed(pedestrians(frame))(segmented)
     except InputError:
         return None
 

@@ -32,8 +32,9 @@ OUT = Path(module.__file__).with_name("fusion.json")
 def samples(frame: Frame, look: Look) -> list[tuple[int, bool, dict[str, float]]]:
     """Class, hit and evidence of every proposal in the image; of those that hit one object the one
     with the best score, as only one is kept."""
-    truth, rows = frame.truth(), []
-    found, in_image = look.proposed, frame.camera().in_view(look.proposed.boxes[:, :3].copy())
+    truth, camera, rows = frame.truth(), frame.camera(), []
+    assert truth is not None and camera is not None  # as of all simulated scans
+    found, in_image = look.proposed, camera.in_view(look.proposed.boxes[:, :3].copy())
     for class_id in np.unique(found.class_ids):
         own = np.flatnonzero((found.class_ids == class_id) & in_image)
         own = own[np.argsort(-found.scores[own], kind="stable")]
