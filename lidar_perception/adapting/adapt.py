@@ -53,6 +53,7 @@ from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.tracking.ego import NO_SOURCE, recorded_source
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.cache import kept as made_once
+from lidar_perception.training.plan import TooShort
 from lidar_perception.training.sources import SIM
 from lidar_perception.training.start import start
 from lidar_perception.types import InputError
@@ -281,9 +282,15 @@ class Adapting:
         save_labels(labels, *zip(*chosen))
         own = AdaptedScenes(self.data, labels, tuple(self.low.tolist()), tuple(self.high.tolist()),
                             self.height)
-        hours = None if self.params.steps else LEARNING * self.hours / self.params.rounds
-        ended = start(self.network, self._training(folder, hours), self._params(len(chosen)),
-                      own=(own,))
+        share = LEARNING / self.params.rounds
+        hours = None if self.params.steps else share * self.hours
+        try:
+            ended = start(self.network, self._training(folder, hours), self._params(len(chosen)),
+                          own=(own,))
+        except TooShort as error:
+            raise InputError(f"a budget of {self.hours:g} h leaves too little time to learn on "
+                             f"this machine: give --budget {error.enough / share:.2g} or more, or "
+                             "fewer --scans") from None
         if ended is not None and ended.progress.stopped:
             raise KeyboardInterrupt
         return taught

@@ -44,6 +44,7 @@ from lidar_perception.labeling.exchange import import_labels
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cache import write_arrays
 from lidar_perception.training.params import AugmentParams
+from lidar_perception.training.plan import TooShort
 from lidar_perception.training.pointpillars.task import Preparation, targets_of
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
 
@@ -249,6 +250,16 @@ def test_bad_input_is_refused_in_one_line(bag, weights, tmp_path):
     other = write(tmp_path / "other.onnx", "no weights")
     assert "other.onnx" in refused(out, "--data", bag, "--weights", other)
     assert not out.exists()
+
+
+def test_what_is_said_of_a_short_budget_is_said_of_the_whole(bag, weights, whole, tmp_path,
+                                                             monkeypatch):
+    def start(network, asked, params, own):
+        raise TooShort(asked.budget, 4 * asked.budget)
+    monkeypatch.setattr(adapt_module, "start", start)
+    shutil.copytree(whole / "round1/looks", tmp_path / "round1/looks")
+    with pytest.raises(InputError, match=r"a budget of 1 h .* give --budget 4 or more"):
+        adapted(bag, weights, tmp_path, replace(SMALL, steps=0))
 
 
 def test_a_folder_of_somebody_else_stays_as_it_is(bag, weights, tmp_path):
