@@ -38,12 +38,17 @@ class Ahead(NamedTuple):
     unknown: str
 
 
+def spectrum(picture: np.ndarray) -> np.ndarray:
+    """Of a picture (see pictures_of) with as much of nothing beside it, for shift_between."""
+    return rfft2(picture, (2 * len(picture), 2 * len(picture)))
+
+
 def shift_between(before: np.ndarray, after: np.ndarray) -> Shift | None:
-    """Of two pictures (see pictures_of): the shift of what stands there under which they agree best
+    """Of the spectra of two pictures: the shift of what stands there under which they agree best
     (correlation by FFT); None where no shift agrees clearly. A turn of a few degrees blurs it and
     does no harm: the shift is then that of the way between."""
-    size = 2 * len(before)
-    match = irfft2(rfft2(before, (size, size)) * np.conj(rfft2(after, (size, size))))
+    size = len(before)
+    match = irfft2(before * np.conj(after))
     best = np.unravel_index(match.argmax(), match.shape)
     peak, elsewhere = match[best], match.copy()
     rows, columns = ((np.arange(-BESIDE, BESIDE + 1) + b) % size for b in best)
@@ -81,11 +86,11 @@ def shifts_of(pictures: np.ndarray, numbers: Sequence[int]) -> list[Shift | None
     """Of pictures and their numbers in the recording: from each to the next of GAPS by which the
     robot has gone MIN_SHIFT, or as far as it went; None where that is not clear."""
     found: list[Shift | None] = []
-    place = {number: i for i, number in enumerate(numbers)}
-    for i, number in enumerate(numbers):
-        others = [place[number + gap] for gap in GAPS if number + gap in place]
-        for other in others:
-            shift = shift_between(pictures[i], pictures[other])
+    spectra = dict(zip(numbers, map(spectrum, pictures), strict=True))
+    for number, before in spectra.items():
+        others = [spectra[number + gap] for gap in GAPS if number + gap in spectra]
+        for after in others:
+            shift = shift_between(before, after)
             if shift is None or np.hypot(*shift) >= MIN_SHIFT:
                 break
         found += [shift] if others else []
