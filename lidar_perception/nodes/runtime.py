@@ -135,14 +135,12 @@ class LidarNode(Node):
         def lost(event: Any) -> None:
             self.counts["lost"] += event.total_count_change
 
-        def heard(data: bytes) -> None:
-            guarded(data)
-
+        received: Any = guarded  # rclpy's annotation has no result
         kind, what = message_class(type_name), "cloud" if type_name == CLOUD else "array"
         added = (Reception(self, kind, name, guarded, lambda: self.robot.input, what)
                  if qos is None else
                  Subscribed(self, lambda: self.create_subscription(
-                     kind, name, heard, qos, raw=True,
+                     kind, name, received, qos, raw=True,
                      event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
                      qos_overriding_options=QoSOverridingOptions.with_default_policies())))
         self.inputs.append(added)
