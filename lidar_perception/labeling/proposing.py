@@ -45,15 +45,19 @@ ALONG = 0.4
 
 class Proposer:
     """Proposals for a drive. weights: of a detector, as open_detector takes them; "": none. kept:
-    the folder that keeps the survey, None for none. looks: of all frames, once they were surveyed,
-    else None; problem: what is wrong with what is kept, or ""."""
+    the folder that keeps the survey, None for none. problem: what is wrong with what is kept, or
+    ""."""
 
     def __init__(self, drive: Drive, weights: str = FUSED, kept: Path | None = None) -> None:
         self.drive, self.weights, self.kept = drive, weights, kept
-        self.looks: list[Look] | None = None
         self.problem = ""
         self._seen: list[Look] = []  # of the first frames
         self._seeds: dict[tuple[int, tuple[float, ...]], Seed | None] = {}
+
+    @property
+    def looks(self) -> list[Look] | None:
+        """Of all frames; None where they are not all surveyed yet."""
+        return self._seen if len(self._seen) == len(self.drive.frames) else None
 
     @cached_property
     def _key(self) -> str:
@@ -67,8 +71,6 @@ class Proposer:
             self._seen, self.problem = survey_cache.read(self.kept, self._key)
         except InputError as error:
             self.problem = str(error)
-        if len(self._seen) == len(self.drive.frames):
-            self.looks = self._seen
 
     def survey(self, done: Callable[[int], bool], here: bool = False) -> bool:
         """Look at all frames that were not yet, in a process of its own or here, and keep that;
@@ -83,7 +85,6 @@ class Proposer:
                     self._keep(looks)
                 if not done(len(looks)):
                     return False
-        self.looks = looks
         return True
 
     def _keep(self, looks: list[Look]) -> None:
