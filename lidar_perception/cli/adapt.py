@@ -81,8 +81,8 @@ def adapt(data: Path, weights: Path, out: Path, budget: float, resume: bool, for
 def begin(out: Path, weights: Path, resume: bool, force: bool) -> None:
     """InputError where out holds something that is neither to be resumed nor replaced."""
     there = [path.name for path in out.iterdir()] if out.is_dir() else []
-    if not out.exists() or (out.is_dir() and not there) or (
-            there == [REPORT] and TITLE in read_text(out / REPORT, 10**9)):
+    free = not out.exists() or (out.is_dir() and not there)
+    if free or (there == [REPORT] and TITLE in read_text(out / REPORT, 10**9)):
         return  # at most the report of a run that was refused
     ours = (out / RECORD).is_file()
     if not ours:
