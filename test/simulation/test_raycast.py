@@ -1,55 +1,24 @@
-"""Laws of the ray caster and the ground."""
+"""Laws of the ray caster."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from numba import njit
+from raycast_samples import FULL, OVER_ROAD, SENSOR, crowd, solids
 
 from lidar_perception.simulation import foliage
 from lidar_perception.simulation.hashing import uniform
 from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.realism.roughness import roughness
 from lidar_perception.simulation.returns import returns_of
-from lidar_perception.simulation.sensor import HDL64E, STILL, Motion, generic, rays
-from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID, Solids
-from lidar_perception.simulation.terrain import Ground, cast_ground, compiled, surface_height, tufts
+from lidar_perception.simulation.sensor import STILL, Motion, generic, rays
+from lidar_perception.simulation.solids import BOX, CYLINDER, ELLIPSOID
+from lidar_perception.simulation.terrain import Ground
 
 pytestmark = pytest.mark.no_cover  # others run these lines
 
-SENSOR = generic(24, -24.0, 12.0, 1.0, 10.0, height=1.7, max_range=60.0, divergence=0.0,
-                 lifts=tuple(np.linspace(0.2, 0.0, 24)))
 WIDE = replace(SENSOR, divergence=8e-3)
 NO_GROUND = np.array([0.0, 0.0, 1e4])
-OVER_ROAD = np.array([0.0, 0.0, SENSOR.height])
 DRIVE = Motion((12.0, -1.0, 0.2), 0.8, stamp=0.3)
-FULL = Ground(0.01, -0.02, 0.05, 20.0, 0.02, 6.0, -4.0, 0.13, 2.0, ((8.0, 15.0), (-30.0, -22.0)),
-              1.5)
-
-
-def solids(kind, centre, half, owner=1, axes=None, density=np.inf, transmission=0.0,
-           velocity=(0.0, 0.0, 0.0)):
-    """Solids of P kinds, centres and half sizes; the rest as given for each or for all."""
-    kind, centre = np.atleast_1d(np.array(kind, np.int8)), np.atleast_2d(np.array(centre, float))
-    n = len(kind)
-    axes = np.eye(3) if axes is None else axes
-    return Solids(kind, centre, np.broadcast_to(np.array(half, float), (n, 3)),
-                  np.broadcast_to(axes, (n, 3, 3)), np.full(n, 0.5), np.full(n, 10, np.uint16),
-                  np.broadcast_to(float(density), n), np.broadcast_to(float(transmission), n),
-                  np.broadcast_to(owner, n).astype(np.int32),
-                  np.broadcast_to(np.array(velocity, float), (n, 3)))
-
-
-def crowd(seed, count=60, moving=True):
-    """Solids of all kinds, turned anyhow, around the sensor and some far away."""
-    rng = np.random.default_rng(seed)
-    axes = np.linalg.qr(rng.normal(size=(count, 3, 3)))[0]
-    bearing, far = rng.uniform(-np.pi, np.pi, count), rng.uniform(4, 70, count)
-    centre = np.stack([far * np.cos(bearing), far * np.sin(bearing), rng.uniform(-3, 2, count)], 1)
-    made = solids(rng.integers(0, 3, count), centre, rng.uniform(0.05, 2.0, (count, 3)),
-                  np.sort(rng.integers(0, 20, count)), axes,
-                  velocity=rng.normal(0, 8, (count, 3)) * moving)
-    return replace(made, reflectance=rng.uniform(0.1, 0.9, count))
 
 
 def reference(made, sensor, motion=STILL):
@@ -292,110 +261,3 @@ def test_random_numbers_are_uniform_and_keep_their_place():
     assert abs(np.corrcoef(u[1:], u[:-1])[0, 1]) < 0.02
     assert abs(np.corrcoef(u, numbers(4))[0, 1]) < 0.02
     assert np.array_equal(numbers(3, 9), u[:9])
-
-
-def test_flat_ground_is_at_height_over_sine():
-    plain = replace(SENSOR, lifts=())
-    hits = cast(crowd(0, 0), Ground(), OVER_ROAD, plain)
-    sine = -np.sin(np.array(plain.elevations))
-    expected = np.where(sine > 0, plain.height / np.where(sine > 0, sine, 1), np.inf)
-    expected[expected > plain.max_range] = np.inf
-    assert np.allclose(hits.range, expected[None], rtol=1e-9)
-    assert (hits.owner == 0).all() and (hits.solid == -1).all()
-
-
-def on_ground(ground, position=(3.0, 0.4), sensor=None):
-    sensor = sensor or replace(SENSOR, azimuth_step=np.radians(0.5))
-    position = np.array([*position, surface_height(ground, *position) + sensor.height])
-    hits = cast(crowd(0, 0), ground, position, sensor)
-    met = np.isfinite(hits.range)
-    turn = rays(sensor)
-    at = position + turn.origin + turn.direction * np.where(met, hits.range, 0.0)[..., None]
-    return at[met], hits.semantic[met], met, hits
-
-
-@pytest.mark.parametrize("ground", [
-    FULL, FULL._replace(crossings=()), FULL._replace(wave=0.0, camber=0.05),
-    Ground(0.02, -0.03, 0.1)])
-def test_the_ground_is_met_where_it_is(ground):
-    at, semantic, met, _ = on_ground(ground)
-    x, y, z = at.T
-    off = z - surface_height(ground, x, y)
-    edges = [np.abs(y - ground.curb_left), np.abs(y - ground.curb_right)]
-    edges += [np.abs(x - end) for pair in ground.crossings for end in pair]
-    curb = (np.min(edges, axis=0) < 1e-6) & (semantic == 48)
-    assert np.abs(off[~curb]).max() < 2e-3
-    assert np.abs(off[curb]).max(initial=0) <= ground.curb_height + 1e-6
-    assert met[:, -12:].mean() > 0.99
-    if ground.curb_height:
-        assert curb.sum() > 50 and (y > ground.curb_left).any() and (y < ground.curb_right).any()
-
-
-def test_no_ray_passes_through_the_ground():
-    _, _, met, hits = on_ground(FULL)
-    sensor = replace(SENSOR, azimuth_step=np.radians(0.5))
-    turn, start = rays(sensor), np.array([3.0, 0.4, surface_height(FULL, 3.0, 0.4) + 1.7])
-    for share in np.linspace(0.02, 0.995, 40):
-        way = turn.direction * (np.where(met, hits.range, 0.0) * share)[..., None]
-        x, y, z = ((start + turn.origin + way)[met]).T
-        assert (z - surface_height(FULL, x, y)).min() > -2e-3
-
-
-def test_classes_of_the_ground_are_where_they_belong():
-    at, semantic, _, _ = on_ground(FULL, sensor=replace(SENSOR, azimuth_step=np.radians(0.25)))
-    x, y, _ = at.T
-    crossing = ((x > 8) & (x < 15)) | ((x > -30) & (x < -22))
-    out = np.maximum(y - 6, -4 - y)
-    sure = (np.abs(out) > 1e-3) & (np.abs(out + 1.5) > 1e-3) & (np.abs(out - 2) > 1e-3)
-    for edge in (8, 15, -30, -22):
-        sure &= np.abs(x - edge) > 1e-3
-    expected = np.select([crossing, out < -1.5, out < 0, out < 2], [40, 40, 44, 48], 72)
-    assert np.array_equal(semantic[sure], expected[sure])
-    assert set(np.unique(semantic)) == {40, 44, 48, 72}
-
-
-def test_rough_ground_lies_within_its_roughness_and_stays_where_it_is():
-    rough = FULL._replace(rough=0.08, litter=0.04)
-    (at, semantic, _, _), (again, *_) = on_ground(rough), on_ground(rough)
-    assert np.array_equal(at, again)
-    off = at[:, 2] - surface_height(rough, at[:, 0], at[:, 1])
-    for chosen, most in ((semantic == 72, 0.08), (semantic == 40, 0.008), (semantic == 44, 0.04)):
-        near = chosen & (np.linalg.norm(at[:, :2], axis=1) < 20)
-        assert off[near].min() > -0.01 and np.quantile(off[near], 0.99) < 1.3 * most
-        assert off[near].std() > 0.1 * most
-    # The same bumps from elsewhere.
-    assert np.isfinite(on_ground(rough, (4.0, 0.4))[0]).all()
-
-
-def test_grass_is_rough_at_every_range_and_hides_what_is_behind_it():
-    meadow = Ground(curb_left=2.0, curb_right=-2.0, walk=0.0, rough=0.6)
-    at, _, met, hits = on_ground(meadow, sensor=HDL64E)
-    above = at[:, 2] - surface_height(meadow, at[:, 0], at[:, 1])
-    assert -0.01 < above.min() and above.max() < 0.6
-    wild = np.abs(at[:, 1]) > 8  # no tuft of the road's side reaches there
-    near, middle, far = roughness(at[wild], np.array([8.0, 12.0, 18.0, 30.0]))
-    assert 0.02 < min(near, middle, far) and max(near, middle, far) < 0.1
-    _, _, _, smooth = on_ground(meadow._replace(rough=0.0), sensor=HDL64E)
-    assert (hits.range[met] <= smooth.range[met] + 1e-9).all()
-
-
-@njit
-def first_below_tufts(ground, start, way):
-    """The first range, 5 mm by 5 mm, at which a ray is below the tufts."""
-    t = 0.0
-    while t < 30.0 and start[2] + t * way[2] >= tufts(ground, start[0] + t * way[0],
-                                                      start[1] + t * way[1], 0.0):
-        t += 0.005
-    return t
-
-
-def test_tufts_are_met_where_a_slow_march_meets_them():
-    rng = np.random.default_rng(1)
-    meadow = Ground(curb_left=2.0, curb_right=-2.0, walk=0.0, rough=0.5)
-    yaw, down = rng.uniform(0.3, 2.8, 400), rng.uniform(0.06, 0.3, 400)
-    ways = np.stack([np.cos(yaw) * np.cos(down), np.sin(yaw) * np.cos(down), -np.sin(down)], 1)
-    ground, start = compiled(meadow), (0.0, 0.0, 1.7)
-    off = np.abs([cast_ground(ground, start, tuple(way), 60.0).range
-                  - first_below_tufts(ground, start, tuple(way)) for way in ways.tolist()])
-    # Steps are longer than tufts are thick: some are missed, and few met too early.
-    assert np.quantile(off, 0.5) < 0.1 and np.quantile(off, 0.9) < 0.5
