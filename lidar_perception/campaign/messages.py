@@ -20,10 +20,11 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.graph import private_domain
 from lidar_perception.nodes.reception import Reception
-from lidar_perception.nodes.runtime import ERROR, MARKERS, ODOMETRY, OK
+from lidar_perception.nodes.runtime import ERROR, MARKERS, OK
 from lidar_perception.nodes.watch import new_context
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode
+from lidar_perception.wire.transforms import ODOMETRY_MESSAGE
 from msg_utils.markers import from_marker_array
 from msg_utils.messages import message_class
 from msg_utils.point_cloud2 import CloudError, to_array
@@ -55,7 +56,7 @@ TRIED: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
         for source, view, window in (
             ("ground_truth", True, "stretched"), ("file", False, "stretched"),
             ("automatic", False, "metric"), ("click", False, "metric"))]),
-    "tracker": (8, {"input/detections": MARKERS, "input/odometry": ODOMETRY}, [{}]),
+    "tracker": (8, {"input/detections": MARKERS, "input/odometry": ODOMETRY_MESSAGE}, [{}]),
     "evaluator": (8, {"input/ground_truth": MARKERS, "input/final": MARKERS}, [{}]),
     "pointnet_detector": (0.5, POINTS, [{}]),
     "pointpillars_detector": (0.2, POINTS, [{}]),

@@ -15,6 +15,7 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.cloud_files import SUFFIXES
 from lidar_perception.data.frame import (
     BOXES,
@@ -27,22 +28,14 @@ from lidar_perception.data.frame import (
 )
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import decode
-from lidar_perception.wire.messages import calibration_of, column, pose_of, to_frame, to_truth
-from lidar_perception.wire.topics import (
-    CAMERA_INFO,
-    EXTRINSICS,
-    INSTANCE,
-    ODOMETRY,
-    POINTS,
-    SEMANTIC,
-    TRUTH,
-)
+from lidar_perception.wire.messages import calibration_of, column, to_frame, to_truth
+from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, INSTANCE, POINTS, SEMANTIC, TRUTH
 from msg_utils.markers import from_marker_array
-from msg_utils.stamps import SECOND, to_ns
+from msg_utils.stamps import SECOND
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 # What is known by these topics
-BESIDE = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}, POSES: {ODOMETRY}}
+BESIDE = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}}
 
 
 def recognises(path: Path) -> bool:
@@ -78,8 +71,8 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
         with suppress(InputError):  # a damaged cloud is named when it is read
             labelled = any(frames.labelled(data) is not None
                            for _, _, data in islice(bag.raw({points}), 1))
-    has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | (
-        {POINT_LABELS} if labelled else set())
+    has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | {
+        *[POINT_LABELS] * labelled, *[POSES] * frames.poses.known}
     return Recording(path, f"rosbag2 bag, clouds on {points}", frames, has, mounted=False)
 
 
@@ -163,15 +156,11 @@ class BagFrames(Sequence):
         return truth, infos, transforms
 
     @cached_property
-    def _poses(self) -> dict[int, Any]:
-        """The odometry by stamp."""
+    def poses(self) -> BagPoses:
+        """Of the frame that the first cloud is in."""
         with Bag(self.path) as bag:
-            return {to_ns(msg.header.stamp): msg.pose.pose
-                    for _, _, msg in bag.messages({ODOMETRY} & set(bag.topics))}
-
-    def _pose(self, stamp: int) -> np.ndarray | None:
-        pose = self._poses.get(stamp)
-        return None if pose is None else pose_of(pose)
+            first = next(bag.raw({self.points}), None)
+        return BagPoses(self.path, _frame_id(first[2]) if first else "")
 
     def _frame(self, i: int, time: int, stamp: int, which: int,
                data: Callable[[], bytes]) -> Frame:
@@ -179,7 +168,7 @@ class BagFrames(Sequence):
         return Frame(name, stamp, partial(self._load, time, data), partial(self._truth, stamp),
                      point_truth=partial(self._point_truth, time, data),
                      calibration=partial(self._calibration, time),
-                     pose=partial(self._pose, stamp), index=i, sensor_height=self.sensor_height,
+                     pose=lambda: self.poses(stamp), index=i, sensor_height=self.sensor_height,
                      native=lambda: decode(data(), self.kind))
 
     def _load(self, time: int, data: Callable[[], bytes]) -> LidarFrame:
@@ -223,6 +212,14 @@ def _stamp(data: bytes, time: int) -> int:
         return time
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return seconds * SECOND + nanoseconds
+
+
+def _frame_id(data: bytes) -> str:
+    """header.frame_id of a serialised message; "" if it is too short to have one."""
+    if len(data) < 16:
+        return ""
+    size, = struct.unpack_from("<I" if data[1] & 1 else ">I", data, 12)
+    return bytes(data[16:16 + size]).rstrip(b"\0").decode(errors="replace")
 
 
 def _latest(messages: list, time: int) -> Any:

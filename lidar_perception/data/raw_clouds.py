@@ -11,6 +11,7 @@ import numpy as np
 
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.cloud_files import cloud_files, to_message
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording, with_topic
@@ -28,13 +29,14 @@ APART = 8  # clouds between those of a pair in which a slow robot moves: see spr
 class RawClouds:
     """Clouds in order of time. layout: what was recognised, for people; stamps_ns: those of all,
     None where the source has none or invents them; load(i) -> PointCloud2 of cloud i, of rosbags'
-    class. InputError from load names what is broken."""
+    class; poses: of the frame of a bag's clouds. InputError from load names what is broken."""
 
     path: Path
     layout: str
     count: int
     stamps_ns: np.ndarray | None
     load: Callable[[int], Any]
+    poses: BagPoses | None = None
 
 
 def open_clouds(path: str | Path, topic: str | None = None) -> RawClouds:
@@ -62,7 +64,7 @@ def _of_bag(path: Path, topic: str) -> RawClouds:
             raise InputError(f"{path} has no cloud on {topic}; record it again")
         frames = bag_frames.BagFrames(path, topic, bag_frames.CLOUD, bag.counts[topic])
     return RawClouds(path, f"rosbag2 bag, clouds on {topic}", len(frames), frames.stamps(),
-                     frames.message)
+                     frames.message, frames.poses)
 
 
 def _of_files(path: Path, files: list[Path]) -> RawClouds:

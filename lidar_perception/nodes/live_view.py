@@ -15,19 +15,13 @@ from lidar_perception.labeling.live import Live
 from lidar_perception.labeling.live_topics import box_topics, clouds_topic
 from lidar_perception.nodes.reception import Reception
 from lidar_perception.nodes.runtime import CLOUD, MARKERS, decoded
-from lidar_perception.nodes.transforms import (
-    NO_TF,
-    STATIC_QOS,
-    TF_MESSAGE,
-    TF_QOS,
-    add_transforms,
-    has_tf,
-)
+from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, TF_QOS, has_tf
 from lidar_perception.nodes.watch import Outside
 from lidar_perception.params import ReceptionParams
 from lidar_perception.runs.files import short
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import TF, TF_STATIC
+from lidar_perception.wire.transforms import TF_MESSAGE, add_transforms
 from msg_utils.detections import from_detection_array
 from msg_utils.markers import from_marker_array
 from msg_utils.messages import message_class

@@ -16,7 +16,6 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.nodes.reception import WARN, Problem
-from lidar_perception.nodes.runtime import ODOMETRY
 from lidar_perception.robot.crop import cropped
 from lidar_perception.robot.deskew import deskewed
 from lidar_perception.robot.placing import Placing, levelling, tilted
@@ -27,34 +26,25 @@ from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_frame
 from lidar_perception.wire.point_times import moved_cloud, point_times
 from lidar_perception.wire.topics import TF, TF_STATIC
+from lidar_perception.wire.transforms import (
+    MOVING,
+    ODOMETRY_MESSAGE,
+    STILL,
+    TF_MESSAGE,
+    add_odometry,
+    add_transforms,
+)
 from msg_utils.stamps import SECOND, to_ns
 
 TF_QOS = QoSProfile(depth=100)
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 ODOMETRY_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # takes any
-TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 NO_TF = "tf2_msgs is not installed, so nothing is known of TF; install ROS 2's tf2_msgs"
-MOVING, STILL = "moving", "still"  # frames of the odometry, whatever the message calls them
 
 
 def has_tf() -> bool:
     """Whether TF can be listened to: the wheels of ROS lack its messages."""
     return importlib.util.find_spec("tf2_msgs") is not None
-
-
-def add_transforms(tree: TransformTree, msg: Any, static: bool) -> None:
-    """Add those of a tf2_msgs/TFMessage to a tree. InputError at the end where one of them is no
-    transform, which is left out."""
-    wrong = None
-    for each in msg.transforms:
-        t, q = each.transform.translation, each.transform.rotation
-        try:
-            tree.set(each.header.frame_id, each.child_frame_id, to_ns(each.header.stamp),
-                     (t.x, t.y, t.z), (q.x, q.y, q.z, q.w), static)
-        except InputError as error:
-            wrong = error
-    if wrong is not None:
-        raise wrong
 
 
 class Transforms:
@@ -102,7 +92,7 @@ class Transforms:
         """Subscribe to the odometry; once."""
         if not self._hearing:
             self._hearing = True
-            self.node.input("odometry", ODOMETRY, self.on_odometry, ODOMETRY_QOS)
+            self.node.input("odometry", ODOMETRY_MESSAGE, self.on_odometry, ODOMETRY_QOS)
 
     def _subscribe(self, topic: str, qos: QoSProfile, static: bool) -> None:
         self.node.input(topic, TF_MESSAGE, lambda m: self.on_tf(m, static), qos,
@@ -117,12 +107,10 @@ class Transforms:
 
     def on_odometry(self, msg: Any) -> None:
         """A nav_msgs/Odometry: where its child frame is at its stamp."""
-        p, q = msg.pose.pose.position, msg.pose.pose.orientation
-        stamp = to_ns(msg.header.stamp)
-        self.odometry.set(STILL, MOVING, stamp, (p.x, p.y, p.z), (q.x, q.y, q.z, q.w))
+        add_odometry(self.odometry, msg)
         self.carrier = msg.child_frame_id.lstrip("/")
         self.odometry_frame = msg.header.frame_id.lstrip("/")
-        self.odometry_ns = self.node.counts["last_pose_ns"] = stamp
+        self.odometry_ns = self.node.counts["last_pose_ns"] = to_ns(msg.header.stamp)
         self._changed()
 
     def _changed(self) -> None:

@@ -28,10 +28,10 @@ class Missing(InputError):
 
 
 class _Link:
-    """A frame in its parent: one pose for ever, or those of the last seconds."""
+    """A frame in its parent: one pose for ever, or those of the last seconds, or all of them."""
 
-    def __init__(self, parent: str, static: bool):
-        self.parent, self.static = parent, static
+    def __init__(self, parent: str, static: bool, keeps_all: bool):
+        self.parent, self.static, self.keeps_all = parent, static, keeps_all
         self.times: list[int] = []  # ns, ascending
         self.values: list[np.ndarray] = []  # (7,) translation and quaternion
 
@@ -47,6 +47,8 @@ class _Link:
             return
         self.times.insert(place, stamp_ns)
         self.values.insert(place, value)
+        if self.keeps_all:
+            return
         old = 0
         while self.times[-1] - self.times[old] > KEPT_NS or len(self.times) - old > MAX_KEPT:
             old += 1
@@ -66,10 +68,12 @@ class _Link:
         if ago > 0 and (max_gap is None or ago > max_gap or len(times) == 1):
             raise Missing(f"the newest transform of {name} is {ago:.3f} s older than needed; "
                           "is its publisher late, or has it stopped?", late=ago < 1.0)
-        if begin < times[0]:
-            raise Missing(f"the oldest transform of {name} is "
-                          f"{(times[0] - begin) / SECOND:.3f} s newer than needed")
+        early = (times[0] - begin) / SECOND
+        if early > 0 and (max_gap is None or early > max_gap or len(times) == 1):
+            raise Missing(f"the oldest transform of {name} is {early:.3f} s newer than needed")
         first, last = bisect_right(times, begin) - 1, bisect_left(times, end)
+        if early > 0:
+            first, last = 0, max(last, 1)
         if ago > 0:
             first = min(first, len(times) - 2)
         chosen = slice(first, last + 1)
@@ -84,11 +88,13 @@ class TransformTree:
     for those who ask for it with max_gap.
 
     Transforms are kept for KEPT_NS. A stamp that is JUMP_NS or more before the last one of its
-    frame is from a bag that starts again: all that moves is forgotten, what is fixed stays.
+    frame is from a bag that starts again: all that moves is forgotten, what is fixed stays. With
+    keeps_all, for what was recorded, nothing is forgotten.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, keeps_all: bool = False) -> None:
         self._links: dict[str, _Link] = {}  # by the frame that is the child
+        self._keeps_all = keeps_all
         self.jumps = 0
 
     def set(self, parent: str, child: str, stamp_ns: int, translation: Sequence[float] | np.ndarray,
@@ -105,10 +111,11 @@ class TransformTree:
         if link is None and len(self._links) >= MAX_FRAMES:
             raise InputError(f"more than {MAX_FRAMES} frames in the tree; '{child}' is left out")
         if link is None or (link.parent, link.static) != (parent, static):
-            link = self._links[child] = _Link(parent, static)
-        if not static and link.times and stamp_ns <= link.times[-1] - JUMP_NS:
+            link = self._links[child] = _Link(parent, static, self._keeps_all)
+        back = bool(link.times) and stamp_ns <= link.times[-1] - JUMP_NS
+        if back and not static and not self._keeps_all:
             self.forget()
-            link = self._links[child] = _Link(parent, static)
+            link = self._links[child] = _Link(parent, static, self._keeps_all)
         link.add(stamp_ns, value)
 
     def forget(self) -> None:
@@ -125,10 +132,10 @@ class TransformTree:
     def poses(self, target: str, source: str, at: np.ndarray,
               max_gap: float | None = None) -> np.ndarray:
         """(M, 4, 4): as lookup, at times (M,) int ns, M > 0. With max_gap, seconds, what moves goes
-        on after its newest transform as the last two do, for so long, and is not known between
-        two that are farther apart."""
+        on after its newest transform as the last two do, and came to its oldest as the first two
+        do, for so long, and is not known between two that are farther apart."""
         target, source = target.lstrip("/"), source.lstrip("/")
-        up, down = self._chain(source), self._chain(target)
+        up, down = self.chain(source), self.chain(target)
         common = next((frame for frame in up if frame in set(down)), None)
         if common is None:
             raise Missing(f"TF does not connect '{source}' with '{target}': "
@@ -136,9 +143,14 @@ class TransformTree:
         return (inverse(self._along(down, common, at, max_gap))
                 @ self._along(up, common, at, max_gap))
 
-    def _chain(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on to the root."""
-        chain = [frame]
+    def fixed(self, frame: str) -> bool:
+        """Whether a frame does not move in its parent; True where it has none."""
+        link = self._links.get(frame.lstrip("/"))
+        return link is None or link.static
+
+    def chain(self, frame: str) -> list[str]:
+        """The frame, its parent, and so on to the root. Missing where they go round."""
+        chain = [frame.lstrip("/")]
         while (link := self._links.get(chain[-1])) is not None:
             chain.append(link.parent)
             if link.parent in chain[:-1]:

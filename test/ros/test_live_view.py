@@ -16,10 +16,11 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 from test_robot_frames import mounted, transforms
 
 from lidar_perception.nodes.graph import SINGLE
-from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, TF_MESSAGE, has_tf
+from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, has_tf
 from lidar_perception.tracking.ego import moved_boxes
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import to_detections
+from lidar_perception.wire.transforms import TF_MESSAGE
 from msg_utils.markers import from_marker_array, to_marker_array
 from msg_utils.stamps import header_message
 

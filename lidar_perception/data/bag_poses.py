@@ -1,0 +1,159 @@
+"""Where the sensor of a bag was: by the odometry and the transforms that lie beside its clouds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+
+from lidar_perception.data.bag import Bag
+from lidar_perception.robot.tree import Missing, TransformTree
+from lidar_perception.types import InputError
+from lidar_perception.wire.topics import ODOMETRY, ODOMETRY_FRAME, TF, TF_STATIC
+from lidar_perception.wire.transforms import (
+    MOVING,
+    ODOMETRY_MESSAGE,
+    STILL,
+    add_odometry,
+    add_transforms,
+)
+
+FILTERED = "/odometry/filtered"  # of robot_localization
+FIRST = 500    # messages of /tf that show which frames there are
+MAX_GAP = 0.5  # seconds between two poses, before the first and after the last
+
+
+def odometry_topic(topics: Mapping[str, str]) -> str:
+    """Of a bag's topics, by name their type, the one with its odometry: /odom, else
+    /odometry/filtered, else the only one of that type; "" where there is none, or several."""
+    every = [name for name, kind in topics.items() if kind == ODOMETRY_MESSAGE]
+    known = [name for name in (ODOMETRY, FILTERED) if name in every]
+    return known[0] if known else every[0] if len(every) == 1 else ""
+
+
+class BagPoses:
+    """The poses of the frame of a bag's clouds in one that does not move, interpolated at any time.
+
+    As a tracker has them live, with ego.source auto: by the odometry, carried to the sensor by TF,
+    and where TF does not connect them, as if they were in one place; without odometry by TF alone,
+    in odom where that is above the sensor, else in the topmost frame that it moves in.
+    """
+
+    def __init__(self, path: Path, frame_id: str):
+        self.path, self.frame_id = path, frame_id.lstrip("/")
+        self.left_out = 0  # transforms and odometry that are no poses
+        with Bag(path) as bag:
+            self.topics = {name: kind for name, kind in bag.topics.items() if bag.counts[name]}
+        self.odometry = odometry_topic(self.topics)
+
+    def __call__(self, stamp_ns: int) -> np.ndarray | None:
+        """(4, 4) at a time; None where it is not known then."""
+        at = np.array([stamp_ns])
+        try:
+            if self.odometry:
+                return self.carrier_pose(stamp_ns) @ self._on_carrier(at)
+            return self._tree.poses(self.fixed, self.frame_id, at, MAX_GAP)[0] if self.fixed else (
+                None)
+        except Missing:
+            return None
+
+    @cached_property
+    def known(self) -> bool:
+        """Whether there are poses at all."""
+        return bool(self.odometry or self.fixed)
+
+    @cached_property
+    def carrier(self) -> str:
+        """The frame that the odometry is of; "" without odometry."""
+        if not self.odometry:
+            return ""
+        with Bag(self.path) as bag:
+            return next(msg for *_, msg in bag.messages({self.odometry})).child_frame_id.lstrip("/")
+
+    @cached_property
+    def fixed(self) -> str:
+        """The frame of TF that the sensor moves in; "" where nothing moves in TF."""
+        moving = [self._above[i + 1] for i, frame in enumerate(self._above[:-1])
+                  if not self._seen.fixed(frame)]
+        return ODOMETRY_FRAME if ODOMETRY_FRAME in moving else moving[-1] if moving else ""
+
+    def mounted(self, base: str) -> np.ndarray | None:
+        """(4, 4): the sensor's pose in a frame of the robot that it does not move in; None where TF
+        does not say it."""
+        frames = self._above[:self._above.index(base)] if base in self._above else None
+        if frames is None or not all(map(self._seen.fixed, frames)):
+            return None
+        return self._seen.lookup(base, self.frame_id, 0)
+
+    @property
+    def base(self) -> str:
+        """The robot's own frame: that of the odometry, else the last above the sensor in which it
+        does not move; "" where TF has none."""
+        if self.carrier and self.carrier != self.frame_id:
+            return self.carrier
+        fixed = [above for frame, above in zip(self._above, self._above[1:])
+                 if self._seen.fixed(frame)]
+        return fixed[-1] if fixed else ""
+
+    def carrier_pose(self, stamp_ns: int) -> np.ndarray:
+        """(4, 4): that of the odometry. Missing where it is not known then."""
+        return self._odometry.lookup(STILL, MOVING, stamp_ns, MAX_GAP)
+
+    def _on_carrier(self, at: np.ndarray) -> np.ndarray:
+        """(4, 4): where on the carrier the sensor is; as if in one place where TF does not say."""
+        if self.carrier == self.frame_id or self.carrier not in self._above:
+            return np.eye(4)
+        if (pose := self.mounted(self.carrier)) is not None:
+            return pose
+        return self._tree.poses(self.carrier, self.frame_id, at, MAX_GAP)[0]
+
+    @cached_property
+    def _odometry(self) -> TransformTree:
+        tree = TransformTree(keeps_all=True)
+        with Bag(self.path) as bag:
+            for _, _, msg in bag.messages({self.odometry} - {""}):
+                try:
+                    add_odometry(tree, msg)
+                except InputError:
+                    self.left_out += 1
+        return tree
+
+    @cached_property
+    def _seen(self) -> TransformTree:
+        """What is fixed, and of what moves the first."""
+        tree = TransformTree(keeps_all=True)
+        with Bag(self.path) as bag:
+            for _, _, msg in bag.messages({TF_STATIC} & self.topics.keys()):
+                self._add(tree, msg, True)
+        with Bag(self.path) as bag:
+            for _, _, msg in islice(bag.messages({TF} & self.topics.keys()), FIRST):
+                self._add(tree, msg, False)
+        return tree
+
+    @cached_property
+    def _above(self) -> list[str]:
+        """The sensor's frame, its parent, and so on; it alone where they go round."""
+        try:
+            return self._seen.chain(self.frame_id)
+        except Missing:
+            return [self.frame_id]
+
+    @cached_property
+    def _tree(self) -> TransformTree:
+        """All of what moves and what is fixed, above the sensor."""
+        tree, above = TransformTree(keeps_all=True), set(self._above)
+        with Bag(self.path) as bag:
+            for topic, _, msg in bag.messages({TF, TF_STATIC} & self.topics.keys()):
+                msg.transforms[:] = [each for each in msg.transforms
+                                     if each.child_frame_id.lstrip("/") in above]
+                self._add(tree, msg, topic == TF_STATIC)
+        return tree
+
+    def _add(self, tree: TransformTree, msg: object, static: bool) -> None:
+        try:
+            add_transforms(tree, msg, static)
+        except InputError:
+            self.left_out += 1

@@ -1,0 +1,81 @@
+"""Bags as other robots record them: odometry of the base at times of its own, and TF."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from lidar_perception.data.bag import BagWriter
+from lidar_perception.data.open import open_recording
+from lidar_perception.robot.placing import tilted
+from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.messages import odometry
+from lidar_perception.wire.topics import POINTS, TF, TF_STATIC
+from lidar_perception.wire.transforms import ODOMETRY_MESSAGE, TF_MESSAGE
+from msg_utils.stamps import SECOND, header_message
+
+START, CLOUDS = 1_700_000_000 * SECOND, 5
+ON_BASE = tilted(0.02, -0.05, 1.1)  # the sensor in base_link: leaning, and turned to the left
+ON_BASE[:3, :3] = ON_BASE[:3, :3] @ Rotation.from_euler("z", 90, degrees=True).as_matrix()
+ON_BASE[0, 3] = 0.4
+
+
+def base_at(stamp):
+    """A robot on a curve, in odom."""
+    t = (stamp - START) / SECOND
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("z", 0.3 * t).as_matrix()
+    pose[:3, 3] = 5 * t, 0.7 * t, 0
+    return pose
+
+
+def stamps():
+    """Of the clouds, between those of the odometry."""
+    return [START + round((0.1 * i + 0.003) * SECOND) for i in range(CLOUDS)]
+
+
+def transform(parent, child, stamp, pose):
+    x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+    return bag_message("geometry_msgs/msg/TransformStamped", child_frame_id=child,
+                       header=header_message(stamp, parent, bag_message),
+                       transform=bag_message(
+        "geometry_msgs/msg/Transform",
+        translation=bag_message("geometry_msgs/msg/Vector3", **dict(zip("xyz", pose[:3, 3]))),
+        rotation=bag_message("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)))
+
+
+def tf(*transforms):
+    return bag_message(TF_MESSAGE, transforms=list(transforms))
+
+
+def moving(topic, child="base_link", seconds=CLOUDS / 10):
+    """Odometry every 20 ms."""
+    for i in range(-2, round(50 * seconds) + 1):
+        stamp = START + i * SECOND // 50
+        yield topic, ODOMETRY_MESSAGE, stamp, odometry(
+            base_at(stamp), header_message(stamp, "odom", bag_message), child, bag_message)
+
+
+def moving_tf(seconds=CLOUDS / 10):
+    """map -> odom -> base_link every 20 ms; the map jumps."""
+    for i in range(-2, round(50 * seconds) + 1):
+        stamp = START + i * SECOND // 50
+        yield TF, TF_MESSAGE, stamp, tf(transform("map", "odom", stamp, tilted(0, 0, i % 2)),
+                                        transform("odom", "base_link", stamp, base_at(stamp)))
+
+
+def mount(parent="base_link", pose=ON_BASE):
+    yield TF_STATIC, TF_MESSAGE, START, tf(transform(parent, "plate", 0, np.eye(4)),
+                                           transform("plate", "/lidar", 0, pose))
+
+
+def recorded(path, *parts):
+    """The frames of a bag with clouds of the frame lidar and these messages."""
+    messages = [message for part in parts for message in part]
+    messages += [(POINTS, "sensor_msgs/msg/PointCloud2", stamp, cloud_message(
+        np.ones((3, 4)), stamp, "lidar")) for stamp in stamps()]
+    with BagWriter(path) as bag:
+        for topic, kind in dict.fromkeys((topic, kind) for topic, kind, *_ in messages):
+            bag.add_topic(topic, kind)
+        for topic, _, stamp, message in sorted(messages, key=lambda m: m[2]):
+            bag.write(topic, stamp, message)
+    return open_recording(path)
