@@ -53,11 +53,13 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
     if there and not force:
         raise InputError(f"{out / there[0]} exists already; give another folder or --force")
     from lidar_perception.data.raw_clouds import open_clouds, spread
+    from lidar_perception.sensor_setup.doubts import doubts
     from lidar_perception.sensor_setup.files import params_yaml, sensor_yaml
-    from lidar_perception.sensor_setup.findings import doubts, findings
+    from lidar_perception.sensor_setup.findings import findings
     from lidar_perception.sensor_setup.measure import measured
     from lidar_perception.sensor_setup.report import report_html
     from lidar_perception.sensor_setup.scans import scan_of
+    from lidar_perception.sensor_setup.told import told_by
 
     clouds = open_clouds(data, topic)
     count = f"{clouds.count} cloud{'s' * (clouds.count != 1)}"
@@ -76,7 +78,8 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
         if not found:
             raise InputError(skipped[0])
         bar.update(task, description="measuring")
-        m = measured(found, numbers, str(data), clouds.count, clouds.stamps_ns)
+        told = told_by(clouds.poses, numbers, clouds.stamps_ns)
+        m = measured(found, numbers, str(data), clouds.count, clouds.stamps_ns, told)
         bar.update(task, description="drawing", advance=1)
         texts = {"sensor.yaml": sensor_yaml(m), "robot.param.yaml": params_yaml(m)}
         page = report_html(m, texts)

@@ -12,7 +12,7 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.clustering.density import followed
 from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams
 from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.sensor_setup.findings import body_fits, doubts
+from lidar_perception.sensor_setup.doubts import body_fits, doubts
 from lidar_perception.sensor_setup.measure import SMALL_ROOM, Measured, sensor_of
 from lidar_perception.simulation.sensor import Sensor
 

@@ -14,10 +14,11 @@ from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import moved_points
 from lidar_perception.sensor_setup.beams import Beams, azimuth_steps, beams_of, range_noise
 from lidar_perception.sensor_setup.coverage import Coverage, coverage_of
-from lidar_perception.sensor_setup.motion import Ahead, ahead_of, pictures_of, shifts_of
+from lidar_perception.sensor_setup.motion import Ahead, ahead_of, driven, pictures_of, shifts_of
 from lidar_perception.sensor_setup.mount import Mount, mount_of
 from lidar_perception.sensor_setup.scans import Intensity, Scan, intensity_of, require_space
 from lidar_perception.sensor_setup.timing import Timing, timing_of
+from lidar_perception.sensor_setup.told import NOTHING, Told
 from lidar_perception.simulation.sensor import NAMES, Sensor, sensor_named
 from lidar_perception.types import InputError
 
@@ -34,7 +35,7 @@ class Measured:
     twice: share of second returns; noise: m, of noise_pieces; least, greatest: m, of what is not
     the robot's own; heading: where the robot drives, None without ground; model: the sensor
     of config/sensors with such beams, "" for none; model_error: degrees, the median over the
-    beams."""
+    beams; told: what the recording says itself."""
 
     source: str
     scans: tuple[Scan, ...]
@@ -53,6 +54,7 @@ class Measured:
     timing: Timing
     model: str
     model_error: float
+    told: Told
 
     @property
     def moved(self) -> bool:
@@ -77,9 +79,10 @@ class Measured:
 
 
 def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: int,
-             stamps_ns: np.ndarray | None) -> Measured:
+             stamps_ns: np.ndarray | None, told: Told = NOTHING) -> Measured:
     """All that can be measured of scans, which are those of these numbers among total ones of the
-    source. InputError for what is of several drivers, or sees in one plane only."""
+    source; told: what that says itself. InputError for what is of several drivers, or sees in one
+    plane only."""
     if len({scan.columns for scan in scans}) > 1:
         raise InputError(f"{source} has clouds of several layouts ({', '.join(scans[0].columns)} "
                          "and others), as of several sensors; give those of one")
@@ -96,19 +99,20 @@ def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: 
         body=tuple(coverage.box.tolist())))]
     least, greatest = np.percentile(away if len(away) else ranges, [0.02, 99.995])
     model, error = model_of(beams)
-    heading = _heading(scans, numbers, mount, coverage.still)
+    heading = _heading(scans, numbers, mount, coverage.still, told)
     return Measured(source, tuple(scans), total, intensity_of(scans), beams, step, twice, noise,
                     pieces, coverage, mount, heading, float(least), float(greatest),
-                    timing_of(scans, stamps_ns), model, error)
+                    timing_of(scans, stamps_ns), model, error, told)
 
 
 def _heading(scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None,
-             still: bool | None) -> Ahead | None:
+             still: bool | None, told: Told) -> Ahead | None:
     if mount is None:
         return None
     pose = tilted(mount.roll, mount.pitch, mount.height)
     levelled = [moved_points(scan.xyz, pose) for scan in scans]
-    return ahead_of(shifts_of(pictures_of(levelled, moves=still is False), numbers))
+    shifts = shifts_of(pictures_of(levelled, moves=still is False), numbers)
+    return ahead_of(shifts, driven(told.poses, shifts))
 
 
 def model_of(beams: Beams | None) -> tuple[str, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ LOCKED, FEW_SCANS = 0.7, 5  # share of the scans, if there are so many, in which
                          # that moves with the robot, as lines of a beam on a straight wall do
 GAPS = (1, 2, 4, 8, 16)  # clouds from one to the one that it is compared with
 AGREED = 0.8             # so long is the mean of the directions at least, 0 .. 1
+STRAIGHT = 5.0           # degrees; what is not at its origin goes elsewhere where the base turns
 ONE = 8.0                # degrees: error of one shift's direction, at least
 
 
@@ -26,16 +27,21 @@ class Shift(NamedTuple):
     y: float
 
 
+Pairs = Mapping[tuple[int, int], Shift | None]  # by the numbers of two scans
+
+
 class Ahead(NamedTuple):
-    """Where the robot drives: degrees from x, counter-clockwise, NaN where that is not known, and
-    the error of that; pairs: of scans that tell; went: the longest shift, metres; unknown: why it
-    is not known, "" where it is."""
+    """Where the robot drives, or the x axis of its base looks: degrees from x, counter-clockwise,
+    NaN where that is not known, and the error of that; pairs: of scans that tell; went: the longest
+    shift, metres; unknown: why it is not known, "" where it is; base: whether it is the base's x
+    axis, whichever way the robot drove."""
 
     degrees: float
     error: float
     pairs: int
     went: float
     unknown: str
+    base: bool = False
 
 
 def spectrum(picture: np.ndarray) -> np.ndarray:
@@ -82,37 +88,55 @@ def pictures_of(scans: Sequence[np.ndarray], moves: bool) -> np.ndarray:
     return images
 
 
-def shifts_of(pictures: np.ndarray, numbers: Sequence[int]) -> list[Shift | None]:
+def shifts_of(pictures: np.ndarray, numbers: Sequence[int]) -> Pairs:
     """Of pictures and their numbers in the recording: from each to the next of GAPS by which the
     robot has gone MIN_SHIFT, or as far as it went; None where that is not clear."""
-    found: list[Shift | None] = []
+    found: dict[tuple[int, int], Shift | None] = {}
     spectra = dict(zip(numbers, map(spectrum, pictures), strict=True))
     for number, before in spectra.items():
-        others = [spectra[number + gap] for gap in GAPS if number + gap in spectra]
-        for after in others:
-            shift = shift_between(before, after)
+        others = [number + gap for gap in GAPS if number + gap in spectra]
+        for other in others:
+            shift = shift_between(before, spectra[other])
             if shift is None or np.hypot(*shift) >= MIN_SHIFT:
                 break
-        found += [shift] if others else []
+        if others:
+            found[number, other] = shift
     return found
 
 
-def ahead_of(shifts: Sequence[Shift | None]) -> Ahead:
-    """The mean direction of the shifts that tell one."""
-    every = np.array([shift for shift in shifts if shift is not None]).reshape(-1, 2)
-    length = np.hypot(*every.T)
-    went, far = float(length.max(initial=0.0)), length >= MIN_SHIFT
-    if not far.any() and 2 * len(every) <= len(shifts):
+def driven(poses: Mapping[int, np.ndarray], pairs: Pairs) -> Pairs:
+    """By poses (4, 4) of the robot's base at scans: how far it went from one scan of a pair to the
+    other, in its own frame; None where it turned by more than STRAIGHT. Pairs without poses are
+    left out."""
+    steps = {pair: np.linalg.solve(poses[pair[0]], poses[pair[1]]) for pair in pairs
+             if set(pair) <= poses.keys()}
+    return {pair: Shift(*map(float, step[:2, 3])) if abs(np.degrees(np.arctan2(
+        step[1, 0], step[0, 0]))) <= STRAIGHT else None for pair, step in steps.items()}
+
+
+def ahead_of(pairs: Pairs, base: Pairs) -> Ahead:
+    """The mean direction of the shifts that tell one. base: how the robot's base went between the
+    same scans, as driven() has it; then the direction is that of its x axis. Empty where that is
+    not known."""
+    every = np.array([complex(*shift) for shift in pairs.values() if shift is not None])
+    far = {pair: complex(*shift) for pair, shift in pairs.items()
+           if shift is not None and np.hypot(*shift) >= MIN_SHIFT}
+    went = float(np.abs(every).max(initial=0.0))
+    if not far and 2 * len(every) <= len(pairs):
         return Ahead(np.nan, np.nan, 0, went, "what stands around is too little, or too much "
                      "alike, to see how the robot moved")
-    if not far.any():
+    if not far:
         return Ahead(np.nan, np.nan, 0, went, f"the robot moved only {went:.1f} m between the "
                      "clouds that were compared")
-    pairs = int(far.sum())
-    x, y = (every[far] / length[far, None]).mean(axis=0)
-    agree = min(float(np.hypot(x, y)), 1.0)
+    by_base = {pair: far[pair] / complex(*step) for pair, step in base.items()
+               if pair in far and step is not None and np.hypot(*step) >= MIN_SHIFT / 2}
+    turns = np.array(list((by_base or far).values()))
+    mean = complex((turns / np.abs(turns)).mean())
+    agree = min(abs(mean), 1.0)
     if agree < AGREED:
-        return Ahead(np.nan, np.nan, pairs, went, "the robot turned, or drove to and fro: "
-                     f"{pairs} shifts have different directions")
-    error = max(float(np.degrees(np.sqrt(-2 * np.log(agree)))), ONE) / np.sqrt(pairs)
-    return Ahead(float(np.degrees(np.arctan2(y, x))), error, pairs, went, "")
+        why = ("what the clouds and the odometry say of its way does not agree" if by_base else
+               f"the robot turned, or drove to and fro: {len(turns)} shifts have different "
+               "directions")
+        return Ahead(np.nan, np.nan, len(turns), went, why, bool(by_base))
+    error = max(float(np.degrees(np.sqrt(-2 * np.log(agree)))), ONE) / np.sqrt(len(turns))
+    return Ahead(float(np.degrees(np.angle(mean))), error, len(turns), went, "", bool(by_base))

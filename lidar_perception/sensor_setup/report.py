@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from lidar_perception.runs.page import data_url, render
+from lidar_perception.sensor_setup.doubts import doubts
 from lidar_perception.sensor_setup.figures import drawn
-from lidar_perception.sensor_setup.findings import doubts, findings
+from lidar_perception.sensor_setup.findings import findings
 from lidar_perception.sensor_setup.measure import Measured
 
 

@@ -8,7 +8,8 @@ import pytest
 from tilted_samples import clouds_of
 
 from lidar_perception.data.raw_clouds import _of_frame
-from lidar_perception.sensor_setup.findings import body_fits, doubts, findings
+from lidar_perception.sensor_setup.doubts import body_fits, doubts
+from lidar_perception.sensor_setup.findings import findings
 from lidar_perception.sensor_setup.measure import measured, sensor_of
 from lidar_perception.sensor_setup.scans import intensity_of, scan_of
 from lidar_perception.sensor_setup.timing import timing_of

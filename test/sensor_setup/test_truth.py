@@ -8,8 +8,9 @@ from tilted_samples import BARE, MOUNTS, clouds_of
 
 from lidar_perception.data.raw_clouds import open_clouds, spread
 from lidar_perception.sensor_setup.beams import beams_of
+from lidar_perception.sensor_setup.doubts import doubts
 from lidar_perception.sensor_setup.files import params_yaml, sensor_yaml
-from lidar_perception.sensor_setup.findings import doubts, findings
+from lidar_perception.sensor_setup.findings import findings
 from lidar_perception.sensor_setup.measure import measured
 from lidar_perception.sensor_setup.scans import scan_of
 from lidar_perception.simulation.sensor import sensor_from_file, sensor_named

@@ -1,0 +1,70 @@
+"""What a recording itself says: where the sensor is mounted, and how the robot moved."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lidar_perception.data.bag_poses import BagPoses
+from lidar_perception.robot.placing import roll_pitch
+from lidar_perception.robot.poses import inverse
+from lidar_perception.robot.tree import Missing
+
+FOOTPRINT = "base_footprint"  # on the ground below base_link (REP-120)
+
+
+class Told(NamedTuple):
+    """base: the robot's frame, "" for none; mount (4, 4): the sensor's pose in it, None where TF
+    does not say it; height: of the sensor above base_footprint, m, NaN where TF has none; poses:
+    of the base in a frame that stands, by the number of the cloud; left_out: transforms and
+    odometry that are no poses."""
+
+    base: str = ""
+    mount: np.ndarray | None = None
+    height: float = np.nan
+    poses: Mapping[int, np.ndarray] = {}
+    left_out: int = 0
+
+    @property
+    def roll_pitch(self) -> tuple[float, float]:
+        """Degrees, of the sensor in the base; NaN where that is not told."""
+        if self.mount is None:
+            return np.nan, np.nan
+        roll, pitch = np.degrees(roll_pitch(self.mount))
+        return float(roll), float(pitch)
+
+    @property
+    def ahead(self) -> float:
+        """Degrees from x of the levelled sensor to x of the base, counter-clockwise; NaN where that
+        is not told."""
+        return np.nan if self.mount is None else float(
+            -np.degrees(np.arctan2(self.mount[1, 0], self.mount[0, 0])))
+
+
+NOTHING = Told()
+
+
+def told_by(poses: BagPoses | None, numbers: Sequence[int], stamps_ns: np.ndarray | None) -> Told:
+    """What the odometry and TF of a bag say; poses None: nothing is told."""
+    if poses is None or stamps_ns is None or not (base := poses.base):
+        return NOTHING
+    mount, footprint = poses.mounted(base), poses.mounted(FOOTPRINT)
+    moved = {}
+    for number in numbers:
+        pose = _base_pose(poses, int(stamps_ns[number]), mount)
+        if pose is not None:
+            moved[number] = pose
+    return Told(base, mount, np.nan if footprint is None else float(footprint[2, 3]), moved,
+                poses.left_out)
+
+
+def _base_pose(poses: BagPoses, stamp_ns: int, mount: np.ndarray | None) -> np.ndarray | None:
+    if poses.carrier == poses.base:
+        try:
+            return poses.carrier_pose(stamp_ns)
+        except Missing:
+            return None
+    pose = poses(stamp_ns)
+    return None if pose is None or mount is None else pose @ inverse(mount)
