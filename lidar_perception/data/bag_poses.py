@@ -65,6 +65,11 @@ class BagPoses:
         """Whether there are poses at all."""
         return bool(self.odometry or self.fixed)
 
+    @property
+    def plain(self) -> bool:
+        """Whether there are none, or /odom has those of the sensor itself: so nodes need no TF."""
+        return not self.known or (self.odometry == ODOMETRY and self.carrier == self.frame_id)
+
     @cached_property
     def carrier(self) -> str:
         """The frame that the odometry is of; "" without odometry."""

@@ -19,6 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from lidar_perception.data.bag_poses import FILTERED, odometry_topic
 from lidar_perception.data.frame import POSES
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import odometry
 from lidar_perception.wire.topics import ODOMETRY, TF, TF_STATIC
@@ -41,8 +43,19 @@ def test_the_sensor_is_where_odometry_and_tf_say_at_the_time_of_its_cloud(tmp_pa
 
 
 def test_odometry_of_the_sensor_itself_or_of_what_tf_does_not_know_is_the_sensors(tmp_path):
-    check(recorded(tmp_path / "own", moving(ODOMETRY, "lidar"), mount()), np.eye(4))
-    check(recorded(tmp_path / "unknown", moving(ODOMETRY, "chassis"), mount()), np.eye(4))
+    own = recorded(tmp_path / "own", moving(ODOMETRY, "lidar"), mount())
+    unknown = recorded(tmp_path / "unknown", moving(ODOMETRY, "chassis"), mount())
+    check(own, np.eye(4))
+    check(unknown, np.eye(4))
+    assert own.frames.poses.plain and not unknown.frames.poses.plain
+
+
+def test_as_a_bag_of_ours_the_sensors_poses_are_the_odometry(tmp_path):
+    robot = recorded(tmp_path / "robot", moving(FILTERED), mount())
+    write_bag(tmp_path / "ours", robot)
+    ours = open_recording(tmp_path / "ours")
+    check(ours)
+    assert ours.frames.poses.plain and ours.frames.poses.odometry == ODOMETRY
 
 
 def test_a_sensor_that_turns_on_the_robot_is_where_it_was(tmp_path):
