@@ -17,6 +17,7 @@ from lidar_perception.wire.transforms import (
     MOVING,
     ODOMETRY_MESSAGE,
     STILL,
+    TF_MESSAGE,
     add_odometry,
     add_transforms,
 )
@@ -46,8 +47,9 @@ class BagPoses:
         self.path, self.frame_id = path, frame_id.lstrip("/")
         self.left_out = 0  # transforms and odometry that are no poses
         with Bag(path) as bag:
-            self.topics = {name: kind for name, kind in bag.topics.items() if bag.counts[name]}
-        self.odometry = odometry_topic(self.topics)
+            topics = {name: kind for name, kind in bag.topics.items() if bag.counts[name]}
+        self.transforms = {name for name in (TF, TF_STATIC) if topics.get(name) == TF_MESSAGE}
+        self.odometry = odometry_topic(topics)
 
     def __call__(self, stamp_ns: int) -> np.ndarray | None:
         """(4, 4) at a time; None where it is not known then."""
@@ -131,10 +133,10 @@ class BagPoses:
         """What is fixed, and of what moves the first."""
         tree = TransformTree(keeps_all=True)
         with Bag(self.path) as bag:
-            for _, _, msg in bag.messages({TF_STATIC} & self.topics.keys()):
+            for _, _, msg in bag.messages({TF_STATIC} & self.transforms):
                 self._add(tree, msg, True)
         with Bag(self.path) as bag:
-            for _, _, msg in islice(bag.messages({TF} & self.topics.keys()), FIRST):
+            for _, _, msg in islice(bag.messages({TF} & self.transforms), FIRST):
                 self._add(tree, msg, False)
         return tree
 
@@ -151,7 +153,7 @@ class BagPoses:
         """All of what moves and what is fixed, above the sensor."""
         tree, above = TransformTree(keeps_all=True), set(self._above)
         with Bag(self.path) as bag:
-            for topic, _, msg in bag.messages({TF, TF_STATIC} & self.topics.keys()):
+            for topic, _, msg in bag.messages(self.transforms):
                 msg.transforms[:] = [each for each in msg.transforms
                                      if each.child_frame_id.lstrip("/") in above]
                 self._add(tree, msg, topic == TF_STATIC)

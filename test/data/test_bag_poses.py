@@ -86,6 +86,9 @@ def test_what_says_nothing_gives_no_pose_and_nothing_is_guessed(tmp_path):
     circle = recorded(tmp_path / "circle", [(TF_STATIC, TF_MESSAGE, START, tf(
         transform("a", "lidar", 0, np.eye(4)), transform("lidar", "a", 0, np.eye(4))))])
     assert POSES not in circle.has
+    other = recorded(tmp_path / "other", [(TF, "std_msgs/msg/String", START, bag_message(
+        "std_msgs/msg/String", data="of something else"))])
+    assert POSES not in other.has
 
 
 def test_what_is_no_pose_is_left_out_and_counted(tmp_path):
