@@ -173,9 +173,10 @@ class TrackerNodeParams:
 
 @dataclass(frozen=True)
 class PlayerParams(Params):
-    """Replay of a rosbag2 bag."""
+    """Replay of a bag."""
 
-    bag: str = param("", "Folder of the bag, or one .mcap or .db3 file.", fixed=True)
+    bag: str = param("", "Folder of the bag, or one .mcap or .db3 file, or .bag of ROS 1.",
+                     fixed=True)
     rate: float = param(1.0, "Speed of the replay; 2.0 is twice as fast as recorded.",
                         low=0.01, high=100.0)
     loop: bool = param(False, "Start again at the end.")

@@ -1,9 +1,15 @@
-"""Bags as other robots record them: odometry of the base at times of its own, and TF."""
+"""Bags as other robots record them: odometry of the base at times of its own, and TF; of ROS 1."""
+
+import io
+from contextlib import redirect_stdout
 
 import numpy as np
+from rosbags.convert.converter import convert
+from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.data.bag import BagWriter
+from lidar_perception.data.frame import POSES
 from lidar_perception.data.open import open_recording
 from lidar_perception.robot.placing import tilted
 from lidar_perception.testing.clouds import cloud_message
@@ -79,3 +85,18 @@ def recorded(path, *parts):
         for topic, _, stamp, message in sorted(messages, key=lambda m: m[2]):
             bag.write(topic, stamp, message)
     return open_recording(path)
+
+
+def check(recording, on_base=ON_BASE):
+    """Its sensor is where the base and the mount say."""
+    assert POSES in recording.has
+    for frame, stamp in zip(recording, stamps(), strict=True):
+        np.testing.assert_allclose(frame.pose(), base_at(stamp) @ on_base, atol=1e-4)
+
+
+def as_ros1(source, path, compress=None):
+    """A copy for ROS 1, as rosbags writes it."""
+    with redirect_stdout(io.StringIO()):
+        convert([source], path, "", 0, compress, "", None,
+                get_typestore(Stores.ROS1_NOETIC), (), (), (), ())
+    return path

@@ -16,9 +16,9 @@ from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
-WHAT = ("KITTI (object, tracking, raw), nuScenes or SemanticKITTI folder, rosbag2 bag, .pcd or "
-        ".bin files, or what `simulate` wrote. BAG:/TOPIC names the clouds of a bag that has "
-        "several.")
+WHAT = ("KITTI (object, tracking, raw), nuScenes or SemanticKITTI folder, bag (rosbag2, or .bag "
+        "of ROS 1), .pcd or .bin files, or what `simulate` wrote. BAG:/TOPIC names the clouds of a "
+        "bag that has several.")
 
 
 def a_path(name: str, what: str, metavar: str = "FILE", **more: Any) -> Callable:

@@ -1,4 +1,4 @@
-"""rosbag2 bags: MCAP and SQLite3 in, MCAP out, with or without ROS."""
+"""Bags: MCAP, SQLite3 and those of ROS 1 in, MCAP out, with or without ROS."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from rosbags.rosbag2 import Reader
 
 from lidar_perception.data.mcap_index import NO_INDEX, check_index
 from lidar_perception.data.record_file import RecordFile
+from lidar_perception.data.ros1_bag import Ros1Reader, is_ros1
 from lidar_perception.runs.files import check_free, regular, short
 from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError
@@ -157,14 +158,14 @@ class Bag:
         self.path = Path(path)
         source = _storage(self.path)
         try:
-            self.reader = Reader(source)
+            self.reader: Reader | Ros1Reader = (
+                Ros1Reader(source) if is_ros1(source) else Reader(source))
             self.reader.open()
         except Exception as error:  # rosbags lets through what damaged sizes lead to
             raise InputError(_unreadable(source, error)) from None
         try:
-            for storage in getattr(self.reader.storage, "storages", [self.reader.storage]):
-                if storage.path.suffix == ".mcap":
-                    check_index(storage.path)
+            for file in _mcap_files(self.reader):
+                check_index(file)
         except Exception as error:
             self.reader.close()
             raise InputError(_unreadable(source, error)) from None
@@ -227,6 +228,12 @@ class Bag:
                 raise InputError(f"{self.path}, topic {topic} at {stamp} ns: {error}") from None
 
 
+def _mcap_files(reader: Reader | Ros1Reader) -> list[Path]:
+    storage = getattr(reader, "storage", None)
+    return [each.path for each in getattr(storage, "storages", [storage])
+            if each is not None and each.path.suffix == ".mcap"]
+
+
 def offered_qos(connection: Connection) -> list:
     """The profiles of a topic of a rosbag2 bag, as rosbags has them; maybe none."""
     return cast(ConnectionExtRosbag2, connection.ext).offered_qos_profiles
@@ -244,8 +251,9 @@ def _storage(path: Path) -> Path:
             raise InputError(f"{path} has no metadata.yaml and {len(files)} storage files, so it "
                              "is no rosbag2 bag; run 'ros2 bag reindex' or give one .mcap file")
         return files[0]
-    if path.is_file() and path.suffix not in (".mcap", ".db3"):
-        raise InputError(f"{path} is no rosbag2 bag; give its folder, an .mcap or a .db3 file")
+    if path.is_file() and path.suffix not in (".mcap", ".db3") and not is_ros1(path):
+        raise InputError(f"{path} is no bag; give the folder of a rosbag2 bag, an .mcap, a .db3 or "
+                         "a ROS 1 .bag file")
     return path
 
 

@@ -26,6 +26,7 @@ from lidar_perception.data.frame import (
     PointTruth,
     Recording,
 )
+from lidar_perception.data.ros1_bag import is_ros1
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import decode
 from lidar_perception.wire.messages import calibration_of, column, to_frame, to_truth
@@ -73,7 +74,12 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
                            for _, _, data in islice(bag.raw({points}), 1))
     has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | {
         *[POINT_LABELS] * labelled, *[POSES] * frames.poses.known}
-    return Recording(path, f"rosbag2 bag, clouds on {points}", frames, has, mounted=False)
+    return Recording(path, layout(path, points), frames, has, mounted=False)
+
+
+def layout(path: Path, points: str) -> str:
+    """What the bag at a path is, for people."""
+    return f"{'ROS 1' if is_ros1(path) else 'rosbag2'} bag, clouds on {points}"
 
 
 class BagFrames(Sequence):

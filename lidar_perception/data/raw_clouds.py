@@ -63,7 +63,7 @@ def _of_bag(path: Path, topic: str) -> RawClouds:
         if not bag.counts[topic]:
             raise InputError(f"{path} has no cloud on {topic}; record it again")
         frames = bag_frames.BagFrames(path, topic, bag_frames.CLOUD, bag.counts[topic])
-    return RawClouds(path, f"rosbag2 bag, clouds on {topic}", len(frames), frames.stamps(),
+    return RawClouds(path, bag_frames.layout(path, topic), len(frames), frames.stamps(),
                      frames.message, frames.poses)
 
 

@@ -1,4 +1,4 @@
-"""Replays a rosbag2 bag: CDR bytes from the file to DDS, never decoded."""
+"""Replays a bag: CDR bytes from the file to DDS, never decoded."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class BagPlayer(LidarNode):
     def __init__(self, **options: Any):
         super().__init__("bag_player", PlayerParams(), **options)
         if not self.params.bag:
-            raise InputError("parameter 'bag' is empty; give the folder of a rosbag2 bag")
+            raise InputError("parameter 'bag' is empty; give the folder of a bag")
         self.bag = Bag(self.params.bag)
         self.names = self._chosen_topics()
         self.publishers_by_topic = {t: p for t in self.names if (p := self._publisher(t))}

@@ -137,7 +137,7 @@ def test_a_folder_without_metadata_is_read_by_its_one_file(written, tmp_path):
 @pytest.mark.parametrize("name, make, words", [
     ("missing", lambda p: None, "there is no bag"),
     ("folder", lambda p: p.mkdir(), "no metadata.yaml and 0 storage files"),
-    ("cloud.bin", lambda p: write(p, b"1234"), "is no rosbag2 bag"),
+    ("cloud.bin", lambda p: write(p, b"1234"), "is no bag"),
     ("empty.mcap", lambda p: write(p, b""), "truncated or damaged"),
     ("text.mcap", lambda p: write(p, b"text " * 100), "truncated or damaged"),
     ("text.db3", lambda p: write(p, b"text " * 100), "truncated or damaged"),

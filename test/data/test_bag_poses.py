@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from robot_bags import (
     CLOUDS,
-    ON_BASE,
     START,
     base_at,
+    check,
     mount,
     moving,
     moving_tf,
@@ -26,12 +26,6 @@ from lidar_perception.wire.messages import odometry
 from lidar_perception.wire.topics import ODOMETRY, TF, TF_STATIC
 from lidar_perception.wire.transforms import ODOMETRY_MESSAGE, TF_MESSAGE
 from msg_utils.stamps import SECOND, header_message
-
-
-def check(recording, on_base=ON_BASE):
-    assert POSES in recording.has
-    for frame, stamp in zip(recording, stamps(), strict=True):
-        np.testing.assert_allclose(frame.pose(), base_at(stamp) @ on_base, atol=1e-4)
 
 
 @pytest.mark.parametrize("parts", [

@@ -199,7 +199,7 @@ def test_commands_measure_the_height_that_a_recording_does_not_say(tmp_path, hei
 @pytest.mark.parametrize("make, words", [
     (lambda p: p / "missing", "there is no .*missing; give a bag or the folder of a data set"),
     (lambda p: p, "no recording that can be read: expected a rosbag2 bag, or the folder of KITTI"),
-    (lambda p: write(p / "notes.txt", b"text"), "no rosbag2 bag; give its folder"),
+    (lambda p: write(p / "notes.txt", b"text"), "no bag; give the folder of a rosbag2 bag"),
     (lambda p: write(p / "training/velodyne/x", b"").parents[2], "has no KITTI scans: expected"),
     (lambda p: write(p / "sequences/00/x", b"").parents[2], "no SemanticKITTI scans: expected"),
     (lambda p: nuscenes_folder.save(nuscenes_root(p), nuscenes_folder.made_tables(), "v1.0-test",

@@ -9,6 +9,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from robot_bags import as_ros1
 from std_srvs.srv import Trigger
 
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
@@ -43,13 +44,15 @@ def start(processes, bag, **params):
     processes.start("bag_player", {}, {"bag": str(bag), "wait_for": ["/text"], **params})
 
 
-def test_bytes_arrive_as_they_are_in_the_bag(processes, peer, drive_bag):
+@pytest.mark.parametrize("ros", [2, 1])
+def test_bytes_arrive_as_they_are_in_the_bag(processes, peer, drive_bag, tmp_path, ros):
+    played = drive_bag if ros == 2 else as_ros1(drive_bag, tmp_path / "drive.bag")
     with Bag(drive_bag) as bag:
         expected = {t: [d for topic, _, d in bag.raw({t})] for t in (POINTS, TRUTH)}
     received = {POINTS: peer.listen_raw(POINTS, CLOUD),
                 TRUTH: peer.listen_raw(TRUTH, "visualization_msgs/msg/MarkerArray")}
     info = peer.listen(CAMERA_INFO, INFO, LATCHED)
-    processes.start("bag_player", {}, {"bag": str(drive_bag), "wait_for": [POINTS, TRUTH]})
+    processes.start("bag_player", {}, {"bag": str(played), "wait_for": [POINTS, TRUTH]})
     peer.wait(lambda: processes.ended("bag_player"), "the end of the bag")
     peer.wait(lambda: all(len(received[t]) == len(expected[t]) for t in expected), "all messages")
     processes.check("bag_player")
