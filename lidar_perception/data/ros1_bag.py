@@ -7,12 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rosbags.convert.converter import (
-    LATCH,
-    STATIC_MSGTYPE_RENAMES,
-    is_same_wireformat,
-    migrate_bytes,
-)
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
 
@@ -35,6 +29,8 @@ class Ros1Reader:
         self.reader = AnyReader([path])
 
     def open(self) -> None:
+        # Not documented as the rest of rosbags is: if it changes, only these bags are affected.
+        from rosbags.convert.converter import LATCH, STATIC_MSGTYPE_RENAMES
         self.reader.open()
         self.recorded = {c.id: c for c in self.reader.connections}
         renamed = {c.id: STATIC_MSGTYPE_RENAMES.get(c.msgtype, c.msgtype)
@@ -68,6 +64,7 @@ class Ros1Reader:
 
     def _conversion(self, recorded: str, wanted: str, made: dict[str, object]
                     ) -> Callable[[Any], Any]:
+        from rosbags.convert.converter import is_same_wireformat, migrate_bytes
         if is_same_wireformat(self.reader.typestore, typestore(), recorded, wanted):
             return partial(typestore().ros1_to_cdr, typename=wanted)
         return partial(migrate_bytes, self.reader.typestore, typestore(), recorded, wanted, made,
