@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 from rosbags.interfaces import Connection, ConnectionExtRosbag2
 from rosbags.rosbag2 import Reader
 
-from lidar_perception.data.mcap_index import NO_INDEX, check_index
+from lidar_perception.data.mcap_index import NO_INDEX, check_index, profile_of
 from lidar_perception.data.record_file import RecordFile
 from lidar_perception.data.ros1_bag import Ros1Reader, is_ros1
 from lidar_perception.runs.files import check_free, regular, short
@@ -162,7 +162,7 @@ class Bag:
                 Ros1Reader(source) if is_ros1(source) else Reader(source))
             self.reader.open()
         except Exception as error:  # rosbags lets through what damaged sizes lead to
-            raise InputError(_unreadable(source, error)) from None
+            raise InputError(_foreign(source) or _unreadable(source, error)) from None
         try:
             for file in _mcap_files(self.reader):
                 check_index(file)
@@ -255,6 +255,17 @@ def _storage(path: Path) -> Path:
         raise InputError(f"{path} is no bag; give the folder of a rosbag2 bag, an .mcap, a .db3 or "
                          "a ROS 1 .bag file")
     return path
+
+
+def _foreign(source: Path) -> str:
+    """What to do with an MCAP file whose messages are not those of ROS 2; "" where it is none."""
+    profile = profile_of(source) if source.is_file() and source.suffix == ".mcap" else None
+    if profile in (None, "ros2"):
+        return ""
+    if profile == "ros1":
+        return f"{source} has messages of ROS 1 in MCAP; give the .bag that it was made of"
+    return (f"{source} is MCAP but no bag of ROS 2 (profile {profile!r}), as Foxglove and others "
+            "write it; give clouds as sensor_msgs/PointCloud2 in a bag of ROS 2")
 
 
 def _unreadable(path: Path, error: Exception) -> str:

@@ -12,7 +12,7 @@ from zlib import crc32
 from lidar_perception.data.unpacking import MAX_CHUNK
 
 MAGIC = b"\x89MCAP0\r\n"
-FOOTER, CHUNK, CHUNK_INDEX, DATA_END = 0x02, 0x06, 0x08, 0x0F
+HEADER, FOOTER, CHUNK, CHUNK_INDEX, DATA_END = 0x01, 0x02, 0x06, 0x08, 0x0F
 FOOTER_BYTES = 9 + 20
 RECORD = struct.Struct("<BQ")  # of each: its kind, and how many bytes follow
 NO_INDEX = (RECORD.pack(DATA_END, 4) + bytes(4) + RECORD.pack(FOOTER, 20) + bytes(20)
@@ -39,6 +39,16 @@ def check_index(path: Path) -> None:
             raise ValueError("the checksum of its index is wrong")
         if sorted(_indexed(index)) != sorted(_chunks(file, index_at)):
             raise ValueError("its index does not fit its data")
+
+
+def profile_of(path: Path) -> str | None:
+    """Of what its messages are, as a writer names it: ros2, ros1, or "" where it does not say; None
+    where this is no MCAP file."""
+    with open(path, "rb") as stream:
+        head = stream.read(256)
+    if not head.startswith(MAGIC) or len(head) < 64 or head[len(MAGIC)] != HEADER:
+        return None
+    return _string(head, len(MAGIC) + RECORD.size)[0].decode(errors="replace")
 
 
 def _indexed(index: bytes) -> Iterator[tuple]:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from bag_samples import cloud_frame, message_bytes, same_cloud, scans
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from samples import STAMP, header, scene, write
 
 from lidar_perception.data import bag as bag_module
@@ -134,12 +135,21 @@ def test_a_folder_without_metadata_is_read_by_its_one_file(written, tmp_path):
         Bag(tmp_path)
 
 
+def mcap_of(path, profile):
+    with open(path, "wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile=profile)
+        writer.finish()
+
+
 @pytest.mark.parametrize("name, make, words", [
     ("missing", lambda p: None, "there is no bag"),
     ("folder", lambda p: p.mkdir(), "no metadata.yaml and 0 storage files"),
     ("cloud.bin", lambda p: write(p, b"1234"), "is no bag"),
     ("empty.mcap", lambda p: write(p, b""), "truncated or damaged"),
     ("text.mcap", lambda p: write(p, b"text " * 100), "truncated or damaged"),
+    ("old.mcap", lambda p: mcap_of(p, "ros1"), "messages of ROS 1 in MCAP; give the .bag"),
+    ("other.mcap", lambda p: mcap_of(p, ""), "no bag of ROS 2 (profile ''), as Foxglove"),
     ("text.db3", lambda p: write(p, b"text " * 100), "truncated or damaged"),
     ("bag", lambda p: write(p / "metadata.yaml", "text"), "truncated or damaged"),
     ("bag", lambda p: write(p / "metadata.yaml", "a: [\n"), "truncated or damaged"),
