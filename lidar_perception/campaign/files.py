@@ -19,7 +19,10 @@ SECONDS, MEGABYTES = 60.0, 3000.0
 KITTI = ("--data", "kitti")
 # Format -> how often it is drawn, the commands that read it; {} is the damaged file.
 COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
-    "bag": (8, [("info", "bag/drive"), ("convert", "bag/drive", "--out", "made", "--force")]),
+    "bag": (8, [("info", "bag/drive"), ("convert", "bag/drive", "--out", "made", "--force"),
+                ("setup", "--data", "bag/drive", "--out", "made")]),
+    "ros1": (3, [("info", "ros1/drive.bag"),
+                 ("convert", "ros1/drive.bag", "--out", "made", "--force")]),
     "kitti": (4, [("convert", "kitti", "--out", "made", "--force"),
                   ("evaluate", "candidates", *KITTI)]),
     "tracking": (2, [("convert", "tracking", "--out", "made", "--force")]),

@@ -5,11 +5,14 @@ from __future__ import annotations
 import io
 import json
 import sys
+from contextlib import redirect_stdout
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rosbags.convert.converter import convert
+from rosbags.typesys import Stores, get_typestore
 
 from lidar_perception.campaign.good import PERSON, STAMP, street
 from lidar_perception.candidates.configurations import BEST_VALUES
@@ -55,7 +58,11 @@ def write_samples(root: Path) -> None:
     write_text(sequence / "calib.txt", calibration_text(FORWARD_CAMERA))
     write_bag(root / "bag/drive", [Frame.of(str(i), LidarFrame(
         street(i), np.full(len(street(i)), 0.4, np.float32), STAMP + i * 10**8, "lidar"), TRUTH,
-        FORWARD_CAMERA) for i in range(FRAMES)])
+        FORWARD_CAMERA, pose=lambda: np.eye(4)) for i in range(FRAMES)])
+    (root / "ros1").mkdir()
+    with redirect_stdout(io.StringIO()):
+        convert([root / "bag/drive"], root / "ros1/drive.bag", "", 0, "lz4", "", None,
+                get_typestore(Stores.ROS1_NOETIC), (), (), (), ())
     _nuscenes(root / "nuscenes")
     labels = (root / "kitti/training/label_2/000000.txt").read_text()
     for i in range(FRAMES):

@@ -166,14 +166,14 @@ class Bag:
         try:
             for file in _mcap_files(self.reader):
                 check_index(file)
+            self.connections = list(self.reader.connections)
+            self.topics = {c.topic: c.msgtype for c in self.connections}
+            self.counts = dict.fromkeys(self.topics, 0)
+            for connection in self.connections:  # of a damaged metadata.yaml they may be texts
+                self.counts[connection.topic] += connection.msgcount
         except Exception as error:
             self.reader.close()
             raise InputError(_unreadable(source, error)) from None
-        self.connections = list(self.reader.connections)
-        self.topics = {c.topic: c.msgtype for c in self.connections}
-        self.counts = dict.fromkeys(self.topics, 0)
-        for connection in self.connections:
-            self.counts[connection.topic] += connection.msgcount
 
     def __enter__(self) -> Bag:
         return self
@@ -270,5 +270,5 @@ def _foreign(source: Path) -> str:
 
 def _unreadable(path: Path, error: Exception) -> str:
     reason = short(error).rstrip(".")
-    return (f"the bag {path} is truncated or damaged ({reason}); "
-            "'mcap recover' may save what it holds")
+    remedy = "rosbag reindex" if is_ros1(path) else "mcap recover"
+    return f"the bag {path} is truncated or damaged ({reason}); '{remedy}' may save what it holds"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import shutil
 import struct
@@ -160,6 +161,15 @@ def test_what_is_no_bag_is_named_in_one_line(tmp_path, name, make, words):
         Bag(tmp_path / name)
     assert str(tmp_path / name) in str(error.value) and words in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_a_count_that_is_no_number_is_damage(written, tmp_path):
+    shutil.copytree(written, tmp_path / "bag")
+    text = (written / "metadata.yaml").read_text()
+    (tmp_path / "bag/metadata.yaml").write_text(re.sub(r"    message_count: \d+",
+                                                       "    message_count: '1,5'", text))
+    with pytest.raises(InputError, match="truncated or damaged"):
+        Bag(tmp_path / "bag")
 
 
 def test_a_bag_without_its_file_is_damaged(written, tmp_path):
