@@ -58,6 +58,9 @@ class ReceptionParams(Params):
         fixed=True)
     fixed_frame: str = param("odom", "For `input.deskew` and `ego.source` tf: a frame in which the "
                              "robot moves without jumps.", fixed=True)
+    ahead: float = param(0.0, "Where the detectors look: degrees from the clouds' x axis, "
+                         "counter-clockwise, 90 where y looks ahead. What goes out stays in the "
+                         "cloud's frame.", unit="deg", low=-180.0, high=360.0, fixed=True)
 
 
 @dataclass(frozen=True)

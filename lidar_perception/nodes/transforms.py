@@ -140,7 +140,7 @@ class Transforms:
     def placing(self, header: Any) -> Placing:
         """Of a cloud with this header."""
         key = header.frame_id, to_ns(header.stamp)
-        if not (self.base_frame or self.target_frame):
+        if not (self.base_frame or self.target_frame or self.node.robot.input.ahead):
             return Placing(header.frame_id)
         if self._last[0] != key:
             self._last = key, self._placing(*key)
@@ -153,7 +153,12 @@ class Transforms:
                 f"'{frame_id}' is {base[2, 3]:.2f} m above '{self.base_frame}', which is to be on "
                 "the ground (as base_footprint is); ground.sensor_pose stands")
             base = None
-        level = None if base is None else levelling(base)
+        ahead = np.radians(self.node.robot.input.ahead)
+        upright = base
+        if upright is None and ahead:  # the turn comes after the tilt, so both are done here
+            upright = self._by_hand()
+            upright = np.eye(4) if upright is None else upright
+        level = None if upright is None else levelling(upright, ahead)
         target = self._looked_up("target_frame", self.target_frame, frame_id, stamp_ns)
         if target is None:
             return Placing(frame_id, base, level, None if level is None else inverse(level))
@@ -175,14 +180,17 @@ class Transforms:
             return None
 
     def mounted(self, params: Any, placing: Placing) -> tuple[Any, np.ndarray | None]:
-        """params, a node's, for a frame that is levelled, and the sensor's pose in base_frame for
-        the crop; both by params.ground.sensor_pose where TF has no base_frame."""
-        if placing.base is None:
-            return params, self._by_hand() if self.base_frame else None
-        height = float(placing.base[2, 3])
-        self.known["mount"] = f"{height:.3f} m above '{self.base_frame}'"
-        ground = replace(params.ground, sensor_pose=SensorPoseParams(height=height))
-        return replace(params, ground=ground), placing.base
+        """params, a node's, for a frame that placing has levelled, and the sensor's pose in
+        base_frame for the crop; both by params.ground.sensor_pose where TF has no base_frame."""
+        height = params.ground.sensor_pose.height
+        if placing.base is not None:
+            height = float(placing.base[2, 3])
+            self.known["mount"] = f"{height:.3f} m above '{self.base_frame}'"
+        if placing.base is not None or placing.level is not None:
+            params = replace(params, ground=replace(
+                params.ground, sensor_pose=SensorPoseParams(height=height)))
+        base = self._by_hand() if placing.base is None and self.base_frame else placing.base
+        return params, base
 
     def to_level(self, header: Any, frame_id: str) -> np.ndarray:
         """(4, 4): takes points of a frame to the level frame of a cloud with this header. Missing

@@ -15,8 +15,8 @@ STRAIGHT = 1e-9  # rad; a smaller tilt is rounding
 @dataclass(frozen=True, eq=False)
 class Placing:
     """Of one cloud. base (4, 4): the sensor's pose in a frame on the ground; level (4, 4): takes
-    its points to the level frame, the same place with z up as in base and x as far ahead as can
-    be; frame_id, out (4, 4): the frame of the results, and what takes boxes of the level frame
+    its points to the level frame, the same place with z up as in base and x where the detectors
+    look; frame_id, out (4, 4): the frame of the results, and what takes boxes of the level frame
     there. None is the identity, and of base: not known."""
 
     frame_id: str
@@ -48,7 +48,14 @@ def tilted(roll: float, pitch: float, height: float = 0.0) -> np.ndarray:
                      [-sp, cp * sr, cp * cr, height], [0.0, 0.0, 0.0, 1.0]])
 
 
-def levelling(base: np.ndarray) -> np.ndarray | None:
-    """level of a Placing with this base; None where the sensor stands upright."""
+def levelling(base: np.ndarray, ahead: float = 0.0) -> np.ndarray | None:
+    """level of a Placing with this base, for detectors that look ahead, rad counter-clockwise from
+    where x of the sensor looks; None where that is the sensor's own frame."""
     roll, pitch = roll_pitch(base)
-    return None if max(abs(roll), abs(pitch)) < STRAIGHT else tilted(roll, pitch)
+    level = None if max(abs(roll), abs(pitch)) < STRAIGHT else tilted(roll, pitch)
+    if not ahead:
+        return level
+    s, c = np.sin(ahead), np.cos(ahead)
+    turn = np.eye(4)
+    turn[:2, :2] = [[c, s], [-s, c]]
+    return turn if level is None else turn @ level

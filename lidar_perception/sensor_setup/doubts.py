@@ -6,6 +6,7 @@ import numpy as np
 
 from lidar_perception.sensor_setup.coverage import ARM
 from lidar_perception.sensor_setup.measure import FEW_SCANS, SMALL_ROOM, Measured
+from lidar_perception.sensor_setup.motion import Ahead
 from lidar_perception.sensor_setup.told import FOOTPRINT
 from lidar_perception.simulation.sensor import sensor_named
 
@@ -128,13 +129,26 @@ def _heading_doubts(m: Measured) -> list[str]:
     if h.unknown:
         return [f"yaw not known: {h.unknown}; record while it drives some metres straight ahead, "
                 "or check that x of the clouds looks ahead"]
-    if abs(h.degrees) - 2 * h.error <= NOT_AHEAD:
+    if not looks_elsewhere(h):
         return []
-    back = ", unless it was driven backwards" if abs(h.degrees) > 180 - 2 * NOT_AHEAD else ""
-    return [f"the robot drives towards {h.degrees:.0f} deg of the cloud's x axis, which should "
-            f"look ahead: the frame is turned about z{back}; turn the clouds by "
-            f"{-h.degrees:.0f} deg in the driver (base_frame does not turn them), or use detectors "
+    found = (f"the robot drives towards {h.degrees:.0f} deg of the cloud's x axis, where detectors "
+             "look ahead")
+    if may_be_backwards(h):
+        return [f"{found}: the frame is turned about z, unless it was driven backwards; if it is "
+                f"turned, set input.ahead to {h.degrees:.0f}"]
+    return [f"{found}: input.ahead lets those of nodes look there; for commands that read the "
+            f"recording, turn the clouds by {-h.degrees:.0f} deg in the driver, or use detectors "
             "that look all around (train --range around)"]
+
+
+def looks_elsewhere(h: Ahead) -> bool:
+    """Whether x does not look ahead."""
+    return not h.unknown and abs(h.degrees) - 2 * h.error > NOT_AHEAD
+
+
+def may_be_backwards(h: Ahead) -> bool:
+    """Whether x may look ahead all the same, of a robot that drove backwards."""
+    return not h.base and abs(h.degrees) > 180 - 2 * NOT_AHEAD
 
 
 def told_doubts(m: Measured) -> list[str]:

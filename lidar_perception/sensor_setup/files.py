@@ -12,7 +12,12 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.clustering.density import followed
 from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams
 from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.sensor_setup.doubts import body_fits, doubts
+from lidar_perception.sensor_setup.doubts import (
+    body_fits,
+    doubts,
+    looks_elsewhere,
+    may_be_backwards,
+)
 from lidar_perception.sensor_setup.measure import SMALL_ROOM, Measured, sensor_of
 from lidar_perception.simulation.sensor import Sensor
 
@@ -117,6 +122,9 @@ def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
     if m.beams is not None and np.isfinite(m.step):
         out |= _of_resolution(m)
     with_values(PipelineParams(), {name: value for name, (value, _) in out.items()})
+    if (h := m.heading) is not None and looks_elsewhere(h) and not may_be_backwards(h):
+        out["input.ahead"] = (float(round(h.degrees)), f"+- {h.error:.0f} degrees: where detectors "
+                              "look, which is not along the clouds' x axis")
     return out
 
 

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidar_perception.sensor_setup.coverage import ALWAYS, ARM
-from lidar_perception.sensor_setup.doubts import NOT_AHEAD, SHORTEST_TURN, SLOPE, told_doubts
+from lidar_perception.sensor_setup.doubts import SHORTEST_TURN, SLOPE, looks_elsewhere, told_doubts
 from lidar_perception.sensor_setup.measure import FEW_SCANS, SMALL_ROOM, Measured
 from lidar_perception.sensor_setup.scans import RINGS
 from lidar_perception.sensor_setup.told import FOOTPRINT
@@ -133,7 +133,7 @@ def _heading(m: Measured) -> Finding:
         "where the robot drives, by")
     return Finding("ahead", f"{h.degrees:z.0f} +- {h.error:.0f} deg from x", f"{what} how what "
                    f"stands around shifts in {h.pairs} pairs of clouds",
-                   FAIR if abs(h.degrees) - 2 * h.error <= NOT_AHEAD else DOUBTFUL)
+                   DOUBTFUL if looks_elsewhere(h) else FAIR)
 
 
 def _told(m: Measured) -> list[Finding]:

@@ -171,6 +171,48 @@ def test_a_network_sees_a_tilted_sensors_cloud_as_a_level_ones(start, weights):
             np.testing.assert_allclose(np.sin(turned), 0, atol=1e-2)
 
 
+@pytest.mark.parametrize("by", ["hand", "TF", "nothing"])
+def test_the_detectors_look_ahead_wherever_x_of_the_clouds_looks(start, weights, by):
+    """Boxes of a sensor that is turned, and leans, are those of one that is not, in its frame."""
+    scan, ahead = frame(), 150.0
+    plain = start(PointPillarsNode, **weights)
+    give(plain, message(scan.xyz, intensity=scan.intensity))
+    expected, _, _ = boxes_of(plain)
+    tilt = np.eye(4) if by == "nothing" else tilted(-0.2, 0.3)
+    level = inverse(mounted(0, 0, 0, np.radians(ahead), 0, 0)) @ tilt
+    seen = moved_points(scan.xyz.astype(np.float64), inverse(level))
+    leans = {"hand": {"ground.sensor_pose.roll": -0.2, "ground.sensor_pose.pitch": 0.3},
+             "TF": {"base_frame": "base"}, "nothing": {}}[by]
+    node = start(PointPillarsNode, **{**weights, **leans, "input.ahead": ahead})
+    if by == "TF":
+        place = mounted(0.7, -0.3, 1.73, 1.0, 0.0, 0.0)  # where it looks in the base matters not
+        node.transforms.on_tf(transforms(("base", "lidar", place @ tilt, 0)), static=True)
+    give(node, message(seen, intensity=scan.intensity))
+    found, frame_id, _ = boxes_of(node)
+    assert frame_id == "lidar" and len(found) == len(expected) > 5
+    back = found.boxes.astype(np.float64)
+    back[:, :3] = moved_points(back[:, :3], level)
+    order, other = (np.lexsort(b[:, 1::-1].round(1).T) for b in (back, expected.boxes))
+    np.testing.assert_allclose(back[order][:, :6], expected.boxes[other][:, :6], atol=2e-2)
+    if by == "nothing":
+        turned = back[order][:, 6] - expected.boxes[other][:, 6] - np.radians(ahead)
+        np.testing.assert_allclose(np.sin(turned), 0, atol=1e-2)
+
+
+def test_a_click_and_candidates_are_where_they_are_in_a_turned_cloud(start):
+    turn = mounted(0, 0, 0, np.radians(-100), 0, 0)
+    node = start(Perception, **WALKING, **{"input.ahead": -100.0})
+    xyz, person = moved_points(walker_scene()[:, :3].astype(np.float64), turn), WALKER[:3]
+    at = moved_points(np.array(person, np.float64)[None], turn)[0]
+    node.seed._on_click(bag_message(
+        "geometry_msgs/msg/PointStamped", header=header_message(START, "lidar", bag_message),
+        point=bag_message("geometry_msgs/msg/Point", **dict(zip("xyz", at.tolist())))))
+    give(node, message(xyz))
+    detections, frame_id, _ = boxes_of(node)
+    assert frame_id == "lidar" and len(detections) == 1
+    assert np.linalg.norm(detections.boxes[0, :2] - at[:2]) < 0.3
+
+
 def test_without_the_frames_the_parameters_stand_and_the_names_are_said(start):
     """Columns and boxes are bit for bit those of a node that asks for no frame."""
     xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))

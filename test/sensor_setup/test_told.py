@@ -10,6 +10,7 @@ from lidar_perception.data.raw_clouds import _of_frame, open_clouds
 from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import inverse
 from lidar_perception.sensor_setup.doubts import doubts
+from lidar_perception.sensor_setup.files import chosen_params
 from lidar_perception.sensor_setup.findings import findings
 from lidar_perception.sensor_setup.measure import measured
 from lidar_perception.sensor_setup.motion import ahead_of, driven
@@ -60,6 +61,8 @@ def test_with_odometry_ahead_is_where_the_base_looks_whichever_way_it_drove(yaw)
         m = found(told(poses[::-1] if backwards else poses, mount, mount), backwards)
         assert m.heading.base and abs((m.heading.degrees + yaw + 180) % 360 - 180) < 3
         assert not any("by TF, x of" in line for line in doubts(m))
+        looks = chosen_params(m).get("input.ahead", (0.0,))[0]
+        assert abs((looks + yaw + 180) % 360 - 180) < 3
     assert abs(abs(found(Told(), backwards=True).heading.degrees) - 180) < 3  # it cannot know
 
 
