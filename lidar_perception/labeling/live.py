@@ -95,7 +95,8 @@ class Live:
     @property
     def first(self) -> int:
         """Number of the oldest frame that is kept."""
-        return next(iter(self._frames), self._next)
+        with self._lock:
+            return next(iter(self._frames), self._next)
 
     @property
     def end(self) -> int:
@@ -213,14 +214,15 @@ class Live:
     def status(self) -> dict[str, Any]:
         """What is wrong, in lines for a person; of each topic how many arrays came, came late or
         without a cloud, and how far behind; of the clouds what `values` says."""
-        lines = [*self.lines, *(
-            f"boxes of {topic} are not shown: {heard.elsewhere}"
-            for topic, heard in self.topics.items() if heard.elsewhere)]
-        return {"lines": lines, "clouds": {**self.values, "passed": self.passed},
-                "topics": [{"topic": topic, "kind": heard.kind, "came": heard.came,
-                            "late": heard.late, "alone": heard.alone,
-                            "ms": round(float(np.median(heard.delays)), -1) if heard.delays
-                            else None} for topic, heard in self.topics.items()]}
+        with self._lock:
+            lines = [*self.lines, *(
+                f"boxes of {topic} are not shown: {heard.elsewhere}"
+                for topic, heard in self.topics.items() if heard.elsewhere)]
+            return {"lines": lines, "clouds": {**self.values, "passed": self.passed},
+                    "topics": [{"topic": topic, "kind": heard.kind, "came": heard.came,
+                                "late": heard.late, "alone": heard.alone,
+                                "ms": round(float(np.median(heard.delays)), -1) if heard.delays
+                                else None} for topic, heard in self.topics.items()]}
 
     def _event(self, frame: LiveFrame) -> dict[str, Any]:
         return {"live": {"first": self.first, **_named(frame), "tracks": self._tracks([frame])}}
@@ -263,9 +265,10 @@ class Live:
     def layers(self, i: int, min_score: float) -> dict[str, Any]:
         """Labels and detections of a frame, as /api/labels has them, and what is missed from this
         score on; what is false cannot be said, as it is not known where labels end."""
-        objects = dict(self._frame(i).objects)  # while more may come
-        of_kind = {kind: {t: o for t, o in objects.items() if t in self.topics
-                          and self.topics[t].kind == kind} for kind in (BOXES, LABELS)}
+        with self._lock:
+            objects = self._frame(i).objects
+            of_kind = {kind: {t: o for t, o in objects.items() if t in self.topics
+                              and self.topics[t].kind == kind} for kind in (BOXES, LABELS)}
         found = {source_name(t): with_sources(o) for t, o in of_kind[BOXES].items()}
         truth = next((to_truth(o) for o in of_kind[LABELS].values()), None)
         matches = {} if truth is None else {

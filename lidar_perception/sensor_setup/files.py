@@ -13,6 +13,7 @@ from lidar_perception.clustering.density import followed
 from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.sensor_setup.doubts import (
+    NOT_AHEAD,
     body_fits,
     doubts,
     looks_elsewhere,
@@ -94,8 +95,8 @@ def _list(name: str, values: Sequence[float] | np.ndarray, digits: int) -> str:
 
 
 def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
-    """Parameter of the nodes -> value and why: what the sensor and its mount ask for, and nothing
-    that is as by default. The values have passed the ranges of the parameters."""
+    """Parameter of PipelineParams -> value and why: what the sensor and its mount ask for, and
+    nothing that is as by default. The values have passed the ranges of the parameters."""
     out: dict[str, tuple[Any, str]] = {}
     if m.intensity is not None:
         out["input.intensity_max"] = (m.intensity.full, f"intensities go up to "
@@ -122,9 +123,18 @@ def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
     if m.beams is not None and np.isfinite(m.step):
         out |= _of_resolution(m)
     with_values(PipelineParams(), {name: value for name, (value, _) in out.items()})
-    if (h := m.heading) is not None and looks_elsewhere(h) and not may_be_backwards(h):
-        out["input.ahead"] = (float(round(h.degrees)), f"+- {h.error:.0f} degrees: where detectors "
-                              "look, which is not along the clouds' x axis")
+    return out
+
+
+def node_params(m: Measured) -> dict[str, tuple[Any, str]]:
+    """The same, and what only nodes have."""
+    h, out = m.heading, chosen_params(m)
+    if h is not None and looks_elsewhere(h) and not may_be_backwards(h):
+        agreed = abs((m.told.ahead - h.degrees + 180) % 360 - 180) <= NOT_AHEAD
+        out["input.ahead"] = (
+            float(round(m.told.ahead if agreed else h.degrees)), "where detectors look, which is "
+            f"not along the clouds' x axis: {h.degrees:.0f} +- {h.error:.0f} degrees by the clouds"
+            + (f", {m.told.ahead:.0f} by TF" if np.isfinite(m.told.ahead) else ""))
     return out
 
 
@@ -161,7 +171,7 @@ def _of_resolution(m: Measured) -> dict[str, tuple[Any, str]]:
 
 def params_yaml(m: Measured) -> str:
     """robot.param.yaml: for every node, with what was chosen and why."""
-    chosen = chosen_params(m)
+    chosen = node_params(m)
     lines = [_head(m, f"{_origin(m)} What is not here is as by default. Of a parameter that a node "
                    "does not have it takes no notice."), "/**:"]
     tree: dict[str, Any] = {}

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+import threading
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -217,3 +220,35 @@ def test_the_cloud_with_most_columns_is_chosen_and_the_boxes_of_its_namespace():
         with pytest.raises(InputError) as said:
             clouds_topic(types, wanted=wanted)
         assert "\n" not in str(said.value)
+
+
+def test_pages_may_ask_while_topics_come_and_go(live):
+    """In another thread, as the server does; threads take turns as often as they can."""
+    before, wrong = sys.getswitchinterval(), []
+    sys.setswitchinterval(1e-6)
+    over = threading.Event()
+
+    def ask():
+        while not over.is_set():
+            try:
+                live.status(), live.frames(), live.tracks(), live.first
+                live.layers(live.end - 1, 0.0)
+            except InputError:
+                pass  # kept no more
+            except Exception as error:
+                wrong.append(error)
+                return
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    try:
+        for i in range(1500):
+            topic = f"/{i % 40}/output/detections"
+            (live.forget if i % 3 == 2 else live.hear)(*([topic] if i % 3 == 2 else [topic, BOXES]))
+            live.boxes(topic, boxes(i), None)
+            live.cloud(cloud(i))
+    finally:
+        over.set()
+        asking.join()
+        sys.setswitchinterval(before)
+    assert wrong == []

@@ -9,7 +9,7 @@ from tilted_samples import clouds_of
 
 from lidar_perception.data.raw_clouds import _of_frame
 from lidar_perception.sensor_setup.doubts import body_fits, doubts
-from lidar_perception.sensor_setup.files import chosen_params
+from lidar_perception.sensor_setup.files import node_params
 from lidar_perception.sensor_setup.findings import findings
 from lidar_perception.sensor_setup.measure import measured, sensor_of
 from lidar_perception.sensor_setup.scans import intensity_of, scan_of
@@ -127,7 +127,7 @@ def test_which_way_is_ahead_is_told_however_slowly_the_robot_drives(name):
             continue
         assert abs((m.heading.degrees - degrees + 180) % 360 - 180) < 5
         assert said(m, "drives towards", "input.ahead") == (degrees != 0)
-        assert ("input.ahead" in chosen_params(m)) == (degrees in (90, -25))
+        assert ("input.ahead" in node_params(m)) == (degrees in (90, -25))
         assert said(m, "backwards") == (degrees == 180) and row.sure == (
             "doubtful" if degrees else "fair") and not said(m, "yaw not known")
 

@@ -4,16 +4,19 @@ from functools import cache
 
 import numpy as np
 import pytest
+import yaml
 from robot_bags import ON_BASE, base_at, mount, moving, recorded
 
 from lidar_perception.data.raw_clouds import _of_frame, open_clouds
+from lidar_perception.params import ReceptionParams
 from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import inverse
 from lidar_perception.sensor_setup.doubts import doubts
-from lidar_perception.sensor_setup.files import chosen_params
+from lidar_perception.sensor_setup.files import node_params, params_yaml
 from lidar_perception.sensor_setup.findings import findings
 from lidar_perception.sensor_setup.measure import measured
 from lidar_perception.sensor_setup.motion import ahead_of, driven
+from lidar_perception.sensor_setup.report import report_html
 from lidar_perception.sensor_setup.scans import scan_of
 from lidar_perception.sensor_setup.told import Told, told_by
 from lidar_perception.simulation.scene import Scenes
@@ -61,9 +64,13 @@ def test_with_odometry_ahead_is_where_the_base_looks_whichever_way_it_drove(yaw)
         m = found(told(poses[::-1] if backwards else poses, mount, mount), backwards)
         assert m.heading.base and abs((m.heading.degrees + yaw + 180) % 360 - 180) < 3
         assert not any("by TF, x of" in line for line in doubts(m))
-        looks = chosen_params(m).get("input.ahead", (0.0,))[0]
+        looks = node_params(m).get("input.ahead", (0.0,))[0]
         assert abs((looks + yaw + 180) % 360 - 180) < 3
     assert abs(abs(found(Told(), backwards=True).heading.degrees) - 180) < 3  # it cannot know
+    report_html(m, {"robot.param.yaml": params_yaml(m)})
+    written = yaml.safe_load(params_yaml(m))["/**"]["ros__parameters"]["input"]
+    assert written.pop("ahead", 0.0) == looks
+    assert ReceptionParams(ahead=looks) and not written.keys() - {"intensity_max"}
 
 
 def test_to_and_fro_is_told_with_odometry_only():
