@@ -49,6 +49,8 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "deskew": dict(default_value="", choices=["", "off", "odometry", "tf"], description="Parameter "
                    "input.deskew: clouds are moved to their stamp; empty: that of the parameter "
                    "file."),
+    "ahead": dict(default_value="", description="Parameter input.ahead: where the detectors look, "
+                  "degrees from the clouds' x axis; empty: that of the parameter file."),
     "config": dict(default_value="", description="Parameter file of all nodes; empty: "
                    "config/*.param.yaml of each detector."),
     "experts": dict(default_value="", description="Of ground and clusters: a parameter file, or "
@@ -218,6 +220,8 @@ def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, 
         given["input.reliability"] = value["reliability"]
     if value["deskew"]:
         given["input.deskew"] = value["deskew"]
+    if value["ahead"]:
+        given["input.ahead"] = _degrees(value["ahead"])
     given |= {name: value[name] for name in ("base_frame", "target_frame") if value[name]}
     detector = node.removesuffix("_detector")
     if detector in NETWORKS:
@@ -226,6 +230,13 @@ def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, 
             if chosen:
                 given[f"{detector}.{name}"] = chosen
     return given
+
+
+def _degrees(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f"ahead:={text} is no number of degrees") from None
 
 
 def _weights(text: str, networks: list[str]) -> dict[str, str]:

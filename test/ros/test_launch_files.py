@@ -94,6 +94,9 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
         assert frames.items() < node.parameters[1].items()
         assert node.parameters[1]["input.deskew"] == "odometry"
         assert ("~/input/odometry", "/odometry") in node.remappings
+    assert all(n.parameters[1]["input.ahead"] == 180.0 for n in nodes(ahead="180").values())
+    with pytest.raises(InputError, match="ahead:=left is no number"):
+        nodes(ahead="left")
 
 
 def test_ground_and_clusters_have_one_file_and_what_others_would_take_is_said(launched, tmp_path):
