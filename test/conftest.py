@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import sys
 from multiprocessing import forkserver, resource_tracker
 from pathlib import Path
 
@@ -21,6 +22,14 @@ def pytest_itemcollected(item):
     """Hypothesis runs the same lines a hundred times; to measure them takes longer than to run."""
     if getattr(item.obj, "is_hypothesis_test", False):
         item.add_marker("no_cover")
+
+
+def pytest_collection_finish():
+    """Autograd counts its devices at the first backward. After an ONNX export a torch that is built
+    for CUDA counts one that is not there, and then works in no process that is forked, as runs are
+    that tests kill. So the first backward comes before all tests."""
+    if (torch := sys.modules.get("torch")) is not None:
+        torch.ones((), requires_grad=True).backward()
 
 
 @pytest.hookimpl(wrapper=True)
