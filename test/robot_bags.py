@@ -1,11 +1,6 @@
-"""Bags as other robots record them: odometry of the base at times of its own, and TF; of ROS 1."""
-
-import io
-from contextlib import redirect_stdout
+"""Bags as other robots record them: odometry of the base at times of its own, and TF."""
 
 import numpy as np
-from rosbags.convert.converter import convert
-from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.data.bag import BagWriter
@@ -92,11 +87,3 @@ def check(recording, on_base=ON_BASE):
     assert POSES in recording.has
     for frame, stamp in zip(recording, stamps(), strict=True):
         np.testing.assert_allclose(frame.pose(), base_at(stamp) @ on_base, atol=1e-4)
-
-
-def as_ros1(source, path, compress=None):
-    """A copy for ROS 1, as rosbags writes it."""
-    with redirect_stdout(io.StringIO()):
-        convert([source], path, "", 0, compress, "", None,
-                get_typestore(Stores.ROS1_NOETIC), (), (), (), ())
-    return path

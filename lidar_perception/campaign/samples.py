@@ -41,6 +41,14 @@ def scan(number: int) -> np.ndarray:
     return np.column_stack([xyz, np.full(len(xyz), 0.4)]).astype(np.float32)
 
 
+def as_ros1(source: Path, path: Path, compress: str | None = None) -> Path:
+    """A copy of a bag for ROS 1, as rosbags writes it; compress: lz4, bz2 or None."""
+    with redirect_stdout(io.StringIO()):
+        convert([source], path, "", 0, compress, "", None, get_typestore(Stores.ROS1_NOETIC),
+                (), (), (), ())
+    return path
+
+
 def write_samples(root: Path) -> None:
     """A folder for each format but ONNX, the same bytes on every machine."""
     for i in range(FRAMES):
@@ -60,9 +68,7 @@ def write_samples(root: Path) -> None:
         street(i), np.full(len(street(i)), 0.4, np.float32), STAMP + i * 10**8, "lidar"), TRUTH,
         FORWARD_CAMERA, pose=lambda: np.eye(4)) for i in range(FRAMES)])
     (root / "ros1").mkdir()
-    with redirect_stdout(io.StringIO()):
-        convert([root / "bag/drive"], root / "ros1/drive.bag", "", 0, "lz4", "", None,
-                get_typestore(Stores.ROS1_NOETIC), (), (), (), ())
+    as_ros1(root / "bag/drive", root / "ros1/drive.bag", "lz4")
     _nuscenes(root / "nuscenes")
     labels = (root / "kitti/training/label_2/000000.txt").read_text()
     for i in range(FRAMES):

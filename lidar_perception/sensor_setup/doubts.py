@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from lidar_perception.geometry import wrap_angle
 from lidar_perception.sensor_setup.coverage import ARM
 from lidar_perception.sensor_setup.measure import FEW_SCANS, SMALL_ROOM, Measured
 from lidar_perception.sensor_setup.motion import Ahead
@@ -151,6 +154,11 @@ def may_be_backwards(h: Ahead) -> bool:
     return not h.base and abs(h.degrees) > 180 - 2 * NOT_AHEAD
 
 
+def turned(degrees: float | np.ndarray) -> Any:
+    """Degrees as a turn by at most half a circle, -180 .. 180."""
+    return np.degrees(wrap_angle(np.radians(degrees)))
+
+
 def told_doubts(m: Measured) -> list[str]:
     """What of TF and odometry the clouds contradict."""
     told, q, h, out = m.told, m.mount, m.heading, []
@@ -159,7 +167,7 @@ def told_doubts(m: Measured) -> list[str]:
                    "no rotation) and were left out: look at what publishes them")
     if q is not None and told.mount is not None:
         by_ground, error = np.degrees([q.roll, q.pitch]), np.degrees(q.error[1:])
-        apart = (by_ground - told.roll_pitch + 180) % 360 - 180
+        apart = turned(by_ground - told.roll_pitch)
         if (np.abs(apart) > TILT_APART + 2 * error).any():
             out.append(f"TF has the sensor in '{told.base}' with roll {told.roll_pitch[0]:.1f} and "
                        f"pitch {told.roll_pitch[1]:.1f} deg, the ground says {by_ground[0]:.1f} "
@@ -169,8 +177,7 @@ def told_doubts(m: Measured) -> list[str]:
         out.append(f"TF has the sensor {told.height:.2f} m above '{FOOTPRINT}', and it is "
                    f"{q.height:.2f} m above the ground: correct the URDF, which base_frame goes by")
     if h is not None and not h.unknown and told.mount is not None:
-        turn = (h.degrees - told.ahead + 180) % 360 - 180
-        if abs(turn) - 2 * h.error > NOT_AHEAD:
+        if abs(turned(h.degrees - told.ahead)) - 2 * h.error > NOT_AHEAD:
             out.append(f"by TF, x of '{told.base}' looks {told.ahead:.0f} deg from the clouds' x "
                        f"axis, and the robot drives towards {h.degrees:.0f}: correct the yaw in "
                        "the URDF" + ("" if h.base else ", unless it was driven another way"))

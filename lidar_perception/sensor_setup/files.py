@@ -18,6 +18,7 @@ from lidar_perception.sensor_setup.doubts import (
     doubts,
     looks_elsewhere,
     may_be_backwards,
+    turned,
 )
 from lidar_perception.sensor_setup.measure import SMALL_ROOM, Measured, sensor_of
 from lidar_perception.simulation.sensor import Sensor
@@ -130,7 +131,7 @@ def node_params(m: Measured) -> dict[str, tuple[Any, str]]:
     """The same, and what only nodes have."""
     h, out = m.heading, chosen_params(m)
     if h is not None and looks_elsewhere(h) and not may_be_backwards(h):
-        agreed = abs((m.told.ahead - h.degrees + 180) % 360 - 180) <= NOT_AHEAD
+        agreed = abs(turned(m.told.ahead - h.degrees)) <= NOT_AHEAD
         out["input.ahead"] = (
             float(round(m.told.ahead if agreed else h.degrees)), "where detectors look, which is "
             f"not along the clouds' x axis: {h.degrees:.0f} +- {h.error:.0f} degrees by the clouds"

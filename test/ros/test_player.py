@@ -9,9 +9,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
-from robot_bags import as_ros1
 from std_srvs.srv import Trigger
 
+from lidar_perception.campaign.samples import as_ros1
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
 from lidar_perception.nodes.runtime import LATCHED
 from lidar_perception.wire.codec import bag_message

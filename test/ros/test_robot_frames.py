@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from detection_samples import eager, frame, lively, tiny
+from robot_bags import tf, transform
 from samples import WALKER
 from samples import scene as walker_scene
 from scipy.spatial.transform import Rotation
@@ -51,16 +52,7 @@ def message(xyz, stamp=START, intensity=None, frame_id="lidar", **columns):
 
 def transforms(*rows):
     """tf2_msgs/TFMessage of rows of parent, child, pose (4, 4), stamp."""
-    made = []
-    for parent, child, pose, stamp in rows:
-        t, q = pose[:3, 3].tolist(), Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
-        made.append(bag_message(
-            "geometry_msgs/msg/TransformStamped", child_frame_id=child,
-            header=header_message(stamp, parent, bag_message), transform=bag_message(
-                "geometry_msgs/msg/Transform",
-                translation=bag_message("geometry_msgs/msg/Vector3", **dict(zip("xyz", t))),
-                rotation=bag_message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", q))))))
-    return bag_message("tf2_msgs/msg/TFMessage", transforms=made)
+    return tf(*(transform(parent, child, stamp, pose) for parent, child, pose, stamp in rows))
 
 
 def odometry(pose, stamp, child="base"):
