@@ -6,8 +6,7 @@ import numpy as np
 from tracking_samples import CAR, CYCLIST, START, TENTH, pose
 
 from lidar_perception.adapting.looking import SOURCES, FrameLook, seen_in
-from lidar_perception.robot.poses import inverse
-from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.robot.poses import inverse, moved_boxes
 from lidar_perception.types import PEDESTRIAN, Detections
 
 FRAMES = 16

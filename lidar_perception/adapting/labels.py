@@ -12,8 +12,7 @@ import numpy as np
 from lidar_perception.adapting.judging import IGNORED, KEPT, STATES, Verdict
 from lidar_perception.adapting.tracks import Followed
 from lidar_perception.geometry import bev_iou, wrap_angle
-from lidar_perception.robot.poses import inverse
-from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.robot.poses import inverse, moved_boxes
 
 BESIDE = 2.0     # seconds that a standing object is there before and after it is detected
 STANDS = 0.5     # metres over the ground, scatter and way, up to which it stands

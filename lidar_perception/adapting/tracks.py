@@ -10,7 +10,7 @@ from scipy.special import logit
 
 from lidar_perception.adapting.looking import LEAST as SCORED
 from lidar_perception.adapting.looking import SOURCES, FrameLook
-from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.robot.poses import moved_boxes
 from lidar_perception.tracking.follow import Hit, followed
 from lidar_perception.types import CLASSES
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -11,6 +14,7 @@ from rich.markup import escape
 
 from lidar_perception.cli.data import a_path, limit_option, opened, split_option
 from lidar_perception.runs.terminal import console, track
+from lidar_perception.types import InputError
 
 BAG = "bag"
 DATASETS = ("kitti_object", "kitti_tracking", "nuscenes", "semantickitti")
@@ -31,14 +35,16 @@ LABELS = ("kitti_object", "kitti_tracking", "nuscenes_detection", "nuscenes_trac
               "PATH (MarkerArray or Detection3DArray), instead of its labels.")
 @click.option("--points", default="", metavar="TOPIC",
               help="Clouds of a bag.  [default: /points, else the only ones]")
+@a_path("--robot", "robot.param.yaml that `setup` wrote, for a recording with a tilted or turned "
+        "sensor: level its clouds, x ahead, without the robot's own returns, as nodes see them.")
 @click.option("--images", is_flag=True, help="To a bag: include the left colour images, as PNG.")
 @split_option
 @limit_option
 @click.option("--force", is_flag=True, help="Replace what is there: a bag, or files of the same "
               "names.")
 def convert(source: Path, format: str, out: Path, data: Path | None, given: str | None,
-            detections: str | None, points: str, images: bool, split: Path | None,
-            limit: int | None, force: bool) -> None:
+            detections: str | None, points: str, robot: Path | None, images: bool,
+            split: Path | None, limit: int | None, force: bool) -> None:
     """The recording at PATH (KITTI, nuScenes, SemanticKITTI, a bag) to one MCAP bag, or to a folder
     of a data set with clouds, labels, poses and calibration, or only its labels to a format of
     other tools. With --data, PATH holds labels.
@@ -51,6 +57,7 @@ def convert(source: Path, format: str, out: Path, data: Path | None, given: str 
     \b
     Examples:
       lidar-perception convert /data/kitti/tracking --out tracking.bag
+      lidar-perception convert drive.bag --robot robot/robot.param.yaml --out level.bag
       lidar-perception convert drive --to kitti_tracking --out drive_kitti
       lidar-perception convert result --detections /fused_detector/output/detections \\
         --to kitti_object --out detected
@@ -60,6 +67,8 @@ def convert(source: Path, format: str, out: Path, data: Path | None, given: str 
     given_labels = data is not None or (format in LABELS and format not in (BAG, *DATASETS))
     for wrong, what in (
             (images and (given_labels or format != BAG), "--images is for --to bag"),
+            (robot is not None and (given_labels or detections is not None),
+             "--robot is for a recording with its clouds"),
             (given is not None and data is None, "--from says what labels PATH holds; give their "
                                                  "drive with --data"),
             (given is not None and detections is not None, "--detections is for a bag, --from for "
@@ -68,21 +77,44 @@ def convert(source: Path, format: str, out: Path, data: Path | None, given: str 
                                                         "or nuscenes_tracking")):
         if wrong:
             raise click.UsageError(what)
-    recording = opened(source if data is None else data, split=split, points=points)
+    recording = opened(source if data is None else data, level=robot is None, split=split,
+                       points=points)
     if given_labels:
         _labels(source, recording, format, out, given, data is not None, detections, limit, force)
     elif format == BAG and detections is None:
-        _bag(source, recording, out, images, limit, force)
+        _bag(source, recording, _seen(recording, robot), out, images, limit, force)
     else:
-        _dataset(source, recording, format, out, detections, limit, force)
+        _dataset(source, recording, _seen(recording, robot), format, out, detections, limit, force)
 
 
-def _bag(source: Path, recording: Any, out: Path, images: bool, limit: int | None,
-         force: bool) -> None:
+def _seen(recording: Any, robot: Path | None) -> Callable[[Any], Any]:
+    """What makes of a frame what nodes with this parameter file see; nothing without one."""
+    if robot is None:
+        return lambda frame: frame
+    if recording.mounted:
+        raise InputError(f"{recording.path} ({recording.layout}) has level clouds; --robot is for "
+                         "bags, .pcd and .bin files")
+    from lidar_perception.candidates.params import PipelineParams
+    from lidar_perception.cli.options import read_config
+    from lidar_perception.data.levelled import levelled
+    from lidar_perception.param_fields import with_values
+    from lidar_perception.params import CloudNodeParams
+    try:
+        params, node = (with_values(known, read_config(robot, known))
+                        for known in (PipelineParams(), CloudNodeParams()))
+    except ValueError as error:
+        raise InputError(f"{robot}: {error}") from None
+    pose = params.ground.sensor_pose
+    return partial(levelled, height=pose.height, roll=pose.roll, pitch=pose.pitch,
+                   ahead=math.radians(node.input.ahead), crop=params.crop)
+
+
+def _bag(source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, images: bool,
+         limit: int | None, force: bool) -> None:
     from lidar_perception.data.to_bag import write_bag
     count = min(len(recording), limit or len(recording))
     skipped: list[str] = []
-    frames = track(islice(recording, count), f"converting {source}", count)
+    frames = track(map(seen, islice(recording, count)), f"converting {source}", count)
     written = write_bag(out, frames, images=images, force=force, skipped=skipped)
     console.print(f"{out}: {written} scans of {count}")
     for line in skipped:
@@ -96,8 +128,8 @@ def _on_topic(source: Path, recording: Any, topic: str) -> Any:
     return bag.read(source, recording.frames[:], topic)
 
 
-def _dataset(source: Path, recording: Any, format: str, out: Path, detections: str | None,
-             limit: int | None, force: bool) -> None:
+def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: str, out: Path,
+             detections: str | None, limit: int | None, force: bool) -> None:
     from lidar_perception.labeling.datasets import write_dataset
     from lidar_perception.labeling.exchange import export_labels
     labels = None if detections is None else _on_topic(source, recording, detections)
@@ -106,7 +138,7 @@ def _dataset(source: Path, recording: Any, format: str, out: Path, detections: s
         export_labels(labels.first(count), format, out, recording.frames[:count], force)
         console.print(f"{out}: {count} scans")
         return
-    frames = track(islice(recording, count), f"converting {source}", count)
+    frames = track(map(seen, islice(recording, count)), f"converting {source}", count)
     summary = write_dataset(format, frames, out, labels, force)
     drives = f"{summary.drives} drive{'' if summary.drives == 1 else 's'}"
     console.print(f"{escape(str(out))}: {summary.frames} scans of {drives}, {summary.boxes} boxes")

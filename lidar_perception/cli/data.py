@@ -108,20 +108,23 @@ def walk_options(data: Callable = data_option) -> Callable:
     return decorate
 
 
-def opened(data: Path, **how: Any) -> Any:
+def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     """The recording at a path, see data.open.open_recording; says in a line what it is. The height
-    of a sensor that the recording does not say is measured, unless it is about KITTI's."""
+    of a sensor that the recording does not say is measured, unless it is about KITTI's; where it is
+    to be level and leans, that is said."""
     from lidar_perception.data.open import open_recording
     recording = open_recording(data, **how)
     errors.print(escape(str(recording)), soft_wrap=True, style="dim")
     if recording.mounted:
         return recording
-    from lidar_perception.ground.segment import mounted
+    from lidar_perception.ground.segment import lean_problem, mounted
     measured = mounted(recording)
     if measured is not recording:
         height = next(iter(measured)).sensor_height
         errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds",
                      soft_wrap=True, style="dim")
+    if level and (problem := lean_problem(recording)):
+        errors.print(escape(problem), soft_wrap=True, style="yellow")
     return measured
 
 

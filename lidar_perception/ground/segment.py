@@ -25,9 +25,11 @@ METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
 # Where the height of the sensor is measured: beyond the vehicle, near enough for a plane.
 NEAREST, FARTHEST = 2.5, 25.0    # m
 PLANE = ThresholdParams(max_slope=15.0)
+STEEP = ThresholdParams(max_slope=30.0)  # where a sensor leans
 MIN_SHARE = 0.15               # of these points on the plane
 FIRST = 3                      # clouds
 HEIGHT_TOLERANCE = 0.25          # m between the parameter and the measured height
+MAX_LEAN = 5.0                   # degrees; as much as roads slope
 
 
 def segment_ground(frame: LidarFrame, params: GroundParams = GroundParams()) -> np.ndarray:
@@ -59,15 +61,32 @@ def measured_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPoseParams()
     """Metres of the sensor above the plane that holds most of the points (N, 3) around it;
     negative if that is overhead, as for a sensor mounted upside down. None where there is no
     such plane."""
-    xyz = level(xyz, pose)
+    plane = _floor(level(xyz, pose))
+    return None if plane is None else -float(plane[2])
+
+
+def _floor(xyz: np.ndarray, params: ThresholdParams = PLANE) -> np.ndarray | None:
+    """The plane z = a x + b y + c, (3,), that holds most of the points (N, 3) around; None where
+    there is none."""
     square = np.einsum("ij,ij->i", xyz[:, :2], xyz[:, :2])
     near = xyz.compress((square >= NEAREST**2) & (square <= FARTHEST**2), axis=0)
-    plane = ransac_plane(near, PLANE)
+    plane = ransac_plane(near, params)
     if plane is None:
         return None
     x, y, z = near.T
-    on_plane = np.abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= PLANE.inlier_distance
-    return -float(plane[2]) if on_plane.mean() >= MIN_SHARE else None
+    on_plane = np.abs(z - (plane[0] * x + plane[1] * y + plane[2])) <= params.inlier_distance
+    return plane if on_plane.mean() >= MIN_SHARE else None
+
+
+def _floors(recording: Recording, params: ThresholdParams = PLANE) -> np.ndarray:
+    """(K, 3): the floors of the first clouds, where there are such; none where one of the clouds
+    cannot be read, which who needs it says."""
+    try:
+        clouds = [frame.load() for frame in islice(recording, FIRST)]
+    except InputError:
+        return np.zeros((0, 3))
+    return np.array([plane for cloud in clouds if len(cloud)
+                     if (plane := _floor(cloud.xyz, params)) is not None]).reshape(-1, 3)
 
 
 def mounted(recording: Recording) -> Recording:
@@ -75,18 +94,26 @@ def mounted(recording: Recording) -> Recording:
     show, the median, where they agree on another one than about KITTI's; else as it is."""
     if recording.mounted or recording.reopen is None:
         return recording
-    try:
-        clouds = [frame.load() for frame in islice(recording, FIRST)]
-    except InputError:  # a damaged cloud is named by who needs it
-        return recording
-    measured = [measured_height(cloud.xyz) for cloud in clouds if len(cloud)]
-    heights = [height for height in measured if height is not None]
-    if not heights or max(heights) - min(heights) > HEIGHT_TOLERANCE:
+    heights = -_floors(recording)[:, 2]
+    if not len(heights) or np.ptp(heights) > HEIGHT_TOLERANCE:
         return recording
     height = round(float(np.median(heights)), 2)
     if height < 0 or abs(height - SENSOR_HEIGHT) <= HEIGHT_TOLERANCE:
         return recording
     return recording.reopen(sensor_height=height)
+
+
+def lean_problem(recording: Recording) -> str | None:
+    """That the sensor of a recording leans, by its first clouds, with the remedy; None where they
+    are level, or less than two of them show it."""
+    floors = _floors(recording, STEEP)
+    if len(floors) < 2:
+        return None
+    lean = float(np.median(np.degrees(np.arctan(np.hypot(*floors[:, :2].T)))))
+    return None if lean <= MAX_LEAN else (
+        f"its sensor leans by {lean:.0f} degrees against the ground, where detectors take z as up; "
+        f"measure it with setup, and make a level bag with convert {recording.path} --robot "
+        "robot/robot.param.yaml --out level.bag")
 
 
 def height_problem(measured: float | None, pose: SensorPoseParams) -> str | None:

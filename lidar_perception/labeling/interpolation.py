@@ -15,8 +15,7 @@ import numpy as np
 
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.labeling.state import INTERPOLATED, KEY, PROPOSED, Box
-from lidar_perception.robot.poses import inverse
-from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.robot.poses import inverse, moved_boxes
 
 Array = np.ndarray[Any, Any]
 

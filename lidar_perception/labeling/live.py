@@ -22,9 +22,8 @@ from lidar_perception.labeling.results import (
     tracks_of,
     with_sources,
 )
-from lidar_perception.robot.poses import moved_points
+from lidar_perception.robot.poses import moved_boxes, moved_points
 from lidar_perception.robot.tree import Missing, TransformTree
-from lidar_perception.tracking.ego import moved_boxes
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_truth
 from lidar_perception.wire.track_markers import drawn_trails

@@ -23,9 +23,8 @@ from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.nodes.graph import relative
 from lidar_perception.nodes.runtime import JUMP_NS, LATCHED, MARKERS, RELIABLE, LidarNode
-from lidar_perception.robot.poses import inverse, moved_points
+from lidar_perception.robot.poses import inverse, moved_boxes, moved_points
 from lidar_perception.robot.tree import Missing
-from lidar_perception.tracking.ego import moved_boxes
 from lidar_perception.types import PEDESTRIAN, InputError
 from lidar_perception.wire.messages import calibrated, camera_of, to_truth
 from lidar_perception.wire.params import ViewParams

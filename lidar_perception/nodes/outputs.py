@@ -14,8 +14,7 @@ from lidar_perception.clustering.shapes import class_by_diagonal
 from lidar_perception.ground.above import obstacles
 from lidar_perception.nodes.runtime import CLOUD, MARKERS, OK, RELIABLE, WARN, LidarNode
 from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, has_detections_3d
-from lidar_perception.robot.poses import inverse
-from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.robot.poses import inverse, moved_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import detection_markers, thin_cloud

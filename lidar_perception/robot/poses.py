@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import InputError
 
 NOT_UNIT = 1e-2  # how far a quaternion's length may be from 1; drivers round
@@ -67,3 +68,12 @@ def moved_points(xyz: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """(N, 3) of the dtype of xyz (N, 3): points of the frame whose pose this is, in the frame of
     the pose."""
     return xyz @ pose[:3, :3].T.astype(xyz.dtype) + pose[:3, 3].astype(xyz.dtype)
+
+
+def moved_boxes(boxes: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """(K, 7) float64 boxes of the frame whose pose this is, in the frame of the pose."""
+    moved = np.array(boxes, np.float64).reshape(-1, 7)
+    flat = pose[:2, :2] @ np.array([np.cos(moved[:, 6]), np.sin(moved[:, 6])])
+    moved[:, :3] = moved[:, :3] @ pose[:3, :3].T + pose[:3, 3]
+    moved[:, 6] = wrap_angle(np.arctan2(flat[1], flat[0]))
+    return moved

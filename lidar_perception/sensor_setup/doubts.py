@@ -140,8 +140,7 @@ def _heading_doubts(m: Measured) -> list[str]:
         return [f"{found}: the frame is turned about z, unless it was driven backwards; if it is "
                 f"turned, set input.ahead to {h.degrees:.0f}"]
     return [f"{found}: input.ahead lets those of nodes look there; for commands that read the "
-            f"recording, turn the clouds by {-h.degrees:.0f} deg in the driver, or use detectors "
-            "that look all around (train --range around)"]
+            "recording, convert --robot robot.param.yaml makes a bag with x ahead"]
 
 
 def looks_elsewhere(h: Ahead) -> bool:

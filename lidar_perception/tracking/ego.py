@@ -14,7 +14,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.data.frame import Frame
-from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import InputError
 
 MAX_SPEED = 100.0   # m/s; a sensor that seems faster was put somewhere else
@@ -81,15 +80,6 @@ def jumped(ego: Ego, pose: np.ndarray, seconds: float) -> bool:
     """Whether a pose is so far from the last one that no sensor drives there in so many seconds."""
     apart = np.linalg.norm(np.asarray(pose, float)[:3, 3] - ego.pose[:3, 3])
     return ego.known and bool(apart > MAX_SPEED * (seconds + ego.missing) + 1.0)
-
-
-def moved_boxes(boxes: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """(K, 7) float64 boxes of the frame whose pose this is, in the frame of the pose."""
-    moved = np.array(boxes, np.float64).reshape(-1, 7)
-    flat = pose[:2, :2] @ np.array([np.cos(moved[:, 6]), np.sin(moved[:, 6])])
-    moved[:, :3] = moved[:, :3] @ pose[:3, :3].T + pose[:3, 3]
-    moved[:, 6] = wrap_angle(np.arctan2(flat[1], flat[0]))
-    return moved
 
 
 def best_source(wanted: str, there: Collection[str]) -> str:

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from lidar_perception.robot.poses import moved_boxes
 from lidar_perception.tracking import motion
-from lidar_perception.tracking.ego import Ego, jumped, moved_boxes, next_ego, usable
+from lidar_perception.tracking.ego import Ego, jumped, next_ego, usable
 from lidar_perception.tracking.existence import probability
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.state import States, Tracks

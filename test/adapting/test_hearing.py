@@ -12,8 +12,7 @@ from lidar_perception.adapting.judging import IGNORED, KEPT, REJECTED, judged
 from lidar_perception.adapting.looking import FrameLook
 from lidar_perception.adapting.tracks import tracks_of
 from lidar_perception.data.frame import Frame
-from lidar_perception.robot.poses import inverse
-from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.robot.poses import inverse, moved_boxes
 from lidar_perception.types import GroundTruth, LidarFrame
 
 TRUE = np.arange(len(KINDS)) != POST

@@ -13,8 +13,7 @@ from lidar_perception.adapting.judging import IGNORED, KEPT, REJECTED, judged
 from lidar_perception.adapting.labels import labels_of
 from lidar_perception.adapting.looking import seen_in
 from lidar_perception.adapting.tracks import tracks_of
-from lidar_perception.robot.poses import inverse
-from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.robot.poses import inverse, moved_boxes
 
 
 def judge(looks, stamps):

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from samples import DATA, needs_data
 from test_cloth import f1, street
 
+from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.open import open_recording
 from lidar_perception.ground.params import (
     GROUND_METHODS,
@@ -17,6 +20,7 @@ from lidar_perception.ground.params import (
 from lidar_perception.ground.segment import (
     METHODS,
     height_problem,
+    lean_problem,
     level,
     measured_height,
     segment_ground,
@@ -124,6 +128,17 @@ def test_the_height_of_the_sensor_is_measured(height):
     assert (height_problem(found, SensorPoseParams()) is None) == (height == 1.73)
     assert height_problem(found, SensorPoseParams(height=height)) is None
     assert abs(measured_height(xyz * np.float32([1, -1, -1])) + height) < 0.03
+
+
+@pytest.mark.parametrize("lean", [0, 3, 8, -20])
+def test_that_a_recordings_sensor_leans_is_said(lean):
+    pose = SensorPoseParams(pitch=np.radians(lean))
+    frames = [Frame.of(str(i), LidarFrame.of(level(street(i)[0], pose))) for i in range(4)]
+    said = lean_problem(Recording(Path("drive.bag"), "bag", frames))
+    assert (said is not None) == (abs(lean) > 5)
+    assert said is None or (f"by {abs(lean)} degrees" in said and "drive.bag --robot" in said)
+    assert lean_problem(Recording(Path("empty"), "bag", [Frame.of("0", LidarFrame.of(
+        np.zeros((0, 3))))])) is None
 
 
 def test_height_problems_name_the_remedy():

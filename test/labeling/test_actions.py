@@ -24,8 +24,7 @@ from lidar_perception.labeling.state import (
     track_from_json,
     track_to_json,
 )
-from lidar_perception.robot.poses import inverse
-from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.robot.poses import inverse, moved_boxes
 from lidar_perception.types import InputError
 
 FRAMES = 8

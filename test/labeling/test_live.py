@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from lidar_perception.labeling import live as rooms
 from lidar_perception.labeling.live import BOXES, LABELS, TRACKS, Live
 from lidar_perception.labeling.live_topics import box_topics, clouds_topic
-from lidar_perception.robot.poses import moved_points, pose_of
-from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.robot.poses import moved_boxes, moved_points, pose_of
 from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.track_markers import track_markers

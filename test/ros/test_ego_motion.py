@@ -16,8 +16,8 @@ from lidar_perception.nodes.ego import ICP_MS
 from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.runtime import MARKERS
 from lidar_perception.nodes.tracker import TrackerNode
-from lidar_perception.robot.poses import inverse
-from lidar_perception.tracking.ego import has_odometry, moved_boxes
+from lidar_perception.robot.poses import inverse, moved_boxes
+from lidar_perception.tracking.ego import has_odometry
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections
 from lidar_perception.wire.codec import bag_message, decode, encode

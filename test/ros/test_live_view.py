@@ -17,7 +17,7 @@ from test_robot_frames import mounted, transforms
 
 from lidar_perception.nodes.graph import SINGLE
 from lidar_perception.nodes.transforms import NO_TF, STATIC_QOS, has_tf
-from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.robot.poses import moved_boxes
 from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.messages import to_detections
 from lidar_perception.wire.transforms import TF_MESSAGE

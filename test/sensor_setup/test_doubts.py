@@ -98,7 +98,7 @@ def test_a_sector_that_never_returns_is_the_end_of_the_view():
 
 def test_a_frame_with_y_ahead_or_z_down_is_said():
     ahead = of(all_changed(turned([[0, -1, 0], [1, 0, 0], [0, 0, 1]])))
-    assert abs(ahead.heading.degrees - 90) < 3 and said(ahead, "90 deg", "by -90 deg in the driver")
+    assert abs(ahead.heading.degrees - 90) < 3 and said(ahead, "90 deg", "convert --robot")
     down = of(all_changed(turned(np.diag([1, -1, -1]))))
     assert abs(np.degrees(down.mount.roll)) == pytest.approx(175, abs=0.3)
     assert said(down, "upside down") and down.mount.height == pytest.approx(0.6, abs=0.02)

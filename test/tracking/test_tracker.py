@@ -8,8 +8,9 @@ from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, perso
 
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.param_fields import with_values
+from lidar_perception.robot.poses import moved_boxes
 from lidar_perception.tracking.association import FORBIDDEN, assigned, costs
-from lidar_perception.tracking.ego import Ego, moved_boxes, next_ego, usable
+from lidar_perception.tracking.ego import Ego, next_ego, usable
 from lidar_perception.tracking.existence import effective_looks
 from lidar_perception.tracking.params import AssociationParams, TrackingParams
 from lidar_perception.tracking.tracker import Tracker

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tracking_samples import START, TENTH, crowd, pose
 
-from lidar_perception.tracking.ego import moved_boxes
+from lidar_perception.robot.poses import moved_boxes
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.tracking.trails import TRAIL_POINTS, Trails
 from lidar_perception.types import CLASSES, Detections

@@ -1,0 +1,93 @@
+"""Clouds of a sensor that leans, and looks aside, as nodes with its parameter file see them."""
+
+import numpy as np
+import pytest
+from cli_samples import error_line, exit_of
+from samples import object_folder, walker_label
+from scipy.spatial.transform import Rotation
+
+from lidar_perception.camera import Calibration
+from lidar_perception.data.frame import Frame, PointTruth
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.robot.poses import pose_of
+from lidar_perception.types import GroundTruth, LidarFrame
+
+ROLL, PITCH, AHEAD = 3.0, -8.0, 130.0  # degrees
+# From the sensor's axes to level ones with x ahead
+UPRIGHT = Rotation.from_euler("z", -AHEAD, degrees=True) * Rotation.from_euler(
+    "xy", [ROLL, PITCH], degrees=True)
+BODY = np.array([[-0.3, 0.2, -0.4], [0.1, 0.0, 0.5]])
+MOUNT = f"""/**:
+  ros__parameters:
+    input: {{ahead: {AHEAD}}}
+    crop: {{body: [-0.5, -0.5, -0.5, 0.5, 0.5, 0.6]}}
+    ground:
+      sensor_pose: {{height: 0.9, roll: {np.radians(ROLL)}, pitch: {np.radians(PITCH)}}}
+"""
+LEVEL = np.random.default_rng(0).uniform([-20, -20, -0.9], [20, 20, 2], (500, 3))
+LEVEL = LEVEL[np.linalg.norm(LEVEL, axis=1) > 1]
+PERSON = np.array([9.0, 2.0, -0.05, 0.5, 0.6, 1.7, 0.7])
+CAMERA = Calibration(np.array([[700.0, 0, 600, 0], [0, 700, 180, 0], [0, 0, 1, 0]]),
+                     np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.1], [1, 0, 0, -0.3], [0, 0, 0, 1]]),
+                     1242, 375)
+
+
+def pose(i):
+    """Of a level sensor on its way."""
+    return pose_of([2.0 * i, 0.1 * i, 0.9], Rotation.from_euler("z", 0.1 * i).as_quat())
+
+
+def leaning():
+    """Frames of the sensor, with the robot's own returns as the first points."""
+    turn = np.eye(4)
+    turn[:3, :3] = UPRIGHT.as_matrix()
+    xyz = np.vstack([BODY, UPRIGHT.inv().apply(LEVEL)])
+    box = np.concatenate([UPRIGHT.inv().apply(PERSON[:3]), PERSON[3:6],
+                          [PERSON[6] + np.radians(AHEAD)]])
+    camera = Calibration(CAMERA.intrinsics, CAMERA.lidar_to_camera @ turn, CAMERA.width,
+                         CAMERA.height)
+    numbers = np.arange(len(xyz), dtype=np.uint16)
+    for i in range(3):
+        yield Frame.of(str(i), LidarFrame.of(xyz, np.linspace(0, 1, len(xyz), dtype=np.float32),
+                                             (i + 1) * 10**8, "front"),
+                       GroundTruth.of(box, [3]), camera, pose=lambda i=i: pose(i) @ turn,
+                       point_truth=lambda: PointTruth(numbers, numbers))
+
+
+def test_a_leaning_sensors_bag_becomes_level_with_all_that_belongs_to_it(tmp_path, monkeypatch):
+    write_bag(tmp_path / "leaning", leaning())
+    (tmp_path / "robot.yaml").write_text(MOUNT)
+    assert exit_of(monkeypatch, "convert", tmp_path / "leaning", "--robot", tmp_path / "robot.yaml",
+                   "--out", tmp_path / "level") == 0
+    recording = open_recording(tmp_path / "level")
+    assert len(recording) == 3
+    for i, frame in enumerate(recording):
+        cloud, truth, labels = frame.load(), frame.truth(), frame.point_truth()
+        np.testing.assert_allclose(cloud.xyz, LEVEL, atol=1e-4)
+        assert cloud.frame_id == "front_level" and labels.classes[0] == len(BODY)
+        np.testing.assert_allclose(truth.boxes[0, :6], PERSON[:6], atol=1e-4)
+        assert truth.boxes[0, 6] == pytest.approx(PERSON[6], abs=0.02)  # it was about another z
+        np.testing.assert_allclose(frame.camera().projection, CAMERA.camera().projection, atol=1e-3)
+        np.testing.assert_allclose(frame.pose(), pose(i), atol=1e-6)
+
+
+@pytest.mark.parametrize("content, more, words", [
+    (MOUNT.replace("0.9", "-9"), [], "ground.sensor_pose.height"),
+    ("[]", [], "is no parameter file"),
+    (MOUNT, ["--to", "openlabel"], "--robot is for a recording with its clouds"),
+])
+def test_what_cannot_be_used_is_said(content, more, words, tmp_path, monkeypatch, capsys):
+    write_bag(tmp_path / "bag", leaning())
+    (tmp_path / "robot.yaml").write_text(content)
+    assert exit_of(monkeypatch, "convert", tmp_path / "bag", "--robot", tmp_path / "robot.yaml",
+                   "--out", tmp_path / "out", *more) == 2
+    assert words in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_a_data_set_is_level_already(tmp_path, monkeypatch, capsys):
+    root = object_folder(tmp_path / "kitti", walker_label())
+    (tmp_path / "robot.yaml").write_text(MOUNT)
+    assert exit_of(monkeypatch, "convert", root, "--robot", tmp_path / "robot.yaml", "--out",
+                   tmp_path / "out") == 2
+    assert "has level clouds" in error_line(capsys)
