@@ -69,11 +69,16 @@ def mount(parent="base_link", pose=ON_BASE):
                                            transform("plate", "/lidar", 0, pose))
 
 
-def recorded(path, *parts):
+def point(stamp):
+    """A cloud of one point."""
+    return cloud_message(np.ones((3, 4)), stamp, "lidar")
+
+
+def recorded(path, *parts, cloud=point):
     """The frames of a bag with clouds of the frame lidar and these messages."""
     messages = [message for part in parts for message in part]
-    messages += [(POINTS, "sensor_msgs/msg/PointCloud2", stamp, cloud_message(
-        np.ones((3, 4)), stamp, "lidar")) for stamp in stamps()]
+    messages += [(POINTS, "sensor_msgs/msg/PointCloud2", stamp, cloud(stamp))
+                 for stamp in stamps()]
     with BagWriter(path) as bag:
         for topic, kind in dict.fromkeys((topic, kind) for topic, kind, *_ in messages):
             bag.add_topic(topic, kind)

@@ -37,13 +37,15 @@ LABELS = ("kitti_object", "kitti_tracking", "nuscenes_detection", "nuscenes_trac
               help="Clouds of a bag.  [default: /points, else the only ones]")
 @a_path("--robot", "robot.param.yaml that `setup` wrote, for a recording with a tilted or turned "
         "sensor: level its clouds, x ahead, without the robot's own returns, as nodes see them.")
+@click.option("--deskew", is_flag=True, help="Of a bag: move the points of each cloud to its "
+              "stamp, by its column of times and the odometry or TF of the bag.")
 @click.option("--images", is_flag=True, help="To a bag: include the left colour images, as PNG.")
 @split_option
 @limit_option
 @click.option("--force", is_flag=True, help="Replace what is there: a bag, or files of the same "
               "names.")
 def convert(source: Path, format: str, out: Path, data: Path | None, given: str | None,
-            detections: str | None, points: str, robot: Path | None, images: bool,
+            detections: str | None, points: str, robot: Path | None, deskew: bool, images: bool,
             split: Path | None, limit: int | None, force: bool) -> None:
     """The recording at PATH (KITTI, nuScenes, SemanticKITTI, a bag) to one MCAP bag, or to a folder
     of a data set with clouds, labels, poses and calibration, or only its labels to a format of
@@ -57,7 +59,7 @@ def convert(source: Path, format: str, out: Path, data: Path | None, given: str 
     \b
     Examples:
       lidar-perception convert /data/kitti/tracking --out tracking.bag
-      lidar-perception convert drive.bag --robot robot/robot.param.yaml --out level.bag
+      lidar-perception convert drive.bag --robot robot/robot.param.yaml --deskew --out level.bag
       lidar-perception convert drive --to kitti_tracking --out drive_kitti
       lidar-perception convert result --detections /fused_detector/output/detections \\
         --to kitti_object --out detected
@@ -67,8 +69,8 @@ def convert(source: Path, format: str, out: Path, data: Path | None, given: str 
     given_labels = data is not None or (format in LABELS and format not in (BAG, *DATASETS))
     for wrong, what in (
             (images and (given_labels or format != BAG), "--images is for --to bag"),
-            (robot is not None and (given_labels or detections is not None),
-             "--robot is for a recording with its clouds"),
+            ((robot is not None or deskew) and (given_labels or detections is not None),
+             "--robot and --deskew are for a recording with its clouds"),
             (given is not None and data is None, "--from says what labels PATH holds; give their "
                                                  "drive with --data"),
             (given is not None and detections is not None, "--detections is for a bag, --from for "
@@ -79,34 +81,55 @@ def convert(source: Path, format: str, out: Path, data: Path | None, given: str 
             raise click.UsageError(what)
     recording = opened(source if data is None else data, level=robot is None, split=split,
                        points=points)
+    seen = _seen(recording, robot, deskew)
     if given_labels:
         _labels(source, recording, format, out, given, data is not None, detections, limit, force)
     elif format == BAG and detections is None:
-        _bag(source, recording, _seen(recording, robot), out, images, limit, force)
+        _bag(source, recording, seen, out, images, limit, force)
     else:
-        _dataset(source, recording, _seen(recording, robot), format, out, detections, limit, force)
+        _dataset(source, recording, seen, format, out, detections, limit, force)
 
 
-def _seen(recording: Any, robot: Path | None) -> Callable[[Any], Any]:
+def _seen(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], Any]:
     """What makes of a frame what nodes with this parameter file see; nothing without one."""
-    if robot is None:
+    if file is None and not deskew:
         return lambda frame: frame
     if recording.mounted:
-        raise InputError(f"{recording.path} ({recording.layout}) has level clouds; --robot is for "
-                         "bags, .pcd and .bin files")
+        raise InputError(f"{recording.path} ({recording.layout}) has level clouds; --robot and "
+                         "--deskew are for bags, .pcd and .bin files")
+    from lidar_perception.data.levelled import Robot, levelled
+    robot = Robot()
+    if file is not None:
+        robot, asked = _robot(file)
+        deskew = deskew or asked
+    if not deskew:
+        return partial(levelled, robot=robot)
+    from lidar_perception.data.bag_frames import recognises
+    from lidar_perception.data.bag_poses import BagPoses
+    if not recognises(recording.path):
+        raise InputError(f"{recording.path} is no bag, so that nothing says how its sensor moved, "
+                         "which --deskew needs")
+    first = recording.frames[len(recording) // 2]
+    poses = BagPoses(recording.path, first.load().frame_id).at
+    levelled(first, robot, poses).load()  # what lacks in all of them is said at once
+    return partial(levelled, robot=robot, poses=poses)
+
+
+def _robot(file: Path) -> tuple[Any, bool]:
+    """The data.levelled.Robot of a parameter file, and whether it asks for deskewing."""
     from lidar_perception.candidates.params import PipelineParams
     from lidar_perception.cli.options import read_config
-    from lidar_perception.data.levelled import levelled
+    from lidar_perception.data.levelled import Robot
     from lidar_perception.param_fields import with_values
     from lidar_perception.params import CloudNodeParams
     try:
-        params, node = (with_values(known, read_config(robot, known))
+        params, node = (with_values(known, read_config(file, known))
                         for known in (PipelineParams(), CloudNodeParams()))
     except ValueError as error:
-        raise InputError(f"{robot}: {error}") from None
+        raise InputError(f"{file}: {error}") from None
     pose = params.ground.sensor_pose
-    return partial(levelled, height=pose.height, roll=pose.roll, pitch=pose.pitch,
-                   ahead=math.radians(node.input.ahead), crop=params.crop)
+    return Robot(pose.height, pose.roll, pose.pitch, math.radians(node.input.ahead), params.crop,
+                 params.input.intensity_max), node.input.deskew != "off"
 
 
 def _bag(source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, images: bool,

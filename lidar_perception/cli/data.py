@@ -111,7 +111,7 @@ def walk_options(data: Callable = data_option) -> Callable:
 def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     """The recording at a path, see data.open.open_recording; says in a line what it is. The height
     of a sensor that the recording does not say is measured, unless it is about KITTI's; where it is
-    to be level and leans, that is said."""
+    to be level and leans, or its intensities have no known scale, that is said."""
     from lidar_perception.data.open import open_recording
     recording = open_recording(data, **how)
     errors.print(escape(str(recording)), soft_wrap=True, style="dim")
@@ -123,9 +123,19 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
         height = next(iter(measured)).sensor_height
         errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds",
                      soft_wrap=True, style="dim")
-    if level and (problem := lean_problem(recording)):
-        errors.print(escape(problem), soft_wrap=True, style="yellow")
+    if level:
+        for problem in filter(None, (lean_problem(recording), _intensity_problem(recording))):
+            errors.print(escape(problem), soft_wrap=True, style="yellow")
     return measured
+
+
+def _intensity_problem(recording: Any) -> str | None:
+    from lidar_perception.wire.messages import intensity_problem
+    try:
+        problem = intensity_problem(next(iter(recording)).load())
+    except InputError:  # who needs the cloud says it
+        return None
+    return problem and f"{recording.path}: {problem}, and use convert --robot"
 
 
 def write_json(path: Path | None, content: dict) -> None:

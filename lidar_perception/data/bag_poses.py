@@ -53,14 +53,19 @@ class BagPoses:
 
     def __call__(self, stamp_ns: int) -> np.ndarray | None:
         """(4, 4) at a time; None where it is not known then."""
-        at = np.array([stamp_ns])
         try:
-            if self.odometry:
-                return self.carrier_pose(stamp_ns) @ self._on_carrier(at)
-            return self._tree.poses(self.fixed, self.frame_id, at, MAX_GAP)[0] if self.fixed else (
-                None)
+            return self.at(np.array([stamp_ns]))[0]
         except Missing:
             return None
+
+    def at(self, times: np.ndarray) -> np.ndarray:
+        """(M, 4, 4) at times (M,) ns, M > 0. Missing where it is not known then."""
+        if self.odometry:
+            return self._carrier_poses(times) @ self._on_carrier(times)
+        if not self.fixed:
+            raise Missing(f"{self.path} has neither odometry nor a TF in which "
+                          f"'{self.frame_id}' moves; record one of them")
+        return self._tree.poses(self.fixed, self.frame_id, times, MAX_GAP)
 
     @cached_property
     def known(self) -> bool:
@@ -107,15 +112,19 @@ class BagPoses:
 
     def carrier_pose(self, stamp_ns: int) -> np.ndarray:
         """(4, 4): that of the odometry. Missing where it is not known then."""
-        return self._odometry.lookup(STILL, MOVING, stamp_ns, MAX_GAP)
+        return self._carrier_poses(np.array([stamp_ns]))[0]
 
-    def _on_carrier(self, at: np.ndarray) -> np.ndarray:
-        """(4, 4): where on the carrier the sensor is; as if in one place where TF does not say."""
+    def _carrier_poses(self, times: np.ndarray) -> np.ndarray:
+        return self._odometry.poses(STILL, MOVING, times, MAX_GAP)
+
+    def _on_carrier(self, times: np.ndarray) -> np.ndarray:
+        """(4, 4), or (M, 4, 4) where it moves on it: where on the carrier the sensor is at times
+        (M,) ns; as if in one place where TF does not say."""
         if self.carrier == self.frame_id or self.carrier not in self._above:
             return np.eye(4)
         if (pose := self.mounted(self.carrier)) is not None:
             return pose
-        return self._tree.poses(self.carrier, self.frame_id, at, MAX_GAP)[0]
+        return self._tree.poses(self.carrier, self.frame_id, times, MAX_GAP)
 
     @cached_property
     def _odometry(self) -> TransformTree:

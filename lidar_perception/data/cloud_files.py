@@ -52,7 +52,8 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     stamps = said or [START_NS + i * PERIOD_NS for i in range(len(files))]
     kinds = " and ".join(sorted({file.suffix for file in files}))
     return Recording(path, f"{kinds} clouds, {'times' if said else 'no times'} in their names",
-                     [Frame(name, stamp, partial(_load, file, stamp), index=i, points=file)
+                     [Frame(name, stamp, partial(_load, file, stamp), index=i, points=file,
+                            native=partial(to_message, file, stamp))
                       for i, (name, stamp, file) in enumerate(zip(names, stamps, files))],
                      mounted=False)
 

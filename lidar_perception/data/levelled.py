@@ -1,8 +1,9 @@
-"""The frames of a robot's sensor as detectors are to see them: level, x ahead, without itself."""
+"""The frames of a robot's sensor as its nodes see them: level, x ahead, without the robot."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,37 +14,64 @@ from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placing import levelling, tilted
 from lidar_perception.robot.poses import inverse, moved_boxes, moved_points
 from lidar_perception.types import GroundTruth, LidarFrame
+from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.point_times import moved_to_stamp
 from lidar_perception.wire.topics import LIDAR_FRAME
 
 
-def levelled(frame: Frame, height: float, roll: float = 0.0, pitch: float = 0.0,
-             ahead: float = 0.0, crop: CropParams = CropParams()) -> Frame:
-    """The frame as a level sensor at the same place, height metres above the ground, would give it
-    with x ahead, as nodes see it. roll, pitch: of the sensor, rad, as a URDF's rpy; ahead: rad
-    counter-clockwise from its x axis; the crop is in its own coordinates.
+@dataclass(frozen=True)
+class Robot:
+    """How a sensor is mounted and read, as the parameters of nodes have it. height: metres above
+    the ground, None what the recording says; roll, pitch: of the sensor, as a URDF's rpy, and
+    ahead: counter-clockwise from its x axis, rad; crop: in the sensor's coordinates;
+    intensity_max: see wire.messages.to_frame."""
 
-    Labels, camera and pose move along; boxes stay upright. The frame_id is the sensor's with _level
-    behind it."""
-    level = levelling(tilted(roll, pitch), ahead)
-    if level is None:
-        level = np.eye(4)
-    back = inverse(level)
+    height: float | None = None
+    roll: float = 0.0
+    pitch: float = 0.0
+    ahead: float = 0.0
+    crop: CropParams = CropParams()
+    intensity_max: float = 0.0
+
+
+def levelled(frame: Frame, robot: Robot,
+             poses: Callable[[np.ndarray], np.ndarray] | None = None) -> Frame:
+    """A frame of a bag or a file, whose native() gives its message, as a level sensor at the same
+    place would give it, with x ahead. Labels, camera and pose move along; boxes stay upright. Where
+    anything is turned the frame_id has _level behind it.
+
+    poses: of the sensor (M, 4, 4) at times (M,) ns; with them points are moved to the stamp first,
+    as input.deskew does. InputError of load() where one of these is not known, or the cloud has no
+    times."""
+    level = levelling(tilted(robot.roll, robot.pitch), robot.ahead)
+    back = np.eye(4) if level is None else inverse(level)
+
+    def read() -> tuple[np.ndarray, LidarFrame]:
+        """indices of the points that are kept, and these."""
+        message = frame.native()
+        scan, indices = to_frame(message, robot.intensity_max)
+        kept, scan = cropped(scan, robot.crop)
+        if poses is not None:
+            scan = moved_to_stamp(message, scan, indices.take(kept), poses)
+        return kept, scan
 
     def load() -> LidarFrame:
-        scan = cropped(frame.load(), crop)[1]
-        return replace(scan, xyz=moved_points(scan.xyz, level),
-                       frame_id=f"{scan.frame_id or LIDAR_FRAME}_level")
+        scan = read()[1]
+        return scan if level is None else replace(
+            scan, xyz=moved_points(scan.xyz, level),
+            frame_id=f"{scan.frame_id or LIDAR_FRAME}_level")
 
     def point_truth() -> PointTruth | None:
         labels = frame.point_truth()
-        if labels is None or not crop.enabled:
+        if labels is None or not robot.crop.enabled:
             return labels
-        kept = cropped(frame.load(), crop)[0]
+        kept, _ = read()
         return PointTruth(labels.classes[kept], labels.instances[kept])
 
     def truth() -> GroundTruth | None:
         labels = frame.truth()
-        return None if labels is None else replace(labels, boxes=moved_boxes(labels.boxes, level))
+        return labels if labels is None or level is None else replace(
+            labels, boxes=moved_boxes(labels.boxes, level))
 
     def calibration() -> Calibration | None:
         camera = frame.calibration()
@@ -54,5 +82,6 @@ def levelled(frame: Frame, height: float, roll: float = 0.0, pitch: float = 0.0,
         at = frame.pose()
         return None if at is None else at @ back
 
+    height = frame.sensor_height if robot.height is None else robot.height
     return replace(frame, load=load, truth=truth, point_truth=point_truth, calibration=calibration,
                    pose=pose, sensor_height=height, points=None, native=None)

@@ -17,14 +17,13 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.nodes.reception import WARN, Problem
 from lidar_perception.robot.crop import cropped
-from lidar_perception.robot.deskew import deskewed
 from lidar_perception.robot.placing import Placing, levelling, tilted
 from lidar_perception.robot.poses import inverse
 from lidar_perception.robot.tree import Missing, TransformTree
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_frame
-from lidar_perception.wire.point_times import moved_cloud, point_times
+from lidar_perception.wire.point_times import corrected, moved_cloud
 from lidar_perception.wire.topics import TF, TF_STATIC
 from lidar_perception.wire.transforms import (
     MOVING,
@@ -276,20 +275,13 @@ class Transforms:
             _, base = self.mounted(self.node.params, self.placing(msg.header))
             kept, frame = cropped(frame, crop, base)
             indices = indices.take(kept)
-        if not len(indices):
+        found = corrected(msg, frame, indices, lambda at: self.sensor_poses(
+            self.node.robot.input.deskew, frame.frame_id, at))
+        if found is None:
             return msg
-        times = point_times(msg, indices)
-        if not times.seconds.any():
-            return msg  # corrected already
-        if np.isnan(times.seconds).any():
-            kept = np.flatnonzero(np.isfinite(times.seconds))
-            indices, frame = indices.take(kept), frame.take(kept)
-            times = times._replace(seconds=times.seconds.take(kept))
+        known, moved, times = found
         self.sweep = float(times.seconds.max())
-        moved = deskewed(frame.xyz, times.seconds, lambda at: self.sensor_poses(
-            self.node.robot.input.deskew, frame.frame_id,
-            frame.stamp_ns + np.rint(at * SECOND).astype(np.int64)))
-        return moved_cloud(msg, bag_message, indices, moved, times)
+        return moved_cloud(msg, bag_message, indices.take(known), moved, times)
 
     # For the diagnostics
 

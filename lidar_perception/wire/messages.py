@@ -25,6 +25,8 @@ from msg_utils.point_cloud2 import CloudError, columns, from_array, to_array, xy
 from msg_utils.stamps import to_ns
 
 MAX_ID = 2**31  # a marker's id is an int32
+FLOAT_SCALES = ((1.5, 1.0), (255.0, 255.0), (np.inf, 65535.0))  # up to here: a full reflection
+DARK, MANY = 0.05, 1000  # no intensity of so many points beyond this: the scale is another one
 INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # the first that the cloud has
 
 
@@ -32,8 +34,8 @@ def to_frame(msg: Any, intensity_max: float | None = None) -> tuple[LidarFrame, 
     """The usable points of a PointCloud2 and their indices (N,) in the cloud; if the cloud has a
     column in_view, only the points where it is not 0. InputError for a broken cloud.
 
-    intensity_max: the value that means 1; 0 takes the largest value of an integer field, and 1
-    for a float field; None does not read intensity.
+    intensity_max: the value that means 1; 0 takes the largest value of an integer field, and of a
+    float field 1, 255 or 65535, by the greatest value in it; None does not read intensity.
     """
     try:
         points = to_array(msg)
@@ -60,19 +62,26 @@ def _intensity(points: np.ndarray, full: float) -> np.ndarray | None:
     name = next((n for n in INTENSITY_FIELDS if n in (points.dtype.names or ())), None)
     if name is None:
         return None
+    values = columns(points, (name,))[:, 0]
     if full == 0.0:
         kind = points.dtype[name]
-        full = np.iinfo(kind).max if kind.kind in "iu" else 1.0
-    return columns(points, (name,))[:, 0] / np.float32(full)
+        full = np.iinfo(kind).max if kind.kind in "iu" else _scale_of(values)
+    return values / np.float32(full)
+
+
+def _scale_of(values: np.ndarray) -> float:
+    """What a full reflection is in a float field with these values (N,)."""
+    greatest = np.max(values, where=np.isfinite(values), initial=0.0)
+    return next((scale for most, scale in FLOAT_SCALES if greatest <= most), FLOAT_SCALES[-1][1])
 
 
 def intensity_problem(frame: LidarFrame) -> str | None:
     """What is wrong with the scale of the intensity, with the remedy; None if nothing is."""
     largest = 0.0 if frame.intensity is None else float(frame.intensity.max(initial=0.0))
-    if largest <= 1.5:
+    if largest <= 1.5 and (largest == 0.0 or largest >= DARK or len(frame) < MANY):
         return None
-    return (f"intensity goes up to {largest:g} where 1 is expected; set input.intensity_max "
-            "(255 for most drivers)")
+    return (f"intensity goes up to {largest:.2g} where 1 is expected; set input.intensity_max "
+            "(255 for most drivers; setup measures it)")
 
 
 def spread(values: np.ndarray | int, indices: np.ndarray, msg: Any, dtype: str) -> np.ndarray:

@@ -13,7 +13,8 @@ class InputParams(Params):
 
     intensity_max: float = param(
         0.0, "The intensity of a full reflection: 1 for KITTI, 255 for Velodyne and nuScenes. 0 "
-        "takes the largest value of an integer field, and 1 for a float field.",
+        "takes the largest value of an integer field, and of a float field 1, 255 or 65535, by the "
+        "greatest value of each cloud.",
         low=0.0, high=1e9)
 
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidar_perception.types import InputError
+from lidar_perception.robot.deskew import deskewed
+from lidar_perception.types import InputError, LidarFrame
 from msg_utils.point_cloud2 import CloudError, add_columns, to_array
-from msg_utils.stamps import to_ns
+from msg_utils.stamps import SECOND, to_ns
 
 # As Ouster, Velodyne, Hesai and RoboSense, Autoware and Livox call it; the first that is there.
 NAMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
@@ -16,6 +19,8 @@ UNITS_NS = (10**9, 10**6, 10**3, 1)
 SWEEP = 2e-3, 1.0   # seconds that a turn takes: by these the unit is told from the others
 SINCE_1970_NS = 1e18  # later than 2001
 MAX_OFFSET = 1.0    # seconds between a point and the stamp of its cloud
+
+Poses = Callable[[np.ndarray], np.ndarray]
 
 
 class PointTimes(NamedTuple):
@@ -71,6 +76,33 @@ def _unit_ns(span: float, whole: bool, low: float) -> int:
         if SWEEP[0] <= span * unit * 1e-9 <= SWEEP[1]:
             return unit
     return 1 if whole else 10**9  # a part of a turn, or one moment
+
+
+def corrected(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: Poses
+              ) -> tuple[np.ndarray, np.ndarray, PointTimes] | None:
+    """Of the N points of a frame, which are those of a PointCloud2 at indices (N,): which of them
+    (M,) have a time, these (M, 3) moved to the stamp, and their times; None where all times are
+    those of the stamp already, and of no points. poses: of the sensor (K, 4, 4), in any frame that
+    does not move, at times (K,) ns."""
+    if not len(indices):
+        return None
+    times = point_times(msg, indices)
+    if not times.seconds.any():
+        return None
+    known = np.flatnonzero(np.isfinite(times.seconds))
+    times = times._replace(seconds=times.seconds.take(known))
+    moved = deskewed(frame.xyz.take(known, axis=0), times.seconds, lambda at: poses(
+        frame.stamp_ns + np.rint(at * SECOND).astype(np.int64)))
+    return known, moved, times
+
+
+def moved_to_stamp(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: Poses) -> LidarFrame:
+    """The frame with its points moved to its stamp, see corrected(); those without a time stay."""
+    if (found := corrected(msg, frame, indices, poses)) is None:
+        return frame
+    xyz = frame.xyz.copy()
+    xyz[found[0]] = found[1]
+    return replace(frame, xyz=xyz)
 
 
 def moved_cloud(msg: Any, make: Any, indices: np.ndarray, moved: np.ndarray,

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from cli_samples import error_line, exit_of
+from robot_bags import CLOUDS, ON_BASE, base_at, mount, moving, moving_tf, point, recorded, stamps
 from samples import object_folder, walker_label
 from scipy.spatial.transform import Rotation
 
@@ -10,8 +11,11 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.robot.poses import pose_of
+from lidar_perception.robot.poses import inverse, pose_of
+from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.types import GroundTruth, LidarFrame
+from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.topics import ODOMETRY
 
 ROLL, PITCH, AHEAD = 3.0, -8.0, 130.0  # degrees
 # From the sensor's axes to level ones with x ahead
@@ -72,10 +76,46 @@ def test_a_leaning_sensors_bag_becomes_level_with_all_that_belongs_to_it(tmp_pat
         np.testing.assert_allclose(frame.pose(), pose(i), atol=1e-6)
 
 
+WORLD = np.random.default_rng(1).uniform(-20, 20, (400, 3)) + [1, 0, 0]
+
+
+def in_motion(stamp):
+    """The cloud of a turn of 0.1 s, of things that stand."""
+    seconds = np.linspace(0, 0.1, len(WORLD))
+    seen = [inverse(base_at(stamp + t * 1e9) @ ON_BASE) @ [*point, 1]
+            for point, t in zip(WORLD, seconds)]
+    return cloud_message(np.array(seen)[:, :3], stamp, "lidar", time=seconds.astype(np.float32))
+
+
+@pytest.mark.parametrize("moves", [moving(ODOMETRY), moving_tf()], ids=["odometry", "TF"])
+def test_a_bags_clouds_are_moved_to_their_stamps(moves, tmp_path, monkeypatch):
+    recorded(tmp_path / "robot", list(moves), mount(), cloud=in_motion)
+    assert exit_of(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out",
+                   tmp_path / "still") == 0
+    for i, frame in enumerate(open_recording(tmp_path / "still")):
+        there = inverse(base_at(stamps()[i]) @ ON_BASE)
+        expected = WORLD @ there[:3, :3].T + there[:3, 3]
+        np.testing.assert_allclose(frame.load().xyz, expected, atol=0.01)
+        blurred = to_frame(in_motion(stamps()[i]))[0].xyz
+        assert np.abs(blurred - expected).max() > 0.4
+    assert i == CLOUDS - 1
+
+
+@pytest.mark.parametrize("parts, cloud, words", [
+    ([moving(ODOMETRY), mount()], point, "no column of times"),
+    ([], in_motion, "neither odometry nor a TF"),
+], ids=["no times", "no poses"])
+def test_what_deskewing_lacks_is_said(parts, cloud, words, tmp_path, monkeypatch, capsys):
+    recorded(tmp_path / "robot", *map(list, parts), cloud=cloud)
+    assert exit_of(monkeypatch, "convert", tmp_path / "robot", "--deskew", "--out",
+                   tmp_path / "out") == 2
+    assert words in error_line(capsys) and not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("content, more, words", [
     (MOUNT.replace("0.9", "-9"), [], "ground.sensor_pose.height"),
     ("[]", [], "is no parameter file"),
-    (MOUNT, ["--to", "openlabel"], "--robot is for a recording with its clouds"),
+    (MOUNT, ["--to", "openlabel"], "are for a recording with its clouds"),
 ])
 def test_what_cannot_be_used_is_said(content, more, words, tmp_path, monkeypatch, capsys):
     write_bag(tmp_path / "bag", leaning())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from samples import CALIBRATION, each_make, header
@@ -15,6 +17,7 @@ from lidar_perception.wire.messages import (
     column,
     detection_markers,
     extrinsics,
+    intensity_problem,
     to_frame,
 )
 from lidar_perception.wire.topics import CAMERA_FRAME
@@ -124,3 +127,20 @@ def test_a_column_with_more_than_one_number_a_point_is_named(make, name):
     msg = from_array(np.ones(3, kind), header(make), make)
     with pytest.raises(InputError, match=f"'{name}' has count > 1"):
         column(msg, name, to_frame(msg)[1])
+
+
+@pytest.mark.parametrize("kind, full", [("<f4", 1), ("<f4", 255), ("<f8", 65535), ("u1", 255),
+                                        ("<u2", 65535)])
+def test_the_same_intensities_are_read_in_every_drivers_scale(kind, full):
+    said = np.random.default_rng(0).uniform(0, 1, 3000) ** 3
+    said[0] = 1.0
+    points = np.ones(len(said), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", kind)])
+    points["intensity"] = np.round(said * full) if full > 1 else said
+    read = to_frame(from_array(points, header(bag_message), bag_message), 0.0)[0]
+    np.testing.assert_allclose(read.intensity, said, atol=0.5 / 255)
+    assert read.intensity.dtype == np.float32 and intensity_problem(read) is None
+    points["intensity"] = points["intensity"] * 0.02  # of a scale that no driver has
+    dark = to_frame(from_array(points, header(bag_message), bag_message), float(full))[0]
+    assert "input.intensity_max" in intensity_problem(dark)
+    assert "input.intensity_max" in intensity_problem(replace(dark, intensity=read.intensity * 2))
+    assert intensity_problem(dark.take(np.arange(100))) is None
