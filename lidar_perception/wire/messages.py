@@ -58,11 +58,14 @@ def to_frame(msg: Any, intensity_max: float | None = None) -> tuple[LidarFrame, 
 
 
 def _intensity(points: np.ndarray, full: float) -> np.ndarray | None:
-    """(N,) float32, 1 where the field has the value `full`; None without such a field."""
+    """(N,) float32, 1 where the field has the value `full`, 0 where it is not finite; None without
+    such a field."""
     name = next((n for n in INTENSITY_FIELDS if n in (points.dtype.names or ())), None)
     if name is None:
         return None
     values = columns(points, (name,))[:, 0]
+    if not (finite := np.isfinite(values)).all():
+        values = np.where(finite, values, np.float32(0))
     if full == 0.0:
         kind = points.dtype[name]
         full = np.iinfo(kind).max if kind.kind in "iu" else _scale_of(values)
@@ -70,8 +73,8 @@ def _intensity(points: np.ndarray, full: float) -> np.ndarray | None:
 
 
 def _scale_of(values: np.ndarray) -> float:
-    """What a full reflection is in a float field with these values (N,)."""
-    greatest = np.max(values, where=np.isfinite(values), initial=0.0)
+    """What a full reflection is in a float field with these finite values (N,)."""
+    greatest = values.max(initial=0.0)
     return next((scale for most, scale in FLOAT_SCALES if greatest <= most), FLOAT_SCALES[-1][1])
 
 

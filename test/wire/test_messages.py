@@ -139,6 +139,10 @@ def test_the_same_intensities_are_read_in_every_drivers_scale(kind, full):
     read = to_frame(from_array(points, header(bag_message), bag_message), 0.0)[0]
     np.testing.assert_allclose(read.intensity, said, atol=0.5 / 255)
     assert read.intensity.dtype == np.float32 and intensity_problem(read) is None
+    if np.dtype(kind).kind == "f":
+        points["intensity"][1:4] = np.nan, np.inf, -np.inf
+        odd = to_frame(from_array(points, header(bag_message), bag_message), 0.0)[0].intensity
+        assert not odd[1:4].any() and np.array_equal(odd[4:], read.intensity[4:])
     points["intensity"] = points["intensity"] * 0.02  # of a scale that no driver has
     dark = to_frame(from_array(points, header(bag_message), bag_message), float(full))[0]
     assert "input.intensity_max" in intensity_problem(dark)
