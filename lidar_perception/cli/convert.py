@@ -127,6 +127,9 @@ def _robot(file: Path) -> tuple[Any, bool]:
                         for known in (PipelineParams(), CloudNodeParams()))
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
+    if params == PipelineParams() and node == CloudNodeParams():
+        raise InputError(f"{file} says nothing of how the sensor is mounted; setup writes such a "
+                         "file")
     pose = params.ground.sensor_pose
     return Robot(pose.height, pose.roll, pose.pitch, math.radians(node.input.ahead), params.crop,
                  params.input.intensity_max), node.input.deskew != "off"

@@ -89,9 +89,11 @@ def corrected(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: Poses
     times = point_times(msg, indices)
     if not times.seconds.any():
         return None
-    known = np.flatnonzero(np.isfinite(times.seconds))
-    times = times._replace(seconds=times.seconds.take(known))
-    moved = deskewed(frame.xyz.take(known, axis=0), times.seconds, lambda at: poses(
+    known, xyz = np.flatnonzero(np.isfinite(times.seconds)), frame.xyz
+    if len(known) < len(frame):
+        times = times._replace(seconds=times.seconds.take(known))
+        xyz = xyz.take(known, axis=0)
+    moved = deskewed(xyz, times.seconds, lambda at: poses(
         frame.stamp_ns + np.rint(at * SECOND).astype(np.int64)))
     return known, moved, times
 
