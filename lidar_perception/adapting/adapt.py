@@ -45,7 +45,7 @@ from lidar_perception.classes import CLASSES
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.ground.segment import lean_problem, mounted
+from lidar_perception.ground.segment import mount_problem, mounted
 from lidar_perception.runs.files import make_folder, read_text, write_bytes, write_text
 from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import duration, errors, track
@@ -112,7 +112,7 @@ class Adapting:
         if recorded_source(self.frames[0].pose() is not None) == NO_SOURCE:
             raise InputError(f"{data} has no poses, and to find them by the scans needs kiss-icp; "
                              "pip install 'lidar_perception[odometry]'")
-        for line in filter(None, (*checked(self.frames, data), lean_problem(recording))):
+        for line in filter(None, (*checked(self.frames, data), mount_problem(recording))):
             errors.print(line, soft_wrap=True)
         self.network = network_to_train(self.header)
         # All sources with weights, opened once while these are looked with.

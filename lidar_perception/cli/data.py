@@ -117,14 +117,14 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     errors.print(escape(str(recording)), soft_wrap=True, style="dim")
     if recording.mounted:
         return recording
-    from lidar_perception.ground.segment import lean_problem, mounted
+    from lidar_perception.ground.segment import mount_problem, mounted
     measured = mounted(recording)
     if measured is not recording:
         height = next(iter(measured)).sensor_height
         errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds",
                      soft_wrap=True, style="dim")
     if level:
-        for problem in filter(None, (lean_problem(recording), _intensity_problem(recording))):
+        for problem in filter(None, (mount_problem(recording), _intensity_problem(recording))):
             errors.print(escape(problem), soft_wrap=True, style="yellow")
     return measured
 

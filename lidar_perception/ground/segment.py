@@ -103,17 +103,20 @@ def mounted(recording: Recording) -> Recording:
     return recording.reopen(sensor_height=height)
 
 
-def lean_problem(recording: Recording) -> str | None:
-    """That the sensor of a recording leans, by its first clouds, with the remedy; None where they
-    are level, or less than two of them show it."""
+def mount_problem(recording: Recording) -> str | None:
+    """That the sensor of a recording leans, or is upside down, by its first clouds, with the
+    remedy; None where it is level, or less than two of them show it."""
     floors = _floors(recording, STEEP)
     if len(floors) < 2:
         return None
+    height = -float(np.median(floors[:, 2]))
     lean = float(np.median(np.degrees(np.arctan(np.hypot(*floors[:, :2].T)))))
-    return None if lean <= MAX_LEAN else (
-        f"its sensor leans by {lean:.0f} degrees against the ground, where detectors take z as up; "
-        f"measure it with setup, and make a level bag with convert {recording.path} --robot "
-        "robot/robot.param.yaml --out level.bag")
+    if height >= 0 and lean <= MAX_LEAN:
+        return None
+    seems = (f"its sensor leans by {lean:.0f} degrees against the ground" if height >= 0 else
+             f"the ground seems to be {-height:.2f} m above its sensor: it is upside down")
+    return (f"{seems}, where detectors take z as up; measure it with setup, and make a level bag "
+            f"with convert {recording.path} --robot robot/robot.param.yaml --out level.bag")
 
 
 def height_problem(measured: float | None, pose: SensorPoseParams) -> str | None:

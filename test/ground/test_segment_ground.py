@@ -20,9 +20,9 @@ from lidar_perception.ground.params import (
 from lidar_perception.ground.segment import (
     METHODS,
     height_problem,
-    lean_problem,
     level,
     measured_height,
+    mount_problem,
     segment_ground,
 )
 from lidar_perception.types import LidarFrame
@@ -134,10 +134,10 @@ def test_the_height_of_the_sensor_is_measured(height):
 def test_that_a_recordings_sensor_leans_is_said(lean):
     pose = SensorPoseParams(pitch=np.radians(lean))
     frames = [Frame.of(str(i), LidarFrame.of(level(street(i)[0], pose))) for i in range(4)]
-    said = lean_problem(Recording(Path("drive.bag"), "bag", frames))
+    said = mount_problem(Recording(Path("drive.bag"), "bag", frames))
     assert (said is not None) == (abs(lean) > 5)
     assert said is None or (f"by {abs(lean)} degrees" in said and "drive.bag --robot" in said)
-    assert lean_problem(Recording(Path("empty"), "bag", [Frame.of("0", LidarFrame.of(
+    assert mount_problem(Recording(Path("empty"), "bag", [Frame.of("0", LidarFrame.of(
         np.zeros((0, 3))))])) is None
 
 
