@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +9,7 @@ import numpy as np
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.robot.crop import cropped
+from lidar_perception.robot.deskew import Poses
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placing import levelling, tilted
 from lidar_perception.robot.poses import inverse, moved_boxes, moved_points
@@ -34,8 +34,7 @@ class Robot:
     intensity_max: float = 0.0
 
 
-def levelled(frame: Frame, robot: Robot,
-             poses: Callable[[np.ndarray], np.ndarray] | None = None) -> Frame:
+def levelled(frame: Frame, robot: Robot, poses: Poses | None = None) -> Frame:
     """A frame of a bag or a file, whose native() gives its message, as a level sensor at the same
     place would give it, with x ahead. Labels, camera and pose move along; boxes stay upright. Where
     anything is turned the frame_id has _level behind it.

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from lidar_perception.robot.deskew import deskewed
+from lidar_perception.robot.deskew import Poses, deskewed
 from lidar_perception.types import InputError, LidarFrame
 from msg_utils.point_cloud2 import CloudError, add_columns, to_array
 from msg_utils.stamps import SECOND, to_ns
@@ -19,8 +18,6 @@ UNITS_NS = (10**9, 10**6, 10**3, 1)
 SWEEP = 2e-3, 1.0   # seconds that a turn takes: by these the unit is told from the others
 SINCE_1970_NS = 1e18  # later than 2001
 MAX_OFFSET = 1.0    # seconds between a point and the stamp of its cloud
-
-Poses = Callable[[np.ndarray], np.ndarray]
 
 
 class PointTimes(NamedTuple):

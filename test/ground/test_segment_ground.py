@@ -137,6 +137,8 @@ def test_that_a_recordings_sensor_leans_is_said(lean):
     said = mount_problem(Recording(Path("drive.bag"), "bag", frames))
     assert (said is not None) == (abs(lean) > 5)
     assert said is None or (f"by {abs(lean)} degrees" in said and "drive.bag --robot" in said)
+    down = [Frame.of(f.name, LidarFrame(f.load().xyz * np.float32([1, -1, -1]))) for f in frames]
+    assert "upside down" in mount_problem(Recording(Path("drive.bag"), "bag", down))
     assert mount_problem(Recording(Path("empty"), "bag", [Frame.of("0", LidarFrame.of(
         np.zeros((0, 3))))])) is None
 
