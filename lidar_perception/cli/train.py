@@ -168,9 +168,13 @@ def tell(progress: Any, steps: int, batches: Any, out: Path) -> None:
     if progress.best is not None:
         console.print(f"{out / 'best.safetensors'}: score {progress.best:.2f} at step "
                       f"{progress.best_step}", soft_wrap=True)
+    if progress.left_out:
+        console.print(f"{progress.left_out:.0f} of {steps} planned steps were left out, to end "
+                      "within the budget", soft_wrap=True)
     if progress.late:
-        console.print(f"the budget is spent: {steps - progress.step} of {steps} steps are missing; "
-                      "--resume goes on", soft_wrap=True)
+        console.print("the budget is spent and the learning rate has not come down: "
+                      f"{steps - progress.step - progress.left_out:.0f} of {steps} steps are "
+                      "missing; --resume goes on", soft_wrap=True)
     if progress.stopped:
         console.print(f"stopped at step {progress.step}; --resume resumes it", soft_wrap=True)
         sys.exit(130)

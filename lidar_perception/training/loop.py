@@ -24,17 +24,22 @@ from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import errors, paused, progress
 from lidar_perception.training.log import Log
 from lidar_perception.training.params import LoopParams
-from lidar_perception.training.ranks import any_of, rank, wait
+from lidar_perception.training.ranks import any_of, least, rank, wait
 from lidar_perception.training.run import Progress, Run, Task
 from lidar_perception.types import InputError
 
 STATE = "last.pt"
+SETTLING = 60.0  # seconds until the pace of a run is known
+MEMORY = 600.0   # seconds after which a step counts 1 / e in it
+SPARE = 2        # steps whose time is kept, as no two steps take as long
 
 
 def train(task: Task, params: LoopParams, out: Path, device: torch.device = torch.device("cpu"),
-          resume: bool = False, until: float = math.inf) -> Progress:
+          resume: bool = False, until: float = math.inf, validation: float = 0.0) -> Progress:
     """Train until the steps are done, a signal (SIGINT, SIGTERM) comes, or time.monotonic() comes
-    to `until`, with so much left as the last validation takes; the state is saved then.
+    to `until`, with so much left as a validation takes (validation: seconds that the first one is
+    expected to take); the state is saved then. Where fewer steps fit until then, the learning rate
+    falls faster, so that it ends as low as planned.
 
     In out: STATE, for resuming; log.csv, validation.csv, and whatever task.keep writes. The same
     task and seed give the same weights on the CPU, whether the run was interrupted or not.
@@ -52,10 +57,10 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
         remove_temporaries(out)
     log = Log(out, run.progress.step) if rank() == 0 else None
     begun = time.monotonic() - run.progress.seconds
-    pace = Pace(run.steps - run.progress.step, until)
+    pace, said = Pace(until, run.every, validation), False
     try:
         with _signals() as stop, progress() as bar:
-            line = bar.add_task("training", total=run.steps, completed=run.progress.step,
+            line = bar.add_task("training", total=run.steps, completed=int(run.place),
                                 visible=rank() == 0)
             batches = iter(task.batches(run.progress.step))
             while True:
@@ -63,20 +68,28 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
                     run.progress.stopped = True
                     _save(path, run)
                     break
-                run.progress.late = any_of(pace.over(), device) and run.progress.step < run.steps
-                if run.due() or (run.progress.late
-                                 and run.progress.step > run.progress.validated):
+                run.progress.late = any_of(pace.over(), device) and not run.done
+                due = run.due() and (run.done or not any_of(pace.over(2), device))
+                if due or (run.progress.late and run.progress.step > run.progress.validated):
                     _save(path, run)  # as validation takes its time
                     with pace.validating(), paused(bar):
                         _validate(run, log)
                     _save(path, run)
-                if run.progress.step >= run.steps or run.progress.late:
+                if run.done or run.progress.late:
                     break
                 row = run.step(next(batches))
                 step = run.progress.step
                 pace.step()
+                if until < math.inf:
+                    fit = step + max(0.0, least(pace.fit(step), device))
+                    run.hurry(fit - step)
+                    if fit < 0.9 * run.steps and not said and rank() == 0:
+                        said = True
+                        errors.print(f"slower than planned, {pace.seconds:.2g} s a step: about "
+                                     f"{fit:.0f} of {run.steps} steps fit into the budget, so the "
+                                     "learning rate falls faster", soft_wrap=True)
                 run.progress.seconds = time.monotonic() - begun
-                bar.update(line, completed=step)
+                bar.update(line, completed=run.place)
                 if row is not None:
                     bar.update(line, description=f"loss {row['loss']:.3f} lr {row['lr']:.1e}")
                     if log is not None and step % params.log_steps == 0:
@@ -91,34 +104,47 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
 
 
 class Pace:
-    """Whether so many steps fit into the time that is left."""
+    """How many steps fit into the time that is left, one validation after each `every` of them and
+    one at the end."""
 
-    def __init__(self, missing: int, until: float):
-        self.missing, self.until, self.last_validation, self.steps = missing, until, 0.0, 0
-        self.begun, self.warned = time.monotonic(), False
+    def __init__(self, until: float, every: int, validation: float = 0.0):
+        self.until, self.every, self.validation = until, every, validation
+        self.begun = self.before = time.monotonic()
+        self.steps = self.passed = 0.0  # of late; earlier ones count less and less
 
-    def over(self) -> bool:
-        """Whether it is time to validate for the last time."""
-        return time.monotonic() + self.last_validation >= self.until
+    @property
+    def seconds(self) -> float:
+        """That a step takes."""
+        return self.passed / self.steps
+
+    def over(self, validations: int = 1) -> bool:
+        """Whether there is no more time than so many validations take."""
+        return time.monotonic() + validations * self.validation >= self.until
 
     def step(self) -> None:
-        """After each step; says once if the steps will not fit."""
-        self.steps += 1
-        passed = time.monotonic() - self.begun
-        if self.warned or passed < 60 or self.until == math.inf:
-            return
-        fit = self.steps + int((self.until - time.monotonic()) * self.steps / passed)
-        if fit < 0.9 * self.missing:
-            self.warned = True
-            errors.print(f"slower than planned, {passed / self.steps:.2g} s a step: about {fit} of "
-                         f"{self.missing} steps fit into the budget", soft_wrap=True)
+        """After each step."""
+        now = time.monotonic()
+        taken, self.before = now - self.before, now
+        kept = math.exp(-taken / MEMORY)
+        self.steps, self.passed = kept * self.steps + 1, kept * self.passed + taken
+
+    def fit(self, step: int) -> float:
+        """How many steps after that one fit, below 1 if none; infinite before that is known."""
+        now = time.monotonic()
+        if now - self.begun < SETTLING or self.until == math.inf:
+            return math.inf
+        since = step % self.every
+        left = self.until - now - self.validation + since * self.seconds
+        whole, rest = divmod(left, self.every * self.seconds + self.validation)
+        return whole * self.every + min(rest / self.seconds, self.every) - since - SPARE
 
     @contextmanager
     def validating(self) -> Iterator[None]:
-        """Around a validation, to know how long one takes."""
+        """Around a validation, to know how long one takes; it is no part of a step."""
         begun = time.monotonic()
         yield
-        self.last_validation = time.monotonic() - begun
+        self.validation = time.monotonic() - begun
+        self.before += self.validation
 
 
 def may_begin(out: Path, resume: bool, name: str = STATE) -> Path:
@@ -149,7 +175,7 @@ def _validate(run: Run, log: Log | None) -> None:
         record = {**vars(progress), "metrics": metrics, "calibration": calibration}
         if better:
             run.task.keep("best", run.average.module, record)
-        if progress.step == run.steps or progress.late:
+        if run.done or progress.late:
             run.task.keep("last", run.average.module, record)
     wait()
 

@@ -131,7 +131,12 @@ def training(plan: Plan, speed: Speed, data: Data) -> tuple[float, float]:
     """Seconds of all steps, and of all validations."""
     validations = -(-plan.steps // plan.validate_steps)
     return (plan.steps * (speed.step if plan.part else speed.whole),
-            validations * (plan.val_scans + data.val_recorded) * speed.frame)
+            validations * validation(plan, speed, data))
+
+
+def validation(plan: Plan, speed: Speed, data: Data) -> float:
+    """Seconds of one validation."""
+    return (plan.val_scans + data.val_recorded) * speed.frame
 
 
 def _within(value: float, bounds: tuple[int, int]) -> int:

@@ -52,6 +52,15 @@ def any_of(flag: bool, device: torch.device) -> bool:
     return bool(value.item())
 
 
+def least(number: float, device: torch.device) -> float:
+    """The least of the numbers that all processes give."""
+    if world() == 1:
+        return number
+    value = torch.tensor(number, device=device)
+    distributed.all_reduce(value, distributed.ReduceOp.MIN)
+    return float(value.item())
+
+
 def wait() -> None:
     """Until all processes are here."""
     if world() > 1:

@@ -47,8 +47,9 @@ class Task(Generic[Net]):
 @dataclass
 class Progress:
     """How far a run is: steps done, steps skipped (of them the last ones in a row), the best score
-    and its step, the step of the last validation, seconds spent; stopped: by a signal; late: the
-    time was over."""
+    and its step, the step of the last validation, seconds spent; left_out: planned steps that were
+    left out of the schedule as there was no time for them; stopped: by a signal; late: the time was
+    over."""
 
     step: int = 0
     skipped: int = 0
@@ -57,6 +58,7 @@ class Progress:
     best_step: int = 0
     validated: int = 0
     seconds: float = 0.0
+    left_out: float = 0.0
     stopped: bool = False
     late: bool = False
 
@@ -83,11 +85,27 @@ class Run:
         self.scaler = torch.amp.GradScaler(device.type, enabled=self.format is torch.float16)
         self.progress = Progress()
 
+    @property
+    def place(self) -> float:
+        """In the schedule, from 0 to steps: the steps done and left out."""
+        return self.progress.step + self.progress.left_out
+
+    @property
+    def done(self) -> bool:
+        """Whether the schedule is at its end."""
+        return self.place >= self.steps
+
+    def hurry(self, fit: float) -> None:
+        """Leave out as much before the next step as before each later one, if so many are to bring
+        the schedule to its end."""
+        left, fit = self.steps - self.place, max(fit, 1.0)
+        if left > fit:  # once fit is 1, one step is left, without an error of rounding
+            self.progress.left_out = self.steps - self.progress.step - (left - left / fit + 1)
+
     def due(self) -> bool:
         """Whether the weights are to be validated now."""
         step = self.progress.step
-        return (step > self.progress.validated
-                and (step % self.every == 0 or step == self.steps))
+        return step > self.progress.validated and (step % self.every == 0 or self.done)
 
     def asked(self) -> dict[str, Any]:
         """What a resumed run must have in common."""
@@ -115,8 +133,7 @@ class Run:
     def step(self, batch: Any) -> dict[str, float] | None:
         """One step; what is to be logged, or None if it was skipped: then nothing has changed but
         the count."""
-        rate, beta = one_cycle(self.progress.step, self.steps, self.params.lr,
-                               self.params.warm_share)
+        rate, beta = one_cycle(self.place, self.steps, self.params.lr, self.params.warm_share)
         for group in self.optimizer.param_groups:
             group["lr"], group["betas"] = rate, (beta, group["betas"][1])
         for norm, momentum in self.norms:

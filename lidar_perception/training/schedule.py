@@ -12,7 +12,7 @@ START, END = 10.0, 1e4          # the first rate is lr / START, the last that / 
 SLOW, FAST = 0.95, 0.85         # momentum while the rate is least and greatest
 
 
-def one_cycle(step: int, steps: int, lr: float, warm_share: float) -> tuple[float, float]:
+def one_cycle(step: float, steps: int, lr: float, warm_share: float) -> tuple[float, float]:
     """Learning rate and momentum of step 0 .. steps - 1: up to lr and down again along cosines
     (Smith, 2018)."""
     first, last = lr / START, lr / START / END

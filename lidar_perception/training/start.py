@@ -34,6 +34,7 @@ from lidar_perception.training.plan import (
     preparing,
     refitted,
     training,
+    validation,
 )
 from lidar_perception.training.preparing import keep_all
 from lidar_perception.training.ranks import joined, rank, wait, world
@@ -154,7 +155,8 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
         task = network.task(params, batches, to_validate, asked.out, device, about, commit,
                             init)
         until = math.inf if hours is None else begun + 3600 * hours
-        progress = train(task, params, asked.out, device, asked.resume, until)
+        progress = train(task, params, asked.out, device, asked.resume, until,
+                         validation(*_planned(asked)))
         return Ended(progress, params.steps, batches) if rank() == 0 else None
 
 
@@ -199,8 +201,7 @@ def _refit(network: Network, asked: Asked, params: Any, sensor: Sensor, device: 
     slower steps are than planned is measured, as other work slows them in another way."""
     if (asked.out / STATE).exists():
         return
-    known = json.loads(read_text(asked.out / RUN, 10**6))
-    made, speed, data = Plan(**known["plan"]), Speed(**known["speed"]), Data(**known["data"])
+    made, speed, data = _planned(asked)
 
     def left() -> float:
         return begun + 3600 * hours - time.monotonic()
@@ -215,7 +216,14 @@ def _refit(network: Network, asked: Asked, params: Any, sensor: Sensor, device: 
         errors.print(f"the preparation took {duration(passed)}, {slower:.1f} times as long as "
                      f"planned, and a step takes {steps:.1f} times as long: {refit.steps} steps "
                      f"instead of {made.steps}", soft_wrap=True)
+        known = json.loads(read_text(asked.out / RUN, 10**6))
         write_text(asked.out / RUN, json.dumps({**known, "plan": asdict(refit)}, indent=1))
+
+
+def _planned(asked: Asked) -> tuple[Plan, Speed, Data]:
+    """What was planned, and from what."""
+    known = json.loads(read_text(asked.out / RUN, 10**6))
+    return Plan(**known["plan"]), Speed(**known["speed"]), Data(**known["data"])
 
 
 def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor, own: tuple) -> Any:

@@ -88,23 +88,29 @@ def test_after_a_slow_preparation_as_many_steps_are_left_as_fit(seconds, slower)
     assert refitted(made, 7000.0, 1.0, SPEED, SIM) == made
 
 
-def test_a_machine_that_becomes_slower_is_said_once(monkeypatch, capsys):
+def test_a_pace_says_how_many_steps_fit_beside_validations(monkeypatch):
     now = [0.0]
     monkeypatch.setattr(loop.time, "monotonic", lambda: now[0])
-    pace = Pace(missing=100, until=100.0)
-    for _ in range(40):
+    pace = Pace(until=1000.0, every=10)
+    for _ in range(29):
         now[0] += 2.0
         pace.step()
-    assert capsys.readouterr().err.count("about 50 of 100 steps fit into the budget") == 1
+        assert pace.fit(1) == math.inf and not pace.over()  # in its first minute
     with pace.validating():
-        now[0] += 5
-    assert not pace.over()
-    now[0] += 10
-    assert pace.over()  # as much is left as a validation takes
-    endless = Pace(10, math.inf)
+        now[0] += 10.0
+    now[0] += 2.0
+    pace.step()
+    # In 930 s: 2 steps, 30 times 10 s and 10 steps, 4 steps and 10 s for the last validation.
+    assert pace.fit(8) == pytest.approx(2 + 30 * 10 + 4 - loop.SPARE, abs=1)
+    for _ in range(400):
+        now[0] += 4.0
+        pace.step()
+    assert pace.seconds == pytest.approx(4.0, abs=0.2)  # what was long ago hardly counts
+    assert pace.over() and pace.fit(3) < 1
+    endless = Pace(math.inf, 1)
     now[0] += 1e6
     endless.step()
-    assert not endless.over() and not capsys.readouterr().err
+    assert not endless.over() and endless.fit(1) == math.inf
 
 
 @pytest.mark.parametrize("hours", [1e-4, 0.01])

@@ -8,6 +8,7 @@ import multiprocessing
 import os
 import signal
 import socket
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -21,7 +22,7 @@ from lidar_perception.training import loop
 from lidar_perception.training.loop import STATE, train
 from lidar_perception.training.params import LoopParams, PointPillarsTraining
 from lidar_perception.training.ranks import joined, rank, world
-from lidar_perception.training.run import Run, Task
+from lidar_perception.training.run import Progress, Run, Task
 from lidar_perception.training.schedule import Average, one_cycle
 from lidar_perception.types import InputError
 
@@ -352,7 +353,7 @@ def test_two_processes_with_half_the_batch_learn_what_one_learns(tmp_path):
         os.environ.update(RANK=str(number), LOCAL_RANK=str(number), WORLD_SIZE="2",
                           MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
         with joined(CPU):
-            train(Toy(plain=True, size=4).task(), PARAMS, tmp_path / "two")
+            train(Toy(plain=True, size=4).task(), PARAMS, tmp_path / "two", until=1e12)
 
     crew = [forked(one_of_two, number) for number in range(2)]
     for process in crew:
@@ -384,3 +385,65 @@ def test_a_run_out_of_time_validates_keeps_and_goes_on_when_it_is_resumed(unbrok
     progress = train(Toy().task(), PARAMS, tmp_path, resume=True)
     assert (progress.step, progress.late) == (13, False)
     assert same(weights(tmp_path), weights(unbroken[0])) and rows(tmp_path) == rows(unbroken[0])
+
+
+PLANNED = LoopParams(**{**vars(PARAMS), "steps": 300, "validate_steps": 60, "save_steps": 300})
+
+
+def timed(seconds, validation: float, folder: Path, monkeypatch, **others) -> tuple[Toy, Progress]:
+    """A run of PLANNED with steps of seconds(step) on a clock of its own."""
+    now = [0.0]
+    monkeypatch.setattr(loop.time, "monotonic", lambda: now[0])
+    toy = Toy(lambda step: now.__setitem__(0, now[0] + seconds(step)))
+    validate = toy.validate
+
+    def slowly(module):
+        now[0] += validation
+        return validate(module)
+    toy.validate = slowly
+    return toy, train(toy.task(), PLANNED, folder, validation=validation, **others)
+
+
+@pytest.fixture(scope="module")
+def planned(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("planned")
+    train(Toy().task(), PLANNED, folder)
+    return folder
+
+
+@pytest.mark.parametrize("fits", [0.2, 0.5, 0.8])
+@pytest.mark.parametrize("seconds", [lambda _: 10.0, lambda step: 4.0 if step < 50 else 12.0,
+                                     lambda step: 6.0 + 6.0 * (step % 7)])
+def test_a_run_that_is_slower_than_planned_ends_in_time_with_the_rate_of_the_end(
+        seconds, fits, planned, tmp_path, monkeypatch, capsys):
+    first = int(fits * 300)
+    until = sum(seconds(step) for step in range(first)) + 30.0 * (first // 60 + 1)
+    toy, progress = timed(seconds, 30.0, tmp_path, monkeypatch, until=until)
+    assert not progress.late and loop.time.monotonic() <= until
+    assert 0.85 * first <= progress.step <= first
+    assert 300 <= progress.step + progress.left_out < 301
+    assert capsys.readouterr().err.count("steps fit into the budget") == 1
+    rates, whole = ([float(row["lr"]) for row in rows(folder)] for folder in (tmp_path, planned))
+    assert rates[-1] == whole[-1] and max(rates) > 0.95 * max(whole)
+    jumps, slope = (max(abs(a - b) for a, b in pairwise(each)) for each in (rates, whole))
+    assert jumps < 3 * slope / fits  # no cliff
+    assert set(toy.kept) == {"best", "last"}
+
+
+def test_with_time_enough_a_budget_changes_nothing(planned, tmp_path, monkeypatch):
+    _, progress = timed(lambda _: 1.0, 30.0, tmp_path, monkeypatch, until=600.0)
+    assert progress.left_out == 0 and equals(tmp_path, (planned,))
+
+
+def test_a_shortened_run_that_is_stopped_is_resumed_where_it_was(tmp_path, monkeypatch):
+    def stop(step):
+        if step == 40:
+            signal.raise_signal(signal.SIGTERM)
+        return 10.0
+    _, before = timed(stop, 0.0, tmp_path, monkeypatch, until=1500.0)
+    assert before.stopped and before.left_out > 10
+    progress = train(Toy().task(), PLANNED, tmp_path, resume=True)
+    rates = [float(row["lr"]) for row in rows(tmp_path)]
+    assert progress.left_out == pytest.approx(before.left_out, abs=1)
+    assert rates[-1] < 1e-3 * PLANNED.lr and progress.step + progress.left_out >= 300
+    assert max(abs(a - b) for a, b in pairwise(rates[45:])) < 0.02 * PLANNED.lr
