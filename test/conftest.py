@@ -20,7 +20,8 @@ settings.load_profile("any machine")
 
 def pytest_itemcollected(item):
     """Hypothesis runs the same lines a hundred times; to measure them takes longer than to run."""
-    if getattr(item.obj, "is_hypothesis_test", False):
+    function = getattr(item, "obj", None)  # a test of launch_testing has none
+    if getattr(function, "is_hypothesis_test", False):
         item.add_marker("no_cover")
 
 
