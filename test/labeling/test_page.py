@@ -49,11 +49,20 @@ def labels(drive_bag, tmp_path_factory):
         yield Label(server.process, server.url, out, arguments)
 
 
-@pytest.fixture
-def page(browser, labels):
-    """A page, opened; what was wrong in it fails the test."""
+@pytest.fixture(scope="module")
+def first_page(browser, labels):
     with opened(browser, labels.url) as made:
         yield made
+
+
+@pytest.fixture
+def page(first_page):
+    """A page on the first frame, in which nothing is selected: the same for all tests, as an
+    annotator's stays open."""
+    first_page.keyboard.press("Escape")
+    first_page.keyboard.press("Escape")
+    first_page.keyboard.press("Home")
+    return first_page
 
 
 @contextmanager
