@@ -37,7 +37,7 @@ CAMERA_IN = [
 SEED_IN = [
     ("~/input/ground_truth", MARKERS, "Labels, for `seed.source` ground_truth; matched to the "
      "cloud by header.stamp."),
-    ("/clicked_point", "geometry_msgs/PointStamped", "A point on a pedestrian, for `seed.source` "
+    ("clicked_point", "geometry_msgs/PointStamped", "A point on a pedestrian, for `seed.source` "
      "click, in the frame of the cloud or, with TF, in any that is connected with it."),
 ]
 ROBOT_IN = [

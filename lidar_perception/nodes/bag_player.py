@@ -6,6 +6,7 @@ import importlib.util
 from time import monotonic
 from typing import Any
 
+from rclpy.exceptions import NameValidationException
 from rclpy.executors import Executor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
@@ -39,7 +40,12 @@ class BagPlayer(LidarNode):
         if not self.publishers_by_topic:
             raise InputError(f"{self.params.bag}: nothing to play; no topic is left of "
                              f"{', '.join(self.bag.topics) or 'an empty bag'}")
+        self.wanted = self._wanted()
         self.start_ns = self.bag.start_ns + int(self.params.start_offset * SECOND)
+        if self.start_ns > self.bag.end_ns:
+            raise InputError(f"start_offset {self.params.start_offset:g} s is after the end of "
+                             f"{self.params.bag}, which has "
+                             f"{(self.bag.end_ns - self.bag.start_ns) / SECOND:.1f} s")
         self.stop_ns = (self.start_ns + int(self.params.duration * SECOND)
                         if self.params.duration else None)
         self.paused = self.params.start_paused
@@ -68,7 +74,33 @@ class BagPlayer(LidarNode):
                 raise InputError(f"remap '{rule}' must be OLD:=NEW with one of the topics "
                                  f"{', '.join(names)}")
             names[old] = new
-        return names
+        expanded = {topic: self._expanded(name, f"the topic {topic}")
+                    for topic, name in names.items()}
+        kinds: dict[str, str] = {}
+        for topic, name in expanded.items():
+            if kinds.setdefault(name, self.bag.topics[topic]) != self.bag.topics[topic]:
+                raise InputError(f"{name} would have the types {kinds[name]} and "
+                                 f"{self.bag.topics[topic]}; remap {topic} to another name")
+        return expanded
+
+    def _expanded(self, name: str, what: str) -> str:
+        """A name of a topic from the root on; relative ones are in the node's namespace."""
+        try:
+            return self.resolve_topic_name(name, only_expand=True)
+        except (ValueError, RuntimeError, NameValidationException) as error:
+            reason = " ".join(str(error).split())
+            raise InputError(f"{what}: '{name}' is no name of a topic ({reason})") from None
+
+    def _wanted(self) -> dict[str, int]:
+        """Topic -> how many subscribers are waited for."""
+        wanted = {}
+        own = [self.names[t] for t in cloud_topics(self.bag.topics) if t in self.names]
+        for rule in self.params.wait_for or own:
+            name, _, count = rule.partition(":=")
+            if count and not count.isdecimal():
+                raise InputError(f"wait_for '{rule}' must be TOPIC or TOPIC:=COUNT")
+            wanted[self._expanded(name, "wait_for")] = int(count or 1)
+        return wanted
 
     def _publisher(self, topic: str) -> Any:
         kind = self.bag.topics[topic]
@@ -92,16 +124,13 @@ class BagPlayer(LidarNode):
             if not self.params.loop:
                 break
         self._count_pace()
-        self.report(OK, "the bag is played")
+        self.report(OK, "stopped" if self.stop.done() else "the bag is played")
         self._wait_until_delivered()
 
     def _wait_for_subscribers(self) -> None:
-        own = [self.names[t] for t in cloud_topics(self.bag.topics) if t in self.names]
-        rules = [rule.partition(":=") for rule in self.params.wait_for or own]
-        wanted = {name: int(count or 1) for name, _, count in rules}
         give_up = monotonic() + self.params.wait_timeout
         while not self.stop.done():
-            missing = [t for t, count in wanted.items() if self._subscribers(t) < count]
+            missing = [t for t, count in self.wanted.items() if self._subscribers(t) < count]
             missing += [t for t in self.params.follow if not self.count_publishers(t)]
             if not missing:
                 return
@@ -175,6 +204,8 @@ class BagPlayer(LidarNode):
             if behind <= 0 and not self.paused:
                 return True
             wait = 0.05 if self.paused else min(behind, 0.05)
+            if self.clock:
+                wait = min(wait, max(self.next_clock - monotonic(), 0.0))
             self.serve(timeout_sec=wait)
         return False
 
@@ -185,7 +216,7 @@ class BagPlayer(LidarNode):
             self.now_ns += int((now - self.anchor) * self.params.rate * SECOND)
         self.anchor = now
         if self.clock and now >= self.next_clock:
-            self.next_clock = now + 1 / self.params.clock_hz
+            self.next_clock = max(self.next_clock + 1 / self.params.clock_hz, now)
             self.clock.publish(Clock(clock=time_message(self.now_ns, ros_message)))
 
     def _pause(self, _: Any, response: Any) -> Any:

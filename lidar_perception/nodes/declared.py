@@ -33,15 +33,27 @@ def declare(node: Node, params: Any) -> Any:
         kind = _kind(f)
         value = list(f.default) if isinstance(f.default, tuple) else f.default
         if name in node._parameter_overrides:
-            node._parameter_overrides[name] = as_declared(node._parameter_overrides[name], kind)
-        # An empty list has no type of its own; declared by type it is "not set".
+            given = as_declared(node._parameter_overrides.pop(name), kind)
+            if given.value == []:
+                value = []
+            else:
+                node._parameter_overrides[name] = given
         declared[name] = node.declare_parameter(name, kind if value == [] else value,
                                                 _descriptor(f, kind)).value
-    return with_values(params, {k: v for k, v in declared.items() if v is not None})
+        if declared[name] is None:
+            # rclpy takes an empty list for one of bytes, and what is declared by its type alone is
+            # "not set", which get_parameters answers with nothing at all for all of its names.
+            node._parameters[name] = Parameter(name, kind, [])
+            declared[name] = []
+    return with_values(params, declared)
 
 
 def as_declared(given: Parameter, kind: Parameter.Type) -> Parameter:
-    """Whole numbers as floats where the declared type is float; all else as given."""
+    """Whole numbers as floats where the declared type is float, and an empty list, which has no
+    type, as one of the declared type; all else as given."""
+    if kind in LISTS.values() and (given.type_ == Parameter.Type.NOT_SET or (
+            given.type_.name.endswith("_ARRAY") and len(given.value) == 0)):
+        return Parameter(given.name, kind, [])
     convert = AS_FLOATS.get((given.type_, kind))
     return Parameter(given.name, kind, convert(given.value)) if convert else given
 

@@ -22,7 +22,14 @@ from lidar_perception.candidates.seed_sources import (
 from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.nodes.graph import relative
-from lidar_perception.nodes.runtime import JUMP_NS, LATCHED, MARKERS, RELIABLE, LidarNode
+from lidar_perception.nodes.runtime import (
+    JUMP_NS,
+    LATCHED,
+    MARKERS,
+    RELIABLE,
+    SENSOR_DATA,
+    LidarNode,
+)
 from lidar_perception.robot.poses import inverse, moved_boxes, moved_points
 from lidar_perception.robot.tree import Missing
 from lidar_perception.types import PEDESTRIAN, InputError
@@ -40,9 +47,12 @@ class CameraInput:
         self.node = node
         self.info: Any = None
         self.transforms: dict[tuple[str, str], Any] = {}
-        node.input("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED)
+        # A latched subscription gets what was sent before, but nothing of a camera driver, which is
+        # volatile and often best effort.
+        node.input("camera_info", "sensor_msgs/msg/CameraInfo", self._on_info, LATCHED,
+                   SENSOR_DATA)
         node.input("extrinsics", "geometry_msgs/msg/TransformStamped", self._on_transform,
-                   LATCHED)
+                   LATCHED, SENSOR_DATA)
 
     def _on_info(self, msg: Any) -> None:
         self.info = msg
@@ -55,7 +65,12 @@ class CameraInput:
         params = self.node.params.view
         if not params.enabled or self.get(cloud.header, params) is not None:
             return None
-        return "the camera's calibration: CameraInfo, and the transform from the LiDAR"
+        info, extrinsics = map(self.node.resolve_topic_name, (
+            "~/input/camera_info", "~/input/extrinsics"))
+        return "the camera's calibration: " + (
+            f"no CameraInfo has come on {info}" if self.info is None else
+            f"neither {extrinsics} nor TF connects the cloud's '{cloud.header.frame_id}' with the "
+            f"CameraInfo's '{self.info.header.frame_id}'")
 
     def get(self, header: Any, params: ViewParams) -> Camera | None:
         """The camera for the levelled points of a cloud with this header; None until it is known

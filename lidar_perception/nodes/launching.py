@@ -97,6 +97,8 @@ def graph_launch(config_folder: Path, detectors: str) -> LaunchDescription:
 
 def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     """The nodes that the values of the arguments ask for."""
+    if value["config"] and not Path(value["config"]).is_file():
+        raise InputError(f"config: there is no parameter file {value['config']}")
     detectors, single = _detectors(value), value["single"] == "true"
     prefix, tracking = value["name_prefix"], value["tracking"] == "true"
     graph = prefixed(graph_of(detectors, single, tracking and not single), prefix)

@@ -83,15 +83,18 @@ def run(name: str, arguments: list[str]) -> int:
 
 def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) -> int:
     import rclpy
-    from rclpy.exceptions import ParameterException
+    from rclpy.exceptions import NameValidationException, ParameterException
     from rclpy.executors import SingleThreadedExecutor
+    from rclpy.impl.implementation_singleton import rclpy_implementation
     from rclpy.signals import SignalHandlerOptions
 
     from lidar_perception.types import InputError
 
-    rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
+    RCLError = rclpy_implementation.RCLError
+    UnknownROSArgsError = rclpy_implementation.UnknownROSArgsError
     node, code = None, 0
     try:
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = node_class()
         node.start()
         stop.react = lambda: node.stop.set_result(None)
@@ -99,8 +102,11 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.spin(executor)
-    except (InputError, ValueError, ParameterException) as error:
-        rclpy.logging.get_logger(node_class.__name__).fatal(str(error))
+    except UnknownROSArgsError as error:
+        rclpy.logging.get_logger(node_class.__name__).fatal(f"unknown after --ros-args: {error}")
+        code = 2
+    except (InputError, ValueError, ParameterException, NameValidationException, RCLError) as error:
+        rclpy.logging.get_logger(node_class.__name__).fatal(" ".join(str(error).split()))
         code = 2
     finally:
         stop.closing()

@@ -35,7 +35,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
     subscribed to while it is active, and a cleanup forgets every attribute that configure() has
     set and destroys every publisher, timer and so on that it has made, so that the memory of a
     network is free again. With the parameter autostart the node goes to active by itself, and
-    where configure() fails tries again, as a file that is missing may appear.
+    where that fails tries again, as a file that is missing may appear.
     """
 
     def __init__(self, name: str, params: Any, robot: Any, **options: Any):
@@ -63,9 +63,9 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
                                    "is false")
             return
         begin = monotonic()
-        if self.trigger_configure() == SUCCESS:
+        if (self.state_label() == "inactive" or self.trigger_configure() == SUCCESS) and (
+                self.trigger_activate() == SUCCESS):
             self._retry_at = None
-            self.trigger_activate()
         else:
             now = monotonic()
             self._retry_at = now + max(RETRY_PERIOD, RETRY_SHARE * (now - begin))
@@ -84,8 +84,9 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
             self._retry_at = None
             return change(request, response)
         self.get_logger().error(
-            f"transition {wanted} is asked for, but the node is {self.state_label()}; a node that "
-            "a lifecycle manager is to drive needs the parameter autostart false")
+            f"transition {wanted} is asked for, but the node is {self.state_label()}" + (
+                "; a node that a lifecycle manager is to drive needs the parameter autostart false"
+                if self.robot.autostart else ""))
         response.success = False
         return response
 

@@ -132,7 +132,8 @@ class Reception:
 
     def close(self) -> None:
         """End the subscription. What waits is dropped; what is sent meanwhile is not missed."""
-        self.node.destroy_subscription(self.subscription)
+        if self.subscription is not None:
+            self.node.destroy_subscription(self.subscription)
         self.subscription = self.last_time = self.needs = self.needed_since = None
         self.arrivals.interrupted(len(self.waiting))
         self.waiting.clear()

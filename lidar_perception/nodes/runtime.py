@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import traceback
 from collections.abc import Callable
 from contextlib import contextmanager
+from functools import partial
 from time import monotonic, perf_counter
 from typing import Any
 
@@ -41,6 +43,7 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 JUMP_NS = 10**9  # stamps that go back by more than this are a bag that starts again
 WAITING = "waiting for input"
 LOG_PERIOD = 60.0  # seconds before the same problem is logged again
+MAX_KINDS = 1000   # of messages whose last time is known
 
 
 class LidarNode(Node):
@@ -65,7 +68,8 @@ class LidarNode(Node):
         self.active = True  # listens to its inputs
         self.forget()
         self._present: set[str] = set()  # kinds of problems
-        self._logged: dict[str, float] = {}  # kind of problem -> when it was logged
+        self._logged: dict[str, float] = {}  # kind of message -> when it was logged
+        self._last_logged = ""
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         self._processing_time = self.create_publisher(Float64, "~/debug/processing_time_ms",
                                                       RELIABLE)
@@ -99,13 +103,14 @@ class LidarNode(Node):
         return SetParametersResult(successful=True)
 
     def input(self, topic: str, type_name: str, callback: Callable,
-              qos: QoSProfile | None = None, private: bool = True,
+              *qos: QoSProfile, private: bool = True,
               needs: Callable[[Any], str | None] = lambda _: None) -> None:
         """Subscribe to ~/input/TOPIC, or with private=False to the name as it is. callback gets
         rosbags' class of the message, the one that offline code reads from bags: it views the
         received bytes, where rclpy's own class copies them several times. Types that rosbags does
-        not come with are of rclpy's class. Without qos the topic is received as reception.py does:
-        needs says what a cloud still waits for, which comes by another input, and None if nothing.
+        not come with are of rclpy's class. With several qos each is subscribed to, as no one of
+        them may fit all publishers. Without qos the topic is received as reception.py does: needs
+        says what a cloud still waits for, which comes by another input, and None if nothing.
         """
         name = f"~/input/{topic}" if private else topic
         _warm_up_type(type_name)
@@ -126,7 +131,7 @@ class LidarNode(Node):
                 self.get_logger().error(traceback.format_exc())
                 self.report(ERROR, f"{self.resolve_topic_name(name)}: {type(error).__name__}: "
                             f"{error}; this is a bug, please report it with the message")
-            if qos is not None:
+            if qos:
                 for reception in self._receptions():
                     reception.try_again()
             return missing
@@ -136,15 +141,23 @@ class LidarNode(Node):
 
         received: Any = guarded  # rclpy's annotation has no result
         kind, what = message_class(type_name), "cloud" if type_name == CLOUD else "array"
-        added = (Reception(self, kind, name, guarded, lambda: self.robot.input, what)
-                 if qos is None else
-                 Subscribed(self, lambda: self.create_subscription(
-                     kind, name, received, qos, raw=True,
-                     event_callbacks=SubscriptionEventCallbacks(message_lost=lost),
-                     qos_overriding_options=QoSOverridingOptions.with_default_policies())))
-        self.inputs.append(added)
+        events = SubscriptionEventCallbacks(message_lost=lost)
+        if len(qos) > 1:
+            events.incompatible_qos = lambda _: None  # another of them fits
+
+        def subscribe(profile: QoSProfile) -> Any:
+            return self.create_subscription(
+                kind, name, received, profile, raw=True, event_callbacks=events,
+                qos_overriding_options=QoSOverridingOptions.with_default_policies()
+                if profile is qos[0] else None)
+
+        added: list[Any] = (
+            [Subscribed(self, partial(subscribe, profile)) for profile in qos]
+            or [Reception(self, kind, name, guarded, lambda: self.robot.input, what)])
+        self.inputs += added
         if self.active:
-            added.open()
+            for made in added:
+                made.open()
 
     def output(self, topic: str, type_name: str, qos: QoSProfile = RELIABLE):
         """Publisher of ~/output/TOPIC, or of any name that starts with ~ or /; it takes encode()d
@@ -158,12 +171,25 @@ class LidarNode(Node):
         return publisher
 
     def report(self, level: bytes, message: str, expected: bool = False) -> None:
-        """Set the diagnostic state; a change is logged and published at once. What is expected,
-        such as that a node waits at its start, is no warning in the log."""
-        if (level, message) != self.state:
-            self.state = (level, message)
-            self._log(OK if expected else level, message)
+        """Set the diagnostic state. A change to a message of another kind, which is more than other
+        numbers in it, is logged and published at once. What is expected, such as that a node waits
+        at its start, is no warning in the log."""
+        kind, before = _kind_of(message), (self.state[0], _kind_of(self.state[1]))
+        self.state = (level, message)
+        if (level, kind) != before:
+            self._log_seldom(kind, OK if expected else level, message)
             self.publish_diagnostics()
+
+    def _log_seldom(self, kind: str, level: bytes, message: str) -> None:
+        """A problem at most once in LOG_PERIOD; what is no problem unless it was the last to say,
+        so that a log ends with how it is."""
+        now = monotonic()
+        if (kind != self._last_logged if level == OK else
+                now - self._logged.get(kind, -LOG_PERIOD) >= LOG_PERIOD):
+            if len(self._logged) > MAX_KINDS:
+                self._logged.clear()
+            self._logged[kind], self._last_logged = now, kind
+            self._log(level, message)
 
     def _log(self, level: bytes, message: str) -> None:
         if level == OK:  # one line a level: rclpy ties the level to the place of the call
@@ -225,12 +251,10 @@ class LidarNode(Node):
             found.append(("name", WARN, f"another node is called {self.get_fully_qualified_name()} "
                           "too, so topics and parameters of both are mixed; end one, or give it "
                           "another namespace"))
-        now, before = monotonic(), self._present
-        self._present = {kind for kind, _, _ in found}
+        before, self._present = self._present, {kind for kind, _, _ in found}
         for kind, level, message in found:
-            if kind not in before and now - self._logged.get(kind, -LOG_PERIOD) >= LOG_PERIOD:
-                self._logged[kind] = now
-                self._log(level, message)
+            if kind not in before:
+                self._log_seldom(kind, level, message)
         return found
 
     def _hardware_id(self) -> str:
@@ -263,12 +287,20 @@ class Subscribed:
 
     def __init__(self, node: Node, subscribe: Callable[[], Any]):
         self.node, self.subscribe = node, subscribe
+        self.subscription: Any = None
 
     def open(self) -> None:
         self.subscription = self.subscribe()
 
     def close(self) -> None:
-        self.node.destroy_subscription(self.subscription)
+        if self.subscription is not None:
+            self.node.destroy_subscription(self.subscription)
+        self.subscription = None
+
+
+def _kind_of(message: str) -> str:
+    """The message without its numbers."""
+    return re.sub(r"\d[\d.,e+-]*", "0", message)
 
 
 def _warm_up_type(type_name: str) -> None:

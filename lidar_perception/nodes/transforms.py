@@ -23,7 +23,7 @@ from lidar_perception.robot.tree import Missing, TransformTree
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_frame
-from lidar_perception.wire.point_times import corrected, moved_cloud
+from lidar_perception.wire.point_times import corrected, moved_cloud, point_times
 from lidar_perception.wire.topics import TF, TF_STATIC
 from lidar_perception.wire.transforms import (
     MOVING,
@@ -58,7 +58,7 @@ class Transforms:
         self.carrier = self.odometry_frame = ""  # what the odometry is of, and in which frame
         self.odometry_ns: int | None = None  # the stamp of the last one
         self.needs: list[Callable[[Any], str | None]] = []  # of a header: what else it waits for
-        self.sweep = 0.0  # seconds from the stamp to the last point of a cloud
+        self.sweep: float | None = None  # seconds from the stamp to the last point of a cloud
         self.lacking: dict[str, str] = {}  # what asked for it -> what is not there
         self.known: dict[str, Any] = {}  # for the diagnostics
         self._last: tuple[tuple[str, int], Placing] = (("", -1), Placing(""))
@@ -131,10 +131,21 @@ class Transforms:
                 self.tree.lookup(frame, frame_id, stamp)
             if self.node.robot.input.deskew != "off":
                 self.sensor_poses(self.node.robot.input.deskew, frame_id,
-                                  np.array([stamp + round(self.sweep * SECOND)]))
+                                  np.array([stamp + round(self._sweep_of(cloud) * SECOND)]))
         except Missing as error:
             return str(error) if error.late else None
         return None
+
+    def _sweep_of(self, cloud: Any) -> float:
+        """As of the last cloud that was moved; before there is one, of this one, which could not
+        wait for the end of its turn otherwise."""
+        if self.sweep is None:
+            try:
+                seconds = point_times(cloud, to_frame(cloud)[1]).seconds
+            except InputError:  # corrected() says it
+                return 0.0
+            self.sweep = float(seconds[np.isfinite(seconds)].max(initial=0.0))
+        return self.sweep
 
     def placing(self, header: Any) -> Placing:
         """Of a cloud with this header."""
@@ -218,7 +229,11 @@ class Transforms:
         if self.odometry_ns is None:
             raise Missing(f"nothing has come on {self.node.resolve_topic_name('~/input/odometry')}"
                           "; remap it to the odometry's topic")
-        return self.odometry.poses(STILL, MOVING, at, max_gap)
+        try:
+            return self.odometry.poses(STILL, MOVING, at, max_gap)
+        except Missing as error:
+            raise Missing(f"{self.node.resolve_topic_name('~/input/odometry')}: {error}",
+                          error.late) from None
 
     def _on_carrier(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
         """(M or 1, 4, 4): where on what the odometry is of a frame is at times (M,) ns."""

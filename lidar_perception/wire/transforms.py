@@ -9,7 +9,9 @@ from lidar_perception.types import InputError
 from msg_utils.stamps import to_ns
 
 TF_MESSAGE, ODOMETRY_MESSAGE = "tf2_msgs/msg/TFMessage", "nav_msgs/msg/Odometry"
-MOVING, STILL = "moving", "still"  # frames of the odometry, whatever the message calls them
+# The frames of the odometry, by the fields of the message and not by what these hold: both may hold
+# the same, or nothing.
+MOVING, STILL = "child_frame_id", "header.frame_id"
 
 
 def add_transforms(tree: TransformTree, msg: Any, static: bool) -> None:

@@ -244,6 +244,12 @@ def put(table, **values):
     (put("sample_annotation", size=[1, 2]), "a size is not 3 finite numbers"),
     (put("sample_annotation", translation=[1, None, 2]), "a translation is not"),
     (put("ego_pose", translation="x"), "ego_pose.json: a translation is not 3 finite"),
+    (put("ego_pose", rotation=[10**400, 0, 0, 0]), "ego_pose.json: a rotation is not"),
+    *((put("sample", timestamp=time), "sample.json: row 0: timestamp is no time")
+      for time in (1e38, 10**38, -1, "now", None)),
+    (put("sample_data", filename=7), "sample_data.json: row 0: filename is no text"),
+    (put("scene", token=[]), "scene.json: row 0: token is no text"),
+    (put("sample_annotation", attribute_tokens=5), "attribute_tokens is no list"),
     (put("calibrated_sensor", rotation=[1, 0, 0, float("nan")]), "a rotation is not"),
 ])
 def test_tables_that_are_wrong_are_named(changed, change, words):

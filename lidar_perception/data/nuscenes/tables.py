@@ -19,6 +19,13 @@ from lidar_perception.types import InputError
 
 CHUNK = 2**22        # characters read at a time; no row is longer
 SPACE = " \t\r\n,"
+MAX_TIME = 2**31 * 10**6  # microseconds since 1970 that a header's seconds can hold
+KINDS: dict[str, type] = {
+    **dict.fromkeys(("token", "sample_token", "instance_token", "scene_token", "sensor_token",
+                     "category_token", "ego_pose_token", "calibrated_sensor_token", "prev", "next",
+                     "name", "channel", "filename"), str),
+    "timestamp": int, "attribute_tokens": list}
+NOT_A = {str: "no text", int: "no time in microseconds", list: "no list"}
 
 
 class Tables:
@@ -40,14 +47,21 @@ class Tables:
 
     def rows(self, table: str, *fields: str) -> Iterator[tuple]:
         """The values of two fields or more, row by row. InputError for a table that is missing,
-        cut or damaged, and for a row without a field."""
+        cut or damaged, and for a row without a field or with one of another kind."""
+        kinds = [(at, KINDS[field]) for at, field in enumerate(fields) if field in KINDS]
         for number, row in enumerate(self._decoded(table)):
             try:
-                yield tuple([row[field] for field in fields])
+                values = tuple([row[field] for field in fields])
             except (KeyError, TypeError):
                 missing = next(f for f in fields if not isinstance(row, dict) or f not in row)
                 raise InputError(f"{self.path(table)}: row {number} has no {missing}; is it a "
                                  "table of nuScenes? download it again") from None
+            for at, kind in kinds:
+                if not isinstance(values[at], kind) or (
+                        kind is int and not 0 <= values[at] < MAX_TIME):
+                    raise InputError(f"{self.path(table)}: row {number}: {fields[at]} is "
+                                     f"{NOT_A[kind]}; download it again")
+            yield values
 
     def _decoded(self, table: str) -> Iterator[Any]:
         path, decode = self.path(table), json.JSONDecoder().raw_decode
@@ -85,7 +99,7 @@ class Tables:
         numbers."""
         try:
             column = np.array(values, np.float64).reshape(len(values), -1)
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):  # the last of an int of 400 digits
             column = np.zeros((len(values), 0))
         if len(values) == 0:
             return np.zeros((0, width))
