@@ -60,7 +60,8 @@ def test_documented_topics_are_the_nodes_own(generate, name, domain):
         first, *others = topics.split(", ")
         names = [first, *(f"{first.rsplit('/', 1)[0]}/{o}" for o in others)]
         if not (kind.startswith("vision_msgs") or ("_ms" in topics and "processing" not in topics)):
-            documented |= {n.replace("~", f"/{name}").replace("STAGE", "final") for n in names}
+            documented |= {("" if n[0] in "~/" else "/") + n.replace("~", f"/{name}").replace(
+                "STAGE", "final") for n in names}
     listed = {t for t in listed if not t.endswith("_ms") or "processing" in t}  # one row for all
     standard = {"/parameter_events", "/rosout", "/clock", "/tf_static"}
     assert listed - standard == documented

@@ -124,7 +124,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
             self._deactivate()
             self.report(ERROR, f"{INACTIVE}: {problem}")
             return FAILURE
-        if self.state[0] == OK:
+        if self.state[0] == OK or self.state[1].startswith(INACTIVE):
             self.report(WARN, WAITING, expected=True)
         return SUCCESS
 

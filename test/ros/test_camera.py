@@ -14,7 +14,7 @@ from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
 from lidar_perception.nodes.graph import SINGLE, STAGES
-from lidar_perception.nodes.runtime import LATCHED
+from lidar_perception.nodes.runtime import LATCHED, SENSOR_DATA
 from lidar_perception.param_fields import flatten
 from lidar_perception.scoring.centres.report import pedestrians, seed_source
 from lidar_perception.types import Detections
@@ -33,8 +33,10 @@ def offline(frame):
                            PAPER)[1].final
 
 
-@pytest.mark.parametrize("graph", [STAGES, SINGLE], ids=["three nodes", "one node"])
-def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, processes, peer, drive_bag):
+@pytest.mark.parametrize("graph, qos", [(STAGES, LATCHED), (SINGLE, SENSOR_DATA)],
+                         ids=["three nodes, latched", "one node, a driver's"])
+def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, qos, processes, peer,
+                                                                drive_bag):
     frame, expected = next((f, e) for f in open_recording(drive_bag) if len(e := offline(f)))
     with Bag(drive_bag) as bag:
         sent = {topic: msg for topic, _, msg in bag.messages({POINTS, TRUTH})
@@ -52,9 +54,16 @@ def test_a_cloud_before_its_camera_gives_the_offline_detections(graph, processes
               in peer.message_of(first), "the reason why it waits")
     assert not found
     assert len(camera) == 2
-    for topic, msg in camera.items():
+    for topic, over in ((CAMERA_INFO, "no CameraInfo has come"),
+                        (EXTRINSICS, "waits for the camera")):
         assert not found
-        peer.talker(topic, types[topic], LATCHED).publish(encode(msg))
+        talker = peer.talker(topic, types[topic], qos)
+        if qos is LATCHED:
+            talker.publish(encode(camera[topic]))
+        else:
+            assert over in peer.message_of(first)
+            peer.send(talker, camera[topic], lambda w=over: w not in peer.message_of(first),
+                      f"an end of '{over}'")
     peer.send(truth, sent[TRUTH], lambda: found, "the detections")
     received = to_detections(from_marker_array(found[-1]))
     np.testing.assert_array_equal(received.boxes, expected.boxes)

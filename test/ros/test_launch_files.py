@@ -88,7 +88,8 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
             assert node.parameters[0] == config
     for node in nodes(autostart="false").values():
         assert node.parameters[1] == {"use_sim_time": False, "autostart": False}
-    assert nodes(config="mine.yaml")["clustering"].parameters[0] == "mine.yaml"
+    mine = str(ROOT / "config" / "best.param.yaml")
+    assert nodes(config=mine)["clustering"].parameters[0] == mine
     frames = {"base_frame": "base", "target_frame": "odom"}
     for node in nodes(deskew="odometry", odometry="/odometry", **frames).values():
         assert frames.items() < node.parameters[1].items()
@@ -120,8 +121,9 @@ def test_ground_and_clusters_have_one_file_and_what_others_would_take_is_said(la
                    if name != "candidates")
         assert len(nodes.said) == len(words)
         assert all(word in line for word, line in zip(words, nodes.said, strict=True))
-    started = nodes(detectors="pointnet,pointpillars", config="all.yaml", experts="pointpillars")
-    assert started["pointnet_detector"].parameters[0] == "all.yaml"
+    everything = str(ROOT / "config" / "fused.param.yaml")
+    started = nodes(detectors="pointnet,pointpillars", config=everything, experts="pointpillars")
+    assert started["pointnet_detector"].parameters[0] == everything
     assert started["clustering"].parameters[0].endswith("pointpillars.param.yaml")
     nodes(single="true", experts="pointnet")
     assert "has no effect" in nodes.said[0]
@@ -203,6 +205,7 @@ def test_weights_and_device_of_a_detector_are_arguments(name, launched):
     ({"detectors": ""}, "detectors is empty"),
     ({"detectors": SEVERAL, "weights": "w.safetensors"}, "NAME=FILE"),
     ({"detectors": SEVERAL, "weights": "v5=w"}, "'v5' is none of"),
+    ({"config": "all.yaml"}, "config: there is no parameter file all.yaml"),
     ({"experts": "pointnets"}, "no parameter file pointnets, nor a detector"),
 ])
 def test_what_cannot_be_started_is_refused_by_name(given, words, launched):

@@ -19,6 +19,8 @@ from test_pointpillars_node import DETECTOR, NODE, offline
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
+from lidar_perception.nodes.reception import Reception
+from lidar_perception.nodes.runtime import ERROR, WAITING
 from lidar_perception.wire.codec import encode
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -135,7 +137,7 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
     drive(peer, node, "deactivate", "cleanup", "unconfigured_shutdown")
     process = f"ready.{NODE}"
     assert not nodes.ended(process) and nodes.end(process) == 0
-    assert "needs the parameter autostart false" in nodes.log(process)
+    assert "asked for, but the node is active\n" in nodes.log(process)
     assert "Traceback" not in nodes.log(process)
 
 
@@ -186,6 +188,20 @@ def test_a_template_that_is_missing_is_known_before_the_first_cloud(nodes, peer)
         peer.set_parameter(f"/{name}", "seed.source", "click")
         drive(peer, name, "configure", "activate", "deactivate", "cleanup",
               "unconfigured_shutdown")
+
+
+def test_an_activation_that_fails_is_said_and_tried_again(here, peer, monkeypatch):
+    def refuse(reception):
+        raise RuntimeError("no such policy")
+    with monkeypatch.context() as broken:
+        broken.setattr(Reception, "open", refuse)
+        node = here(GroundSegmentation, {}, {"~/input/points": "/in"})
+        assert (node.state_label(), node.state[0]) == ("inactive", ERROR)
+        assert "not active: RuntimeError: no such policy" in node.state[1]
+    monkeypatch.setattr("lidar_perception.nodes.managed.RETRY_PERIOD", 0.0)
+    node._retry_at = 0.0
+    peer.wait(lambda: node.active and node.state_label() == "active", "another attempt")
+    assert node.state[1] == WAITING
 
 
 def test_what_waits_is_dropped_and_counted_and_the_pause_is_no_loss(here, peer, good_cloud):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +14,14 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters
-from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter import Parameter, parameter_value_to_python
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.nodes import NODES
+from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.inputs import Paired
-from lidar_perception.nodes.runtime import LATCHED
+from lidar_perception.nodes.perception import Perception
+from lidar_perception.nodes.runtime import ERROR, LATCHED, OK, WARN
 from lidar_perception.param_fields import flatten, parameter_fields
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.wire.codec import bag_message
@@ -81,7 +85,7 @@ def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
     assert set(fields) <= names
     request = GetParameters.Request(names=list(fields))
     values = peer.call("/perception/get_parameters", GetParameters, request).values
-    for name, value in zip(fields, map(parameter_value_to_python, values)):
+    for name, value in zip(fields, map(parameter_value_to_python, values), strict=True):
         assert value == (list(d) if isinstance(d := defaults[name], tuple) else d), name
     described = peer.call("/perception/describe_parameters", DescribeParameters,
                           DescribeParameters.Request(names=list(fields))).descriptors
@@ -96,6 +100,62 @@ def test_parameters_are_those_of_the_dataclass(perception, shared_peer):
                                    ("seed.source", "dream", "ground_truth, click, file")]:
             refused, = peer.change("/perception", {name: value})
             assert refused and words in refused
+
+
+@pytest.mark.parametrize("kind", [GroundSegmentation, Perception])
+def test_every_parameter_is_answered_and_a_list_may_be_empty_and_full(start, kind):
+    """As ros2 param dump asks, and ros2 param set sets, where [] is a list of booleans."""
+    node = start(kind)
+    declared = list(node._parameters)
+    values = node.get_parameters(declared)
+    assert not [p.name for p in values if p.value is None or p.type_ == Parameter.Type.NOT_SET]
+    empty = [p for p in values if p.value == []]
+    assert empty
+    for p in empty:
+        if full := {"crop.sectors": [0, 90], "crop.body": [-1, -1, 0, 1, 1, 2]}.get(p.name):
+            assert node.set_parameters([Parameter(p.name, value=full)])[0].successful
+            assert list(node.get_parameter(p.name).value) == full
+        nothing = Parameter(p.name, Parameter.Type.BOOL_ARRAY, [])
+        assert node.set_parameters([nothing])[0].successful
+        assert node.get_parameter(p.name).type_ == p.type_
+        assert list(node.get_parameter(p.name).value) == []
+
+
+def test_a_problem_whose_numbers_change_with_every_cloud_is_logged_once(start, monkeypatch):
+    """And that it is over, so that the log ends with how it is."""
+    node, lines = start(GroundSegmentation), []
+    monkeypatch.setattr(node, "_log", lambda level, message: lines.append((level, message)))
+    for i in range(100):
+        node.report(WARN, f"intensity goes up to {i / 7:.2g} where 1 is expected")
+        assert node.state[1].startswith(f"intensity goes up to {i / 7:.2g} ")
+        if i % 3 == 0:
+            node.report(OK, "segmenting")
+    node.report(ERROR, "no field 'x'")
+    assert [level for level, _ in lines] == [WARN, OK, ERROR]
+
+
+ARGUMENTS = {"-p foo": "-p foo", "--params-file /nope.yaml": "/nope.yaml",
+             "-r __node:=1bad": "1bad", "--nonsense": "--nonsense", "-p stm.threshold:=7.0":
+             "stm.threshold", "-p bag:=7": "bag"}
+
+
+def test_arguments_that_ros_does_not_take_are_one_line_and_exit_code_2(domain):
+    program = '''
+import sys
+from types import SimpleNamespace
+from lidar_perception.nodes import bag_player, main, perception
+stop = SimpleNamespace(closing=lambda: None, closed=lambda code: None)
+for given in sys.argv[1:]:
+    kind = bag_player.BagPlayer if "bag" in given else perception.Perception
+    print(main._spin(kind, ["x", "--ros-args", *given.split()], 0.0, stop), flush=True)
+    print("---", file=sys.stderr, flush=True)
+'''
+    done = subprocess.run([sys.executable, "-c", program, *ARGUMENTS], text=True,
+                          capture_output=True, timeout=100, check=True)
+    assert done.stdout.split() == ["2"] * len(ARGUMENTS)
+    for words, said in zip(ARGUMENTS.values(), done.stderr.split("---\n"), strict=False):
+        fatal, = [line for line in said.splitlines() if "[FATAL]" in line]
+        assert words in fatal and "Traceback" not in said
 
 
 def test_bad_parameter_files_are_refused_in_one_line(processes):

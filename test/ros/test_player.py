@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import shutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from lidar_perception.campaign.samples import as_ros1
@@ -65,7 +67,7 @@ def test_bytes_arrive_as_they_are_in_the_bag(processes, peer, drive_bag, tmp_pat
 
 def test_offset_duration_topics_and_remapping(processes, peer, text_bag):
     heard, note = peer.listen("/renamed", TEXT), peer.listen("/note", TEXT, LATCHED)
-    start(processes, text_bag, start_offset=0.5, duration=1.0, remap=["/text:=/renamed"],
+    start(processes, text_bag, start_offset=0.5, duration=1.0, remap=["/text:=renamed"],
           wait_for=["/renamed"], rate=10.0)
     peer.wait(lambda: processes.ended("bag_player") and len(heard) >= 10 and note, "ten messages")
     assert texts(heard) == [str(i) for i in range(5, 15)]
@@ -117,6 +119,22 @@ def test_bag_time_runs_at_the_rate_and_stands_still_while_paused(monkeypatch):
     assert player.now_ns == START + 11 * 10**9
 
 
+def test_the_clock_has_its_rate_where_messages_are_rare(monkeypatch):
+    from lidar_perception.nodes import bag_player
+    from lidar_perception.params import PlayerParams
+    player, now, sent = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], []
+    player.now_ns, player.anchor, player.paused, player.steps = START, now[0], False, 0
+    player.params, player.next_clock = PlayerParams(clock_hz=100.0), 0.0
+    player.clock, player.stop = SimpleNamespace(publish=sent.append), Future()
+    monkeypatch.setattr(bag_player, "monotonic", lambda: now[0])
+
+    def serve(timeout_sec):
+        now[0] += timeout_sec + 1e-4
+    player.serve = serve
+    assert player._wait_until(START + 10**9, "/text")
+    assert 99 <= len(sent) <= 102
+
+
 def test_looping_starts_again_and_the_clock_follows_the_bag(processes, peer, text_bag):
     heard, clock = peer.listen("/text", TEXT), peer.listen("/clock", "rosgraph_msgs/msg/Clock")
     start(processes, text_bag, loop=True, rate=10.0, clock_hz=200.0)
@@ -145,6 +163,10 @@ BAD = {
     "nowhere": ({"bag": "/nowhere"}, "no bag /nowhere"),
     "topic": ({"topics": ["/other"]}, "no topic /other"),
     "remap": ({"remap": ["/text"]}, "OLD:=NEW"),
+    "bad_name": ({"remap": ["/text:=a b"]}, "'a b' is no name of a topic"),
+    "no_name": ({"remap": ["/text:="]}, "'' is no name of a topic"),
+    "wait_for": ({"wait_for": ["/text:=x"]}, "must be TOPIC or TOPIC:=COUNT"),
+    "offset": ({"start_offset": 60.0}, "start_offset 60 s is after the end"),
     "rate": ({"rate": -1.0}, "rate"),
     "truncated": ({}, "truncated"),
 }

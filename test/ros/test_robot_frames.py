@@ -303,6 +303,23 @@ def test_a_cloud_of_a_moving_sensor_is_moved_to_its_stamp(start, source):
     assert time_message(START, bag_message).sec == after.header.stamp.sec and len(frame_)
 
 
+def test_the_first_cloud_waits_for_odometry_that_lags_behind_the_end_of_its_turn(start):
+    rng = np.random.default_rng(0)
+    xyz = (rng.uniform(-30, 30, (2000, 3)) * [1, 1, 0.001] - [0, 0, 1.8]).astype(np.float32)
+    msg = message(xyz, t=np.linspace(0, 1e8, len(xyz)).astype("<u4"))
+    node = start(GroundSegmentation, **{"input.deskew": "odometry"})
+    deliver = node._receptions()[0].deliver
+    for i in range(-2, 9):
+        node.transforms.on_odometry(odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
+    needed = deliver(encode(msg), True)
+    assert "/ground_segmentation/input/odometry" in needed and "0.020 s older" in needed
+    assert node.counts["frames"] == 0
+    for i in (9, 10):
+        node.transforms.on_odometry(odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
+    assert deliver(encode(msg), True) is None
+    assert node.counts["deskewed"] == 1 and "not_deskewed" not in node.counts
+
+
 def test_tracks_of_a_tilted_sensor_stay_in_the_clouds_frame(start, weights):
     """Where its detections are in the base, its tracks are in the cloud."""
     scan, tilt = frame(), tilted(-0.2, 0.3, 1.73)
