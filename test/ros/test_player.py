@@ -167,20 +167,21 @@ BAD = {
     "no_name": ({"remap": ["/text:="]}, "'' is no name of a topic"),
     "wait_for": ({"wait_for": ["/text:=x"]}, "must be TOPIC or TOPIC:=COUNT"),
     "offset": ({"start_offset": 60.0}, "start_offset 60 s is after the end"),
+    "types": ({"remap": [f"{POINTS}:={TRUTH}"]}, "would have the types"),
     "rate": ({"rate": -1.0}, "rate"),
     "truncated": ({}, "truncated"),
 }
 
 
 @pytest.fixture(scope="module")
-def refused(shared_processes, text_bag, tmp_path_factory):
+def refused(shared_processes, text_bag, drive_bag, tmp_path_factory):
     """A player for each, in a namespace of its own, all at once; and the truncated bag."""
     cut = tmp_path_factory.mktemp("cut") / "texts"
     shutil.copytree(text_bag, cut)
     storage = next(cut.glob("*.mcap"))
     storage.write_bytes(storage.read_bytes()[:-300])
     for case, (bad, _) in BAD.items():
-        bag = cut if case == "truncated" else text_bag
+        bag = {"truncated": cut, "types": drive_bag}.get(case, text_bag)
         shared_processes.start("bag_player", {}, {"bag": str(bag), **bad}, namespace=case)
     return cut
 
