@@ -35,10 +35,13 @@ def pytest_collection_finish():
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item):
-    """no_cover holds for processes that the test starts, too."""
+    """no_cover holds for processes that the test starts, too. After it coverage starts again, and
+    with each start it wraps os._exit once more: a process that is forked later would save its lines
+    as often, for many seconds."""
     with pytest.MonkeyPatch.context() as patch:
         if item.get_closest_marker("no_cover"):
             patch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)
+            patch.setattr(os, "_exit", os._exit)
         return (yield)
 
 

@@ -68,8 +68,10 @@ def content(folder):
 
 def test_a_cluster_of_two_workers_measures_what_one_process_does(crowds, whole, tmp_path):
     distributed = pytest.importorskip("distributed", reason="needs the extra [distributed]")
-    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
-                                  dashboard_address=None) as cluster:
+    from dask import config
+    forked = config.set({"distributed.worker.multiprocessing-method": "forkserver"})
+    with forked, distributed.LocalCluster(n_workers=2, threads_per_worker=1, processes=True,
+                                          dashboard_address=None) as cluster:
         address = cluster.scheduler_address
         runner.run(STM_CPA, open_recording(crowds), tmp_path / "out", dask=address)
         with pytest.raises(ZeroDivisionError):
