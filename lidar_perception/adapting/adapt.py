@@ -45,7 +45,7 @@ from lidar_perception.classes import CLASSES
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.ground.segment import mount_problem, mounted
+from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
 from lidar_perception.runs.files import make_folder, read_text, write_bytes, write_text
 from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import duration, errors, track
@@ -105,14 +105,15 @@ class Adapting:
             raise InputError(f"--budget {hours:g} must be a number of hours above 0")
         self.header = read_header(weights)
         recording = open_recording(data, sensor_height=params.mount_height or None)
-        self.frames = frames_of(mounted(recording))
+        clouds = first_clouds(recording)
+        self.frames = frames_of(mounted(recording, clouds))
         self.height = self.frames[0].sensor_height
         self.params = settled(params, self.header)
         self.sensor = sensor_named(self.params.sensor, self.height)
         if recorded_source(self.frames[0].pose() is not None) == NO_SOURCE:
             raise InputError(f"{data} has no poses, and to find them by the scans needs kiss-icp; "
                              "pip install 'lidar_perception[odometry]'")
-        for line in filter(None, (*checked(self.frames, data), mount_problem(recording))):
+        for line in filter(None, (*checked(self.frames, data), mount_problem(recording, clouds))):
             errors.print(line, soft_wrap=True)
         self.network = network_to_train(self.header)
         # All sources with weights, opened once while these are looked with.

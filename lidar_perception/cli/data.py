@@ -117,24 +117,23 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     errors.print(escape(str(recording)), soft_wrap=True, style="dim")
     if recording.mounted:
         return recording
-    from lidar_perception.ground.segment import mount_problem, mounted
-    measured = mounted(recording)
+    from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
+    clouds = first_clouds(recording)
+    measured = mounted(recording, clouds)
     if measured is not recording:
         height = next(iter(measured)).sensor_height
         errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds",
                      soft_wrap=True, style="dim")
-    if level:
-        for problem in filter(None, (mount_problem(recording), _intensity_problem(recording))):
+    if level and clouds:
+        for problem in filter(None, (mount_problem(recording, clouds),
+                                     _intensity_problem(recording, clouds[0]))):
             errors.print(escape(problem), soft_wrap=True, style="yellow")
     return measured
 
 
-def _intensity_problem(recording: Any) -> str | None:
+def _intensity_problem(recording: Any, cloud: Any) -> str | None:
     from lidar_perception.wire.messages import intensity_problem
-    try:
-        problem = intensity_problem(next(iter(recording)).load())
-    except InputError:  # who needs the cloud says it
-        return None
+    problem = intensity_problem(cloud)
     return problem and f"{recording.path}: {problem}, and use convert --robot"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
@@ -78,23 +79,27 @@ def _floor(xyz: np.ndarray, params: ThresholdParams = PLANE) -> np.ndarray | Non
     return plane if on_plane.mean() >= MIN_SHARE else None
 
 
-def _floors(recording: Recording, params: ThresholdParams = PLANE) -> np.ndarray:
-    """(K, 3): the floors of the first clouds, where there are such; none where one of the clouds
-    cannot be read, which who needs it says."""
+def first_clouds(recording: Recording) -> list[LidarFrame]:
+    """What mounted() and mount_problem() look at; none where one of them cannot be read, which who
+    needs it says."""
     try:
-        clouds = [frame.load() for frame in islice(recording, FIRST)]
+        return [frame.load() for frame in islice(recording, FIRST)]
     except InputError:
-        return np.zeros((0, 3))
+        return []
+
+
+def _floors(clouds: Sequence[LidarFrame], params: ThresholdParams = PLANE) -> np.ndarray:
+    """(K, 3): the floors of clouds, where there are such."""
     return np.array([plane for cloud in clouds if len(cloud)
                      if (plane := _floor(cloud.xyz, params)) is not None]).reshape(-1, 3)
 
 
-def mounted(recording: Recording) -> Recording:
+def mounted(recording: Recording, clouds: Sequence[LidarFrame]) -> Recording:
     """A recording that does not say how high its sensor is, with the height that its first clouds
     show, the median, where they agree on another one than about KITTI's; else as it is."""
     if recording.mounted or recording.reopen is None:
         return recording
-    heights = -_floors(recording)[:, 2]
+    heights = -_floors(clouds)[:, 2]
     if not len(heights) or np.ptp(heights) > HEIGHT_TOLERANCE:
         return recording
     height = round(float(np.median(heights)), 2)
@@ -103,10 +108,10 @@ def mounted(recording: Recording) -> Recording:
     return recording.reopen(sensor_height=height)
 
 
-def mount_problem(recording: Recording) -> str | None:
+def mount_problem(recording: Recording, clouds: Sequence[LidarFrame]) -> str | None:
     """That the sensor of a recording leans, or is upside down, by its first clouds, with the
     remedy; None where it is level, or less than two of them show it."""
-    floors = _floors(recording, STEEP)
+    floors = _floors(clouds, STEEP)
     if len(floors) < 2:
         return None
     height = -float(np.median(floors[:, 2]))
