@@ -10,7 +10,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lidar_perception.cli.data import browser_option, device_option, opened, port_option
+from lidar_perception.cli.data import (
+    browser_option,
+    device_option,
+    opened,
+    port_option,
+    range_option,
+)
 from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
 
@@ -36,6 +42,7 @@ if TYPE_CHECKING:
               "where there are several.")
 @click.option("--sequence", metavar="NAME", help="The drive of PATH to show, where it has "
               "several.")
+@range_option
 @device_option
 @port_option
 @browser_option
@@ -47,7 +54,7 @@ if TYPE_CHECKING:
               show_default=True, help="Of the page.")
 def view(path: Path | None, live: bool, weights: tuple[str, ...], results: tuple[Path, ...],
          points: str | None, detections: tuple[str, ...], namespace: str, sequence: str | None,
-         device: str, port: int, browser: bool, screenshot: Path | None, frame: int,
+         where: str, device: str, port: int, browser: bool, screenshot: Path | None, frame: int,
          theme: str) -> None:
     """Look at a recording and its results on a page in the browser: clouds with ground and
     clusters, labels, detections by source and score, what is missed and false, tracks. PATH is a
@@ -84,7 +91,7 @@ def view(path: Path | None, live: bool, weights: tuple[str, ...], results: tuple
         with _listening(namespace, points or "", detections) as served:
             asyncio.run(serve(served, port, started))
         return
-    served = _served(path, weights, results, points, sequence, device)
+    served = _served(path, weights, results, points, sequence, where, device)
     if frame >= served.drive.end:
         raise InputError(f"{path} has no frame {frame}; it has {served.drive.end}")
     if screenshot is None:
@@ -113,7 +120,7 @@ def _listening(namespace: str, points: str, detections: tuple[str, ...]) -> Iter
 
 
 def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], points: str | None,
-            sequence: str | None, device: str) -> Served:
+            sequence: str | None, where: str, device: str) -> Served:
     """What the page shows of a path."""
     from lidar_perception.data.bag_frames import recognises
     from lidar_perception.detectors.open import open_detector
@@ -129,8 +136,8 @@ def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], poi
         drive = shown.with_recorded_scans(drive)
         found = shown.recorded(path, [f.stamp_ns for f in drive.frames])
     height = drive.frames[0].sensor_height
-    more = {Path(name).stem: shown.by_detector(open_detector(name, device, sensor_height=height))
-            for name in weights}
+    more = {Path(name).stem: shown.by_detector(
+        open_detector(name, device, sensor_height=height, where=where)) for name in weights}
     more |= {folder.name: shown.by_files(folder) for folder in results}
     found = shown.Results({**found.sources, **more}, found.tracks)
     return Served(drive, layers=found.layers_of(drive), tracks=lambda: found.tracks)

@@ -79,6 +79,15 @@ class NetworkDetector:
         other.header = replace(self.header, calibration={})
         return other
 
+    def seeing(self, where: str) -> Self:
+        """The same detector, of the same network, that sees ahead or around, or what its weights
+        were trained for (auto). InputError where it cannot; without a range of its own it always
+        sees all around."""
+        if where == "ahead":
+            raise InputError(f"{self.header.network} sees all around; crop.* leaves out what is "
+                             "not wanted")
+        return self
+
     def with_min_score(self, min_score: float) -> Self:
         """The same detector, of the same network, with this least score for every class."""
         other = copy.copy(self)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -51,6 +52,14 @@ class NmsParams(Params):
                             low=1, high=10_000)
     max_boxes: int = param(100, "At most this many boxes are kept, those with the highest scores.",
                            low=1, high=10_000)
+
+
+def seen_range() -> Any:
+    """The parameter of detectors with PointPillars that says what they see."""
+    return param("auto", "What it sees. ahead: 69.12 m ahead and 39.68 m to each side; around: "
+                 "51.2 m to every side, in two looks of a network that was trained ahead. auto: "
+                 "what the weights were trained for.", choices=("auto", "ahead", "around"),
+                 fixed=True)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
+from lidar_perception.geometry import wrap_angle
 from lidar_perception.ground.params import GroundParams, SensorPoseParams
 from lidar_perception.ground.segment import level, segment_ground
 from lidar_perception.types import SENSOR_HEIGHT, Detections, LidarFrame
@@ -46,13 +47,23 @@ def in_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detection
     return replace(detections, boxes=boxes)
 
 
+def turned_about(frame: LidarFrame) -> LidarFrame:
+    """The frame of a sensor that looks the other way: turned by 180 degrees about z, exactly."""
+    return replace(frame, xyz=frame.xyz * np.array([-1, -1, 1], np.float32))
+
+
+def turned_boxes(boxes: np.ndarray) -> np.ndarray:
+    """Boxes (K, 7) turned likewise."""
+    turned = boxes * np.array([-1, -1, 1, 1, 1, 1, 1], boxes.dtype)
+    turned[:, 6] = wrap_angle(turned[:, 6] + np.pi)
+    return turned
+
+
 def with_intensity_scaled(frame: LidarFrame, factor: float) -> LidarFrame:
     """The frame with its intensity times factor; itself where it has none."""
     if frame.intensity is None:
         return frame
     return replace(frame, intensity=frame.intensity * np.float32(factor))
-
-
 
 
 def made_up_frame(pose: SensorPoseParams) -> LidarFrame:

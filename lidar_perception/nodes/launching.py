@@ -51,6 +51,9 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
                    "file."),
     "ahead": dict(default_value="", description="Parameter input.ahead: where the detectors look, "
                   "degrees from the clouds' x axis; empty: that of the parameter file."),
+    "range": dict(default_value="", choices=["", "auto", "ahead", "around"],
+                  description="Parameter range of fused and pointpillars: what they see; empty: "
+                  "that of the parameter file."),
     "config": dict(default_value="", description="Parameter file of all nodes; empty: "
                    "config/*.param.yaml of each detector."),
     "experts": dict(default_value="", description="Of ground and clusters: a parameter file, or "
@@ -231,6 +234,8 @@ def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, 
         for name, chosen in (("weights", weights.get(detector)), ("device", value["device"])):
             if chosen:
                 given[f"{detector}.{name}"] = chosen
+        if value["range"] and detector != "pointnet":
+            given[f"{detector}.range"] = value["range"]
     return given
 
 

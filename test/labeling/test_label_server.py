@@ -74,7 +74,7 @@ def asked(url, questions):
     """What the coroutine questions(page) gives."""
     async def run():
         async with opened(url) as page:
-            return await asyncio.wait_for(questions(page), 120)
+            return await asyncio.wait_for(questions(page), 600)
     return asyncio.run(run())
 
 

@@ -20,8 +20,8 @@ from lidar_perception.param_fields import with_values
 
 NODE = "fused_detector"
 FILE = Path(__file__).resolve().parents[2] / "config" / "fused.param.yaml"
-EAGER = with_values(FusedDetectorParams(), {
-    f"fused.scores.{name}": 0.0 for name in ("car", "pedestrian", "cyclist", "other")})
+EAGER = with_values(FusedDetectorParams(), {"fused.range": "around", **{
+    f"fused.scores.{name}": 0.0 for name in ("car", "pedestrian", "cyclist", "other")}})
 DETECTOR = DetectorUnderTest(NODE, graph_of(["fused"], single=True), FILE, EAGER,
                              load_fused_detector)
 

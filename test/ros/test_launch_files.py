@@ -190,13 +190,15 @@ def test_rviz_follows_the_names_of_the_graph(launched):
 
 
 @pytest.mark.parametrize("name", ["pointpillars", "pointnet", "fused"])
-def test_weights_and_device_of_a_detector_are_arguments(name, launched):
+def test_weights_device_and_range_of_a_detector_are_arguments(name, launched):
     expected = {f"{name}.weights": "w.safetensors", f"{name}.device": "cpu",
                 "use_sim_time": False}
+    if name != "pointnet":  # it always sees all around
+        expected[f"{name}.range"] = "around"
     for file, weights in (name, "w.safetensors"), ("detectors", f"{name}=w.safetensors"):
         _, nodes = launched(file)
-        started = nodes(weights=weights, device="cpu", detectors=name if file == name else
-                        "pointnet,pointpillars,fused")
+        started = nodes(weights=weights, device="cpu", range="around", detectors=name
+                        if file == name else "pointnet,pointpillars,fused")
         assert started[f"{name}_detector"].parameters[1] == expected
 
 

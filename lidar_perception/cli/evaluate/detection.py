@@ -13,6 +13,7 @@ from lidar_perception.cli.data import (
     device_option,
     intervals_option,
     no_labels,
+    range_option,
     walk_options,
     weights_option,
 )
@@ -26,6 +27,7 @@ from lidar_perception.types import InputError
 @walk_options()
 @a_path("--results", "Result files of any detector, in KITTI's format: DIR/000000.txt ...", "DIR")
 @weights_option
+@range_option
 @device_option
 @click.option("--min-score", type=click.FloatRange(0, 1), default=MIN_SCORE, show_default=True,
               help="Leave out boxes of --weights with a lower score. Average precision needs "
@@ -44,7 +46,7 @@ from lidar_perception.types import InputError
 @click.option("--errors-from", type=click.FloatRange(0, 1), default=0.2, show_default=True,
               metavar="SCORE", help="With --errors: of boxes from this score on.")
 @intervals_option
-def detection(walk: Walk, results: Path | None, weights: Path | None, device: str,
+def detection(walk: Walk, results: Path | None, weights: Path | None, where: str, device: str,
               min_score: float, keep: float, mount_height: float, write_results: Path | None,
               errors: bool, errors_from: float, intervals: int) -> None:
     """Boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
@@ -94,7 +96,8 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, device: st
         height = recording.frames[0].sensor_height
         if weights.suffix == ".safetensors" and (other := read_header(weights).unlike(height)):
             terminal_errors.print(f"{weights}: {other}", soft_wrap=True)
-        open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height)
+        open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height,
+                        where=where)
         start = partial(by_detector, open_, keep, write_results)
     report = DetectionReport()
     walk.fill(report, recording, start)

@@ -12,6 +12,7 @@ from lidar_perception.cli.data import (
     a_path,
     device_option,
     no_labels,
+    range_option,
     walk_options,
     weights_option,
 )
@@ -24,10 +25,11 @@ from lidar_perception.types import InputError
 @a_path("--results", "Result file of any detector, in the format of nuScenes' detection task.",
         "JSON")
 @weights_option
+@range_option
 @device_option
 @a_path("--write-results", "Write the detections of --weights as a result file, also for frames "
                            "without labels.", "JSON")
-def nuscenes(walk: Walk, results: Path | None, weights: Path | None, device: str,
+def nuscenes(walk: Walk, results: Path | None, weights: Path | None, where: str, device: str,
              write_results: Path | None) -> None:
     """Boxes by the protocol of nuScenes' detection task.
 
@@ -63,7 +65,8 @@ def nuscenes(walk: Walk, results: Path | None, weights: Path | None, device: str
         start = partial(by_file, results)
     else:
         assert weights is not None  # as there are no --results
-        open_ = partial(open_detector, weights, device, sensor_height=first.sensor_height)
+        open_ = partial(open_detector, weights, device, sensor_height=first.sensor_height,
+                        where=where)
         start = partial(by_detector, open_, write_results is not None)
     report = NuscenesReport()
     walk.fill(report, recording, start)

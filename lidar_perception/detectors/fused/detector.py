@@ -69,7 +69,7 @@ class FusedDetector(NetworkDetector):
         return self.params.fused
 
     def seeing(self, where: str) -> FusedDetector:
-        """The same detector with one of the RANGES, whatever PointPillars was trained for."""
+        """See base; the range is PointPillars'."""
         return FusedDetector(self.proposer.seeing(where), self.classifier, self.params)
 
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
@@ -171,7 +171,7 @@ def load_fused_detector(path: str | Path = "", device: str = "auto",
     load_pointnet_detector."""
     settings = params.fused
     proposer = load_detector(path, device, DetectorParams(pointpillars=PointPillarsParams(
-        weights=settings.weights, threads=settings.threads, warm_up=False)))
+        weights=settings.weights, range=settings.range, threads=settings.threads, warm_up=False)))
     classifier = load_pointnet_detector(settings.classifier, device, PointNetDetectorParams(
         pointnet=PointNetParams(warm_up=False)))
     detector = FusedDetector(proposer, classifier, params)

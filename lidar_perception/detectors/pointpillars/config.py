@@ -31,16 +31,18 @@ SIZES = {
 }
 
 
-
-class Range(TypedDict, total=False):
+class Range(TypedDict):
     """What a network sees, fields of NetworkConfig."""
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
 
-RANGES = {"ahead": Range(),  # as in KITTI, where labels are only there
-          "around": Range(low=(-51.2, -51.2, -3.0), high=(51.2, 51.2, 1.0))}
+AHEAD = Range(low=(0.0, -39.68, -3.0), high=(69.12, 39.68, 1.0))  # as in KITTI, where labels are
+RANGES = {"ahead": AHEAD, "around": Range(low=(-51.2, -51.2, -3.0), high=(51.2, 51.2, 1.0))}
+# What one look of two is of around, with a network that was trained ahead: a half, and so much of
+# the other that no object is cut.
+HALF = Range(low=(-5.12, -51.2, -3.0), high=(51.2, 51.2, 1.0))
 
 XY_SCALE = 0.02  # of networks that are trained here
 CHOICES = {"neck": ("deconv", "fpn"), "fusion": ("add", "concat"), "anchors_at": ("cells", "ends")}
@@ -100,8 +102,8 @@ class NetworkConfig:
     pseudo_map: bool = False
     neck: str = "deconv"
     fusion: str = "add"
-    low: tuple[float, float, float] = (0.0, -39.68, -3.0)
-    high: tuple[float, float, float] = (69.12, 39.68, 1.0)
+    low: tuple[float, float, float] = AHEAD["low"]
+    high: tuple[float, float, float] = AHEAD["high"]
     cell: float = 0.16
     xy_scale: float = 1.0
     max_points: int = 0

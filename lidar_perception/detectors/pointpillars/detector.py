@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import torch
@@ -21,8 +21,8 @@ from lidar_perception.detectors.devices import CPU, chosen_device
 from lidar_perception.detectors.nms import best_of_each, suppressed
 from lidar_perception.detectors.pointpillars.anchors import make_anchors
 from lidar_perception.detectors.pointpillars.box_coder import decode
-from lidar_perception.detectors.pointpillars.config import RANGES
-from lidar_perception.detectors.pointpillars.expert import NetworkInput, network_input
+from lidar_perception.detectors.pointpillars.config import HALF, RANGES, NetworkConfig
+from lidar_perception.detectors.pointpillars.expert import NetworkInput, experts, network_input
 from lidar_perception.detectors.pointpillars.network import (
     PointPillars,
     Prediction,
@@ -35,10 +35,14 @@ from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.detectors.view import (
     in_sensor_frame,
     made_up_frame,
+    turned_about,
+    turned_boxes,
     visible,
     with_intensity_scaled,
 )
 from lidar_perception.types import SENSOR_HEIGHT, Detections, InputError, LidarFrame
+
+SHARED = 1.0  # m behind the sensor; what has its centre there is taken from either look
 
 
 class Network(Protocol):
@@ -67,14 +71,30 @@ class TorchNetwork:
         return head.logits(features)[0], lambda anchors: head.boxes_at(features, anchors)
 
 
+class Boxes(NamedTuple):
+    """What passed in one look, before NMS: boxes (M, 7), their best logits (M,) and labels (M,)
+    int, indices in the classes."""
+
+    boxes: np.ndarray
+    logits: np.ndarray
+    labels: np.ndarray
+
+
 class PointPillarsDetector(NetworkDetector):
-    """EG-PointPillars of any version as a detector, see contract.py."""
+    """EG-PointPillars of any version as a detector, see contract.py.
+
+    It looks once, at the range of its config. With a look at a HALF of it, for a network that knows
+    only what is ahead, it looks twice, the second time at the cloud turned about the sensor by 180
+    degrees: what is behind is then ahead. Experts see the whole range, once.
+    """
 
     def __init__(self, network: Network, header: Header, device: torch.device,
-                 params: DetectorParams = DetectorParams()):
+                 params: DetectorParams = DetectorParams(), look: NetworkConfig | None = None):
         super().__init__(header, device, params)
         self.network = network
-        self.anchors = make_anchors(self.config, device)
+        self.look = look or self.config
+        self.turns = (False,) if look is None else (False, True)
+        self.anchors = make_anchors(self.look, device)
 
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:
@@ -84,57 +104,84 @@ class PointPillarsDetector(NetworkDetector):
         indices, seen = visible(frame, self.config, pose)
         seen = with_intensity_scaled(seen, self.settings.intensity_scale)
         t1 = perf_counter()
-        inputs = network_input(
+        looks = self._looks(seen, *experts(
             seen, self.config, None if ground is None else ground.take(indices).astype(bool),
-            None if cluster_ids is None else cluster_ids.take(indices),
-            self.params.ground, self.params.clustering)
+            _taken(cluster_ids, indices), self.params.ground, self.params.clustering))
         t2 = perf_counter()
-        problem = self._problem(frame, seen, inputs)
-        if len(inputs.points) == 0:
+        problem = self._problem(frame, seen, looks)
+        if not looks:
             return Found(Detections.none(),
                          dict(zip(STEPS, ((t1 - t0) * 1e3, (t2 - t1) * 1e3, 0.0, 0.0))),
                          problem or self.fallback)
         with torch.inference_mode():
-            t3, t4, detections, best, broken = self.guarded(lambda: self._predict(inputs))
+            t3, t4, detections, best, broken = self.guarded(lambda: self._predict(looks))
             detections = in_sensor_frame(detections, pose)
         t5 = perf_counter()
         ms = dict(zip(STEPS, (
             (t1 - t0 + t3 - t2) * 1e3, (t2 - t1) * 1e3, (t4 - t3) * 1e3, (t5 - t4) * 1e3)))
         return Found(detections, ms, broken or problem or self.fallback, best)
 
-    def _predict(self, inputs: NetworkInput) -> tuple:
-        """When the network began and ended, detections, and what nothing_passed gives."""
-        points = torch.from_numpy(inputs.points).to(self.device)
-        maps = None
-        if inputs.cluster_map is not None:
-            maps = torch.from_numpy(inputs.cluster_map)[None].to(self.device)
-        pillars = make_pillars([points], self.config)
-        begun = self.now()
-        logits, boxes_at = self.network(pillars, maps)
-        ended = self.now()
-        return begun, ended, *self._detections(logits, boxes_at)
+    def _looks(self, seen: LidarFrame, ground: np.ndarray | None,
+               cluster_ids: np.ndarray | None) -> dict[bool, NetworkInput]:
+        """The network's inputs, by whether they are turned, where there are any."""
+        inputs = {}
+        for turned in self.turns:
+            part, own_ground, own_ids = seen, ground, cluster_ids
+            if len(self.turns) > 1:
+                indices, part = visible(turned_about(seen) if turned else seen, self.look)
+                own_ground, own_ids = _taken(ground, indices), _taken(cluster_ids, indices)
+            inputs[turned] = network_input(part, self.look, own_ground, own_ids)
+        return {turned: given for turned, given in inputs.items() if len(given.points)}
 
-    def _detections(self, logits: Tensor, boxes_at: Callable) -> tuple:
-        settings, broken = self.settings, None
-        best_scores: dict[str, float] = {}
+    def _predict(self, looks: dict[bool, NetworkInput]) -> tuple:
+        """When the network began and ended, detections, and what nothing_passed gives."""
+        given = []
+        for inputs in looks.values():
+            points = torch.from_numpy(inputs.points).to(self.device)
+            maps = None
+            if inputs.cluster_map is not None:
+                maps = torch.from_numpy(inputs.cluster_map)[None].to(self.device)
+            given.append((make_pillars([points], self.look), maps))
+        begun = self.now()
+        predictions = [self.network(*inputs) for inputs in given]
+        ended = self.now()
+        return begun, ended, *self._detections(dict(zip(looks, predictions)))
+
+    def _detections(self, predictions: dict[bool, Prediction]) -> tuple:
+        """Detections, and what nothing_passed gives, of all looks together."""
+        found = [self._passed(turned, *prediction) for turned, prediction in predictions.items()]
+        boxes, logits, labels = map(np.concatenate, zip(*found))
+        best: dict[str, float] = {}
+        broken = None
+        if any(len(scores) > 1 and (scores == scores[0]).all()
+               for scores, _ in predictions.values()):
+            boxes, logits, labels = boxes[:0], logits[:0], labels[:0]
+            broken = "the network gives every place the same scores; the weights are broken, " \
+                     "take others"
+        elif len(boxes) == 0:
+            highest = torch.stack([scores.amax(dim=0) for scores, _ in predictions.values()])
+            best, broken = self.nothing_passed(torch.sigmoid(highest.amax(dim=0)).tolist())
+        scores = torch.sigmoid(torch.from_numpy(logits)).numpy()
+        detections = best_of_each(boxes, scores, labels, self.config.classes, self.settings.nms)
+        return calibrated(detections, self.header.calibration), best, broken
+
+    def _passed(self, turned: bool, logits: Tensor, boxes_at: Callable) -> Boxes:
+        """The boxes of one look whose score suffices, turned back."""
         limits = logits.new_tensor([*map(_logit, self.raw_min_scores())])
         chosen = torch.nonzero((logits >= limits).any(dim=1))[:, 0]
-        if len(logits) > 1 and (logits == logits[0]).all():
-            chosen, broken = chosen[:0], ("the network gives every place the same scores; the "
-                                          "weights are broken, take others")
-        elif len(chosen) == 0:
-            best_scores, broken = self.nothing_passed(torch.sigmoid(logits.amax(dim=0)).tolist())
         best, labels = logits[chosen].max(dim=1)
         valid = torch.nonzero(best >= limits[labels])[:, 0]
-        if len(valid) > settings.nms.candidates:
-            valid = valid[best[valid].topk(settings.nms.candidates).indices]
+        if len(valid) > self.settings.nms.candidates:
+            valid = valid[best[valid].topk(self.settings.nms.candidates).indices]
         chosen, best, labels = chosen[valid], best[valid], labels[valid]
         codes, directions = boxes_at(chosen)
         boxes = decode(codes.float(), directions.argmax(dim=1), self.anchors[chosen],
                        self.config.direction_offset).cpu().numpy()
-        detections = best_of_each(boxes, torch.sigmoid(best).cpu().numpy(), labels.cpu().numpy(),
-                                  self.config.classes, settings.nms)
-        return calibrated(detections, self.header.calibration), best_scores, broken
+        found = Boxes(boxes, best.cpu().numpy(), labels.cpu().numpy())
+        if len(self.turns) > 1:
+            own = boxes[:, 0] >= -SHARED
+            found = Boxes(*(column[own] for column in found))
+        return found._replace(boxes=turned_boxes(found.boxes)) if turned else found
 
     def out_of_sight(self, frame: LidarFrame, seen: LidarFrame) -> str | None:
         """Why nothing of the frame is seen, with the remedy; None where something is."""
@@ -147,10 +194,11 @@ class PointPillarsDetector(NetworkDetector):
                     f"{SENSOR_HEIGHT} m high; is x forward, and ground.sensor_pose right?")
         return None
 
-    def _problem(self, frame: LidarFrame, seen: LidarFrame, inputs: NetworkInput) -> str | None:
+    def _problem(self, frame: LidarFrame, seen: LidarFrame,
+                 looks: dict[bool, NetworkInput]) -> str | None:
         if blind := self.out_of_sight(frame, seen):
             return blind
-        if len(inputs.points) == 0:
+        if not looks:
             return ("every point in the network's range is ground; is the sensor mounted at "
                     "another height or angle? set ground.sensor_pose")
         if frame.intensity is None and self.settings.intensity_scale:
@@ -158,19 +206,34 @@ class PointPillarsDetector(NetworkDetector):
         return None
 
     def seeing(self, where: str) -> PointPillarsDetector:
-        """The same network with one of the RANGES: what it knows of a place it knows of all."""
-        header = replace(self.header, config=replace(self.config, **RANGES[where]))
-        return PointPillarsDetector(self.network, header, self.device, self.params)
+        """See base. Around in two looks, where the network knows only what is ahead. InputError
+        where its cells do not fit the range, and of an exported network, which has one range."""
+        if where == "auto" or (where == "around") == (self.config.low[0] < 0):
+            return self
+        if not isinstance(self.network, TorchNetwork):
+            raise InputError("an exported network sees what it was exported for; take the "
+                             f"checkpoint to see {where}")
+        try:
+            config = replace(self.config, **RANGES[where])
+            look = replace(self.config, **HALF) if where == "around" else None
+        except ValueError as error:
+            raise InputError(f"this network cannot see {where}: {error}") from None
+        return PointPillarsDetector(self.network, replace(self.header, config=config), self.device,
+                                    self.params, look)
 
     def bring_to(self, device: torch.device) -> None:
         """Bring network and anchors to a device."""
         self.network.to(device)
-        self.anchors = make_anchors(self.config, device)
+        self.anchors = make_anchors(self.look, device)
 
     def warm_up(self) -> None:
         """Run every part once on made-up points, so that what is compiled is compiled."""
         self(made_up_frame(self.params.ground.sensor_pose))
         suppressed(np.ones((2, 7)), np.ones(2), np.zeros(2, int), 0.5)
+
+
+def _taken(column: np.ndarray | None, indices: np.ndarray) -> np.ndarray | None:
+    return None if column is None else column.take(indices)
 
 
 def _logit(score: float) -> float:
@@ -204,7 +267,7 @@ def load_detector(path: str | Path = "", device: str = "auto",
         if wanted not in ("auto", found):
             raise InputError(f"{path} holds {name} {found}, asked for was {wanted}; change "
                              f"pointpillars.{name} or pointpillars.weights")
-    detector = PointPillarsDetector(network, header, CPU, params)
+    detector = PointPillarsDetector(network, header, CPU, params).seeing(params.pointpillars.range)
     detector.move(where)
     if params.pointpillars.warm_up:
         detector.warm_up()

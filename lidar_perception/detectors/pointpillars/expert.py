@@ -44,18 +44,11 @@ def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | 
     ground (N,) bool and cluster_ids (N,) int, 0 = none, are computed if the version needs them and
     they are None. The ids that are left are numbered anew from 1, in their order.
     """
-    needs_clusters = config.cluster_ids or config.pseudo_map
-    if not needs_clusters:
-        cluster_ids = None
-    if config.remove_ground or (needs_clusters and cluster_ids is None):
-        if ground is None:
-            ground = levelled_ground(seen, ground_params)
-        if needs_clusters and cluster_ids is None:
-            cluster_ids = cluster_obstacles(seen.xyz, ground, clustering)
-        if config.remove_ground:
-            obstacles = np.flatnonzero(~np.asarray(ground, bool))
-            seen = seen.take(obstacles)
-            cluster_ids = None if cluster_ids is None else cluster_ids.take(obstacles)
+    ground, cluster_ids = experts(seen, config, ground, cluster_ids, ground_params, clustering)
+    if config.remove_ground:
+        obstacles = np.flatnonzero(~np.asarray(ground, bool))
+        seen = seen.take(obstacles)
+        cluster_ids = None if cluster_ids is None else cluster_ids.take(obstacles)
     points = np.zeros((len(seen), config.point_columns), np.float32)
     points[:, :3] = seen.xyz
     if seen.intensity is not None:
@@ -67,6 +60,24 @@ def network_input(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | 
         points[:, 4] = cluster_ids
     return NetworkInput(points, draw_clusters(seen.xyz, cluster_ids, config)
                         if config.pseudo_map else None)
+
+
+def experts(seen: LidarFrame, config: NetworkConfig, ground: np.ndarray | None = None,
+            cluster_ids: np.ndarray | None = None, ground_params: GroundParams = EXPERT_GROUND,
+            clustering: ClusteringParams = EXPERT_CLUSTERING,
+            ) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """ground (N,) bool and cluster_ids (N,) int of the N points of `visible`, computed where they
+    are None and the version needs them; ids are None where it needs none."""
+    needs_clusters = config.cluster_ids or config.pseudo_map
+    if not needs_clusters:
+        cluster_ids = None
+    missing = needs_clusters and cluster_ids is None
+    if ground is None and (config.remove_ground or missing):
+        ground = levelled_ground(seen, ground_params)
+    if missing:
+        assert ground is not None
+        cluster_ids = cluster_obstacles(seen.xyz, ground, clustering)
+    return ground, cluster_ids
 
 
 def draw_clusters(xyz: np.ndarray, cluster_ids: np.ndarray, config: NetworkConfig) -> np.ndarray:

@@ -1,0 +1,107 @@
+"""All around in two looks of a network that knows only what is ahead."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pointnet_samples
+import pytest
+from detection_samples import random_detector, same, tiny
+
+from lidar_perception.classes import CAR
+from lidar_perception.clustering.cluster import cluster_obstacles
+from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.detectors.pointpillars.config import HALF, RANGES
+from lidar_perception.detectors.pointpillars.detector import CPU, PointPillarsDetector
+from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
+from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
+from lidar_perception.detectors.view import turned_about, turned_boxes
+from lidar_perception.geometry import horizontal_range
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.scoring.centres.matching import match_centres
+from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.sensor import HDL64E
+from lidar_perception.types import InputError, LidarFrame
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+
+
+def shipped(version="v4", where="auto"):
+    return open_detector(WEIGHTS / f"pointpillars_{version}_compact.safetensors", "cpu",
+                         min_score=0.05, where=where)
+
+
+def columns_of(scan):
+    """What the experts say of it; of a turned cloud they would say nearly the same."""
+    ground = segment_ground(scan, EXPERT_GROUND)
+    return {"ground": ground, "cluster_ids": cluster_obstacles(scan.xyz, ground, EXPERT_CLUSTERING)}
+
+
+@pytest.fixture(scope="module")
+def street(streets):
+    return scan_at(12, 0, HDL64E)
+
+
+@pytest.mark.parametrize("version", ["v0", "v2", "v4"])
+def test_a_turned_cloud_has_the_turned_boxes(version, street):
+    detector = shipped(version, "around")
+    columns = columns_of(street.frame)
+    found = detector(street.frame, **columns).detections
+    turned = detector(turned_about(street.frame), **columns).detections
+    assert min((found.boxes[:, 0] > 3).sum(), (found.boxes[:, 0] < -3).sum()) > 3
+    assert same(turned, replace(found, boxes=turned_boxes(found.boxes)), atol=1e-4)
+
+
+def test_cars_that_are_plain_to_see_are_found_behind_and_beside(street):
+    truth = street.truth
+    plain = np.array([e["num_points"] > 100 and e["visible"] > 0.5 for e in truth.extras])
+    angle = np.degrees(np.arctan2(truth.boxes[:, 1], truth.boxes[:, 0]))
+    near = horizontal_range(truth.boxes) < 30
+    cars = truth.boxes[(truth.class_ids == CAR) & plain & near & (np.abs(angle) > 60)]
+    found = open_detector("fused", "cpu", where="around")(street.frame).detections
+    mine = found.boxes[found.class_ids == CAR]
+    assert len(cars) >= 4
+    assert len(match_centres(mine[:, :3], cars[:, :3], 1.0)[0]) >= 0.8 * len(cars)
+
+
+def test_away_from_the_border_it_says_what_one_look_says(street):
+    detector, columns = shipped(), columns_of(street.frame)
+    half = replace(detector.header, config=replace(detector.config, **HALF))
+    one = PointPillarsDetector(detector.network, half, CPU, detector.params)
+    apart = [found[np.flatnonzero(found.boxes[:, 0] > 8)] for found in (
+        each(street.frame, **columns).detections for each in (one, detector.seeing("around")))]
+    assert len(apart[0]) > 3 and same(*apart)
+
+
+def test_there_and_back_it_is_the_same_detector(street):
+    detector = shipped("v1")
+    around = detector.seeing("around")
+    assert detector.seeing("auto") is detector.seeing("ahead") is detector
+    assert around.seeing("around") is around and around.config.low == RANGES["around"]["low"]
+    assert same(around.seeing("ahead")(street.frame), detector(street.frame))
+    trained = random_detector(**RANGES["around"])  # one look of it is enough
+    assert trained.seeing("around") is trained and len(trained.turns) == 1
+
+
+def test_nothing_behind_or_nothing_at_all_is_no_trouble(street):
+    detector = shipped(where="around")
+    ahead = detector(street.frame.take(np.flatnonzero(street.frame.xyz[:, 0] > 6)))
+    assert len(ahead.detections) and ahead.problem is None
+    nothing = detector(LidarFrame.of(np.zeros((0, 3))))
+    assert len(nothing.detections) == 0 and "empty" in nothing.problem
+
+
+def test_what_cannot_see_that_says_so():
+    config = pointnet_samples.small()
+    pointnet = PointNetDetector(pointnet_samples.lively(config), Header(config), CPU)
+    assert pointnet.seeing("around") is pointnet
+    with pytest.raises(InputError, match="pointnet sees all around; crop"):
+        pointnet.seeing("ahead")
+    with pytest.raises(InputError, match="cannot see around: a grid of"):
+        random_detector(low=(0.0, -3.52, -3.0), high=(7.04, 3.52, 1.0), cell=0.22).seeing("around")
+    exported = PointPillarsDetector(lambda pillars, maps: None, Header(tiny()), CPU)
+    with pytest.raises(InputError, match="take the checkpoint to see around"):
+        exported.seeing("around")
