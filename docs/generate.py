@@ -196,8 +196,8 @@ PAGES: dict[str, dict[str, Any]] = {
         outputs=[]),
     "bag_player": dict(
         params=params.PlayerParams(),
-        what="Replays a rosbag2 bag (MCAP or SQLite3). Messages go from the file to DDS as they "
-             "are. Ends with exit code 0 when the bag is played.",
+        what="Replays a rosbag2 bag (MCAP or SQLite3), or one of ROS 1. Messages go from the file "
+             "to DDS as they are. Ends with exit code 0 when the bag is played.",
         inputs=[],
         outputs=[("the topics of the bag", "as recorded", "With the recorded QoS."),
                  ("/clock", "rosgraph_msgs/Clock", "The bag's time, with `clock_hz`.")],
@@ -209,7 +209,7 @@ PAGES: dict[str, dict[str, Any]] = {
     "bag_recorder": dict(
         params=params.RecorderParams(),
         what="Records topics to an MCAP bag. The bag appears under its name when the node ends.",
-        inputs=[("the topics of `topics`", "any", "With the QoS of their publishers.")],
+        inputs=[("the topics named in topics", "any", "With the QoS of their publishers.")],
         outputs=[]),
 }
 

@@ -32,9 +32,10 @@ class AdaptParams(Params):
                        "weights were trained on.")
     sensor: str = param("", "Sensor of the simulated scans: a sensor.yaml, or the name of a "
                         "preset. Empty: the one that the weights were trained for.")
-    mount_height: float = param(0.0, "Its height above the ground. 0: as the recording says, or "
-                                "else as its first clouds show.", unit="m", low=0.0, high=10.0)
-    worse_simulated: float = param(2.0, "A round is not taken if the AP on simulated scans falls "
+    mount_height: float = param(0.0, "Height of the sensor above the ground. 0: as the "
+                                "recording says, or else as its first clouds show.", unit="m",
+                                low=0.0, high=10.0)
+    worse_simulated: float = param(2.0, "A round is discarded if the AP on simulated scans falls "
                                    "by more than this.", low=0.0, high=100.0)
-    worse_agreement: float = param(0.02, "Nor if the agreement falls by more than this.", low=0.0,
-                                   high=1.0)
+    worse_agreement: float = param(0.02, "A round is discarded if the agreement falls by "
+                                   "more than this.", low=0.0, high=1.0)

@@ -64,7 +64,7 @@ class CpaParams(Params):
                              low=0.0, high=1e6)
     max_range: float = param(30.0, "Farthest horizontal range where points are added.", unit="m",
                              low=0.0, high=1e6)
-    steps: int = param(2, "Contracted copies of the cluster that are added; 0 adds none.",
+    steps: int = param(2, "Number of shrunken copies of the cluster that are added; 0: none.",
                        low=0, high=100)
     decrement: float = param(0.10, "Scale lost with each copy.", low=0.0, high=1.0)
     min_scale: float = param(0.20, "Smallest scale of a copy.", low=0.0, high=1.0)

@@ -38,10 +38,10 @@ def adapt(data: Path, weights: Path, out: Path, budget: float, resume: bool, for
           device: str, jobs: int, params: AdaptParams) -> None:
     """Adapt a detector to drives without labels.
 
-    What PointPillars, silhouettes and the cluster network agree on while objects are followed over
-    time is learned as objects, what cannot be one as background, and nothing of what is unclear;
-    simulated scans and objects are mixed in. After each round simulated scans, and frames that were
-    not learned from, say whether the weights are worse; then the round is not taken.
+    What PointPillars, silhouettes and the cluster network agree on while objects are tracked is
+    learned as objects, what cannot be one as background; unclear ones are ignored. Simulated scans
+    and objects are mixed in. After each round simulated scans, and frames that were not learned
+    from, test the weights; a round that makes them worse is discarded.
 
     \b
     Examples:

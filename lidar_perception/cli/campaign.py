@@ -39,7 +39,7 @@ WIDTH = max(map(len, PARTS))
               help="The same seed gives the same cases.")
 @click.option("--only", type=click.Choice(list(PARTS)), multiple=True,
               help="Only this part; may be given several times.")
-@click.option("--cases", type=click.IntRange(1), help="At most so many cases of each part.")
+@click.option("--cases", type=click.IntRange(1), help="At most this many cases of each part.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("out/campaign"),
               show_default=True, help="Folder for campaign.json, failures/ and the logs.")
 @click.option("--replay", "file", type=click.Path(path_type=Path), metavar="FILE",

@@ -45,9 +45,9 @@ dask_option = click.option("--dask", metavar="ADDRESS", help="Run on the workers
 json_option = click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
                            help="Write the scores to this file.")
 intervals_option = click.option("--intervals", type=click.IntRange(0), default=0, metavar="N",
-                                help="Also say within which bounds scores lie for N drawings of "
-                                "the drives, with replacement; of runs of 10 frames where there "
-                                "are few drives. 200 are plenty.")
+                                help="Also print bootstrap intervals from N resamples of the "
+                                "drives, or of runs of 10 frames where there are few drives. 200 "
+                                "are plenty.")
 weights_option = a_path("--weights", "Run the detector of this checkpoint, or one by its name: "
                         "fused, pointpillars or pointnet, with the weights that come with the "
                         "package.",

@@ -57,7 +57,7 @@ def label(data: Path, sequence: str | None, out: Path | None, weights: Path | No
 
     \b
     Examples:
-      lidar-perception label --data /data/kitti/tracking
+      lidar-perception label --data /data/kitti/tracking --sequence 0000
       lidar-perception label --data drive --out labels --no-open --port 8080
       lidar-perception label --data drive --export kitti_tracking --to labels
     """

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
 @click.option("--detections", multiple=True, metavar="TOPIC", help="With --live: a topic of boxes, "
               "MarkerArray or Detection3DArray. Default: all */output/detections that go with the "
               "clouds. May be given several times.")
-@click.option("--namespace", default="", metavar="NAME", help="With --live: that of the nodes, "
-              "where there are several.")
+@click.option("--namespace", default="", metavar="NAME", help="With --live: follow the nodes in "
+              "this namespace, where several graphs run.")
 @click.option("--sequence", metavar="NAME", help="The drive of PATH to show, where it has "
               "several.")
 @range_option
@@ -64,7 +64,7 @@ def view(path: Path | None, live: bool, weights: tuple[str, ...], results: tuple
     \b
     Examples:
       lidar-perception view out/demo/result
-      lidar-perception view /data/kitti/tracking --weights fused
+      lidar-perception view /data/kitti/tracking --sequence 0000 --weights fused
       lidar-perception view /data/kitti/object --results labels --screenshot frame.png --frame 12
       lidar-perception view --live --namespace front
     """

@@ -59,10 +59,9 @@ class ClusteringParams(Params):
 
     method: str = param("dbscan", "dbscan: distance-aware DBSCAN (paper A). euclidean: adaptive "
                         "Euclidean clustering (paper C).", choices=CLUSTERING_METHODS)
-    density: float = param(0.0, "Points a square degree of view from which on the numbers below "
-                           "hold as they are. In a cloud that is measured to have fewer, "
-                           "neighbourhoods widen and least sizes shrink. 0: they hold for every "
-                           "cloud.", low=0.0, high=10_000.0)
+    density: float = param(0.0, "Points per square degree of view from which on the values below "
+                           "apply unchanged. In sparser clouds neighbourhoods widen and least "
+                           "sizes shrink. 0: they apply to every cloud.", low=0.0, high=10_000.0)
     dbscan: DbscanParams = DbscanParams()
     euclidean: EuclideanParams = EuclideanParams()
 

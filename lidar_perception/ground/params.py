@@ -74,8 +74,8 @@ class ClothParams(Params):
     curvature: float = param(0.1, "How sharply gravity bends the cloth where nothing holds it; "
                              "less is stiffer.", unit="1/m", low=0.0001, high=10.0)
 
-    slope: float = param(0.08, "Where the ground climbs faster than the cloth can bend, it goes on "
-                         "from what the cloth touches with a slope of up to this; 0: it does not.",
+    slope: float = param(0.08, "Where a road climbs faster than the cloth can bend, the ground is "
+                         "extended from what the cloth touches by slopes of up to this; 0: off.",
                          low=0.0, high=2.0)
 
     def check(self) -> None:

@@ -15,7 +15,7 @@ KIND_OF_CLASS = tuple(KINDS.index(row.moves_as) for row in TABLE)
 class MotionParams(Params):
     """How one kind of object moves, and how well a detector measures it."""
 
-    acceleration: float = param(2.0, "Density of the acceleration that comes as it likes.",
+    acceleration: float = param(2.0, "Noise density of random acceleration.",
                                 unit="m/s^1.5", low=0.01, high=100.0)
     turning: float = param(0.3, "Density of the change of the turn rate; 0: no turn rate, the "
                            "velocity is constant.", unit="rad/s^1.5", low=0.0, high=10.0)
@@ -65,13 +65,15 @@ class ExistenceParams(Params):
     missed: float = param(-1.5, "Evidence of a look that found nothing.", low=-10.0, high=0.0)
     moves: float = param(1.0, "Evidence of motion, where poses say what stands: posts do not "
                          "walk.", low=0.0, high=10.0)
-    walking: float = param(3.0, "No pedestrian is faster.", unit="m/s", low=0.5, high=100.0)
-    faster: float = param(3.0, "Evidence against a pedestrian that is, where poses say what "
-                          "stands: riders look like people.", low=0.0, high=20.0)
+    walking: float = param(3.0, "Greatest walking speed of a pedestrian.", unit="m/s",
+                           low=0.5, high=100.0)
+    faster: float = param(3.0, "Evidence against being a pedestrian above that speed, where "
+                          "poses say what stands: riders look like people.", low=0.0, high=20.0)
     seen: float = param(2.0, "What a hit adds to the log odds of being there still.", low=0.0,
                         high=10.0)
-    max_present: float = param(3.0, "These log odds are no higher.", low=0.0, high=20.0)
-    max_absence: float = param(0.4, "One miss takes no more from them than this: what is hidden "
+    max_present: float = param(3.0, "Upper limit of the log odds of being there still.",
+                               low=0.0, high=20.0)
+    max_absence: float = param(0.4, "Most that one miss subtracts from them: what is hidden "
                                "stays hidden for a while.", low=0.01, high=10.0)
     end: float = param(0.02, "A track ends when it is there with a lower probability.", low=0.0,
                        high=0.5)
@@ -88,15 +90,16 @@ class TrackingParams(Params):
     existence: ExistenceParams = ExistenceParams()
     report: float = param(0.5, "Tracks that exist with at least this probability come out.",
                           low=0.0, high=1.0)
-    report_unseen: float = param(0.5, "Those that were missed come out as long as they are there "
-                                 "with this probability.", low=0.0, high=1.0)
+    report_unseen: float = param(0.5, "Tracks that were missed come out down to this probability "
+                                 "of being there.", low=0.0, high=1.0)
     overlap: float = param(0.3, "Of two tracks that overlap by more than this, seen from above, "
                            "the less probable one ends.", low=0.0, high=1.0)
-    moving_speed: float = param(0.5, "What is faster moves.", unit="m/s", low=0.0, high=10.0)
+    moving_speed: float = param(0.5, "A track that is faster counts as moving.", unit="m/s",
+                                low=0.0, high=10.0)
     min_score: float = param(0.05, "Detections of a lower score are left out.", low=0.0, high=1.0)
     max_detections: int = param(300, "The best this many detections of a frame take part.", low=1,
                                 high=10_000)
-    max_tracks: int = param(300, "No more tracks are kept.", low=1, high=10_000)
+    max_tracks: int = param(300, "Most tracks that are kept at a time.", low=1, high=10_000)
     period: float = param(0.1, "Time between two frames where there are no stamps.", unit="s",
                           low=0.001, high=10.0)
     max_gap: float = param(1.0, "Tracks end where time jumps ahead by more than this, or back.",

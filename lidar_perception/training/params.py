@@ -73,8 +73,8 @@ class NoiseParams(Params):
 class ThingParams(NoiseParams):
     """How background is changed that is taken for objects."""
 
-    things_stretch: float = param(0.5, "Such things are stretched or shrunk, in width and height, "
-                                       "by factors of up to exp(this).", low=0.0, high=3.0)
+    things_stretch: float = param(0.5, "Pasted background is stretched or shrunk, in width and "
+                                       "height, by factors of up to exp(this).", low=0.0, high=3.0)
     things_intensity: float = param(0.8, "Their intensities are multiplied or divided by up to "
                                          "exp(this).", low=0.0, high=3.0)
     things_shine: float = param(0.25, "Probability that a part of such a thing is "
@@ -130,7 +130,7 @@ class DataParams(Params):
     cache_gb: float = param(20.0, "Scans are added to the cache until it has this size; the others "
                             "are simulated in every epoch.", unit="GB", low=0.0, high=1e6)
     val_share: float = param(PAPER_SHARE, "Share of the frames held out for validation, drawn by "
-                             "the seed, where neither --val nor --split is given.", low=0.0,
+                             "the seed, where neither --val nor --val-split is given.", low=0.0,
                              high=0.9)
     view: bool = param(True, "Use only the points in KITTI's image, since its labels end there.")
     min_points: int = param(5, "Objects and clusters with fewer points are left out of the "
@@ -145,8 +145,8 @@ class SceneTraining(LoopParams):
                        "or several in turn, such as street,campus.")
     sensor: str = param("hdl64e", "Sensor of the simulated scans: a sensor.yaml, the name of a "
                         "preset, or generic:BEAMS,LOWEST,HIGHEST,STEP,RATE.")
-    mount_height: float = param(0.0, "Its height above the ground. 0: what its file or preset "
-                                "says.", unit="m", low=0.0, high=10.0)
+    mount_height: float = param(0.0, "Height of the sensor above the ground. 0: what its file "
+                                "or preset says.", unit="m", low=0.0, high=10.0)
 
 
 @dataclass(frozen=True)

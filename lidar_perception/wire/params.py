@@ -12,9 +12,9 @@ class InputParams(Params):
     """How to read the fields of a cloud."""
 
     intensity_max: float = param(
-        0.0, "The intensity of a full reflection: 1 for KITTI, 255 for Velodyne and nuScenes. 0 "
-        "takes the largest value of an integer field, and of a float field 1, 255 or 65535, by the "
-        "greatest value of each cloud.",
+        0.0, "The intensity of a full reflection: 1 for KITTI, 255 for Velodyne and nuScenes. 0: "
+        "the largest value of the type for integer fields; for float fields 1, 255 or 65535, "
+        "whichever fits the greatest value of the cloud.",
         low=0.0, high=1e9)
 
 

@@ -33,8 +33,8 @@ from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
 @device_option
 @click.option("--ego", type=click.Choice(RECORDED_EGO), default="auto", show_default=True,
               help="The sensor's motion: from the recording's poses; from the scans, by KISS-ICP "
-              "(the extra [odometry]); or none, tracks are relative to the sensor then. auto: the "
-              "first of them that there is.")
+              "(the extra [odometry]); or none: tracks are relative to the sensor. auto: the first "
+              "of these that is available.")
 @json_option
 @parameter_options(TrackingParams())
 def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, device: str,
