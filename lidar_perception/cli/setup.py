@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -115,8 +114,8 @@ def _print(rows: list[Any]) -> None:
 def _layouts(topic: str, frame: str) -> dict[str, str]:
     """The layouts for RViz and Foxglove that come with the package, with this topic and frame; none
     where they are not installed."""
-    places = (Path(__file__).parents[2] / "config",
-              Path(sys.prefix) / "share/lidar_perception/config")
+    places = (Path(__file__).parents[2] / "config",  # of a checkout; else where it is installed
+              *(p / "share/lidar_perception/config" for p in Path(__file__).parents))
     folder = next((p for p in places if (p / FILES[-1]).is_file()), None)
     if folder is None:
         return {}
