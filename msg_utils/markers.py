@@ -99,10 +99,18 @@ def from_marker_array(msg: Any) -> MarkedObjects:
               for e in extras]
     boxes = np.array([_box(m) for m in cubes], np.float64).reshape(-1, 7)
     notes = [(m.ns, _content(m.text)) for m in msg.markers if m.action == DELETE and m.text]
-    header = msg.markers[0].header if msg.markers else None
+    header = array_header(msg)
     return MarkedObjects(boxes, [m.ns for m in cubes], np.array(scores, np.float64),
                          np.array([m.id for m in cubes], int), extras, notes,
                          to_ns(header.stamp) if header else 0, header.frame_id if header else "")
+
+
+def array_header(msg: Any) -> Any | None:
+    """The header of a MarkerArray: that of the first CUBE, as a DELETEALL before it may have none;
+    of the first marker where there is no CUBE, and None without markers."""
+    cubes = (m for m in msg.markers if m.action == ADD and m.type == CUBE)
+    found = next(cubes, next(iter(msg.markers), None))
+    return None if found is None else found.header
 
 
 def marker_keys(msg: Any) -> frozenset[tuple[str, int]]:
@@ -134,6 +142,6 @@ def _box(m: Any) -> list[float]:
 def _content(text: str) -> dict[str, Any]:
     try:
         content = json.loads(text) if text else {}
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):  # no JSON, or brackets and digits without end
         return {"text": text}
     return content if isinstance(content, dict) else {"text": text}

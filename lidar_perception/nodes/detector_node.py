@@ -97,7 +97,8 @@ class DetectorNode(ManagedNode):
 
     def _diagnose(self, frame: LidarFrame, found: Found, params: Any,
                   untracked: str | None) -> None:
-        problem = found.problem or self.sensor.problem(frame, params) or untracked
+        problem = "; ".join(filter(None, (found.problem, self.sensor.problem(frame, params),
+                                          untracked)))
         self.counts.update(detections=len(found.detections), device=str(self.detector.device))
         self.counts["best scores"] = " ".join(
             f"{name} {score:.2f}" for name, score in found.best.items())

@@ -20,8 +20,11 @@ from msg_utils.stamps import SECOND, to_ns
 
 START, SCAN = "start", "scan"  # frames of KISS-ICP
 ICP_MS = "kiss_icp_cpu_ms_median"
+AGAIN = 1.0        # seconds without waiting where waiting for a pose was in vain
 GRACE_NS = SECOND  # of frames without a pose; then ego.source auto takes the scans
 TIMED = 100        # scans
+SILENT = 2.0       # seconds without odometry
+APART_NS = 10 * SECOND  # between odometry and detections: no lag, but another clock
 
 
 class EgoInput:
@@ -42,7 +45,7 @@ class EgoInput:
         self.scan_ns = 0  # of the last scan that KISS-ICP took
         self.icp_ms: deque[float] = deque(maxlen=TIMED)  # of CPU time, for the last ones
         self.without_ns: int | None = None  # since when frames have had no pose, with auto
-        self.waits: tuple[int, float] | None = None  # a frame for its pose: stamp, since when
+        self.late_since: float | None = None  # monotonic: since then no pose has come in time
         wanted = params().source
         if wanted in ("auto", "odometry"):
             self.transforms.hear_odometry()
@@ -69,8 +72,9 @@ class EgoInput:
         return pose
 
     def needed(self, header: Any) -> str | None:
-        """What a frame with this header waits for, ego.max_wait seconds at most: its pose, where
-        poses come but are a little behind."""
+        """What a frame with this header waits for: its pose, where poses come but are a little
+        behind. Frames together wait ego.max_wait seconds at most, as a newer one may take the place
+        of the one that waits; where it was in vain none waits for a while."""
         stamp = to_ns(header.stamp)
         try:
             source = self._source(header.frame_id, stamp)
@@ -78,16 +82,28 @@ class EgoInput:
                 self._of(source, header.frame_id, stamp, None)
         except Missing as error:
             if error.late:
-                if self.waits is None or self.waits[0] != stamp:
-                    self.waits = stamp, monotonic()
-                patient = monotonic() - self.waits[1] < self.params().max_wait
+                now, max_wait = monotonic(), self.params().max_wait
+                self.late_since = self.late_since or now
+                patient = (now - self.late_since) % (max_wait + AGAIN) < max_wait
                 return "the pose of its time" if patient else None
-        self.waits = None
+        self.late_since = None
         return None
 
-    def problem(self, frame_id: str) -> str | None:
-        """What is wrong with the poses for frames in frame_id, with the remedy."""
+    def problem(self, frame_id: str, stamp: int) -> str | None:
+        """What is wrong with the poses for frames in frame_id, the last one of this stamp, with the
+        remedy."""
         wanted, carrier = self.params().source, self.transforms.carrier
+        last = self.transforms.odometry_ns
+        if self.source == "odometry" and last is not None:
+            topic = self.node.resolve_topic_name("~/input/odometry")
+            silent = monotonic() - self.transforms.odometry_came
+            if silent > SILENT and stamp - last > self.params().max_gap * SECOND:
+                return (f"no odometry on {topic} for {silent:.0f} s: the sensor is taken to stand; "
+                        "is it running?")
+            if silent <= SILENT and abs(last - stamp) > APART_NS:
+                return (f"the odometry on {topic} is stamped {abs(last - stamp) / SECOND:.0f} s "
+                        f"{'ahead of' if last > stamp else 'behind'} the detections, so none of "
+                        "its poses is used: do both take the time from one clock (use_sim_time)?")
         if wanted == "tf" and self.source != "tf":
             fixed = self.node.robot.input.fixed_frame
             return (f"TF does not connect '{frame_id}' with '{fixed}' (input.fixed_frame): tracks "

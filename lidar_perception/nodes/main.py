@@ -111,7 +111,11 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
     finally:
         stop.closing()
         if node is not None:
-            node.close()
+            try:
+                node.close()
+            except InputError as error:  # what it holds cannot be written
+                node.get_logger().fatal(str(error))
+                code = code or 1
         stop.closed(code)
         if node is not None:
             node.destroy_node()

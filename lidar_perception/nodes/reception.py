@@ -52,7 +52,7 @@ class Arrivals:
             number, gap = info["publication_sequence_number"], 0
             if one_publisher and number and self.sequence is not None and number > self.sequence:
                 gap = number - self.sequence - 1
-            self.sequence = number or None
+            self.sequence = (number or None) if one_publisher else None
             if full and i == 0:
                 self.dropped += gap
             else:
@@ -251,7 +251,7 @@ class Reception:
         if dropped > params.max_dropped * enough:
             found.append(("dropped", WARN, f"{dropped} of the last {sent} {self.what}s on "
                           f"{self.topic} were dropped, as newer ones came before their turn: the "
-                          "work on one takes too long for this machine"))
+                          "work on one takes too long for this machine, or it waits for poses"))
         return found
 
     def _remedy(self, publishers: list[Any]) -> str:

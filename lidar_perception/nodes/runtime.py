@@ -141,9 +141,14 @@ class LidarNode(Node):
 
         received: Any = guarded  # rclpy's annotation has no result
         kind, what = message_class(type_name), "cloud" if type_name == CLOUD else "array"
-        events = SubscriptionEventCallbacks(message_lost=lost)
-        if len(qos) > 1:
-            events.incompatible_qos = lambda _: None  # another of them fits
+        def refused(_: Any) -> None:
+            if len(qos) == 1:  # else another of them fits
+                self.report(WARN, f"a publisher on {self.resolve_topic_name(name)} offers less than"
+                            " is asked for, and is not heard: let it publish reliable, or set "
+                            f"qos_overrides.{self.resolve_topic_name(name)}.subscription.reliability"
+                            " to best_effort")
+
+        events = SubscriptionEventCallbacks(message_lost=lost, incompatible_qos=refused)
 
         def subscribe(profile: QoSProfile) -> Any:
             return self.create_subscription(
@@ -219,8 +224,11 @@ class LidarNode(Node):
         """The state, and what is wrong with the inputs and with the node's name."""
         level, message = self.state
         values = dict(self.counts, last_stamp_ns=self.last_stamp_ns)
-        for source in self._sources():
+        for source in reversed(self._sources()):  # of equal names that of the first input
             values.update(source.values())
+        for name in ("lost", "dropped"):
+            if numbers := [r.values()[name] for r in self._receptions()]:
+                values[name] = sum(numbers, self.counts.get(name, 0))
         if self.times:
             values["processing_ms_median"] = f"{np.median(self.times):.1f}"
         for publisher in self._outputs:
@@ -273,7 +281,7 @@ class LidarNode(Node):
         executor.spin_until_future_complete(self.stop)
 
     def close(self) -> None:
-        """Called once before the node is destroyed."""
+        """Called once before the node is destroyed. InputError where what it holds is lost."""
 
 
 def decoded(data: bytes, type_name: str) -> Any:

@@ -36,6 +36,7 @@ class SensorCheck:
         frame, indices = to_frame(msg, params.input.intensity_max if reads_intensity else None)
         placing = self.node.transforms.placing(msg.header)
         params, base = self.node.transforms.mounted(params, placing)
+        self.node.counts.pop("cropped", None)
         if params.crop.enabled:
             kept, frame = cropped(frame, params.crop, base)
             self.node.counts["cropped"] = len(indices) - len(kept)

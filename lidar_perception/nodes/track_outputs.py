@@ -61,7 +61,7 @@ class TrackOutputs:
         self.poses_from = self.ego.source, self.ego.carried
         if before[0] != NO_SOURCE and before != self.poses_from:
             tracker.reset()  # another fixed frame
-        problem = mixed or self.ego.problem(header.frame_id)
+        problem = mixed or self.ego.problem(header.frame_id, stamp)
         tracker.params = self.params().tracking
         tracks = tracker(detections, stamp, pose)
         if tracker.taken:

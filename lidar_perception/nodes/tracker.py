@@ -11,7 +11,7 @@ from lidar_perception.params import TrackerNodeParams, TrackInputParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.messages import to_detections
 from msg_utils.detections import from_detection_array
-from msg_utils.markers import MarkedObjects, from_marker_array
+from msg_utils.markers import MarkedObjects, array_header, from_marker_array
 from msg_utils.stamps import to_ns
 
 
@@ -25,8 +25,7 @@ class TrackerNode(ManagedNode):
     def configure(self) -> None:
         self.tracks = TrackOutputs(self, lambda: self.params, clouds=False)
         self.input("detections", MARKERS, self.on_markers,
-                   needs=lambda m: self.tracks.ego.needed(m.markers[0].header)
-                   if m.markers else None)
+                   needs=lambda m: self.tracks.ego.needed(array_header(m)) if m.markers else None)
         if has_detections_3d():
             self.input("detections_3d", DETECTIONS_3D, self.on_detections,
                        needs=lambda m: self.tracks.ego.needed(m.header))
@@ -35,7 +34,7 @@ class TrackerNode(ManagedNode):
         if not msg.markers:
             raise InputError("an array without a marker does not say of when it is; send a "
                              "DELETEALL with the header of the frame. It is left out")
-        self._track(msg.markers[0].header, from_marker_array(msg))
+        self._track(array_header(msg), from_marker_array(msg))
 
     def on_detections(self, msg: Any) -> None:
         self._track(msg.header, from_detection_array(msg))

@@ -8,7 +8,8 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable
 from dataclasses import replace
-from time import perf_counter
+from math import inf
+from time import monotonic, perf_counter
 from typing import Any
 
 import numpy as np
@@ -57,6 +58,7 @@ class Transforms:
         self.target_frame = getattr(robot, "target_frame", "").lstrip("/")
         self.carrier = self.odometry_frame = ""  # what the odometry is of, and in which frame
         self.odometry_ns: int | None = None  # the stamp of the last one
+        self.odometry_came = -inf  # monotonic, when it came
         self.needs: list[Callable[[Any], str | None]] = []  # of a header: what else it waits for
         self.sweep: float | None = None  # seconds from the stamp to the last point of a cloud
         self.lacking: dict[str, str] = {}  # what asked for it -> what is not there
@@ -110,6 +112,7 @@ class Transforms:
         self.carrier = msg.child_frame_id.lstrip("/")
         self.odometry_frame = msg.header.frame_id.lstrip("/")
         self.odometry_ns = self.node.counts["last_pose_ns"] = to_ns(msg.header.stamp)
+        self.odometry_came = monotonic()
         self._changed()
 
     def _changed(self) -> None:

@@ -134,7 +134,8 @@ class Tracker:
                             "poses began: all tracks ended, and go on in the fixed frame")
         if given is None and (pose is not None or self._ego.known):
             self.problem = ("the pose is missing or not rigid: the sensor is taken to move on as "
-                            "before")
+                            f"before, after {self.params.max_ego_gap:g} s to stand; are odometry or"
+                            " TF running, and often enough?")
         self._ego = next_ego(self._ego, given, seconds, self.params.max_ego_gap)
 
     def _usable(self, detections: Detections) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

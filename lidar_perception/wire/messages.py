@@ -83,8 +83,8 @@ def intensity_problem(frame: LidarFrame) -> str | None:
     largest = 0.0 if frame.intensity is None else float(frame.intensity.max(initial=0.0))
     if largest <= 1.5 and (largest == 0.0 or largest >= DARK or len(frame) < MANY):
         return None
-    return (f"intensity goes up to {largest:.2g} where 1 is expected; set input.intensity_max "
-            "(255 for most drivers; setup measures it)")
+    return (f"intensity goes up to {largest:.2g} where 1 is expected; set input.intensity_max to "
+            "what a full reflection is (1 or 255 for most drivers; setup measures it)")
 
 
 def spread(values: np.ndarray | int, indices: np.ndarray, msg: Any, dtype: str) -> np.ndarray:

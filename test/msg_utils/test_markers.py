@@ -134,14 +134,17 @@ def test_a_message_without_markers_is_empty(make):
     ('{"score": 1}', 1.0, {"score": 1}),
     ('{"score": "high"}', 1.0, {"score": "high"}),
     ('{"score": null}', 1.0, {"score": None}),
-])
+    *((endless, 1.0, {"text": endless}) for endless in ('{"a":' * 9000, "1" * 5000)),
+], ids=range(11))
 def test_cubes_of_other_nodes_are_read(make, text, score, extra):
     cube = make("visualization_msgs/msg/Marker", header=header(make, 5, "map"), ns="car", id=4,
                 type=CUBE, action=ADD, text=text,
                 pose=box_pose(np.array([1.0, 2, 3, 4, 5, 6, -2.0]), make),
                 scale=make("geometry_msgs/msg/Vector3", x=4.0, y=5.0, z=6.0))
     sphere = make("visualization_msgs/msg/Marker", header=header(make), type=2, action=ADD)
-    got = from_marker_array(make("visualization_msgs/msg/MarkerArray", markers=[cube, sphere]))
+    clear = make("visualization_msgs/msg/Marker", action=3)  # DELETEALL, often without a header
+    got = from_marker_array(make("visualization_msgs/msg/MarkerArray",
+                                 markers=[clear, cube, sphere]))
     assert same_boxes(got.boxes, [[1, 2, 3, 4, 5, 6, -2.0]])
     assert (got.labels, got.ids.tolist(), got.frame_id, got.stamp_ns) == (["car"], [4], "map", 5)
     assert got.scores.tolist() == [score] and got.extras == [extra]

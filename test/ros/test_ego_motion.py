@@ -12,6 +12,8 @@ from rclpy.parameter import Parameter
 from test_robot_frames import message, mounted, odometry, transforms, walker
 from tracking_samples import START, TENTH, crowd, pose
 
+from lidar_perception.nodes import ego as ego_module
+from lidar_perception.nodes import transforms as transforms_module
 from lidar_perception.nodes.ego import ICP_MS
 from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.runtime import MARKERS
@@ -150,3 +152,39 @@ def test_in_a_detectors_process_a_cloud_waits_for_its_pose_and_not_for_ever(star
     assert deliver(clouds[2], True) is None  # it has waited for long enough
     assert deliver(clouds[19], True) is None  # the odometry has stopped
     assert len(node.sent["tracks"]) == 4
+
+
+def test_late_poses_hold_frames_up_for_max_wait_and_not_once_a_frame(start, monkeypatch):
+    """A newer cloud takes the place of one that waits, so that none waits for long by itself."""
+    node, now = start(TrackerNode), [100.0]
+    monkeypatch.setattr(ego_module, "monotonic", lambda: now[0])
+    ego, wait = node.tracks.ego, node.params.ego.max_wait
+    ego.node.transforms.on_odometry(odometry(base_at(0), START, "lidar"))
+    held = []
+    for i in range(1, 9):  # half a second and less after the last pose, so that they are late
+        held.append(ego.needed(header(START + i * TENTH // 2)) is not None)
+        now[0] += 0.06
+    assert held == [0.06 * i < wait for i in range(8)] and not all(held)
+    now[0] = 100.0 + wait + ego_module.AGAIN + 0.01  # patience begins again
+    assert ego.needed(header(START + TENTH // 2)) is not None
+    ego.node.transforms.on_odometry(odometry(base_at(1), START + TENTH, "lidar"))
+    assert ego.needed(header(START + TENTH)) is None and ego.late_since is None
+
+
+def test_odometry_of_another_clock_and_one_that_has_stopped_are_named(start, monkeypatch):
+    node, now = start(TrackerNode), [100.0]
+    for module in ego_module, transforms_module:
+        monkeypatch.setattr(module, "monotonic", lambda: now[0])
+    found = node._receptions()[0]
+
+    def said(seconds):
+        stamp = header(START + round(seconds * 10 * TENTH))
+        found.deliver(encode(detection_markers(next(crowd()), stamp, bag_message)), False)
+        return node.state[1]
+
+    node.transforms.on_odometry(odometry(base_at(0), START + 1000 * 10 * TENTH, "lidar"))
+    assert "1000 s ahead of the detections" in said(0) and "one clock" in node.state[1]
+    node.transforms.on_odometry(odometry(base_at(0), START, "lidar"))
+    now[0] += 5.0
+    said(2)  # the first seconds are the tracker's, which goes on as before
+    assert "no odometry on /tracker/input/odometry for 5 s" in said(2.1)

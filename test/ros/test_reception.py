@@ -193,7 +193,9 @@ def test_a_driver_that_starts_again_or_a_second_one_has_lost_nothing():
     for number in (7, 8, 1, 2):
         arrivals.add(infos([number]), 0)
     arrivals.add(infos([90]), 0, one_publisher=False)
-    assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (0, 0, 5)
+    arrivals.add(infos([99]), 0)  # the first one again, alone
+    arrivals.add(infos([101]), 0)
+    assert (arrivals.lost, arrivals.dropped, arrivals.sent) == (1, 0, 8)
 
 
 def test_a_sensor_that_slows_down_is_seen_by_its_own_clock():
