@@ -88,7 +88,9 @@ def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
     """
     from lidar_perception.detectors.pointpillars.config import RANGES, network_config
     from lidar_perception.training.pointpillars.start import PointPillarsStart
-    config = network_config(params.version, params.size, **RANGES[params.range])
+    config = network_config(params.version, params.size)  # a size sees ahead
+    if params.range == "around":
+        config = replace(config, **RANGES["around"])
     run(PointPillarsStart(config), asked, params)
 
 

@@ -47,7 +47,8 @@ def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
     else:
         path = Path(weights)
         detector = LOAD[POINTPILLARS if path.suffix == ".onnx" else network_of(path)](path, device)
-    detector = detector.seeing(where)
+    if where != "auto":
+        detector = detector.seeing(where)
     if sensor_height is not None:
         detector = detector.mounted_at(sensor_height)
     return detector if min_score is None else detector.with_min_score(min_score)

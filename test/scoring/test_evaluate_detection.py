@@ -59,7 +59,7 @@ def detector(monkeypatch):
     was asked."""
     made = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
 
-    def open_detector(path, device="auto", *, min_score=None, sensor_height=None):
+    def open_detector(path, device="auto", *, min_score=None, sensor_height=None, where="auto"):
         made.asked.append((str(path), device, min_score, sensor_height))
 
         def detect(frame):

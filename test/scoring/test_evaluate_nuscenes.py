@@ -53,7 +53,7 @@ def detector(monkeypatch):
     """A stand-in for the detector of a checkpoint."""
     made = types.SimpleNamespace(asked=[], find=lambda scan: Detections.none())
 
-    def opened(path, device, *, sensor_height):
+    def opened(path, device, *, sensor_height, where):
         made.asked.append((path, device, sensor_height))
         return lambda scan: Found(made.find(scan))
     monkeypatch.setattr("lidar_perception.detectors.open.open_detector", opened)
