@@ -38,7 +38,7 @@ class Range(TypedDict):
     high: tuple[float, float, float]
 
 
-AHEAD = Range(low=(0.0, -39.68, -3.0), high=(69.12, 39.68, 1.0))  # as in KITTI, where labels are
+AHEAD = Range(low=(0.0, -39.68, -3.0), high=(69.12, 39.68, 1.0))  # where KITTI has labels
 RANGES = {"ahead": AHEAD, "around": Range(low=(-51.2, -51.2, -3.0), high=(51.2, 51.2, 1.0))}
 # What one look of two is of around, with a network that was trained ahead: a half, and so much of
 # the other that no object is cut.
