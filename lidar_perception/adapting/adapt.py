@@ -49,6 +49,7 @@ from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
 from lidar_perception.runs.files import make_folder, read_text, write_bytes, write_text
 from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import duration, errors, track
+from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.tracking.ego import NO_SOURCE, recorded_source
 from lidar_perception.training.asked import Asked
@@ -109,6 +110,7 @@ class Adapting:
         self.frames = frames_of(mounted(recording, clouds))
         self.height = self.frames[0].sensor_height
         self.params = settled(params, self.header)
+        Scenes(scene=self.params.scene).sorts()  # InputError for what is none
         self.sensor = sensor_named(self.params.sensor, self.height)
         if recorded_source(self.frames[0].pose() is not None) == NO_SOURCE:
             raise InputError(f"{data} has no poses, and to find them by the scans needs kiss-icp; "
@@ -237,7 +239,8 @@ class Adapting:
             errors.print(f"{state}: " + (", ".join(f"{count} {name}" for name, count in
                                                    counts[state].items()) or "nothing"))
         if (agreed := sum(counts[KEPT].values())) < FEWEST_KEPT:
-            few = f"the detectors agree on {agreed} objects only, too few to learn from"
+            few = (f"the detectors agree on {agreed} object{'s' * (agreed != 1)} only, too few to "
+                   "learn from")
             if self.rounds:
                 errors.print(f"round {number} is not made: {few}; {self.best} stays",
                              soft_wrap=True)

@@ -94,7 +94,8 @@ def _seen(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], An
     """What makes of a frame what nodes with this parameter file see; nothing without one."""
     if file is None and not deskew:
         return lambda frame: frame
-    if recording.mounted:
+    from lidar_perception.data import bag_frames, cloud_files
+    if not any(layout.recognises(recording.path) for layout in (bag_frames, cloud_files)):
         raise InputError(f"{recording.path} ({recording.layout}) has level clouds; --robot and "
                          "--deskew are for bags, .pcd and .bin files")
     from lidar_perception.data.levelled import Robot, levelled
@@ -104,9 +105,8 @@ def _seen(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], An
         deskew = deskew or asked
     if not deskew:
         return partial(levelled, robot=robot)
-    from lidar_perception.data.bag_frames import recognises
     from lidar_perception.data.bag_poses import BagPoses
-    if not recognises(recording.path):
+    if not bag_frames.recognises(recording.path):
         raise InputError(f"{recording.path} is no bag, so that nothing says how its sensor moved, "
                          "which --deskew needs")
     first = recording.frames[len(recording) // 2]

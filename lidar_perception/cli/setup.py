@@ -78,13 +78,13 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
             raise InputError(skipped[0])
         bar.update(task, description="measuring")
         told = told_by(clouds.poses, numbers, clouds.stamps_ns)
-        m = measured(found, numbers, str(data), clouds.count, clouds.stamps_ns, told)
+        m = measured(found, numbers, str(data), clouds.count, clouds.stamps_ns, told, height_hint)
         bar.update(task, description="drawing", advance=1)
         texts = {"sensor.yaml": sensor_yaml(m), "robot.param.yaml": params_yaml(m)}
         page = report_html(m, texts)
     make_folder(out)
     for name, text in {**texts, "report.html": page,
-                       **_layouts(topic or "/points", m.scans[0].frame_id)}.items():
+                       **_layouts(clouds.topic or "/points", m.scans[0].frame_id)}.items():
         write_text(out / name, text)
     _print(findings(m))
     for line in skipped:

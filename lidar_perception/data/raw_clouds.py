@@ -29,7 +29,8 @@ APART = 8  # clouds between those of a pair in which a slow robot moves: see spr
 class RawClouds:
     """Clouds in order of time. layout: what was recognised, for people; stamps_ns: those of all,
     None where the source has none or invents them; load(i) -> PointCloud2 of cloud i, of rosbags'
-    class; poses: of the frame of a bag's clouds. InputError from load names what is broken."""
+    class; poses: of the frame of a bag's clouds, and topic: theirs. InputError from load names
+    what is broken."""
 
     path: Path
     layout: str
@@ -37,6 +38,7 @@ class RawClouds:
     stamps_ns: np.ndarray | None
     load: Callable[[int], Any]
     poses: BagPoses | None = None
+    topic: str = ""
 
 
 def open_clouds(path: str | Path, topic: str | None = None) -> RawClouds:
@@ -64,7 +66,7 @@ def _of_bag(path: Path, topic: str) -> RawClouds:
             raise InputError(f"{path} has no cloud on {topic}; record it again")
         frames = bag_frames.BagFrames(path, topic, bag_frames.CLOUD, bag.counts[topic])
     return RawClouds(path, bag_frames.layout(path, topic), len(frames), frames.stamps(),
-                     frames.message, frames.poses)
+                     frames.message, frames.poses, topic)
 
 
 def _of_files(path: Path, files: list[Path]) -> RawClouds:

@@ -31,6 +31,7 @@ LIMITS = (15.0, 30.0, 45.0)       # m, of the bands; the paper has the first two
 MAX_EPS = (0.5, 0.7, 0.9, 1.0)    # m; farther neighbours join people who walk side by side
 MIN_SAMPLES = 3
 RESERVE = 0.75                    # of the density of a sensor, that no cloud of it counts as thin
+GIVEN = "as --height-hint says; no ground in sight"
 NEAREST_GROUND = 0.9              # of the distance of the nearest ground: where Patchwork++ begins
 
 
@@ -39,11 +40,12 @@ def sensor_yaml(m: Measured) -> str:
     sensor = sensor_of(m)
     model = f"that of {m.model}" if m.model else "a default"
     why = {
-        "height": "not measured: no ground in sight" if m.mount is None else
-        f"+- {m.mount.error[0]:.3f}",
+        "height": f"+- {m.mount.error[0]:.3f}" if m.mount is not None else
+        "not measured: no ground in sight" if m.hint is None else GIVEN,
         "rate": f"from {m.timing.by}" if np.isfinite(m.timing.rate) else "not measured",
         "azimuth_step": f"{sensor.columns} firings in a turn",
-        "min_range": "the nearest that is not the robot's own",
+        "min_range": f"not measured; {model}" if m.model or sensor.min_range == Sensor.min_range
+        else "the nearest that is not the robot's own",
         "max_range": "the farthest seen" if m.greatest >= SMALL_ROOM else f"not measured; {model}",
         "range_noise": f"not measured; {model}" if np.isnan(m.noise) else "about smooth surfaces",
         "divergence": f"not measured; {model}", "reach": f"not measured; {model}"}
@@ -118,6 +120,8 @@ def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
         start = round(NEAREST_GROUND * float(np.median(near)), 1)
         out["ground.patchwork.min_range"] = (start, "the nearest ground is "
                                              f"{float(np.median(near)):.1f} m away")
+    elif m.hint is not None:
+        out["ground.sensor_pose.height"] = (m.hint, GIVEN)
     reach = float(np.clip(np.ceil(m.greatest), 20.0, 200.0))
     if reach < 80.0 and m.greatest > SMALL_ROOM:
         out["ground.patchwork.max_range"] = (reach, "nothing is farther")

@@ -35,7 +35,7 @@ class Measured:
     twice: share of second returns; noise: m, of noise_pieces; least, greatest: m, of what is not
     the robot's own; heading: where the robot drives, None without ground; model: the sensor
     of config/sensors with such beams, "" for none; model_error: degrees, the median over the
-    beams; told: what the recording says itself."""
+    beams; told: what the recording says itself; hint: the height that somebody knows, m."""
 
     source: str
     scans: tuple[Scan, ...]
@@ -55,6 +55,7 @@ class Measured:
     model: str
     model_error: float
     told: Told
+    hint: float | None = None
 
     @property
     def moved(self) -> bool:
@@ -79,10 +80,11 @@ class Measured:
 
 
 def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: int,
-             stamps_ns: np.ndarray | None, told: Told = NOTHING) -> Measured:
+             stamps_ns: np.ndarray | None, told: Told = NOTHING,
+             hint: float | None = None) -> Measured:
     """All that can be measured of scans, which are those of these numbers among total ones of the
-    source; told: what that says itself. InputError for what is of several drivers, or sees in one
-    plane only."""
+    source; told: what that says itself; hint: the height that somebody knows, m. InputError for
+    what is of several drivers, or sees in one plane only."""
     if len({scan.columns for scan in scans}) > 1:
         raise InputError(f"{source} has clouds of several layouts ({', '.join(scans[0].columns)} "
                          "and others), as of several sensors; give those of one")
@@ -102,7 +104,7 @@ def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: 
     heading = _heading(scans, numbers, mount, coverage.still, told)
     return Measured(source, tuple(scans), total, intensity_of(scans), beams, step, twice, noise,
                     pieces, coverage, mount, heading, float(least), float(greatest),
-                    timing_of(scans, stamps_ns), model, error, told)
+                    timing_of(scans, stamps_ns), model, error, told, hint)
 
 
 def _heading(scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None,
@@ -137,17 +139,18 @@ def sensor_of(found: Measured) -> Sensor:
     there is a grid of the same view whose beams wander, with as many points in a turn."""
     known = sensor_named(found.model) if found.model else None
     fields: dict[str, Any] = {} if known is None else {name: getattr(known, name) for name in (
-        "divergence", "reach", "pulse", "max_range", "range_noise", "rate", "silent", "floor",
-        "fade")}
+        "divergence", "reach", "pulse", "min_range", "max_range", "range_noise", "rate", "silent",
+        "floor", "fade")}
     if np.isfinite(found.noise):
         fields["range_noise"] = round(found.noise, 4)
     if found.greatest > SMALL_ROOM or known is None:
         fields["max_range"] = float(np.ceil(max(found.greatest, SMALL_ROOM)))
     fields["rate"] = round(found.timing.rate, 2) if np.isfinite(found.timing.rate) else fields.get(
         "rate", 10.0)
-    if found.mount is not None:
-        fields["height"] = round(found.mount.height, 3)
-    fields["min_range"] = float(np.floor(100 * min(found.least, fields["max_range"] / 2)) / 100)
+    if found.mount is not None or found.hint is not None:
+        fields["height"] = found.hint if found.mount is None else round(found.mount.height, 3)
+    if known is None:  # the nearest thing may be far away, as the ground is
+        fields["min_range"] = float(np.floor(100 * min(found.least, Sensor.min_range)) / 100)
     if found.beams is None:
         return _grid(found, fields)
     # What one place hides is not what the robot hides: there only the ends of the view count.

@@ -21,6 +21,7 @@ CLOSE = 0.05                # metres: of the points to which the plane is fitted
 DEEP, MAX_BEYOND = 0.3, 0.25  # metres below the ground, and how many points as a share of its own
 SECTORS = 6                 # of a scan, that are left out in turn for its uncertainty
 MIN_HEIGHT = 0.1            # metres; what is nearer is what the sensor stands on
+MUCH_MORE = 8.0              # times as many points: a floor overhead, and not a ceiling above one
 MIN_EXTENT = 1.5            # metres that the plane reaches at least
 
 
@@ -136,15 +137,19 @@ def _error(xyz: np.ndarray) -> np.ndarray:
     return np.sqrt((n - 1) / n * ((np.array(found) - np.mean(found, axis=0)) ** 2).sum(axis=0))
 
 
+def _points(planes: Sequence[Plane | None]) -> float:
+    """How many points planes have, the median."""
+    return float(np.median([p.on.sum() for p in planes if p is not None] or [0]))
+
+
 def mount_of(scans: Sequence[Scan]) -> Mount | None:
     """Height, roll and pitch over the ground; None where fewer than half of the scans show ground.
-    The plane below counts, the one overhead only where it is found in twice as many scans."""
-    below = [ground_plane(scan.xyz, True) for scan in scans]
-    above: list[Plane | None] = []
-    if sum(p is not None for p in below) * 2 < len(scans):
-        above = [ground_plane(scan.xyz, False) for scan in scans]
-    over = sum(p is not None for p in above)
-    upside_down = over > 2 * sum(p is not None for p in below)
+    The plane below counts, the one overhead only where it is found in twice as many scans, or has
+    by far more points than what may be a slice of a wall."""
+    below, above = ([ground_plane(scan.xyz, down) for scan in scans] for down in (True, False))
+    under, over = (sum(p is not None for p in planes) for planes in (below, above))
+    upside_down = over > 2 * under or (
+        over >= under and _points(above) > MUCH_MORE * _points(below))
     planes = above if upside_down else below
     found = [p for p in planes if p is not None]
     if len(found) * 2 < len(scans) or not found:

@@ -63,16 +63,21 @@ class Sensor:
                                      ("biases", self.biases))),
                 (not np.isfinite([*self.fade, *np.ravel(self.blocked)]).all(),
                  "fade and blocked must be finite"),
-                (not 0 < self.azimuth_step <= np.pi / 2, "azimuth_step must be in 0 .. pi / 2"),
+                (not 0 < self.azimuth_step <= np.pi / 2,
+                 "azimuth_step must be above 0, at most 90 degrees"),
                 (len(up) * 2 * np.pi > MAX_RAYS * self.azimuth_step,
                  f"a turn must have at most {MAX_RAYS} rays; give a larger step or fewer beams"),
                 (not 0 < self.height < np.inf, "height must be positive"),
                 (not 0 <= self.min_range < self.max_range < np.inf,
-                 "max_range must exceed min_range, which must not be negative"),
+                 "max_range must be finite and exceed min_range, which must not be negative"),
                 (not 0 < self.rate <= MAX_RATE, f"rate must be above 0, at most {MAX_RATE:g}"),
                 (not 0 < self.reach <= np.inf, "reach must be positive"),
                 (not all(0 <= x <= 1 for x in (self.dropout, self.silent, self.floor)),
                  "dropout, silent and floor must be in 0 .. 1"),
+                (self.dropout == 1, "with dropout 1 nothing would come back"),
+                (self.divergence > np.pi / 2, "divergence must be at most 90 degrees"),
+                (not all(0 <= row[0] < max(1, len(up)) for row in self.blocked),
+                 "blocked must begin with a beam, 0 or more"),
                 (not all(0 <= x < np.inf for x in (self.range_noise, self.divergence, self.pulse)),
                  "range_noise, divergence and pulse must not be negative"),
                 (self.range_noise > MAX_NOISE, f"range_noise must be up to {MAX_NOISE:g} m"),
@@ -216,7 +221,7 @@ def _read(key: str, value: Any) -> Any:
     if numbers.ndim != len(shape) or any(n not in (0, m) for n, m in zip(shape, numbers.shape)) or (
             np.isnan(numbers).any()):
         what = "a number" if not shape else "a list of " + (
-            "numbers" if len(shape) == 1 else "[ring, from, to]")
+            f"{shape[0] or ''} numbers".strip() if len(shape) == 1 else "[ring, from, to]")
         raise InputError(f"{key} = {str(value)[:60]} must be {what}")
     rows = (np.radians(numbers) if key in IN_DEGREES else numbers).tolist()
     if not shape:

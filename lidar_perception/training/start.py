@@ -131,6 +131,7 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
     with joined(chosen_device(asked.device)) as device:
         sensor = sensor_named(params.sensor, params.mount_height)
         if rank() == 0:
+            scenes_of(asked, _few(params), sensor, own)  # what cannot be is said before any work
             make_folder(Path(params.data.cache))
             _settle(network, asked, params, sensor, device, own)
         wait()
@@ -187,12 +188,16 @@ def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
 def _measured(network: Network, asked: Asked, params: Any, sensor: Sensor,
               device: torch.device, own: tuple) -> tuple[Speed, Sequence[Any], Sequence[Any]]:
     """What the machine does now, and the sources of scenes to train with and to validate on."""
-    few = with_values(params, {"data.scans": 8, "data.val_scans": 1, "data.cache": ""})
+    few = _few(params)
     sources, held_out = scenes_of(asked, few, sensor, own)
     scenes, scan = _some_scenes((*sources, *held_out))
     cut, step, whole, frame = network.measured(few, scenes, held_out[0], device)
     speed = Speed(scan, cut, step, whole, frame, scenes[0].points.nbytes * 1.02e-6)
     return speed, sources, held_out
+
+
+def _few(params: Any) -> Any:
+    return with_values(params, {"data.scans": 8, "data.val_scans": 1, "data.cache": ""})
 
 
 def _refit(network: Network, asked: Asked, params: Any, sensor: Sensor, device: torch.device,

@@ -76,6 +76,19 @@ def test_a_leaning_sensors_bag_becomes_level_with_all_that_belongs_to_it(tmp_pat
         np.testing.assert_allclose(frame.pose(), pose(i), atol=1e-6)
 
 
+def test_a_level_sensor_at_another_height_is_turned_too(tmp_path, monkeypatch):
+    floor = np.random.default_rng(2).uniform([-20, -20, -0.61], [20, 20, -0.59], (3000, 3))
+    write_bag(tmp_path / "drive", [Frame.of(str(i), LidarFrame.of(floor, None, (i + 1) * 10**8,
+                                                                  "front")) for i in range(3)])
+    (tmp_path / "robot.yaml").write_text(
+        "/**:\n  ros__parameters:\n    input: {ahead: 90.0}\n"
+        "    ground: {sensor_pose: {height: 0.6}}\n")
+    assert exit_of(monkeypatch, "convert", tmp_path / "drive", "--robot", tmp_path / "robot.yaml",
+                   "--out", tmp_path / "level") == 0
+    cloud = next(iter(open_recording(tmp_path / "level"))).load()
+    np.testing.assert_allclose(cloud.xyz, floor[:, [1, 0, 2]] * [1, -1, 1], atol=1e-4)
+
+
 WORLD = np.random.default_rng(1).uniform(-20, 20, (400, 3)) + [1, 0, 0]
 
 

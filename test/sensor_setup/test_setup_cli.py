@@ -37,7 +37,7 @@ def run(*arguments):
 @pytest.fixture(scope="module")
 def robot(bag, tmp_path_factory):
     out = tmp_path_factory.mktemp("setup") / "robot"
-    result = run("--data", bag, "--out", out, "--topic", "/lidar/points", "--height-hint", 1.2)
+    result = run("--data", bag, "--out", out, "--height-hint", 1.2)
     assert result.exit_code == 0
     assert "vlp-16" in result.output and "doubt: the sensor is 0.60 m above" in " ".join(
         result.output.split())

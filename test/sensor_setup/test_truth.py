@@ -1,6 +1,8 @@
 """Simulated sensors that lean are measured as they are; real ones as they are known."""
 
+from dataclasses import replace
 from functools import cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from lidar_perception.sensor_setup.doubts import doubts
 from lidar_perception.sensor_setup.files import params_yaml, sensor_yaml
 from lidar_perception.sensor_setup.findings import findings
 from lidar_perception.sensor_setup.measure import measured
+from lidar_perception.sensor_setup.mount import ground_plane, mount_of
 from lidar_perception.sensor_setup.scans import scan_of
 from lidar_perception.simulation.sensor import sensor_from_file, sensor_named
 
@@ -62,6 +65,29 @@ def test_the_file_that_is_written_is_the_sensor_that_was_measured(tmp_path):
             known.divergence, abs=1e-6)
         assert np.allclose(sensor.elevations, known.elevations, atol=np.radians(0.05))
         assert sensor.height == pytest.approx(MOUNTS[name][3], abs=0.02)
+        assert sensor.min_range == known.min_range  # and not the nearest ground of this drive
+
+
+def test_a_slice_of_a_wall_is_no_ground_under_an_upside_down_sensor():
+    rng = np.random.default_rng(0)
+    ground = rng.uniform([-25, -25, 1.71], [25, 25, 1.75], (20000, 3))
+    wall = rng.uniform([4, -3, -0.28], [9, 3, -0.24], (400, 3))
+    seen = [SimpleNamespace(xyz=np.concatenate(parts).astype(np.float32))
+            for parts in ([ground, wall],) * 3]
+    assert ground_plane(seen[0].xyz, True) is not None
+    mount = mount_of(seen)
+    assert mount.upside_down and mount.height == pytest.approx(1.73, abs=0.01)
+    indoors = [SimpleNamespace(xyz=(s.xyz * [1, 1, -1]).astype(np.float32)) for s in seen]
+    ceiling = rng.uniform([-25, -25, 2.2], [25, 25, 2.24], (20000, 3))
+    indoors = [SimpleNamespace(xyz=np.concatenate([s.xyz, ceiling]).astype(np.float32))
+               for s in indoors]
+    assert not mount_of(indoors).upside_down
+
+
+def test_a_height_that_is_given_counts_where_no_ground_is_seen():
+    m = replace(found("vlp-16"), mount=None, heading=None, hint=0.7)
+    assert "height: 0.7  # as --height-hint says" in sensor_yaml(m)
+    assert "height: 0.7" in params_yaml(m)
 
 
 def test_beams_are_the_same_by_rings_and_by_elevation():
