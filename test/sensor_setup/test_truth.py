@@ -71,7 +71,7 @@ def test_the_file_that_is_written_is_the_sensor_that_was_measured(tmp_path):
 def test_a_slice_of_a_wall_is_no_ground_under_an_upside_down_sensor():
     rng = np.random.default_rng(0)
     ground = rng.uniform([-25, -25, 1.71], [25, 25, 1.75], (20000, 3))
-    wall = rng.uniform([4, -3, -0.28], [9, 3, -0.24], (400, 3))
+    wall = rng.uniform([4, -3, -0.28], [9, 3, -0.24], (150, 3))
     seen = [SimpleNamespace(xyz=np.concatenate(parts).astype(np.float32))
             for parts in ([ground, wall],) * 3]
     assert ground_plane(seen[0].xyz, True) is not None
