@@ -14,6 +14,7 @@ from lidar_perception.sensor_setup.told import FOOTPRINT
 from lidar_perception.simulation.sensor import sensor_named
 
 SLOPE = 1.0         # degrees by which the ground leans from scan to scan, from which on it slopes
+TALL = 5.0          # metres above the ground, more than robots have
 STEEP_MOUNT = 6.0   # degrees of roll or pitch: either mounted so, or all of it on a slope
 NOT_AHEAD = 10.0    # degrees between x and where the robot drives, beyond twice the error
 TILT_APART = 2.0    # degrees between what TF and the ground say of roll or pitch, beyond the error:
@@ -89,8 +90,8 @@ def _beam_doubts(m: Measured) -> list[str]:
     assert beams is not None
     if m.model and len(beams.elevations) < sensor_named(m.model).rings:
         out.append(f"{len(beams.elevations)} of the {sensor_named(m.model).rings} beams of "
-                   f"{m.model} were seen: record where all of them meet something, or take "
-                   f"elevations from config/sensors/{m.model}.yaml")
+                   f"{m.model} were seen, so sensor.yaml has all of the model's: record where all "
+                   "of them meet something to measure them")
     if m.moved:
         out.append(f"points of a beam scatter by {np.median(beams.spread):.2f} deg: the clouds are "
                    "corrected for motion, or in a frame that is not the sensor's, and steep beams "
@@ -107,6 +108,10 @@ def _mount_doubts(m: Measured) -> list[str]:
         return ["no ground in sight, so that height, roll and pitch are not known; record where "
                 "the floor is seen for some metres around, or set ground.sensor_pose by hand"]
     out, q = [], m.mount
+    if q.height > TALL:
+        out.append(f"what is taken for the ground is {q.height:.1f} m away: it may be a wall "
+                   "beside a sensor that lies on its side; look in the report, and set "
+                   "ground.sensor_pose by hand")
     if q.upside_down:
         out.append("the ground is where the sensor's z axis points: it is mounted upside down, and "
                    "ground.sensor_pose.roll says so; with z down in the driver's frame only, turn "

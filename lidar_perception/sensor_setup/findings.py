@@ -116,7 +116,8 @@ def _mount(m: Measured) -> list[Finding]:
     q, found = m.mount, sum(p is not None for p in m.mount.planes)
     how = f"plane through the ground around, {found} of {len(m.scans)} scans"
     degrees = np.degrees(q.error)
-    sure = SURE if len(m.scans) >= FEW_SCANS and np.degrees(q.spread[1:]).max() < SLOPE else FAIR
+    sure = SURE if len(m.scans) >= FEW_SCANS and np.degrees(q.spread[1:]).max() < SLOPE and (
+        not m.coverage.still) else FAIR  # of one place the error is that of its ground
     return [Finding("height", f"{q.height:.3f} +- {q.error[0]:.3f} m",
                     f"{how}; from scan to scan {q.spread[0]:.3f} m", sure),
             Finding("roll", f"{np.degrees(q.roll):.2f} +- {degrees[1]:.2f} deg",

@@ -64,9 +64,12 @@ class Measured:
 
     @property
     def as_model(self) -> bool:
-        """Whether the model's beams are surer than the measured ones, which agree with them."""
-        return self.moved and bool(self.model) and self.beams is not None and (
-            sensor_named(self.model).rings == len(self.beams.elevations))
+        """Whether the model's beams are surer than the measured ones, which agree with them: where
+        points were moved, or some of the beams have too few of them."""
+        if not self.model or self.beams is None:
+            return False
+        measured, known = len(self.beams.elevations), sensor_named(self.model).rings
+        return measured < known or (self.moved and measured == known)
 
     @property
     def elevation_step(self) -> float:
@@ -158,6 +161,9 @@ def sensor_of(found: Measured) -> Sensor:
     fields["blocked"] = tuple(b for b in found.coverage.blocked if places or b[0] == 0)
     up, lifts = np.radians(np.round(found.beams.elevations, 4)), np.round(found.beams.lifts, 4)
     if found.as_model and known is not None:
+        fields["blocked"] = tuple(
+            (first and int(np.abs(np.array(known.elevations) - up[first]).argmin()), start, end)
+            for first, start, end in fields["blocked"])
         up, lifts = np.array(known.elevations), np.array(known.lifts)
     if lifts.any():
         fields["lifts"] = tuple(lifts.tolist())

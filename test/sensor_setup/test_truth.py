@@ -84,6 +84,16 @@ def test_a_slice_of_a_wall_is_no_ground_under_an_upside_down_sensor():
     assert not mount_of(indoors).upside_down
 
 
+def test_of_a_model_that_is_seen_in_part_all_beams_are_written(tmp_path):
+    seen = tuple(s._make(column[s.ring > 1] if isinstance(column, np.ndarray) else column
+                         for column in s) for s in scans("vlp-16"))
+    m = measured(seen, [0, 1, 10, 11], "part", 12, None)
+    (tmp_path / "sensor.yaml").write_text(sensor_yaml(m))
+    assert len(m.beams.elevations) == 14 and "14 of the 16 beams" in " ".join(doubts(m))
+    assert sensor_from_file(tmp_path / "sensor.yaml").elevations == pytest.approx(
+        sensor_named("vlp-16").elevations)
+
+
 def test_a_height_that_is_given_counts_where_no_ground_is_seen():
     m = replace(found("vlp-16"), mount=None, heading=None, hint=0.7)
     assert "height: 0.7  # as --height-hint says" in sensor_yaml(m)
