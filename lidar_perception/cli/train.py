@@ -88,9 +88,8 @@ def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
     """
     from lidar_perception.detectors.pointpillars.config import RANGES, network_config
     from lidar_perception.training.pointpillars.start import PointPillarsStart
-    config = network_config(params.version, params.size)  # a size sees ahead
-    if params.range == "around":
-        config = replace(config, **RANGES["around"])
+    seen: dict[str, Any] = {**RANGES["around"]} if params.range == "around" else {}
+    config = network_config(params.version, params.size, **seen)  # a size by itself sees ahead
     run(PointPillarsStart(config), asked, params)
 
 

@@ -141,12 +141,13 @@ class LidarNode(Node):
 
         received: Any = guarded  # rclpy's annotation has no result
         kind, what = message_class(type_name), "cloud" if type_name == CLOUD else "array"
+
         def refused(_: Any) -> None:
             if len(qos) == 1:  # else another of them fits
-                self.report(WARN, f"a publisher on {self.resolve_topic_name(name)} offers less than"
-                            " is asked for, and is not heard: let it publish reliable, or set "
-                            f"qos_overrides.{self.resolve_topic_name(name)}.subscription.reliability"
-                            " to best_effort")
+                topic = self.resolve_topic_name(name)
+                self.report(WARN, f"a publisher on {topic} offers less than is asked for, and is "
+                            "not heard: let it publish reliable, or set "
+                            f"qos_overrides.{topic}.subscription.reliability to best_effort")
 
         events = SubscriptionEventCallbacks(message_lost=lost, incompatible_qos=refused)
 

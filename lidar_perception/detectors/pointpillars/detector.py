@@ -152,12 +152,12 @@ class PointPillarsDetector(NetworkDetector):
         found = [self._passed(turned, *prediction) for turned, prediction in predictions.items()]
         boxes, logits, labels = map(np.concatenate, zip(*found))
         best: dict[str, float] = {}
-        broken = None
+        broken: str | None = None
         if any(len(scores) > 1 and (scores == scores[0]).all()
                for scores, _ in predictions.values()):
             boxes, logits, labels = boxes[:0], logits[:0], labels[:0]
-            broken = "the network gives every place the same scores; the weights are broken, " \
-                     "take others"
+            broken = ("the network gives every place the same scores; the weights are broken, "
+                      "take others")
         elif len(boxes) == 0:
             highest = torch.stack([scores.amax(dim=0) for scores, _ in predictions.values()])
             best, broken = self.nothing_passed(torch.sigmoid(highest.amax(dim=0)).tolist())
