@@ -45,15 +45,14 @@ def test_pages_are_made_from_the_code(generate, name):
                                   "pointnet_detector", "fused_detector", "tracker"])
 def test_documented_topics_are_the_nodes_own(generate, name, domain):
     pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
-    from lidar_perception.nodes.watch import new_context
+    from lidar_perception.nodes.watch import leave, new_context
     context = new_context(domain)
     module = importlib.import_module(f"lidar_perception.nodes.{name}")
     node = getattr(module, NODES[name][0])(context=context)
     node.start()
     listed = {t for t, _ in [*node.get_publisher_names_and_types_by_node(name, "/"),
                              *node.get_subscriber_names_and_types_by_node(name, "/")]}
-    node.destroy_node()
-    context.try_shutdown()
+    leave(context, node)
     documented = set()
     entry = generate.PAGES[name]
     for topics, kind, _ in entry["inputs"] + generate.outputs(name):

@@ -19,7 +19,7 @@ from lidar_perception.campaign.shapes import NETWORKS, work_of
 from lidar_perception.campaign.worker import memory_mb
 from lidar_perception.nodes.graph import private_domain
 from lidar_perception.nodes.runtime import MARKERS
-from lidar_perception.nodes.watch import new_context
+from lidar_perception.nodes.watch import leave, new_context
 from lidar_perception.types import LidarFrame
 from lidar_perception.wire.codec import encode
 
@@ -59,8 +59,7 @@ class Attempt:
             try:
                 return _repeated(case.name, partial(_frame_of_node, tried))
             finally:
-                tried.node.destroy_node()
-                context.try_shutdown()
+                leave(context, tried.node)
         work = work_of(case.settings["what"])
         frames = [LidarFrame.of(street(i), np.full(len(street(i)), 0.3, np.float32))
                   for i in range(20)]

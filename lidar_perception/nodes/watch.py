@@ -6,13 +6,14 @@ import os
 import struct
 from collections.abc import Callable, Mapping
 from contextlib import contextmanager
-from time import monotonic
+from time import monotonic, sleep
 from typing import Any, Self
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
@@ -21,14 +22,41 @@ from lidar_perception.nodes.runtime import RELIABLE, SENSOR_DATA
 from lidar_perception.wire.topics import POINTS
 
 DISCOVERY_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+STILL, STILL_AT_LAST = 0.1, 3.0  # seconds
 
 
 def new_context(domain: int | None) -> Context:
     """A ROS context of its own, without signal handlers, on a domain; None is that of the
-    environment. context.try_shutdown() ends it."""
+    environment. leave() ends it."""
     context = Context()
     rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     return context
+
+
+def leave(context: Context, *nodes: Node) -> None:
+    """Destroy nodes, all that the context has, and end it, once nobody has come or gone for STILL
+    seconds, or after STILL_AT_LAST.
+
+    Fast DDS as in the wheels may wait for ever, with the interpreter's lock held, if the last node
+    of a context is destroyed in the moment in which it hears that another process leaves
+    (https://github.com/eProsima/Fast-DDS/issues/6513).
+    """
+    if nodes:
+        end, since, seen = monotonic() + STILL_AT_LAST, monotonic(), _others(nodes[0])
+        while (now := monotonic()) < min(end, since + STILL):
+            sleep(STILL / 10)
+            if seen != (seen := _others(nodes[0])):
+                since = now
+    for node in nodes:
+        node.destroy_node()
+    context.try_shutdown()
+
+
+def _others(node: Node) -> tuple[Any, ...]:
+    """Who is on the domain, and how many publish and subscribe to each topic."""
+    return (sorted(node.get_node_names_and_namespaces()),
+            [(topic, node.count_publishers(topic), node.count_subscribers(topic))
+             for topic, _ in node.get_topic_names_and_types()])
 
 
 class Outside:
@@ -49,8 +77,7 @@ class Outside:
 
     def __exit__(self, *_: Any) -> None:
         self.executor.shutdown()
-        self.node.destroy_node()
-        self.context.try_shutdown()
+        leave(self.context, self.node)
 
     def _on_status(self, msg: Any) -> None:
         for status in msg.status:

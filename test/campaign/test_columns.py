@@ -17,7 +17,7 @@ from lidar_perception.campaign.messages import TRIED, Tried
 from lidar_perception.campaign.worker import memory_mb
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes import NODES
-from lidar_perception.nodes.watch import new_context
+from lidar_perception.nodes.watch import leave, new_context
 from lidar_perception.wire.codec import bag_message, encode
 from msg_utils.point_cloud2 import add_columns, to_array
 
@@ -44,9 +44,7 @@ def tried(domain, tmp_path_factory):
                            "fused.threads": 1}}
     nodes = {name: Tried(name, context, **values.get(name, {})) for name in TRIED}
     yield nodes
-    for each in nodes.values():
-        each.node.destroy_node()
-    context.try_shutdown()
+    leave(context, *(each.node for each in nodes.values()))
 
 
 def test_every_input_of_a_node_is_tried(tried):

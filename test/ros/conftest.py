@@ -38,7 +38,7 @@ def start(domain):
     """Makes a node in this process; what it publishes grows in node.sent, by topic."""
     from rclpy.parameter import Parameter
 
-    from lidar_perception.nodes.watch import new_context
+    from lidar_perception.nodes.watch import leave, new_context
     context, nodes = new_context(domain), []
 
     def make(kind, **values):
@@ -55,6 +55,4 @@ def start(domain):
         return node
 
     yield make
-    for node in nodes:
-        node.destroy_node()
-    context.try_shutdown()
+    leave(context, *nodes)

@@ -23,7 +23,7 @@ from lidar_perception.ground.params import ObstacleParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.graph import BEHIND, SINGLE, graph_of
-from lidar_perception.nodes.watch import new_context
+from lidar_perception.nodes.watch import leave, new_context
 from lidar_perception.wire.messages import to_frame
 from lidar_perception.wire.topics import POINTS
 from msg_utils.point_cloud2 import to_array
@@ -70,9 +70,7 @@ def graph(domain):
             types[topic] = kinds[0]
             offered[topic] = node.get_publishers_info_by_topic(topic)[0].qos_profile
     yield types, offered
-    for node in nodes:
-        node.destroy_node()
-    context.try_shutdown()
+    leave(context, *nodes)
 
 
 def rviz_manager():

@@ -3,6 +3,7 @@
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -62,3 +63,37 @@ def test_run_ends_its_node_cleanly(number, processes, peer):
     node = processes.running["evaluator"]
     node.send_signal(number)
     assert node.wait(timeout=20) == 0
+
+
+class Changing:
+    """A node that sees others leave at its first looks, or for ever."""
+
+    def __init__(self, looks):
+        self.looks, self.destroyed = looks, None
+
+    def get_topic_names_and_types(self):
+        return []
+
+    def get_node_names_and_namespaces(self):
+        self.looks -= 1
+        return [(f"node_{max(self.looks, 0)}", "/")]
+
+    def destroy_node(self):
+        self.destroyed = self.looks
+
+
+@pytest.mark.parametrize("looks", [3, 10**9])
+def test_a_node_in_this_process_leaves_when_no_other_does_or_after_a_while(looks, monkeypatch):
+    """Else Fast DDS may wait for ever."""
+    pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+    from lidar_perception.nodes import watch
+    clock, ended = [0.0], []
+    monkeypatch.setattr(watch, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(watch, "sleep", lambda s: clock.__setitem__(0, clock[0] + s))
+    context, node = SimpleNamespace(try_shutdown=lambda: ended.append(clock[0])), Changing(looks)
+    watch.leave(context, node)
+    if looks == 3:
+        assert node.destroyed < 0 and watch.STILL < ended[0] < 2 * watch.STILL
+    else:
+        assert watch.STILL_AT_LAST <= ended[0] < watch.STILL_AT_LAST + watch.STILL
+    assert node.destroyed is not None
