@@ -39,6 +39,7 @@ from msg_utils.stamps import SECOND, to_ns
 TF_QOS = QoSProfile(depth=100)
 STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 ODOMETRY_QOS = QoSProfile(depth=200, reliability=ReliabilityPolicy.BEST_EFFORT)  # takes any
+ALONE = 2.0  # seconds without an odometry, from which on another one may take its place
 NO_TF = "tf2_msgs is not installed, so nothing is known of TF; install ROS 2's tf2_msgs"
 
 
@@ -58,7 +59,7 @@ class Transforms:
         self.target_frame = getattr(robot, "target_frame", "").lstrip("/")
         self.carrier = self.odometry_frame = ""  # what the odometry is of, and in which frame
         self.odometry_ns: int | None = None  # the stamp of the last one
-        self.odometry_came = -inf  # monotonic, when it came
+        self.odometry_came = self.left_out = -inf  # monotonic, when it, or another one, came
         self.needs: list[Callable[[Any], str | None]] = []  # of a header: what else it waits for
         self.sweep: float | None = None  # seconds from the stamp to the last point of a cloud
         self.lacking: dict[str, str] = {}  # what asked for it -> what is not there
@@ -107,12 +108,24 @@ class Transforms:
             self._changed()
 
     def on_odometry(self, msg: Any) -> None:
-        """A nav_msgs/Odometry: where its child frame is at its stamp."""
+        """A nav_msgs/Odometry: where its child frame is at its stamp. Where several, in frames that
+        differ, share the topic, the first one counts as long as it comes."""
+        now, child, frame = (monotonic(), msg.child_frame_id.lstrip("/"),
+                             msg.header.frame_id.lstrip("/"))
+        if (child, frame) != (self.carrier, self.odometry_frame):
+            if now - self.odometry_came < ALONE:
+                self.left_out = now
+                self.lacking["odometry"] = (
+                    f"two odometries on {self.node.resolve_topic_name('~/input/odometry')}: that "
+                    f"of '{child}' in '{frame}' is left out, that of '{self.carrier}' in "
+                    f"'{self.odometry_frame}' is used; give each a topic of its own")
+                return
+            self.odometry = TransformTree()
         add_odometry(self.odometry, msg)
-        self.carrier = msg.child_frame_id.lstrip("/")
-        self.odometry_frame = msg.header.frame_id.lstrip("/")
+        if now - self.left_out > ALONE:
+            self.lacking.pop("odometry", None)
+        self.carrier, self.odometry_frame, self.odometry_came = child, frame, now
         self.odometry_ns = self.node.counts["last_pose_ns"] = to_ns(msg.header.stamp)
-        self.odometry_came = monotonic()
         self._changed()
 
     def _changed(self) -> None:

@@ -24,6 +24,7 @@ SMEARED = 0.01      # degrees: beams that scatter more are not told from each ot
 MAX_LIFT_ERROR = 0.01  # metres
 MIN_LIFT = 0.03     # metres; beams that start nearer to each other start together
 FINER = 1e-3        # degrees: how exactly azimuths are told
+MAX_GAP = 3.5       # steps, up to which it is told how many returns are lost in a gap
 
 
 class Beams(NamedTuple):
@@ -225,12 +226,15 @@ def azimuth_steps(scans: Sequence[Scan], beams: Beams) -> tuple[float, float]:
                 continue
             twice.append(float((apart < FINER).mean()))
             apart = apart[apart >= FINER]
+            if len(apart) < MIN_BEAM // 2:
+                continue
             # Encoders tell azimuths in steps of their own, so that gaps differ: their mean counts,
-            # up to the gaps that a lost return leaves.
-            usual = np.median(apart) if len(apart) else 0.0
-            apart = apart[(apart > 0.4 * usual) & (apart < 1.6 * usual)]
-            if len(apart) >= MIN_BEAM // 2:
-                steps.append(float(apart.mean()))
+            # and a gap that lost returns leave has the steps of these.
+            step = float(np.median(apart))
+            for _ in range(3):
+                near = apart[(apart > 0.4 * step) & (apart < MAX_GAP * step)]
+                step = float(near.sum() / np.maximum(1, np.round(near / step)).sum())
+            steps.append(step)
     if not steps:
         return np.nan, 0.0
     return float(np.median(steps)), float(np.median(twice))

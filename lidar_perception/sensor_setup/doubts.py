@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.geometry import wrap_angle
-from lidar_perception.sensor_setup.coverage import ARM
+from lidar_perception.sensor_setup.coverage import ARM, FAR
 from lidar_perception.sensor_setup.measure import FEW_SCANS, SMALL_ROOM, Measured
 from lidar_perception.sensor_setup.motion import Ahead
 from lidar_perception.sensor_setup.told import FOOTPRINT
@@ -35,8 +35,9 @@ def doubts(m: Measured) -> list[str]:
         out.append("the robot stands still: all is of one place, and its body cannot be told from "
                    "what is around it; record while it drives")
     elif m.coverage.still is None:
-        out.append("whether the robot moved cannot be told, as too few returns are farther than "
-                   "4 m; record while it drives through an open place")
+        out.append("whether the robot moved cannot be told, as too few directions have a return "
+                   f"from beyond {FAR:.0f} m in most of the clouds; record one drive through an "
+                   "open place")
     frames = sorted({scan.frame_id for scan in m.scans} - {""})
     if len(frames) > 1:
         out.append(f"clouds of several frames ({', '.join(frames)}) share the topic: this is no "
@@ -51,7 +52,8 @@ def doubts(m: Measured) -> list[str]:
     out += _heading_doubts(m) + told_doubts(m)
     if m.intensity is None:
         out.append("there is no intensity, or always the same: detectors that were trained with it "
-                   "lose accuracy; turn it on in the driver, or train with --augment-intensity")
+                   "lose accuracy; turn it on in the driver, or train with --sensor sensor.yaml, "
+                   "which has none either (silent: 1)")
     elif not m.intensity.sure:
         out.append(f"intensities end at {m.intensity.greatest:g}, so that the full scale "
                    f"({m.intensity.full:g}) is a guess: no retroreflector was in sight, or the "

@@ -48,7 +48,8 @@ def sensor_yaml(m: Measured) -> str:
         else "the nearest that is not the robot's own",
         "max_range": "the farthest seen" if m.greatest >= SMALL_ROOM else f"not measured; {model}",
         "range_noise": f"not measured; {model}" if np.isnan(m.noise) else "about smooth surfaces",
-        "divergence": f"not measured; {model}", "reach": f"not measured; {model}"}
+        "divergence": f"not measured; {model}", "reach": f"not measured; {model}",
+        "silent": "no intensity was seen" if m.intensity is None else f"not measured; {model}"}
     values = {"name": m.model or "measured", "height": sensor.height, "rate": sensor.rate,
               "azimuth_step": round(float(np.degrees(sensor.azimuth_step)), 6)}
     default = Sensor((0.0,), 0.1)

@@ -144,6 +144,8 @@ def sensor_of(found: Measured) -> Sensor:
     fields: dict[str, Any] = {} if known is None else {name: getattr(known, name) for name in (
         "divergence", "reach", "pulse", "min_range", "max_range", "range_noise", "rate", "silent",
         "floor", "fade")}
+    if found.intensity is None:
+        fields["silent"] = 1.0
     if np.isfinite(found.noise):
         fields["range_noise"] = round(found.noise, 4)
     if found.greatest > SMALL_ROOM or known is None:

@@ -188,3 +188,20 @@ def test_odometry_of_another_clock_and_one_that_has_stopped_are_named(start, mon
     now[0] += 5.0
     said(2)  # the first seconds are the tracker's, which goes on as before
     assert "no odometry on /tracker/input/odometry for 5 s" in said(2.1)
+
+
+def test_of_two_odometries_on_a_topic_the_first_counts_while_it_comes_and_it_is_said(
+        start, monkeypatch):
+    node, now = start(TrackerNode), [100.0]
+    monkeypatch.setattr(transforms_module, "monotonic", lambda: now[0])
+
+    def told(i, stamp):
+        node.transforms.on_odometry(odometry(base_at(i), stamp, "lidar"))
+        if i % 2:
+            node.transforms.on_odometry(odometry(base_at(3 * i), stamp + 1, "lidar", "map"))
+
+    drive(node, told, [base_at(i) for i in range(8)])
+    assert "of 'lidar' in 'map' is left out" in node.transforms.problems()[0][2]
+    now[0] += transforms_module.ALONE + 1
+    node.transforms.on_odometry(odometry(base_at(0), START + 10 * TENTH, "lidar", "map"))
+    assert node.transforms.odometry_frame == "map" and not node.transforms.problems()

@@ -55,10 +55,10 @@ def transforms(*rows):
     return tf(*(transform(parent, child, stamp, pose) for parent, child, pose, stamp in rows))
 
 
-def odometry(pose, stamp, child="base"):
+def odometry(pose, stamp, child="base", frame="odom"):
     t, q = pose[:3, 3].tolist(), Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
     found = bag_message("nav_msgs/msg/Odometry", child_frame_id=child,
-                        header=header_message(stamp, "odom", bag_message))
+                        header=header_message(stamp, frame, bag_message))
     for name, value in zip("xyz", t):
         setattr(found.pose.pose.position, name, value)
     for name, value in zip("xyzw", q):

@@ -119,8 +119,10 @@ def test_a_sparser_sensor_gets_wider_neighbourhoods_and_fewer_points():
 
 def test_a_bare_cloud_says_what_it_lacks():
     assert MOUNTS["pandarxt-32"][0] is BARE
-    text = "\n".join(doubts(found("pandarxt-32")))
+    m = found("pandarxt-32")
+    text = "\n".join(doubts(m))
     assert "there is no intensity" in text and "the rate cannot be told" in text
+    assert "silent: 1  # no intensity was seen" in sensor_yaml(m)
 
 
 @pytest.mark.parametrize("folder, model, height, rings", [
