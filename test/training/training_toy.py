@@ -1,0 +1,76 @@
+"""A training that is small enough to be compared bit by bit, and what it wrote."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from lidar_perception.training.loop import STATE
+from lidar_perception.training.params import LoopParams
+from lidar_perception.training.ranks import rank, world
+from lidar_perception.training.run import Task
+
+PARAMS = LoopParams(steps=13, validate_steps=4, save_steps=3, log_steps=1, seed=3, lr=0.05,
+                    amp="off")
+
+
+class Toy:
+    """A regression with dropout and batch norm. before(step) runs in the loss of each step."""
+
+    def __init__(self, before=lambda step: None, plain: bool = False, size: int = 8):
+        torch.manual_seed(5)
+        middle = [] if plain else [nn.BatchNorm1d(6), nn.Dropout(0.3)]
+        self.module = nn.Sequential(nn.Linear(4, 6), *middle, nn.ReLU(), nn.Linear(6, 1))
+        self.before, self.size, self.kept = before, size, {}
+
+    def task(self, **about) -> Task:
+        return Task(self.module, self.loss, self.batches, self.validate, self.keep, 4, about)
+
+    def loss(self, module, batch):
+        step, inputs, wanted = batch
+        self.before(step)
+        error = (module(inputs) - wanted).square().mean()
+        return error, {"half": error.detach() / 2}
+
+    def batches(self, step):
+        while True:
+            rng = torch.Generator().manual_seed(step)
+            inputs = torch.randn(self.size * world(), 4, generator=rng)
+            inputs = inputs[rank() * self.size:(rank() + 1) * self.size]
+            yield step, inputs, inputs[:, :1] * 2 - inputs[:, 1:2]
+            step += 1
+
+    def validate(self, module):
+        assert not module.training
+        inputs = torch.linspace(-1, 1, 40).view(10, 4)
+        with torch.no_grad():
+            error = (module(inputs) - inputs[:, :1] * 2 + inputs[:, 1:2]).square().mean()
+        return {"score": -error.item()}, {}
+
+    def keep(self, name, module, record):
+        state = {k: v.clone() for k, v in module.state_dict().items()}
+        self.kept[name] = state, record
+
+
+def weights(folder: Path) -> dict[str, torch.Tensor]:
+    state = torch.load(folder / STATE, weights_only=True)
+    return {f"{part}.{name}": value for part in ("module", "average")
+            for name, value in state[part].items()}
+
+
+def same(a: dict, b: dict) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def rows(folder: Path, name: str = "log.csv") -> list[dict]:
+    with open(folder / name) as stream:
+        return [{k: v for k, v in row.items() if k != "seconds"} for row in csv.DictReader(stream)]
+
+
+def equals(folder: Path, other: Path) -> bool:
+    """Whether two runs wrote the same, but for times."""
+    return (same(weights(folder), weights(other)) and rows(folder) == rows(other)
+            and rows(folder, "validation.csv") == rows(other, "validation.csv"))
