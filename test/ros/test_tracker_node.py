@@ -173,11 +173,13 @@ def test_strange_frames_and_poses_end_nothing_and_each_has_its_reason(processes,
         return detection_markers(found, header(now, frame_id), bag_message)
 
     def move(poses, child="lidar"):
-        """Poses of the next frames."""
+        """Poses of the next frames. Those of another child count when the first are silent."""
         for i, at in enumerate(poses):
             stamp = now + (i + 1) * TENTH
-            moving.publish(encode(odometry(at, header(stamp, "odom"), child, bag_message)))
-        peer.wait(lambda: peer.value_of(NODE, "last_pose_ns") == str(stamp), "the poses")
+            message = odometry(at, header(stamp, "odom"), child, bag_message)
+            moving.publish(encode(message))
+        peer.send(moving, message, lambda: peer.value_of(NODE, "last_pose_ns") == str(stamp),
+                  "the poses")
 
     found = cars(car(10))
     for _ in range(3):

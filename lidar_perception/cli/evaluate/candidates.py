@@ -50,10 +50,10 @@ def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
         raise click.UsageError("there is nobody to click here; use --seed-source file")
     report = CandidateReport()
     walk.fill(report, recording, partial(by_pipeline, params))
-    content = report.compute()
-    walk.write(content)
     if report.frames == 0:
         raise no_labels(recording, report.skipped, "a Pedestrian label")
+    content = report.compute()
+    walk.write(content)
     print_candidate_report(content, console)
     if png is not None:
         _draw(png, recording, report, params)

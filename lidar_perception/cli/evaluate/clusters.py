@@ -38,8 +38,8 @@ def clusters(walk: Walk, weights: Path | None) -> None:
     scores = ClusterScores(read_header(file, PointNetConfig).config.classes)
     recording = walk.opened(BOXES)
     walk.fill(scores, recording, partial(by_network, file))
-    content = {"source": str(weights or "the package's own"), **scores.compute()}
-    walk.write(content)
     if not scores.frames:
         raise no_labels(recording, scores.skipped)
+    content = {"source": str(weights or "the package's own"), **scores.compute()}
+    walk.write(content)
     print_cluster_scores(content, console)

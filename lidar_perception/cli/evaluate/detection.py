@@ -108,9 +108,11 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
         content["reliability"] = {name: reliability(together, name) for name in SCORED}
     if intervals and report.frames:
         content["intervals"] = report.intervals(intervals)
-    walk.write(content)
     if write_results is not None:
         console.print(f"result files: {write_results}")
+    if not report.frames and (write_results is None or report.skipped):
+        raise no_labels(recording, report.skipped)
+    walk.write(content)
     if report.frames:
         print_detection_report(content, console)
         if errors:
@@ -118,5 +120,3 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
             print_reliability(content["reliability"], console)
         if intervals:
             print_intervals(content["intervals"], console)
-    elif write_results is None or report.skipped:
-        raise no_labels(recording, report.skipped)

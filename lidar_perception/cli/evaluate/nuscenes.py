@@ -75,8 +75,8 @@ def nuscenes(walk: Walk, results: Path | None, weights: Path | None, where: str,
     if write_results is not None:
         write_result_file(write_results, report.boxes)
         console.print(f"result file: {write_results}")
+    if not report.frames and (write_results is None or report.skipped):
+        raise no_labels(recording, report.skipped)
     walk.write(content)
     if report.frames:
         print_nuscenes_report(content, console)
-    elif write_results is None or report.skipped:
-        raise no_labels(recording, report.skipped)

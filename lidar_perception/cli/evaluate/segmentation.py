@@ -74,10 +74,10 @@ def segmentation(walk: Walk, methods: tuple, png: Path | None, params: Segmentat
         report.source = recording.layout
         walk.fill(report, recording, partial(by_methods, params, grounds, clusterings),
                   recording.layout)
-    content = report.compute()
-    walk.write(content)
     if not (report.ground or report.clusters):
         raise no_labels(recordings[0], report.skipped)
+    content = report.compute()
+    walk.write(content)
     if report.whole:
         errors.print(f"{escape(', '.join(map(str, walk.data)))}: {report.whole} frames "
                      "without a camera calibration were taken as a whole")

@@ -61,8 +61,8 @@ def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, d
                     sensor_height=recording.frames[0].sensor_height)
     report, ego = TrackingReport(), ego_of(recording, ego)
     fill(report, recording, by_tracker(open_, params, ego), limit=limit)
-    content = {"source": str(weights), "ego": ego, **report.compute()}
-    write_json(json_file, content)
     if not report.frames:
         raise no_labels(recording, report.skipped)
+    content = {"source": str(weights), "ego": ego, **report.compute()}
+    write_json(json_file, content)
     print_tracking_report(content, console)
