@@ -101,6 +101,10 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
         start = partial(by_detector, open_, keep, write_results)
     report = DetectionReport()
     walk.fill(report, recording, start)
+    if write_results is not None:
+        console.print(f"result files: {write_results}")
+    if not report.frames and (write_results is None or report.skipped):
+        raise no_labels(recording, report.skipped)
     content = {"source": str(results or weights), "keep": keep, **report.compute()}
     if errors and report.frames:
         together = Comparison.of(report.frames)
@@ -108,10 +112,6 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
         content["reliability"] = {name: reliability(together, name) for name in SCORED}
     if intervals and report.frames:
         content["intervals"] = report.intervals(intervals)
-    if write_results is not None:
-        console.print(f"result files: {write_results}")
-    if not report.frames and (write_results is None or report.skipped):
-        raise no_labels(recording, report.skipped)
     walk.write(content)
     if report.frames:
         print_detection_report(content, console)

@@ -70,13 +70,13 @@ def nuscenes(walk: Walk, results: Path | None, weights: Path | None, where: str,
         start = partial(by_detector, open_, write_results is not None)
     report = NuscenesReport()
     walk.fill(report, recording, start)
-    content = {"source": str(results or weights), "version": recording.layout.split()[-1],
-               **report.compute()}
     if write_results is not None:
         write_result_file(write_results, report.boxes)
         console.print(f"result file: {write_results}")
     if not report.frames and (write_results is None or report.skipped):
         raise no_labels(recording, report.skipped)
+    content = {"source": str(results or weights), "version": recording.layout.split()[-1],
+               **report.compute()}
     walk.write(content)
     if report.frames:
         print_nuscenes_report(content, console)
