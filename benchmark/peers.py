@@ -81,11 +81,12 @@ def by_bands(run: Callable, xyz: np.ndarray, params: DbscanParams = DbscanParams
 
 
 # RANSAC: points (N, 3), those among them to look in (N,) bool -> mask (N,), plane [a b c], trials.
+TRIALS = 2000  # at most, as paper A has it
 
 def ransac(xyz: np.ndarray, low: np.ndarray, **settings) -> tuple[np.ndarray, np.ndarray, int]:
     """The ground of scikit-learn's RANSACRegressor with paper A's numbers."""
     from sklearn.linear_model import LinearRegression, RANSACRegressor
-    found = RANSACRegressor(LinearRegression(), max_trials=2000, residual_threshold=0.1,
+    found = RANSACRegressor(LinearRegression(), max_trials=TRIALS, residual_threshold=0.1,
                             random_state=0, **settings).fit(xyz[low, :2], xyz[low, 2])
     mask = np.abs(xyz[:, 2] - found.predict(xyz[:, :2])) <= 0.1
     line = found.estimator_

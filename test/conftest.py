@@ -14,8 +14,10 @@ from hypothesis import settings
 pytest_plugins = ["lidar_perception.testing"]
 os.environ.pop("COLUMNS", None)  # pytest-xdist sets 80 for its workers; some tests set their own
 
-settings.register_profile("any machine", deadline=None)  # no test measures time
-settings.load_profile("any machine")
+# No test measures time. --hypothesis-profile deep looks where the everyday run seldom comes.
+settings.register_profile("everyday", deadline=None, max_examples=40)
+settings.register_profile("deep", deadline=None, max_examples=2000)
+settings.load_profile("everyday")
 
 
 def pytest_itemcollected(item):

@@ -153,8 +153,9 @@ def test_the_cluster_network_is_timed_beside_a_plain_one(one_thread, capsys):
     assert ball(0.2, 2, xyz, xyz[:, :1]).tolist() == [[[0, 2]]]
 
 
-def test_the_command_writes_what_it_measured(nothing_installed, tmp_path):
+def test_the_command_writes_what_it_measured(nothing_installed, monkeypatch, tmp_path):
     pytest.importorskip("cv2")
+    monkeypatch.setattr(peers, "TRIALS", 20)
     from benchmark.__main__ import main
     root, out = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "b.json"
     done = CliRunner().invoke(main, ["--data", str(root), "--json", str(out), "--repeat", "1",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +19,6 @@ from lidar_perception.geometry import (
 )
 from lidar_perception.types import MAX_RANGE, LidarFrame, usable_returns
 
-few = settings(max_examples=80, database=None)
 seeds = st.integers(0, 2**32 - 1)
 angles = st.floats(-50, 50)
 places = st.floats(-80, 80)
@@ -31,7 +30,6 @@ SIGNS = np.array([[1, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1],
                   [1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]]) / 2
 
 
-@few
 @given(seeds)
 def test_within_is_half_open_and_holds_nothing_that_is_nan(seed):
     at = np.random.default_rng(seed).integers(-3, 4, (40, 7)).astype(np.float32)
@@ -42,14 +40,12 @@ def test_within_is_half_open_and_holds_nothing_that_is_nan(seed):
     assert within(at[:0], low, high).shape == (0,)
 
 
-@few
 @given(some_boxes)
 def test_the_corners_in_the_box_frame_are_half_the_size_away_in_order(box):
     corners = box_corners(box[None])[0]
     np.testing.assert_allclose(to_box_frame(corners, box), SIGNS * box[3:6], rtol=0, atol=1e-10)
 
 
-@few
 @given(some_boxes, seeds)
 def test_the_box_frame_is_the_inverse_of_placing_points_there(box, seed):
     local = np.random.default_rng(seed).uniform(-9, 9, (20, 3))
@@ -63,7 +59,6 @@ def test_corners_of_many_boxes_are_those_of_each_and_none_have_none():
     assert box_corners(np.zeros((0, 7))).shape == (0, 8, 3)
 
 
-@few
 @given(some_boxes, seeds, st.floats(-0.5, 3))
 def test_points_in_box_is_the_slow_reading(box, seed, margin):
     rng = np.random.default_rng(seed)
@@ -81,7 +76,6 @@ def test_points_in_box_is_the_slow_reading(box, seed, margin):
     np.testing.assert_array_equal(found[clear], np.array(inside)[clear])
 
 
-@few
 @given(st.integers(-40, 40), st.integers(-40, 40), st.sampled_from([0.0, np.pi]),
        st.sampled_from([0.0, 0.5, 2.0]))
 def test_points_on_the_faces_count_and_those_just_outside_do_not(x, y, yaw, margin):
@@ -101,7 +95,6 @@ def test_points_on_the_faces_count_and_those_just_outside_do_not(x, y, yaw, marg
             assert points_in_box(points, turned, margin)[1:].tolist() == [False, True]
 
 
-@few
 @given(some_boxes, seeds)
 def test_half_a_turn_of_the_box_keeps_its_points_and_a_quarter_swaps_its_sides(box, seed):
     rng = np.random.default_rng(seed)
@@ -120,7 +113,6 @@ def test_no_points_are_in_a_box_and_none_in_one_of_negative_size():
     assert not points_in_box(np.float32([[1, 2, 3]]), box, margin=-0.6).any()
 
 
-@few
 @given(st.floats(-1e4, 1e4))
 def test_wrap_angle_is_the_same_angle_in_the_half_open_interval(angle):
     wrapped = wrap_angle(angle)
@@ -136,7 +128,6 @@ def test_wrap_angle_at_its_ends():
     assert -np.pi <= wrap_angle(below) < np.pi
 
 
-@few
 @given(seeds, st.sampled_from([np.float32, np.float64]))
 def test_horizontal_range_is_the_hypotenuse_and_knows_no_height_or_heading(seed, dtype):
     xyz = (np.random.default_rng(seed).normal(size=(50, 3)) * 40).astype(dtype)
@@ -184,7 +175,6 @@ def some_camera(rng):
     return Camera.of(p, rotation.as_quat(), translation, WIDTH, HEIGHT), rotation, translation, p
 
 
-@few
 @given(seeds)
 def test_in_view_is_the_float64_projection_away_from_the_borders(seed):
     rng = np.random.default_rng(seed)
@@ -200,7 +190,6 @@ def test_in_view_is_the_float64_projection_away_from_the_borders(seed):
     np.testing.assert_array_equal(camera.in_view(xyz)[clear], inside[clear])
 
 
-@few
 @given(seeds)
 def test_either_direction_of_the_pose_gives_the_same_camera(seed):
     camera, rotation, translation, p = some_camera(np.random.default_rng(seed))

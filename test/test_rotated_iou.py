@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.geometry import bev_and_3d_iou, bev_iou, box_corners, iou_3d
 
-few = settings(max_examples=60, database=None)
 seeds = st.integers(0, 2**32 - 1)
 QUARTER = np.pi / 2
 
@@ -47,7 +46,6 @@ def by_shapely(boxes, others):
                 np.nan_to_num(shared * height / (volume - shared * height)))
 
 
-@few
 @given(seeds)
 def test_overlaps_are_those_of_shapely(seed):
     rng = np.random.default_rng(seed)
@@ -60,7 +58,6 @@ def test_overlaps_are_those_of_shapely(seed):
         np.testing.assert_allclose(found, expected, atol=1e-6)
 
 
-@few
 @given(seeds, st.floats(-7, 7), st.floats(-80, 80), st.floats(-80, 80))
 def test_moving_and_turning_both_changes_nothing(seed, yaw, x, y):
     rng = np.random.default_rng(seed)
@@ -70,7 +67,6 @@ def test_moving_and_turning_both_changes_nothing(seed, yaw, x, y):
     np.testing.assert_allclose(after, before, atol=1e-9)
 
 
-@few
 @given(seeds)
 def test_overlap_is_symmetric_between_0_and_1_and_no_greater_in_space_for_equal_heights(seed):
     rng = np.random.default_rng(seed)
@@ -83,7 +79,6 @@ def test_overlap_is_symmetric_between_0_and_1_and_no_greater_in_space_for_equal_
     assert (space <= bev + 1e-12).all()
 
 
-@few
 @given(seeds)
 def test_a_box_is_the_same_turned_by_half_and_with_sides_swapped(seed):
     rng = np.random.default_rng(seed)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -226,6 +227,24 @@ class Bag:
                 yield topic, stamp, decode(data, self.topics[topic])
             except InputError as error:
                 raise InputError(f"{self.path}, topic {topic} at {stamp} ns: {error}") from None
+
+
+class KeptOpen:
+    """A bag that stays open for whoever reads single messages of it: to open one takes as long as
+    its index, which grows with the bag. Each process and each thread has its own, as SQLite wants
+    it; they are closed with their thread, or when nobody has this any more."""
+
+    def __init__(self, path: Path):
+        self.path, self.here = path, threading.local()
+
+    def __reduce__(self) -> tuple[type[KeptOpen], tuple[Path]]:
+        return KeptOpen, (self.path,)
+
+    def bag(self) -> Bag:
+        if getattr(self.here, "process", None) != os.getpid():  # a fork shares what was open
+            self.here.bag, self.here.process = Bag(self.path), os.getpid()
+        bag: Bag = self.here.bag
+        return bag
 
 
 def _mcap_files(reader: Reader | Ros1Reader) -> list[Path]:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import struct
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property, partial
 from itertools import islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lidar_perception.camera import Calibration
-from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag import Bag, KeptOpen
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.cloud_files import SUFFIXES
 from lidar_perception.data.frame import (
@@ -91,6 +93,7 @@ class BagFrames(Sequence):
                  sensor_height: float = SENSOR_HEIGHT):
         self.path, self.points, self.kind, self.clouds = path, points, kind, count
         self.sensor_height = sensor_height
+        self.opened = KeptOpen(path)
 
     def mounted_at(self, sensor_height: float) -> BagFrames:
         """The frames of a sensor at that height."""
@@ -141,8 +144,8 @@ class BagFrames(Sequence):
         return rows
 
     def _read(self, time: int, before: int) -> bytes:
-        with Bag(self.path) as bag:
-            return next(islice(bag.raw({self.points}, time, time + 1), before, None))[2]
+        messages = self.opened.bag().raw({self.points}, time, time + 1)
+        return next(islice(messages, before, None))[2]
 
     @cached_property
     def _beside(self) -> tuple[dict[int, GroundTruth], list, list]:
@@ -230,5 +233,5 @@ def _frame_id(data: bytes) -> str:
 
 def _latest(messages: list, time: int) -> Any:
     """The last message up to a time, or else the first: latched topics hold from the start."""
-    before = [m for t, m in messages if t <= time]
-    return before[-1] if before else messages[0][1] if messages else None
+    after = bisect_right(messages, time, key=itemgetter(0))
+    return messages[max(after - 1, 0)][1] if messages else None

@@ -191,8 +191,8 @@ def test_time_and_memory_that_grow_too_fast_are_failures():
 
 # The short form. Worker processes do what a long run does, with seeds that stay.
 @pytest.mark.parametrize("part, cases", [
-    ("messages", 100), pytest.param("files", 30, marks=pytest.mark.no_cover),
-    pytest.param("shapes", 12, marks=pytest.mark.no_cover)])
+    ("messages", 60), pytest.param("files", 16, marks=pytest.mark.no_cover),
+    pytest.param("shapes", 8, marks=pytest.mark.no_cover)])
 def test_the_short_campaign_finds_nothing(part, cases, tmp_path):
     if part == "messages":
         pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")

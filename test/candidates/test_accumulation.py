@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.candidates.accumulation import Accumulated, accumulate, aligned, velocities
 
-few = settings(max_examples=30, database=None)
 AGES = np.array([0.4, 0.3, 0.2, 0.1, 0.0])
 
 
@@ -22,7 +21,6 @@ def poses(rng, count):
     return made
 
 
-@few
 @given(st.integers(0, 2**32 - 1))
 def test_what_stands_falls_together(seed):
     rng = np.random.default_rng(seed)

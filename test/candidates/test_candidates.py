@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from candidate_samples import GROUND_Z, PEOPLE, boxes_at, person, scene
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 
@@ -19,7 +19,6 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.groups import group_points
 from lidar_perception.types import PEDESTRIAN, InputError, LidarFrame
 
-few = settings(max_examples=40, database=None)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -32,7 +31,6 @@ def labelled(seed):
     return xyz, rng.permutation(labels).astype(np.int32)
 
 
-@few
 @given(seeds, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3), st.floats(-20, 20))
 def test_snapping_lowers_bottoms_to_the_plane_never_raises_them_and_keeps_tops(seed, a, b, c):
     boxes = oriented_boxes(*labelled(seed), "axis_aligned")
@@ -60,7 +58,6 @@ def test_the_height_filter_keeps_what_differs_at_most_the_tolerance():
         False, False, True, False, False]
 
 
-@few
 @given(seeds)
 def test_group_points_lists_the_wanted_clusters_in_the_order_asked_for(seed):
     xyz, labels = labelled(seed)

@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 
@@ -37,7 +37,6 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import PEDESTRIAN, LidarFrame
 
-few = settings(max_examples=30, database=None)
 seeds = st.integers(0, 2**32 - 1)
 METRIC = with_values(PipelineParams(), {"stm.window": "metric", "stm.spread": True,
                                         "stm.dilations": 0})
@@ -85,7 +84,6 @@ def test_spread_points_make_near_and_far_alike_where_bare_points_do_not():
     assert similarity(draw(far)[None], draw(near))[0] > 0.9
 
 
-@few
 @given(seeds)
 def test_a_metric_silhouette_moves_with_the_ground(seed):
     rng = np.random.default_rng(seed)
@@ -105,7 +103,6 @@ def test_what_is_outside_the_window_is_not_drawn():
     np.testing.assert_array_equal(both, draw(inside))
 
 
-@few
 @given(seeds, st.integers(0, 6))
 def test_shifts_take_the_best_of_the_moved_images(seed, shifts):
     rng = np.random.default_rng(seed)
@@ -173,7 +170,6 @@ def test_features_of_a_board_are_its_measures():
     assert shape["hidden_below_m"] == pytest.approx(0.0, abs=12 * STEP[1])
 
 
-@few
 @given(seeds)
 def test_features_and_confidence_are_each_clusters_own(seed):
     rng = np.random.default_rng(seed)

@@ -8,7 +8,7 @@ import os
 import numpy as np
 import pytest
 from candidate_samples import GROUND_Z, PEOPLE, boxes_at, person, scene
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.candidates.seeds import (
@@ -24,7 +24,6 @@ from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.geometry import points_in_box
 from lidar_perception.types import InputError
 
-few = settings(max_examples=40, database=None)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -97,7 +96,6 @@ def test_a_click_is_finite_and_near(axis, value):
         seed_from_click(click, xyz, labels, boxes, 2.0)
 
 
-@few
 @given(seeds, st.integers(1, 30_000), st.integers(10, 300))
 def test_load_seed_is_the_inverse_of_save_seed(tmp_path_factory, seed, tenth_mm, count):
     rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 
@@ -22,7 +22,6 @@ from lidar_perception.candidates.silhouette import (
 from lidar_perception.types import LidarFrame
 
 SCANS = DATA / "kitti_object/training/velodyne_reduced"
-few = settings(max_examples=40, database=None)
 seeds = st.integers(0, 2**32 - 1)
 PLAIN = np.ones((1, 1))
 
@@ -75,7 +74,6 @@ def radial(xyz):
     return abs(widest @ centre) / np.linalg.norm(centre)
 
 
-@few
 @given(seeds)
 def test_silhouettes_are_the_plain_reading_on_random_clusters(seed):
     rng = np.random.default_rng(seed)
@@ -111,7 +109,6 @@ def test_the_window_is_stretched_over_the_cluster_and_its_top_is_row_0():
     assert not pixels[:70, :28].any()
 
 
-@few
 @given(seeds)
 def test_to_pixels_and_from_pixels_are_inverse(seed):
     rng = np.random.default_rng(seed)
@@ -122,7 +119,6 @@ def test_to_pixels_and_from_pixels_are_inverse(seed):
     assert from_pixels(pixels).dtype == np.uint32 and to_pixels(image).dtype == bool
 
 
-@few
 @given(seeds)
 @example(40877)  # one of its images is blank
 def test_similarity_is_the_cosine_of_the_flattened_images(seed):
@@ -135,7 +131,6 @@ def test_similarity_is_the_cosine_of_the_flattened_images(seed):
     np.testing.assert_allclose(similarity(images, images[0]), expected, rtol=0, atol=1e-12)
 
 
-@few
 @given(seeds)
 def test_similarity_with_itself_is_exactly_1_and_it_is_symmetric_within_0_and_1(seed):
     rng = np.random.default_rng(seed)
@@ -153,7 +148,6 @@ def test_similarity_with_a_blank_image_is_0():
     assert similarity(np.zeros((0, ROWS), np.uint32), full).shape == (0,)
 
 
-@few
 @given(seeds, st.floats(-np.pi, np.pi))
 def test_turning_a_cluster_about_the_sensor_keeps_its_silhouette(seed, angle):
     xyz = cluster(np.random.default_rng(seed), 300)
@@ -162,7 +156,6 @@ def test_turning_a_cluster_about_the_sensor_keeps_its_silhouette(seed, angle):
         assert similarity(moved[None], silhouette(xyz))[0] > 0.97
 
 
-@few
 @given(seeds, st.floats(1.0, 5.0))
 def test_moving_a_cluster_along_its_ray_keeps_its_silhouette(seed, factor):
     xyz = cluster(np.random.default_rng(seed), 300)
@@ -172,7 +165,6 @@ def test_moving_a_cluster_along_its_ray_keeps_its_silhouette(seed, factor):
         assert similarity(moved[None], silhouette(xyz))[0] > 0.97
 
 
-@few
 @given(seeds)
 def test_a_mirrored_cluster_has_the_mirrored_silhouette(seed):
     # What is left of the sensor becomes right of it. Pixels are half-open, so not to the bit.
@@ -182,7 +174,6 @@ def test_a_mirrored_cluster_has_the_mirrored_silhouette(seed):
         assert similarity(from_pixels(mirrored[:, ::-1])[None], silhouette(xyz))[0] > 0.97
 
 
-@few
 @given(seeds)
 def test_the_order_of_points_does_not_matter_nor_do_the_clusters_beside(seed):
     rng = np.random.default_rng(seed)
@@ -192,7 +183,6 @@ def test_the_order_of_points_does_not_matter_nor_do_the_clusters_beside(seed):
     assert similarity(silhouette(rng.permutation(a))[None], both[1])[0] > 0.97
 
 
-@few
 @given(seeds, st.integers(0, 9))
 def test_augmentation_only_adds_pixels(seed, steps):
     # Closing and dilation are increasing, so what held before them holds after.

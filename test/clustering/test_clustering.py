@@ -6,7 +6,7 @@ import multiprocessing
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 from scipy.spatial import cKDTree
@@ -21,7 +21,6 @@ from lidar_perception.ground.threshold import segment_by_threshold
 pytestmark = pytest.mark.no_cover  # others run these lines
 
 SCANS = DATA / "kitti_object/training/velodyne_reduced"
-few = settings(max_examples=40, database=None)
 
 
 def reference(xyz, eps, min_samples):
@@ -55,7 +54,6 @@ def assert_same(xyz, eps, min_samples):
     np.testing.assert_array_equal(found, reference(xyz, eps, min_samples))
 
 
-@few
 @given(st.integers(0, 2**32 - 1), st.integers(1, 400), st.floats(0.05, 1.5), st.integers(1, 12),
        st.sampled_from([0.0, 50.0, 3000.0]))
 def test_labels_are_those_of_sklearn_on_random_points(seed, count, eps, min_samples, offset):
@@ -64,7 +62,6 @@ def test_labels_are_those_of_sklearn_on_random_points(seed, count, eps, min_samp
     assert_same(xyz.astype(np.float32), eps, min_samples)
 
 
-@few
 @given(st.integers(0, 2**32 - 1), st.integers(1, 500), st.integers(1, 4), st.integers(1, 30))
 def test_labels_are_those_of_sklearn_on_a_grid_where_most_distances_tie(seed, count, reach,
                                                                         min_samples):
@@ -134,7 +131,6 @@ def banded_reference(xyz, params):
     return labels
 
 
-@few
 @given(st.integers(0, 2**32 - 1), st.integers(0, 600), st.integers(1, 8))
 def test_distance_aware_is_sklearn_in_each_band(seed, count, min_samples):
     rng = np.random.default_rng(seed)
@@ -181,7 +177,6 @@ def slow_join(xyz, labels, params):
     return {frozenset(np.flatnonzero(np.isin(labels, [*s])).tolist()) for s in joined}
 
 
-@few
 @given(st.integers(0, 2**32 - 1), st.integers(0, 150))
 def test_join_bands_joins_what_touches_across_a_limit_and_nothing_else(seed, count):
     rng = np.random.default_rng(seed)
@@ -230,7 +225,6 @@ def test_clusters_100_km_away_are_found_as_near_ones_are():
     assert partition(dbscan(moved, 0.25, 5)) == partition(dbscan(xyz, 0.25, 5))
 
 
-@few
 @given(st.integers(0, 2**32 - 1))
 def test_permuting_points_permutes_the_core_partition_and_the_noise(seed):
     rng = np.random.default_rng(seed)
@@ -245,7 +239,6 @@ def test_permuting_points_permutes_the_core_partition_and_the_noise(seed):
     np.testing.assert_array_equal(labels == 0, back == 0)
 
 
-@few
 @given(st.integers(0, 2**32 - 1), st.integers(1, 300), st.integers(1, 8))
 def test_ids_are_1_to_K_by_first_core_point_and_every_cluster_has_a_core(seed, count, min_samples):
     rng = np.random.default_rng(seed)
@@ -289,7 +282,6 @@ def test_quarter_turns_about_z_keep_the_clusters(turn):
     assert labels.max() == len(CENTRES)
 
 
-@few
 @given(*[st.floats(-500, 500)] * 3)
 def test_translation_keeps_well_separated_clusters(x, y, z):
     xyz, blob = blobs(np.random.default_rng(13), CENTRES, 60, 0.2)
@@ -324,7 +316,6 @@ def test_two_dense_places_within_eps_are_one_cluster_however_many_points():
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 300),
        scale=st.sampled_from([0.3, 1.0, 4.0]), eps=st.sampled_from([0.1, 0.25, 0.5]),
        min_samples=st.integers(1, 12))
-@settings(max_examples=100)
 def test_by_cells_and_by_pairs_the_labels_are_scikit_learns(seed, n, scale, eps, min_samples):
     rng = np.random.default_rng(seed)
     xyz = (rng.random((n, 3)) * scale).astype(np.float32)

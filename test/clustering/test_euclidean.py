@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmark.plain_euclidean import euclidean as plain
@@ -77,7 +77,6 @@ def test_scenes_give_the_labels_of_the_plain_reading(seed, params):
     assert labels.max() > 3 and ((labels == 0).any() or params.beta == 0)  # it says something
 
 
-@settings(max_examples=150)
 @given(st.data())
 def test_any_cloud_gives_the_labels_of_the_plain_reading(data):
     """Coordinates on a coarse lattice: equal distances and thresholds met exactly are common."""

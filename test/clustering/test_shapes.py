@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 from scipy.spatial import ConvexHull
@@ -16,7 +16,6 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.geometry import box_corners, points_in_box
 from lidar_perception.types import CLASSES
 
-few = settings(max_examples=40, database=None)
 seeds = st.integers(0, 2**32 - 1)
 QUARTER = np.float32(np.pi / 2)  # of a turn
 each_shape = pytest.mark.parametrize("shape", BOX_SHAPES)
@@ -83,7 +82,6 @@ def assert_turned(before, after, angle, atol):
 
 
 @each_shape
-@few
 @given(seeds)
 def test_a_box_holds_all_its_points_and_is_no_larger_than_they_need(shape, seed):
     xyz, labels = some_clusters(seed)
@@ -100,7 +98,6 @@ def test_a_box_holds_all_its_points_and_is_no_larger_than_they_need(shape, seed)
 
 
 @each_oriented
-@few
 @given(seeds)
 def test_oriented_boxes_are_longer_than_wide_and_yaw_is_that_of_a_line(shape, seed):
     boxes = oriented_boxes(*some_clusters(seed), shape)
@@ -108,7 +105,6 @@ def test_oriented_boxes_are_longer_than_wide_and_yaw_is_that_of_a_line(shape, se
     assert (boxes[:, 6] >= -QUARTER).all() and (boxes[:, 6] < QUARTER).all()
 
 
-@few
 @given(seeds)
 def test_axis_aligned_boxes_are_the_min_and_max_of_each_cluster(seed):
     xyz, labels = some_clusters(seed)
@@ -119,7 +115,6 @@ def test_axis_aligned_boxes_are_the_min_and_max_of_each_cluster(seed):
         np.testing.assert_array_equal(box, [*(low + high) / 2, *(high - low), 0])
 
 
-@few
 @given(seeds, st.floats(0, 2 * np.pi))
 def test_min_area_is_the_least_area(seed, angle):
     rng = np.random.default_rng(seed)
@@ -136,7 +131,6 @@ def test_min_area_is_the_least_area(seed, angle):
         assert area <= other[3] * other[4] * (1 + 1e-5)
 
 
-@few
 @given(seeds, st.integers(3, 400), st.floats(0.5, 2000))
 def test_min_area_of_points_that_are_all_corners(seed, count, radius):
     angles = np.random.default_rng(seed).uniform(0, 2 * np.pi, count)
@@ -146,7 +140,6 @@ def test_min_area_of_points_that_are_all_corners(seed, count, radius):
     assert box[3] * box[4] == pytest.approx(least_area(xyz[:, :2]), rel=1e-5)
 
 
-@few
 @given(seeds, st.floats(-10, 10))
 def test_turning_a_cloud_turns_its_least_rectangle(seed, angle):
     # Points that fill a rectangle, and its corners: no other rectangle comes near.
@@ -159,7 +152,6 @@ def test_turning_a_cloud_turns_its_least_rectangle(seed, angle):
     assert_turned(before, one(oriented_boxes, turned(xyz, angle), "min_area"), angle, 1e-4)
 
 
-@few
 @given(seeds, st.integers(-720, 720).map(np.radians))
 def test_turning_a_car_turns_its_fitted_rectangle(seed, angle):
     # By whole degrees the angles that are tried are the same.
@@ -169,7 +161,6 @@ def test_turning_a_car_turns_its_fitted_rectangle(seed, angle):
     assert_turned(before, one(oriented_boxes, turned(xyz, angle), "l_shape"), angle, 1e-3)
 
 
-@few
 @given(seeds, st.floats(-np.pi, np.pi))
 def test_l_shape_recovers_a_car_of_which_two_sides_are_seen(seed, yaw):
     xyz, car = l_shaped_car(np.random.default_rng(seed), yaw)
@@ -191,7 +182,6 @@ def test_l_shape_finds_the_sides_where_the_least_rectangle_does_not():
 
 
 @each_shape
-@few
 @given(seeds)
 def test_the_order_of_the_points_makes_no_difference(shape, seed):
     xyz, labels = some_clusters(seed)
@@ -253,7 +243,6 @@ def test_input_of_any_layout_and_dtype_gives_the_same_boxes_and_stays_unchanged(
     np.testing.assert_array_equal(xyz, before)
 
 
-@few
 @given(seeds, st.floats(-np.pi / 2, np.pi / 2), st.floats(0.2, 0.8))
 def test_an_ellipse_filled_evenly_is_recovered(seed, yaw, ratio):
     rng = np.random.default_rng(seed)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -63,7 +63,6 @@ def lattice(data, most=60):
     return np.array(rows) * data.draw(st.sampled_from([0.125, 0.25]))
 
 
-@settings(max_examples=100)
 @given(st.data())
 def test_every_search_of_the_tree_says_what_all_pairs_say(data):
     tree = tree_of(lattice(data))
@@ -94,7 +93,6 @@ def test_every_search_of_the_tree_says_what_all_pairs_say(data):
             assert (squared[i, leader[i]], *tree.points[leader[i]]) == min(held)
 
 
-@settings(max_examples=100)
 @given(st.data())
 def test_touching_connects_what_all_pairs_connect(data):
     tree = tree_of(lattice(data))

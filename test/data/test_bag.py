@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import multiprocessing
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+
 import numpy as np
 import pytest
 import yaml
@@ -154,6 +158,31 @@ def test_bags_of_sqlite_are_read_alike(written, tmp_path):
         assert same_cloud(a.load().xyz, b.load().xyz)
         assert np.array_equal(a.camera().projection, b.camera().projection)
         assert (a.truth() is None) == (b.truth() is None)
+
+
+def cloud_of(frames, i):
+    return frames[i].load().xyz.tobytes()
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_single_clouds_are_those_of_the_whole_in_any_order_thread_and_process(written, tmp_path,
+                                                                              storage):
+    """And however many they are, a thread opens the bag once: its index may be long."""
+    copy_bag(written, tmp_path / "bag", storage)
+    frames = open_recording(tmp_path / "bag").frames
+    expected = [frame.load().xyz.tobytes() for frame in frames]
+    order = [2, 0, 1] * 4
+
+    def same(i):
+        return cloud_of(frames, i) == expected[i]
+
+    with ThreadPoolExecutor(3) as pool:
+        assert all(map(same, order)) and all(pool.map(same, order))
+    with ProcessPoolExecutor(2, multiprocessing.get_context("fork")) as pool:
+        assert list(pool.map(partial(cloud_of, frames), order)) == [expected[i] for i in order]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Bag, "__init__", None)
+        assert all(map(same, order))
 
 
 def test_raw_takes_topics_and_a_window_of_time(written):

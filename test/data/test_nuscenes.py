@@ -10,7 +10,7 @@ import numpy as np
 import nuscenes_folder as folder
 import nuscenes_reference as reference
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -120,7 +120,6 @@ def test_the_global_pose_takes_boxes_of_a_frame_to_the_labels(root):
 angles = st.floats(-3.1, 3.1)
 
 
-@settings(max_examples=50)
 @given(st.integers(0, 2**32 - 1), angles, st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
 def test_to_the_global_frame_and_back(seed, yaw, pitch, roll):
     rng = np.random.default_rng(seed)

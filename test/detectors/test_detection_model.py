@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from detection_samples import BOXES, LABELS, lively, tiny, two_objects
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.detectors.checkpoint import require_same
@@ -28,7 +28,6 @@ from lidar_perception.detectors.pointpillars.targets import assign
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import InputError
 
-few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 # Others run these lines.
 pytestmark = [pytest.mark.no_cover,
@@ -118,7 +117,6 @@ def test_pillars_know_their_points():
         assert offsets[:, 3:].abs().max() <= config.cell / 2 + 1e-5
 
 
-@few
 @given(seeds, st.integers(1, 5))
 def test_the_first_points_of_each_pillar_are_those_of_a_loop(seed, most):
     cells = torch.from_numpy(np.random.default_rng(seed).integers(0, 9, 50))

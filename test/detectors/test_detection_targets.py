@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from detection_samples import BOXES, LABELS, tiny
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.detectors.nms import suppressed
@@ -26,7 +26,6 @@ from lidar_perception.detectors.pointpillars.targets import (
     stacked,
 )
 
-few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -57,7 +56,6 @@ def test_anchors_lie_in_rows_along_y_then_x_then_class_then_yaw():
         [0.0, pytest.approx(-5.12)], [pytest.approx(10.24), pytest.approx(5.12)])
 
 
-@few
 @given(seeds, st.sampled_from([0.0, np.pi / 4, 0.78539, -np.pi / 2]))
 def test_decoding_undoes_encoding(seed, offset):
     boxes = torch.from_numpy(some_boxes(seed))
@@ -113,7 +111,6 @@ def test_targets_are_those_of_a_plain_reading():
     assert {*found.labels.unique().tolist()} == {IGNORED, BACKGROUND, *labels.tolist()}
 
 
-@few
 @given(seeds)
 def test_anchors_that_are_not_near_overlap_nothing(seed):
     config = tiny()
@@ -228,7 +225,6 @@ def reference_iou(a, b):
     return shared / (first + second - shared)
 
 
-@few
 @given(seeds, st.booleans())
 def test_suppression_is_that_of_a_slow_loop(seed, across):
     rng = np.random.default_rng(seed)

@@ -7,7 +7,7 @@ import os
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 
@@ -25,7 +25,6 @@ from lidar_perception.scoring.points.segmentation import (
 
 pytestmark = pytest.mark.no_cover  # others run these lines
 
-few = settings(max_examples=25, database=None)
 
 
 def obstacles(seed, rows=24, columns=40, seen=0.6):
@@ -53,7 +52,6 @@ def slow_at_rest(obstacle, lift, steps=20_000):
     return sheet
 
 
-@few
 @given(st.integers(0, 2**31), st.floats(0.0001, 0.05), st.integers(1, 4))
 def test_every_cell_touches_its_obstacle_or_hangs_free(seed, lift, levels):
     obstacle = obstacles(seed)
@@ -109,7 +107,6 @@ def test_a_road_that_climbs_stays_ground_and_the_cars_on_it_do_not_become_it():
     assert segment_by_cloth(deep, ClothParams(slope=0.0))[:len(xyz)][road].mean() > 0.9
 
 
-@few
 @given(st.integers(0, 2**31), st.floats(0.01, 0.2))
 def test_cells_are_climbed_as_a_slow_reading_climbs_them(seed, slope):
     rng = np.random.default_rng(seed)
@@ -133,7 +130,6 @@ def test_cells_are_climbed_as_a_slow_reading_climbs_them(seed, slope):
         (r, c) for r, c in touched if lowest[r, c] > np.float32(0.1)}
 
 
-@few
 @given(st.integers(0, 2**31))
 def test_a_higher_obstacle_never_lowers_the_sheet(seed):
     obstacle = obstacles(seed)
@@ -181,7 +177,6 @@ def test_a_hill_too_curved_for_a_plane_is_ground():
     assert found[:len(hill)].mean() > 0.99 and found[len(hill):].mean() < 0.2
 
 
-@few
 @given(st.integers(0, 2**31))
 def test_permuting_points_permutes_the_ground(seed):
     xyz, _ = street(seed, count=4000)

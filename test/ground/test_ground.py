@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data
 from sklearn.linear_model import LinearRegression, RANSACRegressor
@@ -20,7 +20,6 @@ from lidar_perception.ground.threshold import (
 )
 
 SCANS = DATA / "kitti_object/training/velodyne"
-few = settings(max_examples=30, database=None)
 slopes = st.floats(-0.15, 0.15)
 
 
@@ -51,7 +50,6 @@ def real_scans(*numbers):
         yield np.ascontiguousarray(raw[:, :3])
 
 
-@few
 @given(st.integers(0, 2**31), slopes, slopes, st.floats(-3, -1.3))
 def test_the_plane_is_within_1_cm_and_a_tenth_degree_under_40_percent_outliers(seed, a, b, c):
     true = np.array([a, b, c])
@@ -62,7 +60,6 @@ def test_the_plane_is_within_1_cm_and_a_tenth_degree_under_40_percent_outliers(s
                ) < 0.01
 
 
-@few
 @given(st.integers(0, 2**31), slopes, slopes)
 def test_ground_is_every_candidate_within_inlier_distance_of_the_plane(seed, a, b):
     xyz = sloped_scene(seed, [a, b, -1.7])
@@ -74,7 +71,6 @@ def test_ground_is_every_candidate_within_inlier_distance_of_the_plane(seed, a, 
     assert expected.sum() > 500
 
 
-@few
 @given(st.integers(0, 2**31), slopes, slopes, st.sampled_from([0.0, 300.0, 5000.0]))
 def test_the_plane_is_a_fixed_point_of_fitting_the_ground(seed, a, b, offset):
     xyz = sloped_scene(seed, [a, b, -1.7])
@@ -88,7 +84,6 @@ def test_the_plane_is_a_fixed_point_of_fitting_the_ground(seed, a, b, offset):
                                atol=1e-9)
 
 
-@few
 @given(st.integers(0, 2**31), slopes, slopes)
 def test_permuting_points_permutes_the_ground(seed, a, b):
     xyz = sloped_scene(seed, [a, b, -1.7])
@@ -98,7 +93,6 @@ def test_permuting_points_permutes_the_ground(seed, a, b):
                                   segment_by_threshold(xyz, params)[order])
 
 
-@few
 @given(st.integers(0, 2**31), slopes, slopes)
 def test_fit_plane_is_numpys_least_squares(seed, a, b):
     xyz = sloped_scene(seed, [a, b, -1.7], count=50).astype(np.float64)

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.geometry import wrap_angle
@@ -93,7 +93,6 @@ def close(a, b, tolerance=1e-9):
     return bool((np.abs(apart) <= tolerance).all())
 
 
-@settings(max_examples=150)
 @given(st.lists(ACTIONS, max_size=30), st.sampled_from([STANDING, DRIVING]))
 def test_the_lines_replayed_give_the_same_state(actions, motion):
     state, lines = done(actions, motion)
@@ -106,7 +105,6 @@ def test_the_lines_replayed_give_the_same_state(actions, motion):
         assert not track.gone & track.boxes.keys()
 
 
-@settings(max_examples=150)
 @given(st.lists(ACTIONS, max_size=25), st.sampled_from([STANDING, DRIVING]))
 def test_undo_and_redo_are_inverses_without_end(actions, motion):
     end, _ = done(actions, motion)
@@ -121,7 +119,6 @@ def test_undo_and_redo_are_inverses_without_end(actions, motion):
     assert state.next_id == end.next_id  # an id is never given twice
 
 
-@settings(max_examples=60)
 @given(ACTIONS, st.lists(ACTIONS, max_size=8))
 def test_an_action_that_cannot_be_done_changes_nothing(action, before):
     state, _ = done(before, DRIVING)

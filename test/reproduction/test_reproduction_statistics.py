@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.reproduction.params import BootstrapParams
 from lidar_perception.reproduction.statistics import bootstrap, cells, known, rates, ratio, stack
 
-few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 
 
@@ -24,7 +23,6 @@ def hits(frames, rate, rng):
     return np.column_stack([hit, ~hit])
 
 
-@few
 @given(seeds, st.integers(30, 300), st.floats(0.2, 0.8))
 def test_the_interval_holds_the_value(seed, frames, rate):
     rng = np.random.default_rng(seed)
@@ -34,7 +32,6 @@ def test_the_interval_holds_the_value(seed, frames, rate):
     assert value[0] == pytest.approx(counts[:, 0].sum() / counts.sum())
 
 
-@few
 @given(seeds, st.floats(0.2, 0.8))
 def test_the_interval_of_a_share_is_that_of_the_binomial_distribution(seed, rate):
     counts = hits(1000, rate, np.random.default_rng(seed))
@@ -107,7 +104,6 @@ def test_figures_of_any_shape_are_those_of_their_columns():
         np.testing.assert_allclose(together[:, k], alone)
 
 
-@few
 @given(st.integers(0, 50), st.integers(0, 50), st.integers(0, 50))
 def test_rates_are_recall_precision_and_their_harmonic_mean(tp, fp, fn):
     recall, precision, f1 = known(rates(np.array(tp), np.array(fp), np.array(fn)))

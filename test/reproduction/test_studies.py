@@ -7,7 +7,7 @@ import importlib
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from samples import crowd_folder
 
@@ -24,7 +24,6 @@ from lidar_perception.reproduction.studies.density import thinned
 from lidar_perception.reproduction.variants import Found, best_f1, score
 from lidar_perception.types import InputError
 
-few = settings(max_examples=30, database=None)
 COUNT = 4
 
 
@@ -138,7 +137,6 @@ def test_a_given_pedestrian_is_neither_found_nor_missed():
     assert without["ranked"] == [[0.8, 0]]
 
 
-@few
 @given(st.integers(0, 2**32 - 1))
 def test_the_best_f1_is_that_of_the_best_threshold(seed):
     rng = np.random.default_rng(seed)

@@ -327,7 +327,6 @@ def brute_best(scores):
     return max(scores.table(s)["all"]["f1"] for _, _, found in scores.frames for s in found)
 
 
-@settings(few, max_examples=60)
 @given(seeds)
 def test_the_best_score_is_the_best_of_all_scores(seed):
     rng = np.random.default_rng(seed)

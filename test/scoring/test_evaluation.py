@@ -10,7 +10,7 @@ from types import NoneType
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.candidates.params import PipelineParams, SeedParams
@@ -25,7 +25,6 @@ from lidar_perception.scoring.centres.report import (
 from lidar_perception.scoring.run import Skipped, fill, results
 from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, InputError, LidarFrame
 
-few = settings(max_examples=60, database=None)
 seeds = st.integers(0, 2**32 - 1)
 small = st.integers(0, 5)
 
@@ -57,7 +56,6 @@ def distances(found, truth, pairs):
     return np.linalg.norm(found[pairs[0], :3] - truth[pairs[1], :3], axis=1)
 
 
-@few
 @given(seeds, small, small, st.sampled_from([0.3, 1.0, 5.0]))
 def test_matching_is_the_best_of_all_pairings(seed, found_count, truth_count, limit):
     rng = np.random.default_rng(seed)
@@ -68,7 +66,6 @@ def test_matching_is_the_best_of_all_pairings(seed, found_count, truth_count, li
     assert distances(found, truth, pairs).sum() == pytest.approx(total, abs=1e-9)
 
 
-@few
 @given(seeds, st.integers(0, 30), st.integers(0, 30))
 def test_matching_is_one_to_one_and_within_the_distance(seed, found_count, truth_count):
     rng = np.random.default_rng(seed)
@@ -105,7 +102,6 @@ def test_detections_with_nan_or_infinite_centres_match_nothing_and_count_as_fals
     assert (everything["tp"], everything["fp"], everything["fn"]) == (1, 2, 1)
 
 
-@few
 @given(seeds, st.lists(st.tuples(st.integers(0, 12), st.integers(0, 12)), max_size=4))
 def test_hits_and_misses_add_up_to_the_truth_and_to_what_was_found(seed, frames):
     rng = np.random.default_rng(seed)

@@ -8,7 +8,7 @@ from functools import partial
 
 import pytest
 from cli_samples import error_line, exit_of
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from samples import object_folder, walker_label, write
 
@@ -144,7 +144,6 @@ def test_a_recording_that_cannot_be_opened_again_is_measured_here(root):
     assert len([*results(recording, counting)]) == COUNT
 
 
-@settings(max_examples=60, database=None)
 @given(st.sets(st.integers(0, 20)), st.randoms(use_true_random=False))
 def test_pairs_come_in_order_each_as_soon_as_it_can(numbers, random):
     numbers = sorted(numbers)

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from samples import DATA, needs_data, object_folder, walker_label, write
 
@@ -34,7 +34,6 @@ from lidar_perception.scoring.points.segmentation import (
 from lidar_perception.scoring.points.tables import PUBLISHED
 from lidar_perception.types import CLASSES, GroundTruth, InputError
 
-few = settings(max_examples=60, database=None)
 seeds = st.integers(0, 2**32 - 1)
 CAR, VAN, TRUCK = (CLASSES.index(name) for name in ("Car", "Van", "Truck"))
 
@@ -130,7 +129,6 @@ def test_neutral_points_speak_neither_for_nor_against_their_own_object_only():
     assert other.iou.tolist() == [1, 0.5]
 
 
-@few
 @given(seeds)
 def test_order_of_points_and_numbers_of_clusters_do_not_matter(seed):
     found, truth = some(seed)
@@ -143,7 +141,6 @@ def test_order_of_points_and_numbers_of_clusters_do_not_matter(seed):
     assert report_of(renamed[order], shuffled) == report_of(found, truth)
 
 
-@few
 @given(seeds)
 def test_scores_are_those_of_a_plain_loop_over_sets(seed):
     found, truth = some(seed)

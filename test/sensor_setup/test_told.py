@@ -68,7 +68,8 @@ def test_with_odometry_ahead_is_where_the_base_looks_whichever_way_it_drove(yaw)
         looks = node_params(m).get("input.ahead", (0.0,))[0]
         assert abs((looks + yaw + 180) % 360 - 180) < 3
     assert abs(abs(found(Told(), backwards=True).heading.degrees) - 180) < 3  # it cannot know
-    report_html(m, {"robot.param.yaml": params_yaml(m)})
+    if not yaw:
+        report_html(m, {"robot.param.yaml": params_yaml(m)})
     written = yaml.safe_load(params_yaml(m))["/**"]["ros__parameters"]["input"]
     assert written.pop("ahead", 0.0) == looks
     assert ReceptionParams(ahead=looks) and not written.keys() - {"intensity_max"}

@@ -6,7 +6,7 @@ import math
 import re
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.training import loop
@@ -24,7 +24,6 @@ from lidar_perception.training.plan import (
 )
 from lidar_perception.types import InputError
 
-few = settings(max_examples=200, database=None)
 SPEED = Speed(scan=0.4, cut=0.1, step=1.2, whole=3.0, frame=0.2)
 SIM = Data(True, True, 0, 0, 4, 500)
 speeds = st.builds(
@@ -37,7 +36,6 @@ data = st.one_of(st.builds(Data, st.just(True), st.just(True), st.integers(0, 50
                            st.integers(1, 50), st.integers(1, 32), st.integers(0, 500)))
 
 
-@few
 @given(speeds, data, st.floats(0.3, 100), st.integers(1, 64))
 def test_what_is_planned_fits_into_the_budget_or_is_refused_with_one_that_does(
         speed, data, hours, cores):
@@ -77,7 +75,6 @@ def test_what_is_given_wins():
     assert plan(1.0, 2, SPEED, SIM, Plan(steps=10)).scans <= 40  # no more than are looked at
 
 
-@few
 @given(st.floats(0, 7200), st.floats(1, 20))
 def test_after_a_slow_preparation_as_many_steps_are_left_as_fit(seconds, slower):
     made = plan(2.0, 2, SPEED, SIM)

@@ -66,12 +66,17 @@ def _weights(out):
 
 def test_every_row_of_the_ablation_is_trained_and_shown(cache, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
+    papers = train_module.PAPER_ABLATION
+    assert len(papers) == len(ABLATIONS)
+    for name in list(ABLATIONS)[1:-1]:  # those are made and run in test_pointnet.py
+        monkeypatch.delitem(ABLATIONS, name)
+    monkeypatch.setattr(train_module, "PAPER_ABLATION", (papers[0], papers[-1]))
     result = train(cache, tmp_path / "all", "--ablation", **{"--steps": 1, "--validate-steps": 1})
     assert result.exit_code == 0, result.output
     for name in ABLATIONS:
         assert read_header(tmp_path / "all" / name / "best.safetensors").config.name == name
         assert name in result.output
-    assert "88.96" in result.output and len(train_module.PAPER_ABLATION) == len(ABLATIONS)
+    assert "75.52" in result.output and "88.96" in result.output
 
 
 def test_every_network_can_be_asked_for():

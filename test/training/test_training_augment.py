@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from lidar_perception.geometry import bev_iou, points_in_box, wrap_angle
@@ -32,7 +32,6 @@ from lidar_perception.training.putting import inside
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 
 AREA = np.array([0.0, -15, -3]), np.array([20.0, 15, 1])
-few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 CAR, CYCLIST = CLASSES.index("Car"), CLASSES.index("Cyclist")
 STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
@@ -70,7 +69,6 @@ def touching(boxes: np.ndarray) -> bool:
     return bool((bev_iou(boxes, boxes) - np.eye(len(boxes)) > 1e-9).any())
 
 
-@few
 @given(seeds, st.floats(0, 0.5))
 def test_points_inside_a_box_are_found_as_by_the_plain_way(seed, margin):
     scene = random_scene(seed)
@@ -81,7 +79,6 @@ def test_points_inside_a_box_are_found_as_by_the_plain_way(seed, margin):
 
 # augmentation
 
-@few
 @given(seeds)
 def test_points_in_a_box_stay_in_it(seed):
     scene, rng = random_scene(seed), np.random.default_rng(seed)
@@ -97,7 +94,6 @@ def test_points_in_a_box_stay_in_it(seed):
         assert touching(changed.boxes) is False
 
 
-@few
 @given(seeds)
 def test_whole_scenes_move_as_one(seed):
     scene = random_scene(seed)
@@ -105,7 +101,6 @@ def test_whole_scenes_move_as_one(seed):
         assert np.array_equal(members(changed, 1e-3).sum(axis=1), members(scene, 1e-3).sum(axis=1))
 
 
-@few
 @given(seeds, st.floats(-0.1, 0.1), st.floats(-0.1, 0.1))
 def test_on_a_slope_everything_is_as_high_above_the_ground_as_before(seed, ahead, aside):
     scene = random_scene(seed)
@@ -116,7 +111,6 @@ def test_on_a_slope_everything_is_as_high_above_the_ground_as_before(seed, ahead
         assert np.array_equal(np.delete(after, 2, axis=1), np.delete(before, 2, axis=1))
 
 
-@few
 @given(seeds, st.floats(-7, 7))
 def test_changes_are_undone_by_their_inverses(seed, angle):
     scene = random_scene(seed)
@@ -136,7 +130,6 @@ def test_a_turn_takes_what_is_ahead_to_the_left():
     np.testing.assert_allclose(changed.boxes, [[0, 5, 1, 4, 2, 1, 0.1 + np.pi / 2]], atol=1e-9)
 
 
-@few
 @given(seeds, st.floats(0, 0.99))
 def test_thinning_leaves_a_part_of_the_points_in_their_order(seed, share):
     scene = random_scene(seed)
@@ -147,7 +140,6 @@ def test_thinning_leaves_a_part_of_the_points_in_their_order(seed, share):
     assert all(point in places for point in left.points.tolist())
 
 
-@few
 @given(seeds)
 def test_intensities_stay_intensities_and_nothing_else_changes(seed):
     scene = random_scene(seed)
@@ -158,7 +150,6 @@ def test_intensities_stay_intensities_and_nothing_else_changes(seed):
     assert (brightened(scene, 1.4, 0.2).points[::2, 3] == 0).all()
 
 
-@few
 @given(seeds, st.booleans())
 def test_the_same_rng_gives_the_same_scene_and_zeros_change_nothing(seed, around):
     scene = random_scene(seed, around)
@@ -173,7 +164,6 @@ def test_the_same_rng_gives_the_same_scene_and_zeros_change_nothing(seed, around
 
 # objects of other scenes
 
-@few
 @given(seeds)
 def test_objects_that_are_put_in_touch_nothing_and_keep_their_points(seed):
     database = joined([cut(random_scene(seed + k), ("Car", "Pedestrian", "Cyclist"), 5)
@@ -222,7 +212,6 @@ def street_with(*walls: np.ndarray) -> TrainingScene:
                  np.zeros(0, bool))
 
 
-@few
 @given(seeds)
 @pytest.mark.no_cover
 def test_what_is_behind_an_object_goes_and_none_is_put_behind_something(seed):
@@ -268,7 +257,6 @@ def test_posts_are_learned_from_but_are_no_objects():
     assert added[:, 2].max() == pytest.approx(0.6, abs=0.1)
 
 
-@few
 @given(seeds)
 def test_noise_is_along_the_ray_and_beams_have_theirs_in_common(seed):
     rng = np.random.default_rng(seed)
@@ -291,7 +279,6 @@ def test_noise_is_along_the_ray_and_beams_have_theirs_in_common(seed):
 STILL_THINGS = AugmentParams(things_stretch=0, things_intensity=0, things_shine=0)
 
 
-@few
 @given(seeds)
 def test_what_shines_of_a_thing_is_between_two_heights(seed):
     scene, rng = random_scene(seed), np.random.default_rng(seed)
@@ -306,7 +293,6 @@ def test_what_shines_of_a_thing_is_between_two_heights(seed):
             assert bright[(points[:, 2] >= low) & (points[:, 2] <= high)].all()
 
 
-@few
 @given(seeds)
 def test_things_are_stretched_upon_their_floor(seed):
     scene, rng = random_scene(seed), np.random.default_rng(seed)
@@ -323,7 +309,6 @@ def test_things_are_stretched_upon_their_floor(seed):
         np.testing.assert_allclose(still, own, atol=1e-6)
 
 
-@few
 @given(seeds, st.sampled_from([-1, 1]), st.sampled_from([-1, 1]))
 def test_nothing_that_may_come_into_view_is_cut_off(seed, larger, higher):
     scene, params = random_scene(seed), AugmentParams(turn=0, scale=0.1, height=0.3, tilt=0.1)

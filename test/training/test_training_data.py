@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from detection_samples import BOXES, tiny, two_objects
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from samples import WALKER, object_folder, walker_label, write
 
@@ -56,7 +56,6 @@ from lidar_perception.types import (
     LidarFrame,
 )
 
-few = settings(max_examples=25, database=None)
 seeds = st.integers(0, 2**32 - 1)
 CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
 STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
@@ -150,7 +149,6 @@ def test_splits_name_their_frames(tmp_path):
         names_of(root, tmp_path / "missing.txt")
 
 
-@few
 @given(st.integers(2, 200), st.floats(0, 1), seeds)
 def test_a_random_split_is_a_partition_drawn_by_its_seed(count, share, seed):
     names = tuple(f"{i:06}" for i in range(count))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from torch import nn
 from training_toy import PARAMS, Toy, equals, rows, same
@@ -20,11 +20,9 @@ from lidar_perception.training.run import Progress, Run
 from lidar_perception.training.schedule import Average, one_cycle
 
 pytestmark = pytest.mark.usefixtures("one_thread_for_all")
-few = settings(max_examples=25, database=None)
 PLANNED = LoopParams(**{**vars(PARAMS), "steps": 300, "validate_steps": 60, "save_steps": 300})
 
 
-@few
 @given(st.integers(3, 300), st.floats(0.05, 0.95))
 def test_the_rate_is_that_of_one_cycle_in_torch(steps, warm):
     parameter = nn.Parameter(torch.zeros(1))
@@ -48,7 +46,6 @@ def test_the_shortest_runs_have_a_rate(steps):
     assert all(0 < one_cycle(i, steps, 0.1, 0.01)[0] <= 0.1 for i in range(steps))
 
 
-@few
 @given(st.lists(st.floats(-10, 10), min_size=1, max_size=30), st.floats(0, 0.99))
 def test_the_average_is_the_weighted_sum_of_what_it_saw(values, decay):
     module = nn.Linear(1, 1, bias=False).double()
