@@ -24,7 +24,7 @@ from lidar_perception.types import LidarFrame
 from lidar_perception.wire.codec import encode
 
 FRAMES = 3000
-SECONDS = 240.0      # of one case, however few frames that are
+SECONDS = 900.0      # of one case, however few frames that are
 SETTLED = 0.3        # of the frames: from here on memory must be flat
 LEAST = 100          # frames; fewer say nothing
 GROWTH_MB = 20.0
