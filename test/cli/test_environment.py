@@ -1,0 +1,30 @@
+"""./lidar and the environment that it makes."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+from samples import write
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
+def test_of_two_first_calls_one_makes_the_environment_and_the_other_waits(tmp_path):
+    venv = tmp_path / "venv"
+    wanted = subprocess.run(["cksum"], input=b"".join(
+        (ROOT / name).read_bytes() for name in ("constraints.txt", "setup.py", "setup.cfg")),
+        capture_output=True, check=True).stdout.decode()
+    write(venv / "bin/lidar-perception", "#!/bin/sh\necho ran $1\n").chmod(0o755)
+    with open(venv / "lidar-lock", "w") as lock:  # the one
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        other = subprocess.Popen([ROOT / "lidar", "info"], text=True, stdout=subprocess.PIPE,
+                                 stderr=subprocess.PIPE, env={
+            **os.environ, "LIDAR_VENV": str(venv), "LIDAR_PYTHON": "/bin/false"})
+        assert "another call is making" in other.stderr.readline()
+        write(venv / "lidar-setup", wanted)
+    assert other.communicate() == ("ran info\n", "") and other.returncode == 0
