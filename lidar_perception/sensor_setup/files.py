@@ -31,6 +31,7 @@ LIMITS = (15.0, 30.0, 45.0)       # m, of the bands; the paper has the first two
 MAX_EPS = (0.5, 0.7, 0.9, 1.0)    # m; farther neighbours join people who walk side by side
 MIN_SAMPLES = 3
 RESERVE = 0.75                    # of the density of a sensor, that no cloud of it counts as thin
+UNREAD = 1e9                      # full intensity beside which any other is 0
 GIVEN = "as --height-hint says; no ground in sight"
 NEAREST_GROUND = 0.9              # of the distance of the nearest ground: where Patchwork++ begins
 
@@ -106,6 +107,9 @@ def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
         out["input.intensity_max"] = (m.intensity.full, f"intensities go up to "
                                       f"{m.intensity.greatest:.4g}" + ("" if m.intensity.sure
                                                                        else "; a guess"))
+    elif m.scans[0].intensity is not None and m.scans[0].intensity.any():
+        out["input.intensity_max"] = (UNREAD, "intensities are always the same, which says nothing:"
+                                      " read as 0, as sensor.yaml has it")
     if body_fits(m):
         out["crop.body"] = (tuple(round(float(v), 2) for v in m.coverage.box),
                             f"around the robot's own returns, {100 * m.coverage.body_share:.1f} % "

@@ -11,12 +11,13 @@ from tilted_samples import BARE, MOUNTS, clouds_of
 from lidar_perception.data.raw_clouds import open_clouds, spread
 from lidar_perception.sensor_setup.beams import beams_of
 from lidar_perception.sensor_setup.doubts import doubts
-from lidar_perception.sensor_setup.files import params_yaml, sensor_yaml
+from lidar_perception.sensor_setup.files import chosen_params, params_yaml, sensor_yaml
 from lidar_perception.sensor_setup.findings import findings
 from lidar_perception.sensor_setup.measure import measured
 from lidar_perception.sensor_setup.mount import ground_plane, mount_of
-from lidar_perception.sensor_setup.scans import scan_of
+from lidar_perception.sensor_setup.scans import intensity_of, scan_of
 from lidar_perception.simulation.sensor import sensor_from_file, sensor_named
+from lidar_perception.wire.params import InputParams
 
 CHECKED = ("hdl-64e", "vlp-16", "pandarxt-32")  # by the order, by rings, and by elevations
 
@@ -123,6 +124,16 @@ def test_a_bare_cloud_says_what_it_lacks():
     text = "\n".join(doubts(m))
     assert "there is no intensity" in text and "the rate cannot be told" in text
     assert "silent: 1  # no intensity was seen" in sensor_yaml(m)
+    assert "input.intensity_max" not in chosen_params(m)
+
+
+def test_intensities_that_never_change_are_read_as_0_as_sensor_yaml_has_them():
+    m = found("pandarxt-32")
+    same = replace(m, scans=tuple(s._replace(intensity=np.full(len(s.xyz), 255.0))
+                                  for s in m.scans))
+    full, _ = chosen_params(same)["input.intensity_max"]
+    assert 255 / InputParams(full).intensity_max < 1e-6
+    assert intensity_of(same.scans) is None and "silent: 1" in sensor_yaml(same)
 
 
 @pytest.mark.parametrize("folder, model, height, rings", [
