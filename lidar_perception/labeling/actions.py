@@ -53,11 +53,12 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
                     (state.seeds, seeds), (state.checked, checked),
                     (state.kept, action.get("kept", state.kept) if name == "import"
                      else state.kept))
-    done = change, state.done
+    done, undone = (change, state.done), None
     if action.get("joins") and state.done is not None:  # the rest of what the last action began
         done = state.done[0].then(change), state.done[1]
-    after = replace(state.after(change), seq=state.seq + 1, done=done, undone=None)
-    return after, change
+    elif action.get("beside"):  # nobody did it: what people did stays what can be undone
+        done, undone = state.done, state.undone
+    return replace(state.after(change), seq=state.seq + 1, done=done, undone=undone), change
 
 
 def motion_of(state: State, motion: Motion) -> Motion:
@@ -222,7 +223,9 @@ def _copy(state: State, action: Action, motion: Motion) -> Made:
 
 
 def _class(state: State, action: Action, motion: Motion) -> Made:
-    return _only(state, replace(track_of(state, action.get("track")), class_name=class_of(action)))
+    track = track_of(state, action.get("track"))
+    return _only(state, replace(track, class_name=class_of(action),
+                                edited=track.edited or track.state == PROPOSED))
 
 
 def _reject_rest(state: State, action: Action, motion: Motion) -> Made:
@@ -260,7 +263,8 @@ def _merge(state: State, action: Action, motion: Motion) -> Made:
     boxes |= {f: b for f, b in second.boxes.items()
               if b.kind == KEY and boxes[f].kind != KEY}
     gone = (first.gone | second.gone) - boxes.keys()
-    merged = replace(first, boxes=boxes, gone=gone, extra={**second.extra, **first.extra})
+    merged = replace(first, boxes=boxes, gone=gone, extra={**second.extra, **first.extra},
+                     edited=True, nearby=False)
     seeds = tuple(dict.fromkeys((f, first.id if t == second.id else t) for f, t in state.seeds))
     return {first.id: merged, second.id: None}, seeds, state.checked
 
@@ -275,7 +279,8 @@ def _split(state: State, action: Action, motion: Motion) -> Made:
     def part(frames: set[int], number: int, after: bool) -> Track:
         return replace(track, id=number, boxes={f: track.boxes[f] for f in sorted(frames)},
                        gone=frozenset(f for f in track.gone if (f >= frame) == after),
-                       extra={f: v for f, v in track.extra.items() if (f >= frame) == after})
+                       extra={f: v for f, v in track.extra.items() if (f >= frame) == after},
+                       edited=True, nearby=False)
     new = state.next_id
     seeds = tuple((f, new if t == track.id and f >= frame else t) for f, t in state.seeds)
     return ({track.id: part(early, track.id, False), new: part(late, new, True)}, seeds,

@@ -54,12 +54,12 @@ class SeedSize:
 
 @dataclass(frozen=True)
 class Wanted:
-    """What is looked for: what is like these seeds; and by frame, what a person put there.
+    """What is looked for: what is like these seeds; and by frame, all that a person put there.
     detected: a detector looks too, so that what is as large as a seed but not found counts less."""
 
     seeds: Sequence[SeedLook] = ()
     sizes: Sequence[SeedSize] = ()
-    placed: Mapping[int, Placed] = field(default_factory=dict)
+    placed: Mapping[int, Sequence[Placed]] = field(default_factory=dict)
     detected: bool = False
 
 
@@ -75,17 +75,17 @@ def likeness(look: Look, seeds: Sequence[SeedLook]) -> Array:
 
 
 def found_in(look: Look, wanted: Wanted,
-             placed: Placed | None = None) -> tuple[Detections, Array]:
+             placed: Sequence[Placed] = ()) -> tuple[Detections, Array]:
     """What there is in a frame: detections, and candidates where none is; and which (K,) bool are
     these. What a person placed is there for sure."""
     detections, candidates = _with_things(look, wanted, *_seen_in(look, wanted.seeds))
-    if placed is None or placed[1] not in CLASSES:
-        return detections, candidates
-    box, name = placed
-    others = centre_distances(detections.boxes, box[None])[:, 0] > max(SAME, box[3] / 3)
-    kept = detections[others]
-    sure = Detections.of(box, CLASSES.index(name), SURE)
-    return kept.followed_by(sure), np.append(candidates[others], False)
+    for box, name in placed:
+        if name in CLASSES:
+            others = centre_distances(detections.boxes, box[None])[:, 0] > max(SAME, box[3] / 3)
+            sure = Detections.of(box, CLASSES.index(name), SURE)
+            detections = detections[others].followed_by(sure)
+            candidates = np.append(candidates[others], False)
+    return detections, candidates
 
 
 def _seen_in(look: Look, seeds: Sequence[SeedLook]) -> tuple[Detections, Array]:
@@ -134,7 +134,7 @@ def proposed(looks: Sequence[Look], wanted: Wanted, stamps_ns: Sequence[int], mo
     for i in frames:
         if not told(i - frames.start):
             return None
-        found, candidates = found_in(looks[i], wanted, wanted.placed.get(i))
+        found, candidates = found_in(looks[i], wanted, wanted.placed.get(i, ()))
         pose = None if motion.poses is None else motion.poses[i]
         tracks = tracker(found, stamps_ns[i], pose)
         by = hits(tracks, found)

@@ -31,7 +31,7 @@ from lidar_perception.labeling.proposals import (
     Wanted,
     proposed,
 )
-from lidar_perception.labeling.state import REJECTED, State, Track
+from lidar_perception.labeling.state import KEY, Box, State, Track
 from lidar_perception.labeling.survey import Look, surveyed
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 
@@ -113,8 +113,11 @@ class Proposer:
         seeds = [SeedLook(seed.silhouette(BEST), seed.height) for seed in self.seeds(state)]
         sizes = [SeedSize(t.class_name, _size(t, f))
                  for f, t in self._things(state)]
-        placed = {f: (np.array(b.values), t.class_name) for t in state.tracks.values()
-                  if is_placed(t) for f, b in t.boxes.items()}
+        placed: dict[int, list[tuple[Array, str]]] = {}
+        for t in state.tracks.values():
+            for f, b in t.boxes.items() if t.placed else ():
+                if b.kind == KEY:
+                    placed.setdefault(f, []).append((np.array(b.values), t.class_name))
         stamps = [frame.stamp_ns for frame in self.drive.frames]
         wanted = Wanted(seeds, sizes, placed, self.weights != "")
         return proposed(self.looks or [], wanted, stamps, motion,
@@ -213,15 +216,11 @@ def _drawn(pixels: Array) -> dict[str, Any]:
             "bits": "".join("01"[bit] for bit in pixels.ravel().astype(int))}
 
 
-def is_placed(track: Track) -> bool:
-    """Whether a person put it into one frame, and it waits to be followed through the others."""
-    return track.touched and len(track.boxes) == 1 and track.state != REJECTED
-
-
 def merged(state: State, made: Sequence[Track], motion: Motion) -> tuple[list[Track], list[int]]:
     """What new proposals mean for the tracks that are there: those that a person has had a hand in
-    stay, but for one that was placed, which is followed through the drive; a proposal where one was
-    before takes its place and id; proposals that are no more are removed."""
+    stay, but for one that was placed, which is followed through the drive, or stays where it was
+    put if no proposal is there; a proposal where one was before takes its place and id; proposals
+    that are no more are removed."""
     there = _Places(state.tracks)
     waiting = {t.id for t in state.tracks.values()
                if not t.touched and t.source in (FUSED, CANDIDATES)}
@@ -231,23 +230,28 @@ def merged(state: State, made: Sequence[Track], motion: Motion) -> tuple[list[Tr
         old = there.same(new)
         by_person = [t for t in old if t.id not in waiting]
         if by_person:
-            placed = next((t for t in by_person if is_placed(t) and t.id not in taken), None)
+            placed = next((t for t in by_person if t.placed and t.id not in taken), None)
             if placed is not None:
                 taken.add(placed.id)
-                found.append(followed(placed, new, motion))
+                found.append(followed(placed, new.boxes, motion))
             continue
         number = next((t.id for t in old if t.id not in taken), free)
         free += number == free
         taken.add(number)
         found.append(replace(new, id=number))
+    found += [followed(t, {}, motion) for t in state.tracks.values()
+              if t.placed and t.id not in taken]
     return ([t for t in found if t != state.tracks.get(t.id)], sorted(waiting - taken))
 
 
-def followed(placed: Track, new: Track, motion: Motion) -> Track:
-    """A track that has one box, through the frames of a proposal: corrected by that box."""
-    (frame, box), = placed.boxes.items()
-    boxes = {f: b for f, b in new.boxes.items() if f not in placed.gone}
-    return replace(placed, boxes=corrected(boxes, placed.gone, frame, box.values, motion))
+def followed(placed: Track, boxes: Mapping[int, Box], motion: Motion) -> Track:
+    """A track that was placed, through the frames of a proposal with these boxes: corrected by
+    each box that a person gave it."""
+    found: Mapping[int, Box] = {f: b for f, b in boxes.items() if f not in placed.gone}
+    for frame, box in sorted(placed.boxes.items()):
+        if box.kind == KEY:
+            found = corrected(found, placed.gone, frame, box.values, motion)
+    return replace(placed, boxes=dict(sorted(found.items())), nearby=False)
 
 
 class _Places:

@@ -35,13 +35,13 @@ from lidar_perception.labeling.proposing import Proposer, merged
 from lidar_perception.labeling.snap import around_click, to_cluster, to_ground, to_size
 from lidar_perception.labeling.state import (
     ACCEPTED,
+    CLICK,
     KEY,
     Box,
     Change,
     State,
     Track,
     progress,
-    track_from_json,
     track_to_json,
 )
 from lidar_perception.runs.files import short
@@ -66,9 +66,7 @@ class Session:
         self._cancelled = False
         self._beside: threading.Thread | None = None
         self._what = ""  # goes on there
-        # Seeds that were followed nearby only: as they were placed, and as they are.
-        self._partly: dict[int, tuple[Track, Track]] = {}
-        self._lock = threading.RLock()
+        self._lock, self._exporting = threading.RLock(), threading.Lock()
         for line in journal.lines:
             self.state, _ = apply(self.state, line, drive.motion)
         journal.lines.clear()
@@ -85,7 +83,7 @@ class Session:
             return self.prepare(by, True) if action["do"] == "propose" else self.cancel()
         with self._lock:
             seq = self._record(self._computed(_asked(action)), by)
-            if action.get("do") == "seed" and self._partly:
+            if action.get("do") == "seed" and self._waiting():
                 self._start("following", lambda: self._follow(by, seq))
         return seq
 
@@ -100,7 +98,8 @@ class Session:
         with self._lock:
             if self._what == "proposing":
                 raise InputError("proposals are being made already")
-            self._start("proposing", lambda: self.propose(by, anew=anew or not self.was_proposed))
+            self._start("proposing", lambda: self.propose(by, anew=anew or not self.was_proposed,
+                                                          asked=anew))
         return self.state.seq
 
     def _start(self, what: str, work: Callable[[], None]) -> None:
@@ -132,10 +131,12 @@ class Session:
             self._beside.join()
 
     def propose(self, by: str = "", here: bool = False,
-                told: Callable[[int], object] = lambda count: None, anew: bool = True) -> None:
-        """Look at the drive, in a process of its own or here, and write down the proposals, but not
-        with anew=False; nothing is written if it is cancelled. told: how many frames were looked
-        at. InputError where a frame or the weights cannot be read."""
+                told: Callable[[int], object] = lambda count: None, anew: bool = True,
+                asked: bool = False) -> None:
+        """Look at the drive, in a process of its own or here, and write down the proposals, with
+        anew=False only where a seed waits to be followed; nothing is written if it is cancelled.
+        told: how many frames were looked at; asked: by a person, who can undo it. InputError where
+        a frame or the weights cannot be read."""
         def done(count: int) -> bool:
             told(count)
             return self._done(count)
@@ -149,8 +150,8 @@ class Session:
         with self._lock:
             if not self.state.poses and (poses := self.proposer.poses()) is not None:
                 self._record({"do": "poses", "poses": poses}, by)
-        if anew:
-            self._propose_all(by, None)
+        if anew or self._waiting():
+            self._propose_all(by, None, asked)
 
     def _tell_problem(self) -> None:
         """What is wrong with what is kept of the survey, once."""
@@ -165,24 +166,20 @@ class Session:
             self.tell({"progress": self.progress()})
         return not self._cancelled
 
-    def _propose_all(self, by: str, seed: int | None) -> None:
+    def _propose_all(self, by: str, seed: int | None, asked: bool = False) -> None:
         """Follow everything through the whole drive, and write that down; with the number of the
         action that began it as one action, if it is the last. Others may be done meanwhile."""
-        with self._lock:
-            state = self._as_placed(self.state)
-        motion = motion_of(state, self.drive.motion)
-        found = self.proposer.proposals(state, motion, None, self._done)
+        state = self.state
+        found = self.proposer.proposals(state, self.motion, None, self._done)
         with self._lock:
             if found is None or self._cancelled or (seed is not None and not self._waiting()):
                 return
-            state = self._as_placed(self.state)
-            tracks, removed = merged(state, found, motion_of(state, self.drive.motion))
-            followed = {t.id for t in tracks}
-            tracks += [state.tracks[n] for n in self._partly if n not in followed
-                       and state.tracks.get(n) != self.state.tracks.get(n)]
-            joins = {"joins": True} if seed == self.state.seq else {}
-            self._record({"do": "propose", **_made(tracks, removed), **joins}, by)
-            self._partly.clear()
+            tracks, removed = merged(self.state, found, self.motion)
+            # A seed is undone with all that came of it, but never with the first proposals.
+            joins = seed == self.state.seq and self.was_proposed
+            how = {} if asked else {"joins": True} if joins else {"beside": True}
+            self._record({"do": "propose", **_made(tracks, removed), **how}, by)
+            self.was_proposed = True
 
     def _follow(self, by: str, seed: int) -> None:
         with self._lock:
@@ -192,13 +189,7 @@ class Session:
 
     def _waiting(self) -> bool:
         """Whether there is a seed that is to be followed through the whole drive."""
-        return any(self.state.tracks.get(n) == partly for n, (_, partly) in self._partly.items())
-
-    def _as_placed(self, state: State) -> State:
-        """Without what was only followed nearby, and not touched since."""
-        placed = {n: alone for n, (alone, partly) in self._partly.items()
-                  if state.tracks.get(n) == partly}
-        return replace(state, tracks={**state.tracks, **placed})
+        return any(t.nearby and t.placed for t in self.state.tracks.values())
 
     def _computed(self, action: Action) -> Action:
         """The action with what is computed for it, as the journal has it."""
@@ -238,7 +229,7 @@ class Session:
         click = np.array(numbers(action, "xyz", 3))
         box = around_click(self.drive.clouds(frame), click, named)
         box = self.proposer.detected(frame, box, named)
-        track = Track(self.state.next_id, named, ACCEPTED, 1.0, "click",
+        track = Track(self.state.next_id, named, ACCEPTED, 1.0, CLICK,
                       {frame: Box(tuple(rounded(box)), KEY)})
         alone = {**action, "track": track.id, "tracks": [track_to_json(track)]}
         if self.proposer.looks is None:
@@ -252,11 +243,8 @@ class Session:
         if some:  # what is known of the frames around says nothing of what is there already
             tracks = [t for t in tracks if t.id == track.id or t.id not in state.tracks]
             removed = []
-        if all(t.id != track.id for t in tracks):
-            tracks.append(track)
-        if some:
-            partly = next(t for t in tracks if t.id == track.id)
-            self._partly[track.id] = track, track_from_json(track_to_json(partly))
+        own = next((t for t in tracks if t.id == track.id), track)
+        tracks = [t for t in tracks if t is not own] + [replace(own, nearby=some)]
         return {**alone, **_made(tracks, removed)}
 
     def _snapped(self, action: Action) -> Array:
@@ -322,7 +310,7 @@ def _asked(action: Mapping[str, Any]) -> Action:
     computed = {"seed": ("track", "tracks", "removed"), "propose": ("tracks", "removed"),
                 "import": ("tracks", "removed", "kept"),
                 "accept": ("seed",), "snap": ("box",)}
-    unwanted = ("seq", "time", "by", "joins", *computed.get(str(action.get("do")), ()))
+    unwanted = ("seq", "time", "by", "joins", "beside", *computed.get(str(action.get("do")), ()))
     return {k: v for k, v in action.items() if k not in unwanted}
 
 

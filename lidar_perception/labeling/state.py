@@ -15,6 +15,7 @@ import numpy as np
 
 KEY, PROPOSED, INTERPOLATED = "key", "proposed", "interpolated"  # kinds of boxes
 ACCEPTED, REJECTED = "accepted", "rejected"                      # of tracks, beside PROPOSED
+CLICK = "click"  # source of a track that a person clicked, to be followed through the drive
 
 
 class Box(NamedTuple):
@@ -33,22 +34,32 @@ class Box(NamedTuple):
 @dataclass(frozen=True)
 class Track:
     """One object through the drive. boxes by frame; gone: frames where a person removed its box;
-    extra: by frame, what an imported label says besides, to be exported again."""
+    extra: by frame, what an imported label says besides, to be exported again; edited: a person
+    gave it its class, or cut or joined it; nearby: it was clicked, and is followed only through the
+    frames around that yet."""
 
     id: int
     class_name: str
     state: str = PROPOSED
     score: float = 1.0
-    source: str = "click"
+    source: str = CLICK
     boxes: Mapping[int, Box] = field(default_factory=dict)
     gone: frozenset[int] = frozenset()
     extra: Mapping[int, Any] = field(default_factory=dict)
+    edited: bool = False
+    nearby: bool = False
 
     @property
     def touched(self) -> bool:
         """Whether a person has had a hand in it."""
-        return (self.state != PROPOSED or bool(self.gone)
+        return (self.state != PROPOSED or self.edited or bool(self.gone)
                 or any(box.kind == KEY for box in self.boxes.values()))
+
+    @property
+    def placed(self) -> bool:
+        """Whether a person clicked it, and it waits to be followed through the drive."""
+        return (self.source == CLICK and self.state != REJECTED and not self.edited
+                and (len(self.boxes) == 1 or self.nearby))
 
     @property
     def uncertainty(self) -> float:
@@ -126,7 +137,7 @@ def track_to_json(track: Track) -> dict[str, Any]:
         found["gone"] = sorted(track.gone)
     if track.extra:
         found["extra"] = {str(f): track.extra[f] for f in sorted(track.extra)}
-    return found
+    return found | {name: True for name in ("edited", "nearby") if getattr(track, name)}
 
 
 def track_from_json(found: Mapping[str, Any]) -> Track:
@@ -135,7 +146,8 @@ def track_from_json(found: Mapping[str, Any]) -> Track:
              for f, *values, kind in found["boxes"]}
     return Track(int(found["id"]), str(found["class"]), found["state"], float(found["score"]),
                  str(found["source"]), boxes, frozenset(found.get("gone", ())),
-                 {int(f): v for f, v in found.get("extra", {}).items()})
+                 {int(f): v for f, v in found.get("extra", {}).items()},
+                 found.get("edited", False), found.get("nearby", False))
 
 
 def next_uncertain(state: State, after: int | None = None,

@@ -17,16 +17,19 @@ from lidar_perception.classes import CAR
 from lidar_perception.data.frame import BOXES, POSES, Recording
 from lidar_perception.geometry import points_in_box
 from lidar_perception.labeling import survey_cache
+from lidar_perception.labeling.actions import apply
 from lidar_perception.labeling.alike import alike
 from lidar_perception.labeling.annotator import Annotator, Truth, is_right
 from lidar_perception.labeling.drive import Clouds, Drive, Scan, one_drive
 from lidar_perception.labeling.interpolation import Motion
+from lidar_perception.labeling.proposals import Wanted, found_in
 from lidar_perception.labeling.proposing import merged
 from lidar_perception.labeling.session import session
 from lidar_perception.labeling.snap import headed, to_cluster, to_ground, to_size
 from lidar_perception.labeling.state import KEY, PROPOSED, Box, State, Track
+from lidar_perception.labeling.survey import Look
 from lidar_perception.simulation.to_bag import simulated_scans
-from lidar_perception.types import InputError
+from lidar_perception.types import Detections, InputError
 
 SEED, FRAMES = 119, 6  # a street with people near and far
 MOTION = Motion.of(np.arange(8) * 10**8)
@@ -194,6 +197,45 @@ def test_a_survey_takes_no_more_room_than_it_may(drive, tmp_path, monkeypatch):
     assert 0 < len(sizes) < FRAMES / 2 and sum(sizes) <= 60_000
 
 
+@pytest.mark.parametrize("restarted", [False, True])
+def test_a_seed_that_is_corrected_before_it_was_followed_is_followed_all_the_same(
+        drive, tmp_path, monkeypatch, restarted):
+    """Also if the server was killed meanwhile, by the next one."""
+    monkeypatch.setattr("lidar_perception.labeling.session.NEARBY", 1)
+    with session(drive, tmp_path, weights="") as made:
+        made.propose(here=True)
+        monkeypatch.setattr(made, "_start", lambda *_: None)  # it had no time
+        _, track = click(made)
+        moved = [track.boxes[1].values[0] + 0.1, *track.boxes[1].values[1:]]
+        made.do({"do": "box", "track": track.id, "frame": 1, "box": moved})
+        assert len(made.state.tracks[track.id].boxes) < FRAMES - 1
+        if not restarted:
+            made.propose(here=True, anew=False)
+            found = made.state.tracks[track.id]
+    if restarted:
+        with session(drive, tmp_path, weights="") as again:
+            again.prepare()
+            again.wait()
+            found = again.state.tracks[track.id]
+    assert len(found.boxes) >= FRAMES - 1 and not found.nearby
+    assert found.boxes[1] == Box(tuple(moved), KEY)
+    assert [f for f, b in found.boxes.items() if b.kind == KEY] == [0, 1]
+
+
+def test_what_was_only_looked_at_by_the_server_is_nobodys_to_undo(made):
+    """The first proposals come when they come: they take nothing from redo, nor a seed with them
+    when they are undone."""
+    made.do({"do": "check", "frame": 1})
+    made.do({"do": "undo"})
+    made.propose(here=True)
+    assert not made.state.done
+    made.do({"do": "redo"})
+    assert made.state.checked == {1}
+    _, track = click(made)
+    made.do({"do": "undo"})
+    assert track.id not in made.state.tracks and made.state.checked == {1}
+
+
 def test_the_survey_is_kept_over_a_restart_and_made_again_where_it_is_damaged(drive, tmp_path):
     with session(drive, tmp_path, weights="") as made:
         made.propose(here=True)
@@ -274,9 +316,9 @@ def test_proposals_that_are_cancelled_write_nothing(made):
     assert made.state == State() and made.proposer.looks is None
 
 
-def straight(x, y, frames, **more):
+def straight(x, y, frames, kind=PROPOSED, **more):
     """A track that stands."""
-    boxes = {f: Box((x, y, -1.0, 0.8, 0.6, 1.7, 0.0), PROPOSED) for f in frames}
+    boxes = {f: Box((x, y, -1.0, 0.8, 0.6, 1.7, 0.0), kind) for f in frames}
     return Track(0, "Pedestrian", boxes=boxes, **{"source": "fused", **more})
 
 
@@ -289,7 +331,7 @@ def test_proposals_keep_ids_and_take_nothing_from_a_person():
     old = {1: with_id(straight(5, 0, range(8)), 1),
            2: with_id(straight(9, 0, range(8)), 2, state="rejected"),
            3: with_id(straight(20, 0, range(8)), 3),
-           4: with_id(straight(30, 0, [2]), 4, state="accepted", source="click"),
+           4: with_id(straight(30, 0, [2], kind=KEY), 4, state="accepted", source="click"),
            5: with_id(straight(40, 0, range(8)), 5, source="imported")}
     state = State(old, next_id=6)
     new = [straight(5.1, 0, range(8)), straight(9.1, 0, range(8)), straight(30.1, 0, range(6)),
@@ -301,6 +343,28 @@ def test_proposals_keep_ids_and_take_nothing_from_a_person():
     assert found[4].state == "accepted" and found[4].boxes.keys() == set(range(6))
     again = State({**{n: t for n, t in old.items() if n != 3}, **found}, next_id=7)
     assert merged(again, new, MOTION) == ([], [])
+
+
+def test_an_imported_box_and_one_of_a_proposal_are_no_clicks():
+    """Labels without track ids are tracks of one box each: nobody asked to follow them."""
+    old = {n: with_id(straight(5, 0, [n], kind=KEY), n, state="accepted", source=source)
+           for n, source in enumerate(("imported", "fused", "person"), 1)}
+    assert merged(State(old, next_id=4), [straight(5, 0, range(8))], MOTION) == ([], [])
+
+
+@pytest.mark.parametrize("work", [{"do": "class", "track": 1, "class": "Cyclist"},
+                                  {"do": "split", "track": 1, "frame": 4}])
+def test_proposals_leave_what_a_person_named_or_cut(work):
+    state, _ = apply(State({1: with_id(straight(5, 0, range(8)), 1)}, next_id=2), work, MOTION)
+    assert merged(state, [straight(5, 0, range(8))], MOTION) == ([], [])
+
+
+def test_two_clicks_in_one_frame_are_both_there():
+    look = Look(Detections.none(), np.zeros((0, 7)), np.zeros((0, 80), np.uint32), {},
+                np.zeros((0, 7)))
+    both = [(np.array([x, 0.0, -1, 0.8, 0.6, 1.7, 0]), "Pedestrian") for x in (5.0, 9.0)]
+    found, _ = found_in(look, Wanted(), both)
+    assert found.boxes[:, 0].tolist() == [5.0, 9.0]
 
 
 def test_clouds_keep_to_their_bound_and_are_made_once():
