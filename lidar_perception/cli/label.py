@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -63,7 +64,8 @@ def label(data: Path, sequence: str | None, out: Path | None, weights: Path | No
     """
     from lidar_perception.detectors.contract import FUSED
     from lidar_perception.labeling.drive import one_drive
-    from lidar_perception.labeling.session import session
+    from lidar_perception.labeling.journal import NAME as JOURNAL
+    from lidar_perception.labeling.session import ImportedAlready, session
 
     if (exports is None) != (to is None):
         raise click.UsageError("--export and --to go together")
@@ -72,16 +74,24 @@ def label(data: Path, sequence: str | None, out: Path | None, weights: Path | No
         write_json(json_file, _simulated(recording, sequence, detector))
         return
     drive = one_drive(recording, sequence)
-    with session(drive, out or Path("out/label") / drive.name, detector) as made:
+    folder = out or Path("out/label") / drive.name
+    if exports is not None and not imports and not (folder / JOURNAL).is_file():
+        raise InputError(f"there is no journal in {folder}; give its folder with --out")
+    with session(drive, folder, detector) as made:
         if made.journal.message:
             errors.print(made.journal.message, style="yellow", soft_wrap=True, markup=False)
         for each in imports:
             named, _, path = each.partition(":")
-            made.do({"do": "import", "format": named, "path": path})
+            try:
+                made.do({"do": "import", "format": named, "path": path})
+            except ImportedAlready as error:  # the same command, another day
+                errors.print(str(error), style="yellow", soft_wrap=True, markup=False)
         if exports is not None:
-            written = made.export(exports, str(Path(str(to)).absolute()), force)
+            written = made.export(exports, os.path.abspath(str(to)), force)
             console.print(f"{written['path']}: {written['boxes']} boxes in {written['frames']} "
                           "frames", soft_wrap=True, markup=False)
+            for each in written["left_out"]:
+                errors.print(f"left out: {each}", style="yellow", soft_wrap=True, markup=False)
         else:
             _serve(drive, made, **page)
 

@@ -22,6 +22,7 @@ from lidar_perception.labeling.state import (
     Box,
     Change,
     Seeds,
+    Stack,
     State,
     Track,
     track_from_json,
@@ -53,7 +54,8 @@ def apply(state: State, action: Action, motion: Motion) -> tuple[State, Change]:
                     (state.seeds, seeds), (state.checked, checked),
                     (state.kept, action.get("kept", state.kept) if name == "import"
                      else state.kept))
-    done, undone = (change, state.done), None
+    done: Stack = (change, state.done)
+    undone: Stack = None
     if action.get("joins") and state.done is not None:  # the rest of what the last action began
         done = state.done[0].then(change), state.done[1]
     elif action.get("beside"):  # nobody did it: what people did stays what can be undone

@@ -6,6 +6,7 @@ appended and brought to the disk one by one.
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
@@ -20,12 +21,14 @@ from lidar_perception.types import InputError
 NAME, VERSION = "journal.jsonl", 1
 
 
-def header(drive: str, names: Sequence[str], stamps_ns: Sequence[int]) -> dict[str, Any]:
-    """What a journal says of its drive: one of other frames is another."""
+def header(drive: str, names: Sequence[str], stamps_ns: Sequence[int],
+           clouds: str = "") -> dict[str, Any]:
+    """What a journal says of its drive: one of other frames is another. clouds: a digest of some;
+    where it is the same, the folder of the drive may have any name."""
     stamps = hashlib.sha256(" ".join(map(str, stamps_ns)).encode()).hexdigest()[:16]
     return {"journal": VERSION, "drive": drive, "frames": len(names),
             "first": names[0] if names else "", "last": names[-1] if names else "",
-            "stamps_sha": stamps}
+            "stamps_sha": stamps, "clouds": clouds}
 
 
 def _encoded(line: Mapping[str, Any]) -> bytes:
@@ -46,6 +49,7 @@ class Journal:
         except OSError as error:
             raise InputError(f"cannot open {self.path}: {error.strerror}") from None
         try:
+            self._lock()
             self._size = self._read()
             if self._size == 0:
                 self.append(self._head)
@@ -57,6 +61,9 @@ class Journal:
     def append(self, line: Mapping[str, Any]) -> None:
         """Write a line, to the disk. InputError where that cannot be; the file is as it was."""
         content = _encoded(line)
+        if os.fstat(self._file).st_size != self._size:  # on a file system without locks
+            raise InputError(f"another process has written {self.path}; nothing was done: end one "
+                             "of them, and start again")
         try:
             view = memoryview(content)
             while view:
@@ -69,6 +76,17 @@ class Journal:
             raise InputError(f"cannot write {self.path}: {error.strerror}; nothing was done, make "
                              "room and do it again") from None
         self._size += len(content)
+
+    def _lock(self) -> None:
+        """The file too: on NFS the lock of a folder is none."""
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise InputError(f"another process is writing {self.path}; end it, or give another "
+                             "--out") from None
+        except OSError as error:
+            self.message = (f"{self.path} cannot be locked ({error.strerror}): let no second "
+                            "process label this drive")
 
     def close(self) -> None:
         """No more lines."""
@@ -110,7 +128,12 @@ class Journal:
                              "file or move it away") from None
 
     def _check(self, found: Mapping[str, Any]) -> None:
-        if different := differences({k: found.get(k) for k in self._head}, self._head):
+        asked = dict(self._head)
+        if not found.get("clouds") or not asked["clouds"]:  # a journal of before, or broken clouds
+            asked.pop("clouds")
+        elif found["clouds"] == asked["clouds"]:
+            asked.pop("drive")
+        if different := differences({k: found.get(k) for k in asked}, asked):
             raise InputError(f"{self.path} is the journal of another drive: "
                              f"{'; '.join(different)}; give another --out")
 

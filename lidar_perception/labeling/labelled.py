@@ -6,13 +6,15 @@ of frames and of the drive in State.kept.
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Sequence
 from typing import Any
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.labeling.labels import NO_TRACK, DriveLabels, FrameLabels
-from lidar_perception.labeling.state import ACCEPTED, KEY, Box, State, Track
+from lidar_perception.labeling.state import ACCEPTED, KEY, Box, Kept, State, Track, track_to_json
 
 IMPORTED = "imported"  # source of a track
 ID, SCORE, REST = "track_id", "score", "rest"  # of Track.extra
@@ -37,6 +39,21 @@ def from_labels(labels: DriveLabels, first_id: int) -> tuple[list[Track], dict[s
     notes = {str(f): [list(note) for note in frame.notes]
              for f, frame in enumerate(labels.frames) if frame.notes}
     return tracks, {"notes": notes, "extra": labels.extra}
+
+
+def digest_of(tracks: Sequence[Track], kept: Kept) -> str:
+    """Of what from_labels gave, whatever the numbers of the tracks are."""
+    rows = [{**track_to_json(t), "id": 0} for t in tracks]
+    return hashlib.sha256(json.dumps([rows, kept], sort_keys=True).encode()).hexdigest()[:16]
+
+
+def joined(before: Kept, new: Kept) -> dict[str, Any]:
+    """State.kept after another import: nothing of the one before is lost."""
+    notes = {f: list(rows) for f, rows in before.get("notes", {}).items()}
+    for f, rows in new["notes"].items():
+        there = notes.setdefault(f, [])
+        there += [row for row in rows if row not in there]
+    return {"notes": notes, "extra": {**before.get("extra", {}), **new["extra"]}}
 
 
 def to_labels(state: State, frames: Sequence[Frame]) -> DriveLabels:
@@ -66,6 +83,8 @@ def _exported_ids(state: State) -> dict[int, int]:
     taken = set[int]()
     for t in chosen:
         said = {extra[ID] for extra in t.extra.values() if ID in extra}
+        if len(t.boxes) > 1:  # boxes without an id that a person joined are a track
+            said.discard(NO_TRACK)
         if len(said) == 1 and (number := said.pop()) not in taken:
             found[t.id] = number
             taken |= {number} - {NO_TRACK}

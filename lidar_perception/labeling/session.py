@@ -30,7 +30,7 @@ from lidar_perception.labeling.drive import Drive
 from lidar_perception.labeling.exchange import export_labels, import_labels, recognised
 from lidar_perception.labeling.interpolation import Motion
 from lidar_perception.labeling.journal import Journal, header, opened
-from lidar_perception.labeling.labelled import from_labels, to_labels
+from lidar_perception.labeling.labelled import digest_of, from_labels, joined, to_labels
 from lidar_perception.labeling.proposing import Proposer, merged
 from lidar_perception.labeling.snap import around_click, to_cluster, to_ground, to_size
 from lidar_perception.labeling.state import (
@@ -51,6 +51,10 @@ Array = np.ndarray[Any, Any]
 
 NEARBY = 20  # frames before and after a click through which it is followed before it is answered
 Listener = Callable[[dict[str, Any]], None]
+
+
+class ImportedAlready(InputError):
+    """The same labels are among those of the journal."""
 
 
 class Session:
@@ -212,7 +216,12 @@ class Session:
             raise InputError("an import needs the path of labels, and may name their format")
         labels = import_labels(Path(path), named or recognised(Path(path)), self.drive.frames)
         tracks, kept = from_labels(labels, self.state.next_id)
-        return {**action, "tracks": [track_to_json(t) for t in tracks], "kept": kept}
+        before = self.state.kept
+        digest, done = digest_of(tracks, kept), before.get("imports", [])
+        if digest in done:
+            raise ImportedAlready(f"the labels of {path} were imported already; nothing was done")
+        return {**action, "tracks": [track_to_json(t) for t in tracks],
+                "kept": {**joined(before, kept), "imports": [*done, digest]}}
 
     def export(self, named: str, out: str, force: bool = False) -> dict[str, Any]:
         """Write the accepted tracks in a format of exchange.FORMATS, to a path or, by its name,
@@ -220,9 +229,13 @@ class Session:
         path = Path(out).expanduser()
         if not out or ".." in path.parts:
             raise InputError(f"{out!r} is no name for an export; give one without '..'")
-        written = export_labels(to_labels(self.state, self.drive.frames), named,
-                                self.journal.path.parent / path, self.drive.frames, force)
-        return {"path": str(written.path), "boxes": written.boxes, "frames": written.frames}
+        with self._exporting:  # a button may be pressed twice
+            written = export_labels(to_labels(self.state, self.drive.frames), named,
+                                    self.journal.path.parent / path, self.drive.frames, force)
+        nearby = [t.id for t in self.state.tracks.values() if t.nearby and t.placed]
+        return {"path": str(written.path), "boxes": written.boxes, "frames": written.frames,
+                "left_out": [*written.left_out, *(
+                    [f"the rest of tracks that are being followed: {nearby}"] if nearby else [])]}
 
     def _seeded(self, action: Action) -> Action:
         frame, named = frame_of(action, self.drive.motion), class_of(action)
@@ -318,7 +331,8 @@ def _asked(action: Mapping[str, Any]) -> Action:
 def session(drive: Drive, folder: Path, weights: str = FUSED) -> Iterator[Session]:
     """The labels of a drive in a folder, gone on with from where they were left. InputError for the
     journal of another drive, and while another process has it."""
-    head = header(drive.name, [f.name for f in drive.frames], [f.stamp_ns for f in drive.frames])
+    head = header(drive.name, [f.name for f in drive.frames], [f.stamp_ns for f in drive.frames],
+                  survey_cache.clouds_of(drive))
     with opened(folder, head) as journal:
         made = Session(drive, journal, weights)
         made.proposer.remember()

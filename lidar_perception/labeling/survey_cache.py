@@ -33,12 +33,21 @@ def key_of(drive: Drive, weights: str) -> str:
     """What a survey depends on: the drive, the weights, the version of the package. InputError
     where the first or the last cloud cannot be read."""
     frames, file = drive.frames, Path(weights)
-    head = header(drive.name, [f.name for f in frames], [f.stamp_ns for f in frames])
-    clouds = hashlib.sha256(b"".join(frames[i].load().xyz.tobytes() for i in (0, -1)))
+    head = header(drive.name, [f.name for f in frames], [f.stamp_ns for f in frames],
+                  clouds_of(drive))
     content = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
-    return json.dumps({**head, "clouds": clouds.hexdigest()[:16], "layout": LAYOUT,
+    return json.dumps({**head, "layout": LAYOUT,
                        "weights": weights, "content": content[:16], "version": __version__,
                        "posed": drive.motion.poses is not None})
+
+
+def clouds_of(drive: Drive) -> str:
+    """A digest of its first and its last cloud; "" where they cannot be read."""
+    try:
+        clouds = b"".join(drive.frames[i].load().xyz.tobytes() for i in (0, -1))
+    except InputError:
+        return ""
+    return hashlib.sha256(clouds).hexdigest()[:16]
 
 
 def clear(folder: Path) -> None:

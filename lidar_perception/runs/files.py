@@ -4,6 +4,7 @@ may have written."""
 from __future__ import annotations
 
 import errno
+import itertools
 import os
 import shutil
 from collections.abc import Iterator
@@ -11,6 +12,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from lidar_perception.types import InputError
+
+_calls = itertools.count()
 
 
 def regular(path: Path) -> Path:
@@ -54,7 +57,7 @@ def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
     """Write, fsync, rename: path holds the old content or the whole new one, never a part.
     InputError where it cannot be written."""
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    temporary = _beside(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with open(temporary, "wb") as stream:
@@ -66,6 +69,11 @@ def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
         with suppress(OSError):
             temporary.unlink()
         raise InputError(f"cannot write {path}: {error.strerror}") from None
+
+
+def _beside(path: Path) -> Path:
+    """A hidden name in the same folder that no other process and no other call takes."""
+    return path.with_name(f".{path.name}.{os.getpid()}-{next(_calls)}.tmp")
 
 
 def check_free(path: Path, force: bool) -> None:
@@ -81,7 +89,7 @@ def whole_folder(path: Path, force: bool = False) -> Iterator[Path]:
     force they replace files of the same names there, and InputError names a file that would be left
     among them."""
     check_free(path, force)
-    hidden = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    hidden = _beside(path)
     try:
         make_folder(hidden)
         yield hidden

@@ -1,6 +1,7 @@
 // Clouds: read, kept, fetched ahead.
 
 import { getBytes } from "./api.js";
+import { commit } from "./edits.js";
 import { sayError } from "./messages.js";
 import { resultsOf } from "./results.js";
 import { changed, store } from "./store.js";
@@ -62,6 +63,7 @@ export async function goTo(frame) {
   const last = store.drive.frames.length - 1;
   frame = Math.max(store.drive.first, Math.min(last, Math.round(frame)));
   if (frame === store.wanted && store.cloud) return;
+  commit(); // what a held key has moved is of the frame that is left
   store.wanted = frame;
   changed("wanted");
   await show(frame);

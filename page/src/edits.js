@@ -85,12 +85,14 @@ export async function next() {
 /** Of the selected track; while a seed or a place is looked for, or nothing is selected, of new
  * ones. */
 export function setClass(name) {
-  if (store.tool === "select" && selectedTrack()) return onTrack({ do: "class", class: name });
+  if (store.tool === "select" && selectedTrack()) return setTrackClass(name);
   store.newClass = name;
   if (store.tool === "select") say(`New boxes and seeds are now of class ${name}.`);
   changed("tool");
   return null;
 }
+
+export const setTrackClass = (name) => onTrack({ do: "class", class: name });
 
 /** All that is left in the list, of the class that it shows or of all: one action. */
 export async function rejectRest() {

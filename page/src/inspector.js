@@ -3,7 +3,7 @@
 import { getJson } from "./api.js";
 import { colourOfClass } from "./colours.js";
 import { element } from "./dom.js";
-import { copyOn, decide, interpolate, merge, removeBox, setClass, setNumbers, snap, split, trim }
+import { copyOn, decide, interpolate, merge, removeBox, setNumbers, setTrackClass, snap, split, trim }
   from "./edits.js";
 import { on, selectedBox, selectedTrack, store } from "./store.js";
 
@@ -34,6 +34,11 @@ export function openInspector() {
       step: unit === "m" ? 0.05 : 1, onchange: takeNumbers });
     fields.append(element("label", {}, element("span", {}, name), input, element("i", {}, unit)));
   }
+  // What was typed is of the track and the frame that are left by this click, so it is taken first.
+  addEventListener("pointerdown", ({ target }) => {
+    const typing = document.activeElement;
+    if (fields.contains(typing) && target !== typing) typing.blur();
+  }, { capture: true });
   const rows = document.getElementById("actions");
   for (const [title, buttons] of BUTTONS) {
     rows.append(element("div", { class: "buttons", role: "group", "aria-label": title },
@@ -42,7 +47,7 @@ export function openInspector() {
         onclick: run, "data-do": label }, label, element("kbd", {}, key)))));
   }
   const choice = document.getElementById("class");
-  choice.onchange = () => setClass(choice.value);
+  choice.onchange = () => setTrackClass(choice.value);
   document.getElementById("accept").onclick = () => decide(pressed("accepted", "accept"));
   document.getElementById("reject").onclick = () => decide(pressed("rejected", "reject"));
   on("drive", fillClasses);

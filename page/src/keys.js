@@ -128,6 +128,8 @@ export function openKeys() {
   addEventListener("keydown", press);
   addEventListener("keyup", (event) => { if (HELD.has(event.key)) commit(); });
   addEventListener("blur", () => commit());
+  // After a click by mouse the keys are the page's again: Space plays, and presses no button twice.
+  addEventListener("click", ({ detail, target }) => { if (detail) target.closest?.("button")?.blur(); });
 }
 
 /** Fill the help, for label or view mode. */

@@ -15,6 +15,7 @@ const FACES = [["+x", "front"], ["-x", "back"], ["+y", "left side"], ["-y", "rig
                ["+z", "top"], ["-z", "bottom"]];
 const AXES = { x: 0, y: 1, z: 2 };
 
+export const STILL = 4; // pixels; less is a click, more drags or turns the camera
 const SMALL = 34; // pixels: handles of a box that looks smaller would hide it
 const ring = svg("path", { class: "ring" });
 const grip = svg("path", { class: "ringgrip", "data-handle": "yaw" }, svg("title", {}, "Drag to turn"));
@@ -101,12 +102,21 @@ function apart(wanted) {
 }
 afterDrawing.push(placeHandles, placeNames);
 
-/** Follow the pointer from here on: move(event) for each step; commits at the end, Escape gives up. */
+/** Follow the pointer from here on: move(event) for each step; commits at the end. Escape gives up,
+ * as does another selection or frame. A hand that only clicked moves nothing. */
 export function follow(target, event, move) {
   target.setPointerCapture(event.pointerId);
   controls.enabled = false;
-  let given = false;
-  const step = (e) => { if (!given) move(e); };
+  const { selected, frame } = store, { clientX, clientY } = event;
+  let given = false, moved = false;
+  const step = (e) => {
+    moved ||= Math.hypot(e.clientX - clientX, e.clientY - clientY) > STILL;
+    if (!given && (store.selected !== selected || store.frame !== frame)) {
+      given = true;
+      dropDraft();
+    }
+    if (!given && moved) move(e);
+  };
   const stop = (e) => {
     target.removeEventListener("pointermove", step);
     target.removeEventListener("pointerup", stop);

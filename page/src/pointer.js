@@ -3,14 +3,12 @@
 import { rayBox } from "./boxmath.js";
 import { addAt, seedAt } from "./edits.js";
 import { say } from "./messages.js";
-import { dragBody } from "./overlay.js";
+import { dragBody, STILL } from "./overlay.js";
 import { hitAt, pointAt, rayAt } from "./picking.js";
 import { controls, mark, renderer } from "./scene.js";
 import { changed, on, select, selectFound, selectedBox, store } from "./store.js";
 
 const canvas = renderer.domElement;
-const STILL = 4; // pixels; less is a click, more turns the camera
-
 let down = null, hovering = 0;
 
 // Before the camera's own listeners, so that a box can be dragged instead.

@@ -129,15 +129,19 @@ function showTool() {
 
 async function sendExport(event) {
   event.preventDefault();
-  const line = by("export-error");
+  const line = by("export-error"), button = event.submitter;
   line.textContent = "";
+  if (button) button.disabled = true;
   try {
-    const { path, boxes, frames } = await exportLabels({ format: by("export-format").value,
+    const found = await exportLabels({ format: by("export-format").value,
       out: by("export-out").value, force: by("export-force").checked });
     by("export-dialog").close();
-    say(`Exported ${boxes} boxes of ${frames} frames to ${path}`);
+    const without = found.left_out.length ? `, without ${found.left_out.join(", ")}` : "";
+    say(`Exported ${found.boxes} boxes of ${found.frames} frames to ${found.path}${without}`);
   } catch (error) {
     line.textContent = error.message;
+  } finally {
+    if (button) button.disabled = false;
   }
 }
 

@@ -166,6 +166,38 @@ def test_arrow_keys_step_along_the_box_and_a_held_key_is_one_action(page, labels
     assert wrap_angle(labels.box(number)[6] - before[6]) == pytest.approx(math.radians(1))
 
 
+def test_what_is_typed_or_held_is_of_the_track_and_the_frame_where_that_began(page, labels, person):
+    other, number = labels.chosen(page, person), labels.chosen(page, person)
+    labels.wait(page, other, lambda t: t is not None)
+    page.click("[data-filter=all]")
+    before = labels.tracks()
+    page.fill("#field-y", "4.5")
+    page.click(f"[data-track='{other}']")
+    labels.wait(page, number, lambda t: boxes_of(t)[0][1] == 4.5)
+    assert labels.tracks()[other] == before[other]
+    page.keyboard.down("ArrowUp")
+    page.keyboard.press(".")
+    page.keyboard.up("ArrowUp")
+    labels.wait(page, other, lambda t: boxes_of(t)[0] != boxes_of(before[other])[0])
+    assert labels.lines()[-1]["frame"] == 0
+    page.keyboard.press(",")
+    page.wait_for_function("() => page.store.frame === 0")
+
+
+def test_a_hand_that_shakes_moves_no_box_and_space_presses_no_button(page, labels, person):
+    number = labels.chosen(page, person)
+    lines = len(labels.lines())
+    drag(page, middle(page, "[data-view=top] rect.body"), (2, 2))
+    page.click("[data-do=copy]")  # and on to frame 1
+    page.wait_for_function("() => page.store.frame === 1")
+    page.keyboard.press("Space")
+    page.wait_for_function("() => page.store.playing")
+    page.keyboard.press("Space")
+    page.wait_for_function("() => !page.store.playing")
+    assert [line["do"] for line in labels.lines()[lines:]] == ["copy"]
+    assert labels.tracks()[number]["boxes"]
+
+
 def test_undo_and_redo_go_back_and_forth_over_every_step(page, labels, person):
     number = labels.chosen(page, person)
     states = [labels.tracks()]
@@ -273,7 +305,7 @@ def test_help_lists_the_keys_and_needs_no_mouse(page):
         name = page.evaluate("""() => { const e = document.activeElement;
             return e === document.body ? "-" : e.ariaLabel || e.title || e.textContent.trim()
                 || e.labels?.[0]?.textContent; }""")
-        assert name
+        assert name, page.evaluate("document.activeElement.outerHTML.slice(0, 200)")
 
 
 def test_a_killed_server_loses_nothing(page, browser, labels, person):

@@ -22,6 +22,7 @@ from lidar_perception.labeling.alike import alike
 from lidar_perception.labeling.annotator import Annotator, Truth, is_right
 from lidar_perception.labeling.drive import Clouds, Drive, Scan, one_drive
 from lidar_perception.labeling.interpolation import Motion
+from lidar_perception.labeling.journal import NAME
 from lidar_perception.labeling.proposals import Wanted, found_in
 from lidar_perception.labeling.proposing import merged
 from lidar_perception.labeling.session import session
@@ -178,9 +179,11 @@ def test_a_survey_of_something_else_is_begun_anew_and_that_is_said(drive, tmp_pa
     other = Drive("simulated", Recording(Path("simulated"), "simulated", [
         replace(frame, load=drive.frames[0].load) for frame in drive.frames]))  # other clouds only
     frames_looked_at(drive, tmp_path, until=5)
+    (tmp_path / NAME).unlink()  # the journal is of the clouds, too
     looked_at, said, _ = frames_looked_at(other, tmp_path, until=3)
     assert looked_at == [1, 2, 3] and "something else (clouds " in said
     assert kept_in(tmp_path).keys() == {"000000.npz"}
+    (tmp_path / NAME).unlink()
     looked_at, said, _ = frames_looked_at(drive, tmp_path)
     assert looked_at == [1, 2, 3, 4, 5, 6] and "looked at again" in said
     found, why = survey_cache.read(tmp_path / survey_cache.FOLDER,
