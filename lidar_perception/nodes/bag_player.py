@@ -21,6 +21,9 @@ from lidar_perception.types import InputError
 from msg_utils.messages import ros_message
 from msg_utils.stamps import SECOND, time_message
 
+SERVED = 0.05       # seconds between looks for services and parameters, while messages are late
+SHORTEST_LOOP = 0.1  # seconds
+
 
 class BagPlayer(LidarNode):
     """Ends with exit code 0 when the bag is played, unless it loops.
@@ -55,7 +58,7 @@ class BagPlayer(LidarNode):
         self.now_ns, self.anchor = self.start_ns, monotonic()
         self.pace = Pace(self, self.params.follow, self.params.ahead, self.params.follow_timeout)
         self.clock = self.params.clock_hz and self.create_publisher(Clock, "/clock", RELIABLE)
-        self.next_clock = 0.0
+        self.next_clock, self.served = 0.0, 0.0  # monotonic
         for name, action in (("pause", self._pause), ("resume", self._resume),
                              ("step", self._step)):
             self.create_service(Trigger, f"~/{name}", action)
@@ -120,9 +123,12 @@ class BagPlayer(LidarNode):
         self._wait_for_subscribers()
         self.report(OK, f"playing {self.params.bag}")
         while not self.stop.done():
+            begun = monotonic()
             self._play_once()
             if not self.params.loop:
                 break
+            while not self.stop.done() and (left := begun + SHORTEST_LOOP - monotonic()) > 0:
+                self.serve(timeout_sec=left)
         self._count_pace()
         self.report(OK, "stopped" if self.stop.done() else "the bag is played")
         self._wait_until_delivered()
@@ -139,6 +145,7 @@ class BagPlayer(LidarNode):
                             f"what is followed) after {self.params.wait_timeout:g} s; playing "
                             "anyway")
                 return
+            self._tell_time()  # who waits for the time may be who is waited for
             self.serve(timeout_sec=0.02)
 
     def _subscribers(self, topic: str) -> int:
@@ -202,7 +209,12 @@ class BagPlayer(LidarNode):
                 return True
             behind = (stamp - self.now_ns) / SECOND / self.params.rate
             if behind <= 0 and not self.paused:
-                return True
+                if monotonic() - self.served < SERVED:
+                    return True
+                self.served = monotonic()  # services are heard however far behind it is
+                self.serve(timeout_sec=0)
+                continue
+            self.served = monotonic()
             wait = 0.05 if self.paused else min(behind, 0.05)
             if self.clock:
                 wait = min(wait, max(self.next_clock - monotonic(), 0.0))
@@ -215,6 +227,10 @@ class BagPlayer(LidarNode):
         if not self.paused:
             self.now_ns += int((now - self.anchor) * self.params.rate * SECOND)
         self.anchor = now
+        self._tell_time()
+
+    def _tell_time(self) -> None:
+        now = monotonic()
         if self.clock and now >= self.next_clock:
             self.next_clock = max(self.next_clock + 1 / self.params.clock_hz, now)
             self.clock.publish(Clock(clock=time_message(self.now_ns, ros_message)))

@@ -6,6 +6,8 @@ import queue
 import threading
 from typing import Any
 
+from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile
 
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, BagWriter
@@ -15,7 +17,8 @@ from lidar_perception.types import InputError
 from lidar_perception.wire.codec import typestore
 from msg_utils.messages import message_class
 
-DEPTH = 100  # messages of a topic that may wait while the machine is busy, before any is lost
+DEPTH = 100  # messages of a topic that may wait at DDS while the machine is busy
+MAX_WAITING = 256 * 2**20  # bytes that wait for the file; what comes then is dropped, and counted
 DISCOVERY_PERIOD = 0.2  # seconds between looks for the type of a topic that is not there yet
 
 
@@ -31,10 +34,14 @@ class BagRecorder(LidarNode):
         self.writer.__enter__()
         self.waiting = list(self.params.topics)
         self.queue: queue.Queue = queue.Queue()
+        self.put, self.done = 0, 0  # bytes, each counted by one thread
+        self.counts.update(lost=0, dropped=0)
+        self.said = 0  # lost or dropped
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._write)
         self.thread.start()
-        self.create_timer(DISCOVERY_PERIOD, self._discover)
+        self.create_timer(DISCOVERY_PERIOD, self._discover, clock=Clock(
+            clock_type=ClockType.STEADY_TIME))  # also while the clock of a simulation stands
         self._discover()
 
     def _discover(self) -> None:
@@ -57,17 +64,31 @@ class BagRecorder(LidarNode):
             self._subscribe(topic, message_class(types[topic][0]),
                             LATCHED if latched else QoSProfile(depth=DEPTH, reliability=(
                                 RELIABLE if reliable else SENSOR_DATA).reliability))
-        if self.waiting:
+        gone = self.counts["lost"] + self.counts["dropped"]
+        if gone > self.said:
+            self.said = gone
+            self.report(WARN, f"{self.counts['lost']} messages were lost on the way and "
+                        f"{self.counts['dropped']} dropped, as the file could not be written fast "
+                        "enough: record fewer topics, or on a faster machine")
+        elif self.waiting:
             self.report(WARN, f"waiting for {', '.join(self.waiting)}", expected=True)
         else:
             self.report(OK, "recording")
 
     def _subscribe(self, topic: str, kind: type, qos: QoSProfile) -> None:
         def received(data: bytes) -> None:
+            if self.put - self.done + len(data) > MAX_WAITING:
+                self.counts["dropped"] += 1
+                return
             self.counts["frames"] += 1
+            self.put += len(data)
             self.queue.put(("message", topic, self.get_clock().now().nanoseconds, data))
 
-        self.create_subscription(kind, topic, received, qos, raw=True)
+        def lost(event: Any) -> None:
+            self.counts["lost"] += event.total_count_change
+
+        self.create_subscription(kind, topic, received, qos, raw=True,
+                                 event_callbacks=SubscriptionEventCallbacks(message_lost=lost))
 
     def _write(self) -> None:
         try:
@@ -77,6 +98,7 @@ class BagRecorder(LidarNode):
                     self.writer.add_topic(topic, *rest)
                 else:
                     self.writer.write(topic, *rest)
+                    self.done += len(rest[1])
         except Exception as error:  # a full disk; the timer ends the node
             self.failure = error
 

@@ -42,7 +42,9 @@ class EgoInput:
         self.source, self.carried = NO_SOURCE, True
         self.icp: Odometry | None = None
         self.scans = TransformTree()
-        self.scan_ns = 0  # of the last scan that KISS-ICP took
+        self.scan_ns, self.scan_frame = 0, ""  # of the last scan that KISS-ICP took
+        self.apart = False  # TF does not connect it with the frame of the detections
+        self.begun = 0  # how often KISS-ICP has begun, each time at an origin of its own
         self.icp_ms: deque[float] = deque(maxlen=TIMED)  # of CPU time, for the last ones
         self.without_ns: int | None = None  # since when frames have had no pose, with auto
         self.late_since: float | None = None  # monotonic: since then no pose has come in time
@@ -61,7 +63,7 @@ class EgoInput:
         where the node takes the clouds."""
         frame_id, stamp = header.frame_id, to_ns(header.stamp)
         if self.icp is not None and self.clouds and xyz is not None and self._by_scans():
-            self._register(stamp, xyz)
+            self._register(header, xyz)
         pose = None
         try:
             pose = self._of(self._source(frame_id, stamp), frame_id, stamp, self.params().max_gap)
@@ -112,9 +114,13 @@ class EgoInput:
             topic = "odometry" if wanted == "odometry" else "points"
             return (f"no pose has come on {self.node.resolve_topic_name(f'~/input/{topic}')} yet: "
                     "tracks are relative to the sensor")
-        if not self.carried and carrier and frame_id:
+        if not self.carried and frame_id:
             return (f"the odometry is of '{carrier}', the detections of '{frame_id}', and TF does "
-                    "not connect them: they are taken to be in one place")
+                    "not connect them: they are taken to be in one place"
+                    + ("; its child_frame_id is empty" if not carrier else ""))
+        if self.source == "kiss_icp" and self.apart:
+            return (f"KISS-ICP moves with '{self.scan_frame}', the detections are in '{frame_id}', "
+                    "and TF does not connect them: tracks are relative to the sensor")
         return None
 
     def _source(self, frame_id: str, stamp: int) -> str:
@@ -152,12 +158,24 @@ class EgoInput:
             max_gap: float | None) -> np.ndarray | None:
         at = np.array([stamp])
         if source == "kiss_icp":
-            return self.scans.lookup(START, SCAN, stamp, max_gap)
+            scan = self.scans.lookup(START, SCAN, stamp, max_gap)
+            return scan @ self._on_scan(frame_id.lstrip("/"), at, max_gap)
         if source == "odometry" and not self.carried:
             return self.transforms.odometry_poses(at, max_gap)[0]
         if source == NO_SOURCE:
             return None
         return self.transforms.sensor_poses(source, frame_id, at, max_gap)[0]
+
+    def _on_scan(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:
+        """(4, 4): where a frame is in that of the scans at times (1,) ns."""
+        if not frame_id or frame_id == self.scan_frame:
+            self.apart = False
+            return np.eye(4)
+        self.transforms.listen()
+        self.apart = True
+        pose: np.ndarray = self.transforms.tree.poses(self.scan_frame, frame_id, at, max_gap)[0]
+        self.apart = False
+        return pose
 
     def _look_further(self, stamp: int, known: bool) -> None:
         """With auto: TF where no odometry comes, and KISS-ICP where TF says nothing either."""
@@ -177,15 +195,16 @@ class EgoInput:
 
     def _on_cloud(self, msg: Any) -> None:
         if self._by_scans():
-            self._register(to_ns(msg.header.stamp), to_frame(msg)[0].xyz)
+            self._register(msg.header, to_frame(msg)[0].xyz)
 
-    def _register(self, stamp_ns: int, xyz: np.ndarray) -> None:
+    def _register(self, header: Any, xyz: np.ndarray) -> None:
+        stamp_ns = to_ns(header.stamp)
         if not len(xyz):
             raise InputError("the cloud has no usable point, so the sensor's motion is not known")
         gap = (stamp_ns - self.scan_ns) / SECOND
         if not 0 < gap <= 2 * self.params().max_gap:  # a map of another place, or of another time
-            self.icp, self.scans = Odometry(), TransformTree()
-        self.scan_ns = stamp_ns
+            self.icp, self.scans, self.begun = Odometry(), TransformTree(), self.begun + 1
+        self.scan_ns, self.scan_frame = stamp_ns, header.frame_id.lstrip("/")
         assert self.icp is not None  # made by the first scan
         begin = thread_time()
         pose = self.icp(xyz)

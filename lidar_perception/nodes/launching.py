@@ -104,6 +104,7 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
         raise InputError(f"config: there is no parameter file {value['config']}")
     detectors, single = _detectors(value), value["single"] == "true"
     prefix, tracking = value["name_prefix"], value["tracking"] == "true"
+    # Whether a node wants odometry, its parameter file may say; it changes nothing for the others.
     graph = prefixed(graph_of(detectors, single, tracking and not single), prefix)
     files = {node: value["config"] or _own_file(name, config_folder) for name in detectors
              for node in (ALONE if single else BEHIND)[name]}
@@ -111,14 +112,13 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     files |= dict.fromkeys(trackers_of(detectors), value["config"] or str(
         config_folder / f"{TRACKER}.param.yaml"))
     topics = {relative(POINTS): value["points"], relative(ODOMETRY): value["odometry"]}
-    inside = ODOMETRY_IN if (tracking and single) or value["deskew"] == "odometry" else {}
     viewer = [_viewer(value, config_folder)] if value["rviz"] == "true" else []
     return viewer + [Node(
         package="lidar_perception", executable=executable_of(node.removeprefix(prefix)), name=node,
         namespace=value["namespace"] or None, output="screen",
         parameters=[files[node.removeprefix(prefix)],
                     _given(value, node.removeprefix(prefix), detectors)],
-        remappings=[(a, topics.get(b, b)) for a, b in {**remap, **inside}.items()],
+        remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_IN}.items()],
         ros_arguments=["--log-level", value["log_level"]],
     ) for node, remap in graph.items()]
 

@@ -23,6 +23,9 @@ BEST_EFFORT, RELIABLE = ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABL
 DEPTH = 5
 SHARE_OF = 100        # clouds sent, of which the lost and the dropped are counted
 LEARNED_FROM = 20     # intervals between clouds; their median is what is expected
+HELD = 1.0            # seconds for which a newer cloud does not take the place of one that waits
+TRY_AGAIN = 5.0       # seconds between trials where waiting was in vain,
+TRIAL = 0.3           # and how long one takes
 RATE_OF = 10          # intervals, of which the present rate is the mean
 PROFILE = files("lidar_perception.nodes") / "fastdds.xml"
 
@@ -121,6 +124,7 @@ class Reception:
         self.last_time: float | None = None  # monotonic, of the last cloud
         self.needs: str | None = None  # by the cloud that waits, or the last one
         self.needed_since: float | None = None  # monotonic
+        self.begun: float | None = None  # monotonic: since when the first one waits
         self.subscription: Any = None
         self.arrivals = Arrivals()
 
@@ -134,7 +138,8 @@ class Reception:
         """End the subscription. What waits is dropped; what is sent meanwhile is not missed."""
         if self.subscription is not None:
             self.node.destroy_subscription(self.subscription)
-        self.subscription = self.last_time = self.needs = self.needed_since = None
+        self.subscription = self.last_time = None
+        self.needs = self.needed_since = self.begun = None
         self.arrivals.interrupted(len(self.waiting))
         self.waiting.clear()
 
@@ -182,9 +187,15 @@ class Reception:
             while taken := handle.take_message(self.kind, True):
                 self.waiting.append(taken[0])
                 infos.append(taken[1])
+        # One that has waited for its pose for a short while is not pushed out, or none would ever
+        # be answered where poses are later than the next cloud.
+        held = self.begun is not None and monotonic() - self.begun < HELD
+        first = [self.waiting.popleft()] if held else []
         dropped = max(0, len(self.waiting) - self.params().queue)
         for _ in range(dropped):
             self.waiting.popleft()
+            self.begun = self.begun if held else None
+        self.waiting.extendleft(first)
         self.arrivals.add(infos, dropped, one_publisher=len(self.publishers()) < 2)
         self._deliver_one()
 
@@ -192,17 +203,25 @@ class Reception:
         if not self.waiting:
             return
         since = self.needed_since
-        patient = since is None or monotonic() - since < self.params().max_wait
+        patient = since is None or self._patient(monotonic() - since)
         self.needs = self.deliver(self.waiting[0], patient)
         self.last_time = monotonic()  # the work on a cloud is no silence
         self.needed_since = None if self.needs is None else since or self.last_time
         if since and self.needs is None:
             self.arrivals.begin_anew()
         if self.needs is not None and patient:
+            self.begun = self.begun or self.last_time
             return
         self.waiting.popleft()
+        self.begun = None
         if self.waiting:
             self.go_on.trigger()
+
+    def _patient(self, waited: float) -> bool:
+        """Whether a cloud may wait, after so many seconds without one that got what it needs; after
+        max_wait only now and then, in case that comes again."""
+        beyond = waited - self.params().max_wait
+        return beyond < 0 or beyond % TRY_AGAIN > TRY_AGAIN - TRIAL
 
     def try_again(self) -> None:
         """What a cloud needs may have come, or it has waited for too long."""

@@ -39,7 +39,7 @@ class TrackOutputs:
         self.node, self.params = node, params
         self.tracker = Tracker(params().tracking)
         self.ego = EgoInput(node, lambda: params().ego, clouds)
-        self.poses_from = NO_SOURCE, True  # of the last frame
+        self.poses_from = NO_SOURCE, True, 0  # of the last frame
         self.trails = Trails()
         self.frame_id: str | None = None
         self.shown: Any = ()
@@ -58,7 +58,7 @@ class TrackOutputs:
         stamp, tracker = to_ns(header.stamp), self.tracker
         mixed, before = self._same_sensor(header.frame_id), self.poses_from
         pose = self.ego.pose(header, xyz)
-        self.poses_from = self.ego.source, self.ego.carried
+        self.poses_from = self.ego.source, self.ego.carried, self.ego.begun
         if before[0] != NO_SOURCE and before != self.poses_from:
             tracker.reset()  # another fixed frame
         problem = mixed or self.ego.problem(header.frame_id, stamp)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from lidar_perception.classes import DETECTED
 from lidar_perception.nodes.managed import ManagedNode
 from lidar_perception.nodes.runtime import MARKERS, OK, WARN
 from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, has_detections_3d
 from lidar_perception.params import TrackerNodeParams, TrackInputParams
 from lidar_perception.types import InputError
-from lidar_perception.wire.messages import to_detections
+from lidar_perception.wire.messages import to_detections, unknown_names
 from msg_utils.detections import from_detection_array
 from msg_utils.markers import MarkedObjects, array_header, from_marker_array
 from msg_utils.stamps import to_ns
@@ -43,7 +44,10 @@ class TrackerNode(ManagedNode):
         self.frame_id = header.frame_id
         with self.frame(to_ns(header.stamp)):
             problem = self.tracks.publish(header, to_detections(objects))
-        if problem:
+        if unknown := unknown_names(objects.labels):
+            self.report(WARN, f"detections of the classes {', '.join(unknown)[:80]} are tracked as "
+                        f"Misc: call them {', '.join(DETECTED)} in markers' ns or in class_id")
+        elif problem:
             self.report(WARN, problem)
         else:
             self.report(OK, "tracking")

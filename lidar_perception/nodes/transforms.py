@@ -255,6 +255,9 @@ class Transforms:
         """(M or 1, 4, 4): where on what the odometry is of a frame is at times (M,) ns."""
         if frame_id.lstrip("/") == self.carrier:
             return np.eye(4)[None]
+        if not self.carrier:
+            raise Missing(f"the odometry on {self.node.resolve_topic_name('~/input/odometry')} "
+                          "says in no child_frame_id what it is of; set it where it is made")
         try:
             return self.tree.poses(self.carrier, frame_id, at, max_gap)
         except Missing as error:

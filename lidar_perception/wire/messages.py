@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -193,6 +194,23 @@ def truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()
                            extras=truth.extras, notes=truth.notes, previous=previous)
 
 
+# What other stacks call them; as ours, without regard to case.
+NAMES = {name.casefold(): i for i, name in enumerate(CLASSES)} | {
+    other: CLASSES.index(name) for name, others in {
+        "Pedestrian": ("person", "people", "human"), "Car": ("vehicle", "automobile"),
+        "Cyclist": ("bicycle", "bicyclist", "rider")}.items() for other in others}
+
+
+def any_class_ids(names: Iterable[str]) -> list[int]:
+    """Into CLASSES, of what any stack calls them; an unknown name is Misc."""
+    return [NAMES.get(name.casefold(), CLASSES.index("Misc")) for name in names]
+
+
+def unknown_names(names: Iterable[str]) -> list[str]:
+    """Those that any_class_ids does not know, each once."""
+    return sorted({name for name in names if name.casefold() not in NAMES})
+
+
 def to_truth(objects: MarkedObjects) -> GroundTruth:
     """Labels from markers; objects of unknown class are Misc, with their own in extras'
     class_name."""
@@ -203,7 +221,7 @@ def to_truth(objects: MarkedObjects) -> GroundTruth:
 
 def to_detections(objects: MarkedObjects) -> Detections:
     """Detections from markers; objects of unknown class are Misc."""
-    return Detections.of(objects.boxes, np.array(class_ids(objects.labels), np.int32),
+    return Detections.of(objects.boxes, np.array(any_class_ids(objects.labels), np.int32),
                          objects.scores)
 
 

@@ -32,7 +32,8 @@ class PointTimes(NamedTuple):
 def point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     """Of the points (N,) of a PointCloud2 at indices (N,). Whether seconds, milli-, micro- or
     nanoseconds is told by the span of a turn; times that count from 1970 are taken from the stamp.
-    InputError where there is no such column, or its times do not fit the stamp."""
+    What the column says of other points, such as beams without a return, does not count. InputError
+    where there is no such column, none of the points has a time, or they do not fit the stamp."""
     try:
         points = to_array(msg)
     except CloudError as error:
@@ -45,7 +46,7 @@ def point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     if points.dtype[name].shape:
         raise InputError(f"field '{name}' has count > 1; a single number is needed")
     whole = points[name].dtype.kind in "iu"
-    values = points[name].astype(np.int64 if whole else np.float64)
+    values = points[name].take(indices).astype(np.int64 if whole else np.float64)
     known = values if whole else values[np.isfinite(values)]
     if not len(known):
         raise InputError(f"no time in the column '{name}' is a number")
@@ -54,9 +55,7 @@ def point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     stamp = to_ns(msg.header.stamp)
     since_stamp = abs(float(low)) * unit <= abs(float(low) * unit - stamp)
     at_stamp = 0 if since_stamp else stamp // unit if whole else stamp / unit
-    seconds = (values.take(indices) - at_stamp) * (unit * 1e-9)
-    if np.isnan(seconds).all():
-        return PointTimes(name, seconds, at_stamp)
+    seconds = (values - at_stamp) * (unit * 1e-9)
     off = max(float(np.nanmin(seconds)), float(np.nanmax(seconds)), key=abs)
     if abs(off) > MAX_OFFSET:
         raise InputError(f"the times in '{name}' are {off:.3f} s from header.stamp; do sensor and "

@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter
 from test_robot_frames import message, mounted, odometry, transforms, walker
 from tracking_samples import START, TENTH, crowd, pose
 
+from lidar_perception.classes import CAR, CYCLIST, PEDESTRIAN
 from lidar_perception.nodes import ego as ego_module
 from lidar_perception.nodes import transforms as transforms_module
 from lidar_perception.nodes.ego import ICP_MS
@@ -19,11 +20,12 @@ from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.runtime import MARKERS
 from lidar_perception.nodes.tracker import TrackerNode
 from lidar_perception.robot.poses import inverse, moved_boxes
+from lidar_perception.robot.tree import Missing
 from lidar_perception.tracking.ego import has_odometry
 from lidar_perception.tracking.tracker import Tracker
-from lidar_perception.types import Detections
+from lidar_perception.types import CLASSES, Detections
 from lidar_perception.wire.codec import bag_message, decode, encode
-from lidar_perception.wire.messages import detection_markers
+from lidar_perception.wire.messages import any_class_ids, detection_markers
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import header_message
 
@@ -205,3 +207,47 @@ def test_of_two_odometries_on_a_topic_the_first_counts_while_it_comes_and_it_is_
     now[0] += transforms_module.ALONE + 1
     node.transforms.on_odometry(odometry(base_at(0), START + 10 * TENTH, "lidar", "map"))
     assert node.transforms.odometry_frame == "map" and not node.transforms.problems()
+
+
+def test_odometry_that_does_not_say_what_it_is_of_is_named_and_turns_no_cloud(start):
+    node = start(TrackerNode)
+    drive(node, lambda i, stamp: node.transforms.on_odometry(odometry(base_at(i), stamp, "")),
+          [base_at(i) for i in range(10)])
+    assert "child_frame_id is empty" in node.state[1]
+    with pytest.raises(Missing, match="child_frame_id"):
+        node.transforms.sensor_poses("odometry", "lidar", np.array([START]))
+
+
+def test_poses_of_the_scans_are_carried_to_the_frame_of_the_detections(start):
+    """Who looks to the rear goes backwards; without a way between the frames nothing is claimed."""
+    if not has_odometry():
+        pytest.skip("needs kiss-icp, the extra [odometry]")
+    node = start(TrackerNode, **{"ego.source": "kiss_icp"})
+    ego, rear = node.tracks.ego, mounted(-1.0, 0.2, 1.8, np.pi, 0.0, 0.0)
+    xyz, _ = walker(SENSOR)
+    for i in range(3):
+        ego._on_cloud(message(xyz, START + i * TENTH))
+    assert ego.pose(header(START, "base")) is None
+    assert "TF does not connect them" in ego.problem("base", START)
+    node.transforms.on_tf(transforms(("base", "lidar", rear, 0)), static=True)
+    np.testing.assert_allclose(ego.pose(header(START, "base")),
+                               ego.pose(header(START)) @ inverse(rear), atol=1e-6)
+    assert ego.problem("base", START) is None
+    ego._on_cloud(message(xyz, START + 10**11))  # another map, with another origin
+    assert ego.begun == 2
+
+
+def test_classes_of_other_stacks_are_known_and_those_that_are_not_are_named(start):
+    found = next(crowd())
+    there = detection_markers(found, header(START), bag_message)
+    for marker in there.markers:
+        marker.ns = {"Pedestrian": "person", "Car": "car", "Cyclist": "BICYCLE"}.get(marker.ns,
+                                                                                     marker.ns)
+    node = start(TrackerNode)
+    node.on_markers(there)
+    assert node.state[1] == "tracking"
+    assert any_class_ids(["person", "CAR", "bicycle", "tree"]) == [
+        PEDESTRIAN, CAR, CYCLIST, CLASSES.index("Misc")]
+    there.markers[-1].ns = "sofa"
+    node.on_markers(there)
+    assert "sofa" in node.state[1] and "Pedestrian" in node.state[1]

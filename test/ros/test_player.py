@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import threading
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from rclpy.clock import ClockType
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
@@ -205,3 +207,59 @@ def test_the_recorder_writes_what_the_player_plays(processes, peer, text_bag, tm
         assert [m.data for _, _, m in bag.messages({"/text"})] == [str(i) for i in range(20)]
         assert [m.data for _, _, m in bag.messages({"/note"})] == ["latched"]
         assert bag.qos("/note")[0].durability.name == "TRANSIENT_LOCAL"
+
+
+def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tmp_path):
+    """What waits has a bound, whatever comes; the clock of a simulation may stand."""
+    from lidar_perception.nodes import bag_recorder
+    monkeypatch.setattr(bag_recorder, "MAX_WAITING", 100)
+    held = threading.Event()
+    monkeypatch.setattr(bag_recorder.BagWriter, "write", lambda *_: held.wait())
+    kept = []
+    monkeypatch.setattr(bag_recorder.BagRecorder, "create_subscription",
+                        lambda self, kind, topic, received, *_, **__: kept.append(received))
+    node = start(bag_recorder.BagRecorder, **{"bag": str(tmp_path / "bag"), "topics": ["/a"],
+                                              "use_sim_time": True})
+    node._subscribe("/a", None, None)
+    try:
+        for _ in range(10):
+            kept[-1](bytes(40))
+        assert node.counts["frames"] == 2 and node.counts["dropped"] == 8
+        node._discover()
+        assert "8 dropped" in node.state[1]
+    finally:
+        held.set()
+    assert all(timer.clock.clock_type == ClockType.STEADY_TIME for timer in node.timers)
+
+
+def test_a_bag_of_one_message_in_a_loop_floods_nobody_and_hears_its_services(
+        monkeypatch, tmp_path):
+    from lidar_perception.nodes import bag_player
+    from lidar_perception.params import PlayerParams
+    player, now, sent, served = bag_player.BagPlayer.__new__(bag_player.BagPlayer), [50.0], [], []
+    player.params, player.wanted, player.clock = PlayerParams(loop=True), {}, None
+    player.paused, player.steps, player.stop = False, 0, Future()
+    player.served, player.report, player._count_pace = 0.0, lambda *_: None, lambda: None
+    player._wait_until_delivered = lambda: None
+    monkeypatch.setattr(bag_player, "monotonic", lambda: now[0])
+
+    def play():
+        player.now_ns, player.anchor = START, now[0]
+        for late in range(200):  # as at a rate that nobody can keep
+            if not player._wait_until(START - late, "/text"):
+                return
+            sent.append(now[0])
+            now[0] += 0.001
+
+    def serve(timeout_sec):
+        served.append(now[0])
+        now[0] += timeout_sec + 1e-5
+        if now[0] > 60:
+            player.stop.set_result(None)
+    player._play_once = play
+    player.spin(SimpleNamespace(spin_once=serve))
+    assert np.diff(served).max() < 0.06
+    player._play_once, player.stop, sent = lambda: sent.append(now[0]), Future(), []
+    now[0] = 50.0
+    player.spin(SimpleNamespace(spin_once=serve))
+    assert 90 < len(sent) < 110  # ten a second

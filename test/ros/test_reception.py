@@ -9,6 +9,7 @@ import sys
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -17,10 +18,12 @@ pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from test_bad_input import CLOUD, MARKERS, cloud
 
+from lidar_perception.nodes import reception as reception_module
 from lidar_perception.nodes import shared_memory
 from lidar_perception.nodes.graph import STAGES
-from lidar_perception.nodes.reception import RATE_OF, SHARE_OF, Arrivals
+from lidar_perception.nodes.reception import RATE_OF, SHARE_OF, Arrivals, Reception
 from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES, SOCKET_BUFFER, socket_buffer
+from lidar_perception.params import ReceptionParams
 from lidar_perception.wire.codec import encode
 from msg_utils.stamps import to_ns
 
@@ -246,3 +249,56 @@ def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(peer,
     assert not any(segment.exists() or Path(f"{segment}_el").exists() for segment in theirs)
     assert living and all(segment.exists() for segment in living)
     assert "that killed processes left in /dev/shm" in capsys.readouterr().err
+
+
+class Late:
+    """A Reception of clouds at 10 Hz, each of whose poses comes lag(stamp) seconds after it; in a
+    time that is made up. answered: (stamp, whether it had its pose)."""
+
+    def __init__(self, monkeypatch, lag, **params):
+        self.now, self.lag, self.answered = 0.0, lag, []
+        monkeypatch.setattr(reception_module, "monotonic", lambda: self.now)
+        node = SimpleNamespace(
+            resolve_topic_name=lambda name: name, _parameter_overrides={},
+            create_guard_condition=lambda work: SimpleNamespace(trigger=lambda: self.todo.append(
+                work)))
+        self.todo, asked = [], ReceptionParams(**params)
+        self.reception = Reception(node, None, "points", self.deliver, lambda: asked)
+        handle = MagicMock()
+        handle.take_message.return_value = None
+        self.reception.subscription = SimpleNamespace(handle=handle)
+        self.reception.publishers = lambda: []
+
+    def deliver(self, stamp, patient):
+        known = self.now >= stamp + self.lag(stamp)
+        if known or not patient:
+            self.answered.append((stamp, known))
+        return None if known else "its pose"
+
+    def run(self, seconds):
+        for tick in range(1, round(seconds * 100)):
+            self.now = tick / 100
+            if tick % 10 == 0:
+                self.reception._received(self.now, {"publication_sequence_number": tick // 10,
+                                                    "source_timestamp": tick * 10**7})
+            self.reception.try_again()
+            while self.todo:
+                self.todo.pop(0)()
+
+
+@pytest.mark.parametrize("lag, rate", [(0.0, 10), (0.05, 10), (0.13, 10), (0.25, 4), (0.6, 1.6)])
+def test_however_late_poses_are_clouds_are_answered_with_theirs(monkeypatch, lag, rate):
+    late = Late(monkeypatch, lambda stamp: lag)
+    late.run(30.0)
+    assert all(known for _, known in late.answered)
+    stamps = [stamp for stamp, _ in late.answered]
+    assert stamps == sorted(stamps) and len(stamps) > 0.9 * 30 * rate
+
+
+def test_without_poses_clouds_are_used_as_they_are_and_with_them_again_when_they_come(monkeypatch):
+    late = Late(monkeypatch, lambda stamp: 100.0 if 5 < stamp < 40 else 0.15, max_wait=2.0)
+    late.run(60.0)
+    assert not [s for s, _ in late.answered if 5.2 < s < 6.0]  # it waits for max_wait
+    without = [s for s, known in late.answered if 8 < s < 39]
+    assert len(without) > 0.85 * 310 and not any(k for s, k in late.answered if 8 < s < 39)
+    assert all(known for s, known in late.answered if s > 46)

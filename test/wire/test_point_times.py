@@ -101,3 +101,14 @@ def test_times_that_cannot_be_used_are_named(name, values, words):
     msg = from_array(points, header(bag_message), bag_message)
     with pytest.raises(InputError, match=words):
         point_times(msg, every(msg))
+
+
+def test_what_the_column_says_of_beams_without_a_return_does_not_count():
+    """Drivers fill organised clouds with zeros where nothing came back."""
+    values = np.where(np.arange(1000) % 3, STAMP * 1e-9 + SECONDS, 0.0)
+    msg, there = cloud("timestamp", values), np.flatnonzero(np.arange(1000) % 3)
+    np.testing.assert_allclose(point_times(msg, there).seconds, SECONDS[there], atol=1e-6)
+    one = np.full(1000, np.nan)
+    one[0] = 0.05
+    with pytest.raises(InputError, match="is a number"):
+        point_times(cloud("time", one), np.arange(1, 1000))
