@@ -294,13 +294,16 @@ def _trim(state: State, action: Action, motion: Motion) -> Made:
     side = action.get("side")
     if side not in ("before", "after"):
         raise InputError("a track is trimmed before or after a frame")
-    cut = {f for f in track.boxes if (f < frame if side == "before" else f > frame)}
+    beyond = {f for f in range(len(motion.times))
+              if (f < frame if side == "before" else f > frame)}
+    cut = beyond & track.boxes.keys()
     kept = {f: b for f, b in track.boxes.items() if f not in cut}
     if not cut or not kept:
         raise InputError(f"track {track.id} has {'no' if kept else 'only'} boxes {side} frame "
                          f"{frame}")
     seeds = tuple(s for s in state.seeds if s[1] != track.id or s[0] not in cut)
-    return ({track.id: replace(track, boxes=kept, gone=track.gone | cut)}, seeds, state.checked)
+    gone = track.gone | (beyond if track.nearby else cut)  # it may be followed there yet
+    return ({track.id: replace(track, boxes=kept, gone=gone)}, seeds, state.checked)
 
 
 def _check(state: State, action: Action, motion: Motion) -> Made:

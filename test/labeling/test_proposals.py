@@ -362,6 +362,15 @@ def test_proposals_leave_what_a_person_named_or_cut(work):
     assert merged(state, [straight(5, 0, range(8))], MOTION) == ([], [])
 
 
+def test_a_click_that_ends_here_is_not_followed_beyond():
+    near = with_id(straight(5, 0, [2, 4], source="click"), 1, state="accepted", nearby=True)
+    near = replace(near, boxes=near.boxes | straight(5, 0, [3], kind=KEY).boxes)
+    state, _ = apply(State({1: near}, next_id=2), {"do": "trim", "track": 1, "frame": 3,
+                                                   "side": "after"}, MOTION)
+    (found,), _ = merged(state, [straight(5, 0, range(8))], MOTION)
+    assert sorted(found.boxes) == [0, 1, 2, 3] and not found.nearby
+
+
 def test_two_clicks_in_one_frame_are_both_there():
     look = Look(Detections.none(), np.zeros((0, 7)), np.zeros((0, 80), np.uint32), {},
                 np.zeros((0, 7)))
