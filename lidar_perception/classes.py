@@ -37,25 +37,28 @@ class Numbers:
 class ObjectClass:
     """looks_like: a class that it is taken for without harm, as KITTI's benchmark does; vehicle:
     whether people can be in it; moves_as: vehicle, pedestrian or cyclist, for
-    the tracker."""
+    the tracker; called: what detectors of other stacks call it."""
 
     name: str
     numbers: Numbers | None = None
     looks_like: str = ""
     vehicle: bool = False
     moves_as: str = "vehicle"
+    called: tuple[str, ...] = ()
 
 
 TABLE = (
     ObjectClass("Car", Numbers((3.9, 1.6, 1.56), 0.6, 0.45, (3.88, 1.63, 1.53), 3.00, 0.7, 0.5),
-                vehicle=True),
+                vehicle=True, called=("vehicle", "automobile")),
     ObjectClass("Van", looks_like="Car", vehicle=True),
     ObjectClass("Truck", vehicle=True),
     ObjectClass("Pedestrian", Numbers((0.8, 0.6, 1.73), 0.5, 0.35, (0.84, 0.66, 1.76), 0.40, 0.5,
-                                      0.25), moves_as="pedestrian"),
+                                      0.25), moves_as="pedestrian",
+                called=("person", "people", "human")),
     ObjectClass("Person_sitting", looks_like="Pedestrian", moves_as="pedestrian"),
     ObjectClass("Cyclist", Numbers((1.76, 0.6, 1.73), 0.5, 0.35, (1.76, 0.60, 1.74), 1.72, 0.5,
-                                   0.25), moves_as="cyclist"),
+                                   0.25), moves_as="cyclist",
+                called=("bicycle", "bicyclist", "rider")),
     ObjectClass("Tram", vehicle=True),
     ObjectClass("Misc"),
     ObjectClass("DontCare"),
@@ -63,6 +66,8 @@ TABLE = (
 MAX_DIAGONAL = 6.40  # metres, of the largest class: paper B, Table 2
 
 CLASSES = tuple(row.name for row in TABLE)
+# Into CLASSES, by all that a class is called, in lower case
+CALLED = {name.casefold(): i for i, row in enumerate(TABLE) for name in (row.name, *row.called)}
 DETECTED = {row.name: row.numbers for row in TABLE if row.numbers is not None}
 BY_SIZE = sorted(DETECTED, key=lambda name: -DETECTED[name].min_diagonal)  # the largest first
 CAR, PEDESTRIAN, CYCLIST, DONT_CARE = map(CLASSES.index, ("Car", "Pedestrian", "Cyclist",

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.camera import Calibration, Camera
+from lidar_perception.classes import CALLED
 from lidar_perception.groups import renumbered
 from lidar_perception.robot import poses
 from lidar_perception.types import (
@@ -194,21 +195,14 @@ def truth_markers(truth: GroundTruth, header: Any, make: Any, previous: Any = ()
                            extras=truth.extras, notes=truth.notes, previous=previous)
 
 
-# What other stacks call them; as ours, without regard to case.
-NAMES = {name.casefold(): i for i, name in enumerate(CLASSES)} | {
-    other: CLASSES.index(name) for name, others in {
-        "Pedestrian": ("person", "people", "human"), "Car": ("vehicle", "automobile"),
-        "Cyclist": ("bicycle", "bicyclist", "rider")}.items() for other in others}
-
-
 def any_class_ids(names: Iterable[str]) -> list[int]:
     """Into CLASSES, of what any stack calls them; an unknown name is Misc."""
-    return [NAMES.get(name.casefold(), CLASSES.index("Misc")) for name in names]
+    return [CALLED.get(name.casefold(), CLASSES.index("Misc")) for name in names]
 
 
 def unknown_names(names: Iterable[str]) -> list[str]:
     """Those that any_class_ids does not know, each once."""
-    return sorted({name for name in names if name.casefold() not in NAMES})
+    return sorted({name for name in names if name.casefold() not in CALLED})
 
 
 def to_truth(objects: MarkedObjects) -> GroundTruth:
