@@ -229,6 +229,7 @@ def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tm
         assert "8 dropped" in node.state[1]
     finally:
         held.set()
+        node.close()
     assert all(timer.clock.clock_type == ClockType.STEADY_TIME for timer in node.timers)
 
 
