@@ -77,7 +77,8 @@ class BagRecorder(LidarNode):
 
     def _subscribe(self, topic: str, kind: type, qos: QoSProfile) -> None:
         def received(data: bytes) -> None:
-            if self.put - self.done + len(data) > MAX_WAITING:
+            waiting = self.put - self.done
+            if waiting and waiting + len(data) > MAX_WAITING:
                 self.counts["dropped"] += 1
                 return
             self.counts["frames"] += 1

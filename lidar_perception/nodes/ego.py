@@ -172,10 +172,13 @@ class EgoInput:
             self.apart = False
             return np.eye(4)
         self.transforms.listen()
-        self.apart = True
-        pose: np.ndarray = self.transforms.tree.poses(self.scan_frame, frame_id, at, max_gap)[0]
+        try:
+            poses: np.ndarray = self.transforms.tree.poses(self.scan_frame, frame_id, at, max_gap)
+        except Missing as error:
+            self.apart = not error.late
+            raise
         self.apart = False
-        return pose
+        return poses[0]
 
     def _look_further(self, stamp: int, known: bool) -> None:
         """With auto: TF where no odometry comes, and KISS-ICP where TF says nothing either."""
