@@ -81,7 +81,9 @@ def by_bands(run: Callable, xyz: np.ndarray, params: DbscanParams = DbscanParams
 
 
 # RANSAC: points (N, 3), those among them to look in (N,) bool -> mask (N,), plane [a b c], trials.
+
 TRIALS = 2000  # at most, as paper A has it
+
 
 def ransac(xyz: np.ndarray, low: np.ndarray, **settings) -> tuple[np.ndarray, np.ndarray, int]:
     """The ground of scikit-learn's RANSACRegressor with paper A's numbers."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from lidar_perception.candidates.pipeline import segment
 from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.labeling.interpolation import Motion
+from lidar_perception.labeling.journal import header
 from lidar_perception.param_fields import with_values
 from lidar_perception.tracking.ego import usable
 from lidar_perception.types import InputError, LidarFrame
@@ -129,6 +131,19 @@ class Drive:
     def end(self) -> int:
         """One more than the number of the last frame."""
         return len(self.frames)
+
+    @cached_property
+    def known_by(self) -> dict[str, Any]:
+        """Its journal's header: names, stamps, and a digest of the first and the last cloud, ""
+        where they cannot be read."""
+        try:
+            clouds = b"".join(self.frames[i].load().xyz.tobytes() for i in (0, -1))
+        except InputError:
+            digest = ""
+        else:
+            digest = hashlib.sha256(clouds).hexdigest()[:16]
+        return header(self.name, [f.name for f in self.frames],
+                      [f.stamp_ns for f in self.frames], digest)
 
     @cached_property
     def motion(self) -> Motion:

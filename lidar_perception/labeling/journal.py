@@ -6,7 +6,6 @@ appended and brought to the disk one by one.
 
 from __future__ import annotations
 
-import fcntl
 import hashlib
 import json
 import os
@@ -15,7 +14,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from lidar_perception.runs.resuming import differences, locked
+from lidar_perception.runs.resuming import claim, differences, locked
 from lidar_perception.types import InputError
 
 NAME, VERSION = "journal.jsonl", 1
@@ -49,7 +48,9 @@ class Journal:
         except OSError as error:
             raise InputError(f"cannot open {self.path}: {error.strerror}") from None
         try:
-            self._lock()
+            if why := claim(self._file, self.path):  # on NFS the lock of its folder is none
+                self.message = (f"{self.path} cannot be locked ({why}): let no second process "
+                                "label this drive")
             self._size = self._read()
             if self._size == 0:
                 self.append(self._head)
@@ -76,17 +77,6 @@ class Journal:
             raise InputError(f"cannot write {self.path}: {error.strerror}; nothing was done, make "
                              "room and do it again") from None
         self._size += len(content)
-
-    def _lock(self) -> None:
-        """The file too: on NFS the lock of a folder is none."""
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise InputError(f"another process is writing {self.path}; end it, or give another "
-                             "--out") from None
-        except OSError as error:
-            self.message = (f"{self.path} cannot be locked ({error.strerror}): let no second "
-                            "process label this drive")
 
     def close(self) -> None:
         """No more lines."""

@@ -29,7 +29,7 @@ from lidar_perception.labeling.actions import (
 from lidar_perception.labeling.drive import Drive
 from lidar_perception.labeling.exchange import export_labels, import_labels, recognised
 from lidar_perception.labeling.interpolation import Motion
-from lidar_perception.labeling.journal import Journal, header, opened
+from lidar_perception.labeling.journal import Journal, opened
 from lidar_perception.labeling.labelled import digest_of, from_labels, joined, to_labels
 from lidar_perception.labeling.proposing import Proposer, merged
 from lidar_perception.labeling.snap import around_click, to_cluster, to_ground, to_size
@@ -331,9 +331,7 @@ def _asked(action: Mapping[str, Any]) -> Action:
 def session(drive: Drive, folder: Path, weights: str = FUSED) -> Iterator[Session]:
     """The labels of a drive in a folder, gone on with from where they were left. InputError for the
     journal of another drive, and while another process has it."""
-    head = header(drive.name, [f.name for f in drive.frames], [f.stamp_ns for f in drive.frames],
-                  survey_cache.clouds_of(drive))
-    with opened(folder, head) as journal:
+    with opened(folder, drive.known_by) as journal:
         made = Session(drive, journal, weights)
         made.proposer.remember()
         try:

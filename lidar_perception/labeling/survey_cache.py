@@ -16,7 +16,6 @@ import numpy as np
 
 from lidar_perception import __version__
 from lidar_perception.labeling.drive import Drive
-from lidar_perception.labeling.journal import header
 from lidar_perception.labeling.survey import Look
 from lidar_perception.runs.files import short, write_bytes
 from lidar_perception.runs.resuming import differences
@@ -30,24 +29,12 @@ PARTS = "detections", "classes", "scores", "boxes", "images", "features", "thing
 
 
 def key_of(drive: Drive, weights: str) -> str:
-    """What a survey depends on: the drive, the weights, the version of the package. InputError
-    where the first or the last cloud cannot be read."""
-    frames, file = drive.frames, Path(weights)
-    head = header(drive.name, [f.name for f in frames], [f.stamp_ns for f in frames],
-                  clouds_of(drive))
+    """What a survey depends on: the drive, the weights, the version of the package."""
+    file = Path(weights)
     content = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
-    return json.dumps({**head, "layout": LAYOUT,
+    return json.dumps({**drive.known_by, "layout": LAYOUT,
                        "weights": weights, "content": content[:16], "version": __version__,
                        "posed": drive.motion.poses is not None})
-
-
-def clouds_of(drive: Drive) -> str:
-    """A digest of its first and its last cloud; "" where they cannot be read."""
-    try:
-        clouds = b"".join(drive.frames[i].load().xyz.tobytes() for i in (0, -1))
-    except InputError:
-        return ""
-    return hashlib.sha256(clouds).hexdigest()[:16]
 
 
 def clear(folder: Path) -> None:

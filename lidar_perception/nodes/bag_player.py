@@ -208,16 +208,13 @@ class BagPlayer(LidarNode):
                 self.steps -= topic == self.step_topic
                 return True
             behind = (stamp - self.now_ns) / SECOND / self.params.rate
-            if behind <= 0 and not self.paused:
-                if monotonic() - self.served < SERVED:
-                    return True
-                self.served = monotonic()  # services are heard however far behind it is
-                self.serve(timeout_sec=0)
-                continue
-            self.served = monotonic()
-            wait = 0.05 if self.paused else min(behind, 0.05)
+            late = behind <= 0 and not self.paused
+            if late and monotonic() - self.served < SERVED:
+                return True  # else services are heard first, however far behind it is
+            wait = 0.05 if self.paused else min(max(behind, 0.0), 0.05)
             if self.clock:
                 wait = min(wait, max(self.next_clock - monotonic(), 0.0))
+            self.served = monotonic()
             self.serve(timeout_sec=wait)
         return False
 

@@ -6,7 +6,6 @@ import queue
 import threading
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSProfile
 
@@ -40,8 +39,7 @@ class BagRecorder(LidarNode):
         self.failure: Exception | None = None
         self.thread = threading.Thread(target=self._write)
         self.thread.start()
-        self.create_timer(DISCOVERY_PERIOD, self._discover, clock=Clock(
-            clock_type=ClockType.STEADY_TIME))  # also while the clock of a simulation stands
+        self.every(DISCOVERY_PERIOD, self._discover)
         self._discover()
 
     def _discover(self) -> None:
@@ -85,11 +83,9 @@ class BagRecorder(LidarNode):
             self.put += len(data)
             self.queue.put(("message", topic, self.get_clock().now().nanoseconds, data))
 
-        def lost(event: Any) -> None:
-            self.counts["lost"] += event.total_count_change
-
         self.create_subscription(kind, topic, received, qos, raw=True,
-                                 event_callbacks=SubscriptionEventCallbacks(message_lost=lost))
+                                 event_callbacks=SubscriptionEventCallbacks(
+                                     message_lost=self.count_lost))
 
     def _write(self) -> None:
         try:

@@ -8,7 +8,6 @@ from math import isfinite
 from pathlib import Path
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.qos import QoSProfile
 
 from lidar_perception.nodes.reception import Problem
@@ -49,8 +48,7 @@ class Evaluator(LidarNode):
             name = node if what == "processing_time_ms" else what.removesuffix("_ms")
             self.input(topic, "std_msgs/msg/Float64", lambda m, n=name: self._time(n, m.data),
                        ALL_THAT_COME, private=False)
-        self.create_timer(WRITE_PERIOD, self.write, clock=Clock(
-            clock_type=ClockType.STEADY_TIME))
+        self.every(WRITE_PERIOD, self.write)
 
     def _time(self, name: str, ms: float) -> None:
         if isfinite(ms):

@@ -73,8 +73,7 @@ class LidarNode(Node):
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", RELIABLE)
         self._processing_time = self.create_publisher(Float64, "~/debug/processing_time_ms",
                                                       RELIABLE)
-        self.create_timer(1.0, self._tick, clock=Clock(
-            clock_type=ClockType.STEADY_TIME))
+        self.every(1.0, self._tick)
 
     def forget(self) -> None:
         """What is known of the input and output so far."""
@@ -84,6 +83,14 @@ class LidarNode(Node):
         self.frame_id = ""  # of the last cloud
         self.inputs: list[Any] = []  # with open() and close()
         self._outputs: list[Any] = []
+
+    def every(self, seconds: float, work: Callable[[], None]) -> None:
+        """Do it again and again, also while the clock of a simulation stands."""
+        self.create_timer(seconds, work, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def count_lost(self, event: Any) -> None:
+        """Of a subscription: messages that were lost on the way."""
+        self.counts["lost"] += event.total_count_change
 
     def start(self) -> None:
         """Called once, when the node is made and before it spins."""
@@ -136,9 +143,6 @@ class LidarNode(Node):
                     reception.try_again()
             return missing
 
-        def lost(event: Any) -> None:
-            self.counts["lost"] += event.total_count_change
-
         received: Any = guarded  # rclpy's annotation has no result
         kind, what = message_class(type_name), "cloud" if type_name == CLOUD else "array"
 
@@ -149,7 +153,7 @@ class LidarNode(Node):
                             "not heard: let it publish reliable, or set "
                             f"qos_overrides.{topic}.subscription.reliability to best_effort")
 
-        events = SubscriptionEventCallbacks(message_lost=lost, incompatible_qos=refused)
+        events = SubscriptionEventCallbacks(message_lost=self.count_lost, incompatible_qos=refused)
 
         def subscribe(profile: QoSProfile) -> Any:
             return self.create_subscription(

@@ -44,10 +44,8 @@ class TrackerNode(ManagedNode):
         self.frame_id = header.frame_id
         with self.frame(to_ns(header.stamp)):
             problem = self.tracks.publish(header, to_detections(objects))
+        said = [problem] if problem else []
         if unknown := unknown_names(objects.labels):
-            self.report(WARN, f"detections of the classes {', '.join(unknown)[:80]} are tracked as "
-                        f"Misc: call them {', '.join(DETECTED)} in markers' ns or in class_id")
-        elif problem:
-            self.report(WARN, problem)
-        else:
-            self.report(OK, "tracking")
+            said.append(f"detections of the classes {', '.join(unknown)[:80]} are tracked as Misc: "
+                        f"call them {', '.join(DETECTED)} in markers' ns or in class_id")
+        self.report(WARN if said else OK, "; ".join(said) or "tracking")

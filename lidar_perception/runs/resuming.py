@@ -6,11 +6,23 @@ from __future__ import annotations
 import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from lidar_perception.types import InputError
+
+
+def claim(descriptor: int, path: Path) -> str:
+    """Lock what is open for this process; "", or why the file system has no locks. InputError while
+    another process has it."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise InputError(f"another process is writing {path}; wait for it or end it") from None
+    except OSError as error:
+        return error.strerror or str(error)
+    return ""
 
 
 @contextmanager
@@ -24,12 +36,7 @@ def locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise InputError(f"cannot make the folder {folder}: {error.strerror}") from None
     try:
-        with suppress(OSError):  # of a file system without locks
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise InputError(f"another process is writing {folder}; wait for it or end "
-                                 "it") from None
+        claim(descriptor, folder)
         yield
     finally:
         os.close(descriptor)

@@ -136,8 +136,8 @@ def test_a_second_sensor_has_names_of_its_own(launched):
         assert not any(topic.startswith("/") for _, topic in node.remappings)
     started = nodes(name_prefix="left_", detectors="pointnet")
     assert [n.name for n in started.values()] == ["left_" + n for n in started]
-    assert ("~/input/points", "left_ground_segmentation/output/points") in (
-        started["clustering"].remappings)
+    assert started["clustering"].remappings == [
+        ("~/input/points", "left_ground_segmentation/output/points"), ("~/input/odometry", "odom")]
     assert ("~/input/points", "points") in started["ground_segmentation"].remappings
 
 
