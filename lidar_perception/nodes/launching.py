@@ -75,7 +75,8 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
                  "same namespace."),
     "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: that of its "
                        "file, velodyne."),
-    "use_sim_time": dict(**SWITCHES, description="Take the time from /clock."),
+    "use_sim_time": dict(default_value="", choices=["", "true", "false"], description="Take the "
+                         "time from /clock; empty: that of the parameter file, else false."),
     "log_level": dict(default_value="info", description="debug, info, ..."),
 }
 
@@ -116,8 +117,8 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     return viewer + [Node(
         package="lidar_perception", executable=executable_of(node.removeprefix(prefix)), name=node,
         namespace=value["namespace"] or None, output="screen",
-        parameters=[files[node.removeprefix(prefix)],
-                    _given(value, node.removeprefix(prefix), detectors)],
+        parameters=list(filter(None, [files[node.removeprefix(prefix)],
+                                      _given(value, node.removeprefix(prefix), detectors)])),
         remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_IN}.items()],
         ros_arguments=["--log-level", value["log_level"]],
     ) for node, remap in graph.items()]
@@ -215,8 +216,10 @@ def _shown(topic: str, value: dict[str, str]) -> str:
 
 
 def _given(value: dict[str, str], node: str, detectors: list[str]) -> dict[str, Any]:
-    """Parameters that arguments set."""
-    given: dict[str, Any] = {"use_sim_time": value["use_sim_time"] == "true"}
+    """Parameters that arguments set, above those of the file."""
+    given: dict[str, Any] = {}
+    if value["use_sim_time"]:
+        given["use_sim_time"] = value["use_sim_time"] == "true"
     if value["tracking"] == value["single"] == "true":
         given["tracking.enabled"] = True
     if value["autostart"] == "false":

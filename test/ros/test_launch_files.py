@@ -87,7 +87,7 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
         if not node.name.endswith("_detector"):
             assert node.parameters[0] == config
     for node in nodes(autostart="false").values():
-        assert node.parameters[1] == {"use_sim_time": False, "autostart": False}
+        assert node.parameters[1] == {"autostart": False}  # what is not given, the file may say
     mine = str(ROOT / "config" / "best.param.yaml")
     assert nodes(config=mine)["clustering"].parameters[0] == mine
     frames = {"base_frame": "base", "target_frame": "odom"}
@@ -152,9 +152,8 @@ def test_tracking_puts_a_tracker_behind_each_detector(launched):
     assert dict(behind.remappings) == {"~/input/points": "/cloud", "~/input/odometry": "/odometry",
                                        "~/input/detections": found}
     assert behind.namespace == "left"
-    file, given = behind.parameters
+    [file] = behind.parameters
     assert Path(file).name == "tracker.param.yaml" and Path(file).is_file()
-    assert given == {"use_sim_time": False}
     alone = nodes(tracking="true", detectors="pointpillars")
     assert ("~/input/detections", "pointpillars_detector/output/detections") in (
         alone["tracker"].remappings)
@@ -191,8 +190,7 @@ def test_rviz_follows_the_names_of_the_graph(launched):
 
 @pytest.mark.parametrize("name", ["pointpillars", "pointnet", "fused"])
 def test_weights_device_and_range_of_a_detector_are_arguments(name, launched):
-    expected = {f"{name}.weights": "w.safetensors", f"{name}.device": "cpu",
-                "use_sim_time": False}
+    expected = {f"{name}.weights": "w.safetensors", f"{name}.device": "cpu"}
     if name != "pointnet":  # it always sees all around
         expected[f"{name}.range"] = "around"
     for file, weights in (name, "w.safetensors"), ("detectors", f"{name}=w.safetensors"):
