@@ -248,7 +248,8 @@ class Transforms:
         try:
             return self.odometry.poses(STILL, MOVING, at, max_gap)
         except Missing as error:
-            raise Missing(f"{self.node.resolve_topic_name('~/input/odometry')}: {error}",
+            said = str(error).replace(STILL, self.odometry_frame).replace(MOVING, self.carrier)
+            raise Missing(f"{self.node.resolve_topic_name('~/input/odometry')}: {said}",
                           error.late) from None
 
     def _on_carrier(self, frame_id: str, at: np.ndarray, max_gap: float | None) -> np.ndarray:

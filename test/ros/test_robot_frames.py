@@ -313,6 +313,7 @@ def test_the_first_cloud_waits_for_odometry_that_lags_behind_the_end_of_its_turn
         node.transforms.on_odometry(odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
     needed = deliver(encode(msg), True)
     assert "/ground_segmentation/input/odometry" in needed and "0.020 s older" in needed
+    assert "'lidar'" in needed and "child_frame_id" not in needed
     assert node.counts["frames"] == 0
     for i in (9, 10):
         node.transforms.on_odometry(odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
