@@ -10,7 +10,14 @@ import numpy as np
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import POINT_LABELS, POSES, Frame, PointTruth, Recording
 from lidar_perception.data.kitti.calibration import homogeneous, matrices, matrix
-from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS, load_velodyne, read_velodyne
+from lidar_perception.data.kitti.folder import (
+    GAP_NS,
+    PERIOD_NS,
+    START_NS,
+    load_velodyne,
+    number_of,
+    read_velodyne,
+)
 from lidar_perception.data.kitti.write import numbers, write_velodyne
 from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import regular, write_bytes
@@ -37,20 +44,24 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     """The labelled scans of PATH/sequences/NN or PATH/dataset/sequences/NN, in order; only the
     file lists are read. PATH may also be sequences/ or one sequence. Sequences without a labels
     folder, as the test ones, are left out. InputError says what is missing."""
-    found = [(sequence, i, scan) for sequence in _sequences(path.absolute())
-             for i, scan in enumerate(sorted(sequence.glob("velodyne/*.bin")))]
-    if not found:
+    sequences = [(s, files) for s in _sequences(path.absolute())
+                 if (files := sorted(s.glob("velodyne/*.bin")))]
+    if not sequences:
         raise InputError(f"{path} has no SemanticKITTI scans: expected "
                          "sequences/00/velodyne/*.bin beside sequences/00/labels/*.label")
-    frames = []
-    for number, (sequence, i, scan) in enumerate(found):
-        if (sequence / "labels").is_dir():
-            stamp = START_NS + number * PERIOD_NS
+    frames: list[Frame] = []
+    for sequence, files in sequences:
+        if not (sequence / "labels").is_dir():
+            continue
+        start = frames[-1].stamp_ns + GAP_NS if frames else START_NS
+        for scan in files:
+            number = number_of(scan)
+            stamp = start + (number - number_of(files[0])) * PERIOD_NS
             frames.append(Frame(
                 f"{sequence.name}/{scan.stem}", stamp, partial(load_velodyne, scan, stamp),
                 point_truth=partial(_point_truth, scan, sequence / f"labels/{scan.stem}.label"),
-                pose=partial(_pose, sequence, i), sequence=sequence.name, index=i, points=scan,
-                native=sequence / "poses.txt"))
+                pose=partial(_pose, sequence, number), sequence=sequence.name, index=number,
+                points=scan, native=sequence / "poses.txt"))
     if not frames:
         raise InputError(f"{path} has scans but no labels: expected "
                          "sequences/00/labels/*.label; download the labels of SemanticKITTI too")
@@ -78,7 +89,7 @@ def _point_truth(scan: Path, path: Path) -> PointTruth:
 
 
 def _pose(sequence: Path, i: int) -> np.ndarray | None:
-    """(4, 4) the LiDAR's frame of scan i in that of the first scan, as pose_line wrote it; None
+    """(4, 4) the LiDAR's frame of scan number i in that of scan 0, as pose_line wrote it; None
     without poses.txt. InputError for files that are not as they should be."""
     poses, calibration = sequence / "poses.txt", sequence / "calib.txt"
     if not poses.is_file():

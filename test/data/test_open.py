@@ -15,6 +15,7 @@ from samples import CALIBRATION, STAMP, object_folder, scene, write
 from lidar_perception.cli.data import opened
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES, Frame
+from lidar_perception.data.kitti.folder import GAP_NS, PERIOD_NS
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.raw_clouds import open_clouds
 from lidar_perception.data.semantickitti import calibration_text, pose_line, write_scan
@@ -380,9 +381,16 @@ def test_unusable_returns_go_from_all_columns_alike(tmp_path):
     assert np.array_equal(read.point_truth().instances, kept)
 
 
-def test_poses_of_semantickitti_invert_pose_line(tmp_path):
-    for frame in open_recording(semantic_folder(tmp_path)):
-        np.testing.assert_allclose(frame.pose(), drive(frame.index), atol=1e-9)
+def test_poses_of_semantickitti_invert_pose_line_also_of_some_of_the_scans(tmp_path):
+    frames = open_recording(semantic_folder(tmp_path)).frames
+    for frame in frames:
+        np.testing.assert_allclose(frame.pose(), drive(int(frame.points.stem)), atol=1e-9)
+    stamps = [frame.stamp_ns for frame in frames]
+    assert np.diff(stamps).tolist() == [PERIOD_NS, GAP_NS]  # drives of a bag are told by gaps
+    frames[0].points.unlink()
+    assert [f.index for f in open_recording(tmp_path)] == [1, 0]
+    np.testing.assert_allclose(open_recording(tmp_path).frames[0].pose(), drive(1), atol=1e-9)
+    frames[0].points.write_bytes(b"")
     (tmp_path / "sequences/00/poses.txt").write_text("1 0 0\n")
     with pytest.raises(InputError, match=r"cannot read pose 0 of .*poses.txt .*download it again"):
         open_recording(tmp_path).frames[0].pose()

@@ -113,8 +113,8 @@ def _tracking(folder: Path) -> list[Frame]:
         truth = _truth_by_number(folder / f"label_02/{name}.txt",
                                  partial(_tracking_truth, calibration))
         for points in scans:
-            number = _number(points)
-            stamp = start + (number - _number(scans[0])) * PERIOD_NS
+            number = number_of(points)
+            stamp = start + (number - number_of(scans[0])) * PERIOD_NS
             frames.append(Frame(f"{name}/{points.stem}", stamp,
                                 partial(load_velodyne, points, stamp), partial(truth, number),
                                 calibration=calibration, sequence=name, index=number,
@@ -138,7 +138,7 @@ def _raw(root: Path) -> list[Frame]:
         truth = _truth_by_number(drive / "tracklet_labels.xml", read_tracklets)
         stamps = _raw_stamps(drive / "velodyne_points" / "timestamps.txt")
         for points in sorted((drive / "velodyne_points/data").glob("*.bin")):
-            number = _number(points)
+            number = number_of(points)
             if number >= len(stamps):
                 raise InputError(f"{drive}/velodyne_points/timestamps.txt has {len(stamps)} lines "
                                  f"but there is a scan {points.name}; download the drive again")
@@ -161,7 +161,8 @@ def _truth_by_number(path: Path, read: Callable[[Path], dict[int, GroundTruth]]
     return truth
 
 
-def _number(scan: Path) -> int:
+def number_of(scan: Path) -> int:
+    """The number of a scan in its drive, which is its file's name. InputError where it is none."""
     try:
         return int(scan.stem)
     except ValueError:
