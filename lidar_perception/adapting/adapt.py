@@ -37,7 +37,16 @@ from lidar_perception.adapting.learning import (
     training_params,
 )
 from lidar_perception.adapting.looking import FrameLook, Looker
-from lidar_perception.adapting.params import RECORD, AdaptParams
+from lidar_perception.adapting.params import (
+    BEST,
+    HEARD,
+    JUDGED,
+    POSES,
+    RECORD,
+    ROUND,
+    SCANS,
+    AdaptParams,
+)
 from lidar_perception.adapting.scenes import AdaptedScenes, save_labels
 from lidar_perception.adapting.tracks import Followed, tracks_of
 from lidar_perception.adapting.watch import Watched, agreement_of, confirmed_share, worse
@@ -59,8 +68,7 @@ from lidar_perception.training.sources import SIM
 from lidar_perception.training.start import start
 from lidar_perception.types import InputError
 
-BEST, LAST, JUDGED = "best.safetensors", "last.safetensors", "judged.json"
-HEARD, POSES, SCANS, ROUND = "heard.json", "poses", "scans", "round{}"
+LAST = "last.safetensors"
 LOOKING = 0.3     # of the budget, to look at frames
 LEARNING = 0.5    # of it, to learn; what is left is for the poses and to judge
 MEASURED = 3      # frames that are looked at to know how long one takes

@@ -8,6 +8,9 @@ from lidar_perception.param_fields import Params, param
 
 # In the folder of a run: what was asked for, and how it went; and for people, under this title.
 RECORD, REPORT, TITLE = "adapt.json", "report.html", "A detector, adapted"
+BEST, HEARD, JUDGED = "best.safetensors", "heard.json", "judged.json"
+POSES, SCANS, ROUND, LABELS = "poses", "scans", "round{}", "labels"
+MADE = (RECORD, REPORT, BEST, HEARD, JUDGED, POSES, SCANS, ROUND.format("*"), LABELS)
 
 
 @dataclass(frozen=True)

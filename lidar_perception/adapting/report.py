@@ -10,7 +10,7 @@ import numpy as np
 from lidar_perception.adapting.adapt import Adapting, Seen
 from lidar_perception.adapting.figures import COLORS, drawn
 from lidar_perception.adapting.judging import KEPT, STATES
-from lidar_perception.adapting.params import REPORT, TITLE
+from lidar_perception.adapting.params import LABELS, REPORT, TITLE
 from lidar_perception.data.frame import Frame
 from lidar_perception.labeling.exchange import export_labels
 from lidar_perception.labeling.labels import DriveLabels, FrameLabels, Row, of_rows
@@ -18,7 +18,6 @@ from lidar_perception.runs.files import write_text
 from lidar_perception.runs.page import data_url, render
 from lidar_perception.types import CLASSES
 
-LABELS = "labels"
 FORMAT = "openlabel"
 PICTURES = 6   # of all pieces
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import click
 
-from lidar_perception.adapting.params import RECORD, REPORT, TITLE, AdaptParams
+from lidar_perception.adapting.params import MADE, RECORD, REPORT, TITLE, AdaptParams
 from lidar_perception.cli.data import WHAT, a_path, device_option
 from lidar_perception.cli.options import parameter_options
-from lidar_perception.runs.files import read_text
+from lidar_perception.runs.files import read_text, refuse_others
 from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console, errors
 from lidar_perception.types import InputError
@@ -89,8 +89,10 @@ def begin(out: Path, weights: Path, resume: bool, force: bool) -> None:
         raise InputError(f"{out} exists and is no run of adapt; give another name")
     if not (resume or force):
         raise InputError(f"{out} exists already; give another name, --resume or --force")
-    if force and weights.resolve().is_relative_to(out.resolve()):
-        raise InputError(f"{weights} would be replaced with {out}; give another --out")
+    if force:
+        refuse_others(out, MADE)
+        if weights.resolve().is_relative_to(out.resolve()):
+            raise InputError(f"{weights} would be replaced with {out}; give another --out")
 
 
 def package_weights(weights: Path) -> Path:

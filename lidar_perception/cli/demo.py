@@ -32,13 +32,15 @@ from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.scoring.recorded import Answered, answered
 from lidar_perception.tracking.ego import NO_SOURCE
-from lidar_perception.types import CLASSES, PEDESTRIAN
+from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 from lidar_perception.wire.messages import column, to_detections, to_frame, to_truth
 from lidar_perception.wire.topics import POINTS
 from lidar_perception.wire.track_markers import drawn_trails
 from msg_utils.stamps import to_ns
 
 CANDIDATES = "candidates"
+RECORD = "demo.json"                      # in a folder that demo has made, what it replayed
+REPLACED = ("drive", "result", "logs")    # by the next demo
 
 
 @click.command()
@@ -80,11 +82,11 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
         raise click.UsageError(f"--config and the parameters are those of --detector {CANDIDATES}")
     require_rclpy()  # before the drive is made
     recording = None if data is None else opened(data)
-    for old in ("drive", "result", "logs"):
-        shutil.rmtree(out / old, ignore_errors=True)
+    if recording is not None:
+        recording.require(BOXES, "demo")
+    _make_room(out, data, detector)
     drive = _bag(out / "drive", recording, frames, drive_seed)
     played = open_recording(drive)
-    played.require(BOXES, "demo")
     clouds = len(played)
     from lidar_perception.nodes.replay import TRACKS, replay
     with errors.status("loading compiled code (the first time: compiling, about a minute)"):
@@ -110,6 +112,20 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
             "; without --real-time none is dropped" if real_time else f"; see {out}/logs"))
         if not real_time:
             raise SystemExit(1)
+
+
+def _make_room(out: Path, data: Path | None, detector: str) -> None:
+    """Remove what an earlier demo left in out. InputError where something else lies there."""
+    old = [out / name for name in REPLACED if (out / name).exists()]
+    if old and not (out / RECORD).is_file():
+        raise InputError(f"{old[0]} is there, and no {RECORD} beside it says that demo made it; "
+                         "remove it, or give another --out")
+    for folder in old:
+        if data is not None and data.resolve().is_relative_to(folder.resolve()):
+            raise InputError(f"{data} would be replaced; give another --out")
+    for folder in old:
+        shutil.rmtree(folder, ignore_errors=True)
+    write_text(out / RECORD, json.dumps({"data": data and str(data), "detector": detector}))
 
 
 def _params_of(detector: str, played: Recording, params: PipelineParams) -> Any:

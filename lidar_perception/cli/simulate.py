@@ -14,7 +14,7 @@ from lidar_perception.data.to_bag import write_bag
 from lidar_perception.runs.folder import is_finished, unfinished
 from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console, track
-from lidar_perception.simulation.dataset import LAYOUTS, Plan, write_frames
+from lidar_perception.simulation.dataset import FOLDERS, LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import longest_drive
 from lidar_perception.simulation.scene import SCENES, Scenes
 from lidar_perception.simulation.sensor import GENERIC, NAMES, sensor_named
@@ -117,7 +117,7 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
                         + (f" --street {scenes.kind}" if scenes.kind else ""))
     complete, begun = resume and is_finished(out), False
     try:
-        with unfinished(out, asked, resume=resume, force=force) as missing:
+        with unfinished(out, asked, FOLDERS, resume=resume, force=force) as missing:
             begun = True
             with closing(write_frames(out, plan, missing, jobs)) as written:
                 for _ in track(written, "simulating", len(missing)):

@@ -18,7 +18,7 @@ from rosbags.rosbag2 import Reader
 from lidar_perception.data.mcap_index import NO_INDEX, check_index, profile_of
 from lidar_perception.data.record_file import RecordFile
 from lidar_perception.data.ros1_bag import Ros1Reader, is_ros1
-from lidar_perception.runs.files import check_free, regular, short
+from lidar_perception.runs.files import check_free, refuse_others, regular, short
 from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode, encode, typestore
@@ -64,6 +64,8 @@ class BagWriter:
         check_free(self.path, self.force)
         if self.path.exists() and not (self.path / "metadata.yaml").is_file():
             raise InputError(f"{self.path} is no bag, so it is not replaced; give another name")
+        if self.path.exists():
+            refuse_others(self.path, ("metadata.yaml", "*.mcap*", "*.db3*"))
 
     def __enter__(self) -> BagWriter:
         with ExitStack() as stack, self._named():

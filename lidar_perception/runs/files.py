@@ -7,8 +7,9 @@ import errno
 import itertools
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from fnmatch import fnmatch
 from pathlib import Path
 
 from lidar_perception.types import InputError
@@ -80,6 +81,16 @@ def check_free(path: Path, force: bool) -> None:
     """InputError for what is there already, but with force."""
     if path.exists() and not force:
         raise InputError(f"{path} exists already; give another name or --force")
+
+
+def refuse_others(folder: Path, ours: Iterable[str]) -> None:
+    """InputError that names what is in a folder beside what fits the patterns of `ours`, and would
+    be removed with it."""
+    ours = [*ours, "*.tmp"]
+    if others := sorted(path.name for path in folder.iterdir()
+                        if not any(fnmatch(path.name, pattern) for pattern in ours)):
+        raise InputError(f"{folder} has other files too ({len(others)}, such as {others[0]}), "
+                         "which would be removed; move them away, or give another name")
 
 
 @contextmanager

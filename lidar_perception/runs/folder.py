@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lidar_perception.runs.files import remove_temporaries, write_bytes, write_text
+from lidar_perception.runs.files import refuse_others, remove_temporaries, write_bytes, write_text
 from lidar_perception.runs.resuming import differences, locked
 from lidar_perception.types import InputError
 
@@ -27,17 +27,17 @@ def is_finished(folder: Path) -> bool:
 
 
 @contextmanager
-def unfinished(folder: Path, asked: dict, *, resume: bool = False,
+def unfinished(folder: Path, asked: dict, made: Iterable[str], *, resume: bool = False,
                force: bool = False) -> Iterator[list[int]]:
     """The numbers of the frames 0 .. asked["frames"] - 1 that are to be made, each of which ends
     with finish_frame(). After the block the folder is whole; after an exception in it the folder
-    can be resumed.
+    can be resumed. made: the names that any such folder has in it, which force replaces.
 
     InputError if the folder is there already, without resume or force; to resume, if it was begun
-    with something else asked for; to force, if it is no data set of ours.
+    with something else asked for; to force, if it is no data set of ours, or has other files.
     """
     with locked(folder):
-        _begin(folder, asked, resume, force)
+        _begin(folder, asked, made, resume, force)
         if not is_finished(folder):
             remove_temporaries(folder)
             yield [i for i in range(asked["frames"]) if not _part(folder, i).exists()]
@@ -58,7 +58,7 @@ def _part(folder: Path, number: int) -> Path:
     return folder / PARTS / f"{number:06}.json"
 
 
-def _begin(folder: Path, asked: dict, resume: bool, force: bool) -> None:
+def _begin(folder: Path, asked: dict, made: Iterable[str], resume: bool, force: bool) -> None:
     """Look at what is there, and begin anew unless that is to be resumed."""
     there = any(folder.iterdir())
     ours = (folder / MARK).is_file() or (folder / RECORD).is_file()
@@ -71,6 +71,7 @@ def _begin(folder: Path, asked: dict, resume: bool, force: bool) -> None:
     if there and resume:
         _compare(folder, asked)
         return
+    refuse_others(folder, (*made, MARK, RECORD, PARTS))
     write_text(folder / MARK, json.dumps(asked, indent=1))  # first: a stop leaves it marked
     for old in folder.iterdir():
         if old.is_dir() and not old.is_symlink():

@@ -24,6 +24,7 @@ from lidar_perception.simulation.sensor import Sensor
 from lidar_perception.types import InputError
 
 LAYOUTS = ("kitti", "kitti-tracking", "semantickitti")
+FOLDERS = ("training", "sequences")  # that one of them has in it
 
 
 @dataclass(frozen=True)

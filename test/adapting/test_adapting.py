@@ -19,12 +19,12 @@ from detection_samples import BOXES, lively, tiny, two_objects
 from samples import write
 
 from lidar_perception.adapting import adapt as adapt_module
-from lidar_perception.adapting.adapt import BEST, HEARD, LAST, Adapting
+from lidar_perception.adapting.adapt import LAST, Adapting
 from lidar_perception.adapting.drives import FEWEST
 from lidar_perception.adapting.judging import IGNORED, KEPT, REJECTED, STATES
 from lidar_perception.adapting.labels import ConcludedLabels
 from lidar_perception.adapting.looking import SOURCES, FrameLook
-from lidar_perception.adapting.params import AdaptParams
+from lidar_perception.adapting.params import BEST, HEARD, LABELS, MADE, RECORD, REPORT, AdaptParams
 from lidar_perception.adapting.scenes import AdaptedScenes, save_labels
 from lidar_perception.classes import CAR, DONT_CARE
 from lidar_perception.cli.main import cli
@@ -41,6 +41,7 @@ from lidar_perception.detectors.pointpillars.losses import detection_loss
 from lidar_perception.detectors.pointpillars.network import Outputs
 from lidar_perception.detectors.pointpillars.targets import stacked
 from lidar_perception.labeling.exchange import import_labels
+from lidar_perception.runs.files import refuse_others
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cache import write_arrays
 from lidar_perception.training.params import AugmentParams
@@ -166,12 +167,13 @@ def test_the_cluster_network_is_adapted_in_the_same_way(bag, whole, tmp_path):
 
 
 def test_report_and_labels_say_what_was_kept(bag, weights, whole):
-    from lidar_perception.adapting.report import LABELS, REPORT, write_report
+    from lidar_perception.adapting.report import write_report
     run = adapted(bag, weights, whole)
     write_report(run)
     frames = list(open_recording(bag))
     labels = import_labels(whole / LABELS, "openlabel", frames)
     assert labels.boxes == sum(own.of(KEPT).sum() for own in run.seen[0].labels) > 0
+    refuse_others(whole, MADE)  # --force replaces all of it
     page = (whole / REPORT).read_text()
     assert page.count("<img") == 6 and all(v.reason in page.replace("&#39;", "'")
                                            for v in run.seen[0].verdicts)
@@ -267,7 +269,10 @@ def test_a_folder_of_somebody_else_stays_as_it_is(bag, weights, tmp_path):
     for more in ((), ("--force",), ("--resume",)):
         assert "no run of adapt" in refused(tmp_path / "out", "--data", bag, "--weights", weights,
                                             *more)
-    assert [p.name for p in file.parent.iterdir()] == ["thesis.txt"]
+    write(tmp_path / "out" / RECORD, "{}")
+    assert "such as thesis.txt" in refused(tmp_path / "out", "--data", bag, "--weights", weights,
+                                           "--force")
+    assert sorted(p.name for p in file.parent.iterdir()) == [RECORD, "thesis.txt"]
 
 
 def test_too_little_agreement_is_said_with_a_report(bag, weights, tmp_path):

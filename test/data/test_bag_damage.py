@@ -44,6 +44,11 @@ def test_force_replaces_nothing_but_bags(tmp_path, make):
     with pytest.raises(InputError, match="is no bag"):
         write_bag(tmp_path / "bag", scans(1), force=True)
     assert kept.read_bytes() == b"text"
+    write_bag(tmp_path / "other", scans(1))
+    notes = write(tmp_path / "other/notes.txt", b"text")
+    with pytest.raises(InputError, match=r"other files too \(1, such as notes.txt\)"):
+        write_bag(tmp_path / "other", scans(1), force=True)
+    assert notes.read_bytes() == b"text"
 
 
 @pytest.mark.parametrize("force", [False, True])

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 
 import pytest
 import torch
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from bag_samples import message_bytes
 from click.testing import CliRunner
 from detector_node import assert_equal
 
-from lidar_perception.cli.demo import demo
+from lidar_perception.cli.demo import RECORD, demo
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.nodes.graph import FINAL, result_topics
@@ -39,6 +41,18 @@ def test_the_demo_scores_what_fused_finds_offline(drive_bag, make_bag, tmp_path)
     assert people["hits"] > 0 and people["hits"] + people["missed"] == people["labels"]
     assert scores["tracks"]["scores"]["Pedestrian"]["hits"] > 0
     assert (tmp_path / "birdseye.png").stat().st_size > 10_000
+
+
+def test_what_demo_did_not_make_stays(drive_bag, make_bag, tmp_path):
+    out = tmp_path / "out"
+    bag = make_bag(open_recording(drive_bag).frames[:1])
+    mine = shutil.copytree(bag, out / "drive")
+    for record, said in (None, "remove it, or give another --out"), ("{}", "would be replaced"):
+        if record:
+            (out / RECORD).write_text(record)
+        outcome = CliRunner().invoke(demo, ["--data", str(mine), "--out", str(out)])
+        assert said in str(outcome.exception)
+    assert message_bytes(mine) == message_bytes(bag)
 
 
 def test_parameters_of_the_candidates_are_refused_for_another_detector(tmp_path):

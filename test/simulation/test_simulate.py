@@ -180,6 +180,12 @@ def test_what_is_there_is_not_touched_without_a_word(made, tmp_path):
     assert content(tmp_path / "mine") == {"letter.txt": b"dear"}
     with pytest.raises(InputError, match="is a file"):
         run(tmp_path / "mine/letter.txt", "kitti", 2, 1, "--force")
+    notes = out / "notes.txt"
+    notes.write_text("dear")
+    with pytest.raises(InputError, match=r"such as notes\.txt"):
+        run(out, "kitti", 2, 1, "--force")
+    assert content(out) == before | {"notes.txt": b"dear"}
+    notes.unlink()
     assert run(out, "semantickitti", 5, 1, "--streets-of", 2, "--force").exit_code == 0
     assert content(out) == content(made / "semantickitti")
 
