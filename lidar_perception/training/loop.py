@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from lidar_perception.runs.files import make_folder, remove_temporaries, write_bytes
@@ -169,7 +170,10 @@ def _validate(run: Run, log: Log | None) -> None:
         log.add("validation", progress.step, metrics)
         shown = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
         errors.print(f"step {progress.step}: {shown}", soft_wrap=True)
-        better = progress.best is None or metrics["score"] > progress.best
+        if np.isnan(metrics["score"]):
+            errors.print("no object in the frames that are validated on, so the latest weights "
+                         "count as the best")
+        better = progress.best is None or not metrics["score"] <= progress.best
         if better:
             progress.best, progress.best_step = metrics["score"], progress.step
         record = {**vars(progress), "metrics": metrics, "calibration": calibration}

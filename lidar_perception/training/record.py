@@ -66,8 +66,8 @@ def judged(report: DetectionReport, score: str, classes: Sequence[str]) -> Judge
 
 def metrics_of(content: dict[str, Any], score: str, classes: Sequence[str]) -> dict[str, float]:
     """score, the mean over the classes with objects, and each class's AP from above at the relaxed
-    overlaps and in space at the strict ones (moderate, R40); NaN without objects. content is that
-    of a DetectionReport."""
+    overlaps and in space at the strict ones (moderate, R40); each is NaN without objects. content
+    is that of a DetectionReport."""
     metrics: dict[str, float] = {}
     for name in classes:
         for row in "bev_relaxed", "3d":
@@ -75,4 +75,4 @@ def metrics_of(content: dict[str, Any], score: str, classes: Sequence[str]) -> d
             metrics[f"{name}_{row}"] = float("nan") if value is None else value["r40"]
     row = "bev_relaxed" if score == "bev" else "3d"
     known = [v for name in classes if not np.isnan(v := metrics[f"{name}_{row}"])]
-    return {"score": float(np.mean(known)) if known else 0.0, **metrics}
+    return {"score": float(np.mean(known)) if known else float("nan"), **metrics}

@@ -308,6 +308,7 @@ def test_a_perfect_detector_scores_and_a_blind_one_does_not(tmp_path):
         assert metrics["score"] == metrics["Pedestrian_3d"] == 100.0
         assert np.isnan(metrics["Car_bev_relaxed"])
         assert metrics_of(blind.compute(), score, names)["score"] == 0.0
+        assert np.isnan(metrics_of(right.compute(), score, ["Car"])["score"])  # no such object
 
 
 def test_samples_are_plain_arrays_that_other_processes_can_send():
