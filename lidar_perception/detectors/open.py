@@ -9,8 +9,10 @@ from typing import Any, Protocol, Self
 from lidar_perception.detectors.checkpoint import POINTNET, POINTPILLARS, network_of
 from lidar_perception.detectors.contract import FUSED, Detector
 from lidar_perception.detectors.fused.detector import load_fused_detector
+from lidar_perception.detectors.params import SEEN
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointpillars.detector import load_detector
+from lidar_perception.types import InputError
 
 
 class Configured(Detector, Protocol):
@@ -42,6 +44,8 @@ def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
     trained for (auto). InputError for a file that cannot be used or cannot see that, or a device
     that is not there.
     """
+    if where not in SEEN:
+        raise InputError(f"where = {where!r} must be one of {', '.join(SEEN)}")
     if str(weights) in LOAD:
         detector = LOAD[str(weights)]("", device)
     else:

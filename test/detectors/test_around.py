@@ -63,6 +63,8 @@ def test_cars_that_are_plain_to_see_are_found_behind_and_beside(street):
     cars = truth.boxes[(truth.class_ids == CAR) & plain & near & (np.abs(angle) > 60)]
     found = open_detector("fused", "cpu", where="around")(street.frame).detections
     mine = found.boxes[found.class_ids == CAR]
+    with pytest.raises(InputError, match="'Around' must be one of auto, ahead, around"):
+        open_detector("fused", "cpu", where="Around")
     assert len(cars) >= 4
     assert len(match_centres(mine[:, :3], cars[:, :3], 1.0)[0]) >= 0.8 * len(cars)
 
