@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 import tracking_reference as slow
 
+from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.results import read_tracking_results, write_tracking_results
 from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
 from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
 from lidar_perception.scoring.tracking.over_recall import over_recall
 from lidar_perception.scoring.tracking.pairs import Pairs, pairs_of, tracked_labels, without_ignored
-from lidar_perception.scoring.tracking.report import TrackingReport, observe
+from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, observe
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
 
@@ -149,6 +150,11 @@ def test_what_cannot_be_scored_says_why():
         observe("a", 0, truth, twice)
     with pytest.raises(InputError, match="no track id"):
         pairs_of(GroundTruth.of(truth.boxes, truth.class_ids), tracks, None)
+    frame = Frame("a/0", 0, lambda: 1 / 0, lambda: GroundTruth.of(
+        truth.boxes, truth.class_ids, [{"track_id": -1}] * len(truth)))  # as KITTI writes none
+    measure = by_tracker(lambda: None, ego="none")(Recording("a", "", [frame], frozenset()))
+    with pytest.raises(InputError, match="no track id"):  # before the scan is loaded
+        measure(frame)
     with pytest.raises(InputError, match="needs a calibration"):
         pairs_of(truth, tracks, None, "image")
 

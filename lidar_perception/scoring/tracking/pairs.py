@@ -66,7 +66,7 @@ def pairs_of(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration |
         raise InputError(f"similarity = {similarity!r} must be one of {', '.join(SIMILARITIES)}")
     if similarity == "image" and calibration is None:
         raise InputError("similarity in the image needs a calibration; take 'centres' or '3d'")
-    true_ids, track_ids = _ids(truth, "label"), _ids(tracks, "track")
+    true_ids, track_ids = ids_of(truth, "label"), ids_of(tracks, "track")
     true, found = (camera_objects(objects, calibration) for objects in (truth, tracks))
     # Regions without a box come last there, and are in .regions.
     true_objects, objects = true.take(np.arange(len(truth))), found.take(np.arange(len(tracks)))
@@ -78,11 +78,11 @@ def pairs_of(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration |
                             similarity) for name in DETECTED}
 
 
-def _ids(objects: GroundTruth, what: str) -> np.ndarray:
-    try:
-        ids = np.array([extra["track_id"] for extra in objects.extras], np.int64)
-    except KeyError:
-        raise InputError(f"a {what} has no track id; tracking scores need one in each") from None
+def ids_of(objects: GroundTruth, what: str) -> np.ndarray:
+    """(N,) int64 track ids. InputError where one is missing (KITTI writes -1), or there twice."""
+    ids = np.array([extra.get("track_id", -1) for extra in objects.extras], np.int64)
+    if (ids < 0).any():
+        raise InputError(f"a {what} has no track id; tracking scores need one in each")
     if len(np.unique(ids)) < len(ids):
         raise InputError(f"a frame has the {what} id "
                          f"{np.sort(ids)[:-1][np.diff(np.sort(ids)) == 0][0]} twice")

@@ -14,7 +14,13 @@ from lidar_perception.scoring.run import Start
 from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
 from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
 from lidar_perception.scoring.tracking.over_recall import over_recall
-from lidar_perception.scoring.tracking.pairs import Pairs, pairs_of, tracked_labels, without_ignored
+from lidar_perception.scoring.tracking.pairs import (
+    Pairs,
+    ids_of,
+    pairs_of,
+    tracked_labels,
+    without_ignored,
+)
 from lidar_perception.tracking.ego import recorded_poses, recorded_source
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
@@ -62,9 +68,11 @@ def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, ego: str,
         nonlocal last, tracker, pose_of
         if frame.sequence != last:
             last, tracker, pose_of = frame.sequence, Tracker(params), recorded_poses(ego)
+        truth = frame.truth()
+        if truth is not None:
+            ids_of(truth, "label")  # before the detector's work
         scan = frame.load()
         tracks = tracker(detector(scan).detections, frame.stamp_ns, pose_of(frame, scan.xyz))
-        truth = frame.truth()
         if truth is None:
             return None
         return observe(frame.sequence, frame.index, truth,
