@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import partial
 
 import detection_samples
@@ -20,6 +21,7 @@ from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
 from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
+from lidar_perception.scoring.comparison.contenders import contenders
 from lidar_perception.scoring.comparison.outcomes import (
     ComparisonReport,
     Contender,
@@ -121,6 +123,12 @@ def test_without_networks_the_candidates_are_compared_in_any_layout(bare, tmp_pa
     assert len(reasons) == 15 and "no PointNet" in reasons["STM-CPA + PointNet"]
     assert "--weights" in reasons["PointNet"]
     assert (tmp_path / "a.png").stat().st_size > 0
+    frame, _ = open_recording(crowd_folder(tmp_path / "crowd", 2))  # as of a bag without a camera
+    found, _ = contenders([], "cpu", 1.73)
+    scan, blind = frame.load(), replace(frame, calibration=lambda: None)
+    whole, cropped = ([len(each.detector_of(one)(scan).detections) for each in found]
+                      for one in (blind, frame))
+    assert whole >= cropped > [0, 0, 0]
 
 
 def test_a_detector_that_finds_everything_has_100_and_one_that_fails_goes_on(tmp_path):

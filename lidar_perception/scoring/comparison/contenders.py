@@ -168,11 +168,14 @@ def _hybrids(opened: Sequence[Opened], best: PipelineParams
 
 def _seeded(name: str, make: Callable[..., Detector], params: PipelineParams,
             seed_of: Callable[[Frame], SeedSource | None], source: str = "") -> Contender:
-    """A detector make(seed, camera, params) that needs a seed and a camera for each frame."""
+    """A detector make(seed, camera, params) that needs a seed for each frame; where there is no
+    camera it sees the whole scan, as the others do."""
+    uncropped = with_values(params, {"view.enabled": False})
+
     def detector_of(frame: Frame) -> Detector | None:
-        seed = seed_of(frame)
-        return None if seed is None else make(seed, frame.camera(), params).with_min_score(
-            MIN_SCORE)
+        seed, camera = seed_of(frame), frame.camera()
+        return None if seed is None else make(
+            seed, camera, uncropped if camera is None else params).with_min_score(MIN_SCORE)
     operating = make(_no_seed, None, params).min_scores[PERSON]
     return Contender(name, detector_of, (PERSON,), operating, source)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from lidar_perception.scoring.average_precision import FEW
 from lidar_perception.scoring.comparison.outcomes import AP_ROWS
@@ -44,7 +44,7 @@ def print_comparison(content: dict, console: Console) -> None:
     _print_intervals(content, console)
     for reason in dict.fromkeys(each["reason"] for each in content["missing"]):
         names = [each["name"] for each in content["missing"] if each["reason"] == reason]
-        console.print(f"[yellow]missing[/]: {', '.join(names)}: {escape(reason)}")
+        console.print(Text("missing", "yellow") + f": {', '.join(names)}: {reason}")
     failed = [f"{name}: {line}" for name, row in content["rows"].items() for line in row["failed"]]
     print_skipped([*content["skipped"], *failed], console)
 
