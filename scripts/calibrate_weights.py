@@ -46,7 +46,7 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
     for path in weights:
         report = DetectionReport()
         fill(report, open_recording(scans),
-             partial(by_detector, partial(uncalibrated, path), 1.0, None), jobs=jobs, limit=limit)
+             by_detector(partial(uncalibrated, path)), jobs=jobs, limit=limit)
         found = lines(Comparison.of(report.frames))
         header, network = (load_pointnet if network_of(path) == POINTNET else load_network)(path)
         save_checkpoint(path, network, replace(header, calibration=found), half=True)

@@ -46,7 +46,7 @@ def scores_of(weights: Path, folder: Path) -> dict[str, Any]:
     """What evaluate detection finds, as JSON."""
     report = DetectionReport()
     open_ = partial(open_detector, weights, min_score=MIN_SCORE)
-    fill(report, open_recording(folder), partial(by_detector, open_, 1.0, None))
+    fill(report, open_recording(folder), by_detector(open_))
     return report.compute()
 
 

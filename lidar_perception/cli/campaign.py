@@ -8,9 +8,9 @@ from pathlib import Path
 
 import click
 from rich.box import SIMPLE_HEAD
-from rich.markup import escape
 from rich.progress import TaskID
 from rich.table import Table
+from rich.text import Text
 
 from lidar_perception.campaign.case import FAILED, REFUSED, SKIPPED, SURVIVED
 from lidar_perception.campaign.run import PARTS, Tally, replay, run_campaign
@@ -49,8 +49,8 @@ def campaign(minutes: float, seed: int, only: tuple[str, ...], cases: int | None
     if file is not None:
         with tempfile.TemporaryDirectory(prefix="campaign-") as folder:
             case, outcome = replay(file, Path(folder))
-        console.print(escape(f"{case.part}, {case.name}: {outcome.verdict}"
-                             f"{f': {outcome.reason}' if outcome.reason else ''}"))
+        console.print(f"{case.part}, {case.name}: {outcome.verdict}"
+                      f"{f': {outcome.reason}' if outcome.reason else ''}")
         raise SystemExit(1 if outcome.verdict == FAILED else 0)
     with progress() as bar:
         tasks: dict[str, TaskID] = {}
@@ -80,13 +80,13 @@ def _print(tallies: list[Tally]) -> None:
     console.print(table)
     for t in tallies:
         for name, figures in t.figures.items():
-            console.print(escape(f"{t.part}, {name}: " + ", ".join(
-                f"{k} {v:g}" for k, v in figures.items())), soft_wrap=True)
+            console.print(f"{t.part}, {name}: " + ", ".join(
+                f"{k} {v:g}" for k, v in figures.items()), soft_wrap=True)
         if t.problem:
-            console.print(f"[red]{escape(t.problem)}[/]", soft_wrap=True)
+            console.print(t.problem, style="red", soft_wrap=True)
         for (verdict, reason), count in t.reasons.most_common():
             if verdict in (FAILED, SKIPPED):
-                console.print(f"[red]{t.part}[/] {verdict} {count:,} x: {escape(reason)}",
+                console.print(Text(t.part, "red") + f" {verdict} {count:,} x: {reason}",
                               soft_wrap=True)
         for path in t.files:
             console.print(f"  lidar-perception campaign --replay {path}", soft_wrap=True)

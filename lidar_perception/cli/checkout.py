@@ -9,6 +9,7 @@ import tempfile
 from pathlib import Path
 
 import click
+from rich.text import Text
 
 from lidar_perception.runs.terminal import errors
 from lidar_perception.runs.threads import one_thread_each
@@ -56,7 +57,7 @@ def test(arguments: tuple[str, ...]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         failed = _everything(Path(folder))
     if failed:
-        errors.print(f"[red]failed:[/] {', '.join(failed)}")
+        errors.print(Text("failed:", "red") + f" {', '.join(failed)}")
     sys.exit(bool(failed))
 
 

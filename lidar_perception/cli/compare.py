@@ -14,6 +14,7 @@ from lidar_perception.cli.data import (
     device_option,
     intervals_option,
     no_labels,
+    out_file,
     walk_options,
 )
 from lidar_perception.runs.terminal import console, errors
@@ -23,7 +24,7 @@ from lidar_perception.runs.terminal import console, errors
 @walk_options()
 @a_path("--weights", "One more network, PointPillars or PointNet; may be given several times.",
         multiple=True)
-@a_path("--png", "Draw F1 and mean AP against time.")
+@out_file("--png", "Draw F1 and mean AP against time.")
 @intervals_option
 @device_option
 def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, device: str,
@@ -63,8 +64,8 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, device: str
         "python": platform.python_version(), **report.compute(),
         "pedestrians": {key: centres[key] for key in ("frames", "ground_truth")},
         "missing": [vars(each) for each in missing], "paper_f1": CENTRE_F1}
-    walk.write(content)
     print_comparison(content, console)
+    walk.write(content)
     if png is not None:
         draw_comparison(png, content)
         console.print(f"figure: {png}")

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.markup import escape
+from rich.text import Text
 
 from lidar_perception.cli.data import a_path, limit_option, opened, split_option
 from lidar_perception.runs.terminal import console, track
@@ -144,7 +144,7 @@ def _bag(source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, im
     written = write_bag(out, frames, images=images, force=force, skipped=skipped)
     console.print(f"{out}: {written} scans of {count}")
     for line in skipped:
-        console.print(f"[yellow]left out[/]: {escape(line)}")
+        console.print(Text("left out", "yellow") + f": {line}")
     raise SystemExit(1 if skipped else 0)
 
 
@@ -167,9 +167,9 @@ def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: s
     frames = track(map(seen, islice(recording, count)), f"converting {source}", count)
     summary = write_dataset(format, frames, out, labels, force)
     drives = f"{summary.drives} drive{'' if summary.drives == 1 else 's'}"
-    console.print(f"{escape(str(out))}: {summary.frames} scans of {drives}, {summary.boxes} boxes")
+    console.print(f"{out}: {summary.frames} scans of {drives}, {summary.boxes} boxes")
     for remark, frames_of in summary.remarks.items():
-        console.print(f"[yellow]{escape(remark)}[/] ({frames_of} scans)")
+        console.print(Text(remark, "yellow") + f" ({frames_of} scans)")
 
 
 def _labels(source: Path, recording: Any, format: str, out: Path, given: str | None,
@@ -185,7 +185,7 @@ def _labels(source: Path, recording: Any, format: str, out: Path, given: str | N
         labels = DriveLabels([of_truth(frame.name, frame.stamp_ns, frame.truth())
                               for frame in recording.frames[:]])
     written = export_labels(labels.first(count), format, out, recording.frames[:count], force)
-    console.print(f"{escape(str(out))}: {written.boxes} boxes of {written.frames} frames, "
+    console.print(f"{out}: {written.boxes} boxes of {written.frames} frames, "
                   f"as {format}")
     for what in written.left_out:
-        console.print(f"[yellow]left out: {what}, for which the format has no place[/]")
+        console.print(f"left out: {what}, for which the format has no place", style="yellow")

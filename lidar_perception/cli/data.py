@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import functools
 import json
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import click
-from rich.markup import escape
 
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import errors
@@ -24,6 +24,22 @@ WHAT = ("KITTI (object, tracking, raw), nuScenes or SemanticKITTI folder, bag (r
 def a_path(name: str, what: str, metavar: str = "FILE", **more: Any) -> Callable:
     """An option that takes a path."""
     return click.option(name, type=click.Path(path_type=Path), metavar=metavar, help=what, **more)
+
+
+class OutFile(click.Path):
+    """A file that is written when the work is done: what stands in its way is said before."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        above = next(folder for folder in path.absolute().parents if folder.exists())
+        if path.is_dir() or str(path) == "-" or not (above.is_dir() and os.access(above, os.W_OK)):
+            raise InputError(f"{path} cannot be written; give the name of a file")
+        return path
+
+
+def out_file(name: str, what: str, *names: str) -> Callable:
+    """An option that takes the path of a file to write."""
+    return click.option(name, *names, type=OutFile(path_type=Path), metavar="FILE", help=what)
 
 
 data_option = a_path("--data", WHAT, "PATH", required=True)
@@ -42,8 +58,7 @@ jobs_option = click.option("--jobs", type=click.IntRange(1), default=1, show_def
 dask_option = click.option("--dask", metavar="ADDRESS", help="Run on the workers of the Dask "
                            "scheduler at this address, such as tcp://10.0.0.1:8786. They must see "
                            "PATH under the same name.")
-json_option = click.option("--json", "json_file", type=click.Path(path_type=Path), metavar="FILE",
-                           help="Write the scores to this file.")
+json_option = out_file("--json", "Write the scores to this file.", "json_file")
 intervals_option = click.option("--intervals", type=click.IntRange(0), default=0, metavar="N",
                                 help="Also print bootstrap intervals from N resamples of the "
                                 "drives, or of runs of 10 frames where there are few drives. 200 "
@@ -118,7 +133,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     to be level and leans, or its intensities have no known scale, that is said."""
     from lidar_perception.data.open import open_recording
     recording = open_recording(data, **how)
-    errors.print(escape(str(recording)), soft_wrap=True, style="dim")
+    errors.print(str(recording), soft_wrap=True, style="dim")
     if recording.mounted:
         return recording
     from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
@@ -131,7 +146,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     if level and clouds:
         for problem in filter(None, (mount_problem(recording, clouds),
                                      _intensity_problem(recording, clouds[0]))):
-            errors.print(escape(problem), soft_wrap=True, style="yellow")
+            errors.print(problem, soft_wrap=True, style="yellow")
     return measured
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import click
 import numpy as np
+from rich.text import Text
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
@@ -108,7 +109,7 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
                   + (", birdseye.png" if picture else ""))
     console.print(f"look at it: lidar-perception view {out / 'result'}", soft_wrap=True)
     if missing := clouds - content["results"]:
-        errors.print(f"[red]{missing} clouds gave no result[/]" + (
+        errors.print(Text(f"{missing} clouds gave no result", "red") + (
             "; without --real-time none is dropped" if real_time else f"; see {out}/logs"))
         if not real_time:
             raise SystemExit(1)
@@ -191,7 +192,7 @@ def _print_tracks(frames: Sequence[Answered], calibration: Any, poses: str) -> d
     if result.problem:
         console.print(f"tracks: {result.count}; HOTA is not known: {result.problem}")
     remedy = "; pip install 'lidar_perception[odometry]' takes them from the scans"
-    console.print(f"tracks are with {EGO[poses]}{remedy * (poses == NO_SOURCE)}", markup=False)
+    console.print(f"tracks are with {EGO[poses]}{remedy * (poses == NO_SOURCE)}")
     return {"found": result.count, "scores": result.scores}
 
 

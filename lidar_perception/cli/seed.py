@@ -53,7 +53,7 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
     template = source(segmented)
     save_seed(template, out)
     for row in to_pixels(template.silhouette(params))[::2]:
-        console.print("".join(".#"[bit] for bit in row.astype(int)), markup=False)
+        console.print("".join(".#"[bit] for bit in row.astype(int)))
     console.print(f"{out}: frame {frame.name}, height {template.height:.2f} m")
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import click
 from rich.box import SIMPLE_HEAD
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from lidar_perception.cli.data import a_path
 from lidar_perception.runs.files import make_folder, write_text
@@ -62,7 +62,7 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
 
     clouds = open_clouds(data, topic)
     count = f"{clouds.count} cloud{'s' * (clouds.count != 1)}"
-    errors.print(escape(f"{data}: {clouds.layout}, {count}"), soft_wrap=True, style="dim")
+    errors.print(f"{data}: {clouds.layout}, {count}", soft_wrap=True, style="dim")
     numbers, found, skipped = [], [], []
     chosen = spread(clouds.count, scans)
     with progress() as bar:
@@ -88,9 +88,9 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
         write_text(out / name, text)
     _print(findings(m))
     for line in skipped:
-        console.print(f"[yellow]left out[/]: {escape(line)}", soft_wrap=True)
+        console.print(Text("left out", "yellow") + f": {line}", soft_wrap=True)
     for line in doubts(m) + _hint(m, height_hint):
-        console.print(f"[yellow]doubt[/]: {escape(line)}", soft_wrap=True)
+        console.print(Text("doubt", "yellow") + f": {line}", soft_wrap=True)
     console.print(f"{out}: {', '.join(name for name in FILES if (out / name).exists())}",
                   soft_wrap=True, highlight=False)
 
@@ -107,7 +107,7 @@ def _print(rows: list[Any]) -> None:
     for name in ("what", "value", "how sure"):
         table.add_column(name, overflow="fold")
     for row in rows:
-        table.add_row(row.what, escape(row.value), f"[{COLORS[row.sure]}]{row.sure}[/]")
+        table.add_row(row.what, row.value, Text(row.sure, COLORS[row.sure]))
     console.print(table)
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from lidar_perception import __version__
-from lidar_perception.cli.data import a_path, opened, write_json
+from lidar_perception.cli.data import a_path, opened, out_file, write_json
 from lidar_perception.data.frame import BOXES
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.runs.folder import is_finished, unfinished
@@ -50,8 +50,8 @@ from lidar_perception.types import InputError
 @click.option("--force", is_flag=True, help="Replace an earlier simulated data set in --out.")
 @a_path("--compare", "Compare simulated scans with the labelled ones of this data set or bag; "
         "nothing is written to --out.", "PATH")
-@a_path("--json", "With --compare: write every curve to this file.")
-@a_path("--png", "With --compare: draw every curve.")
+@out_file("--json", "With --compare: write every curve to this file.")
+@out_file("--png", "With --compare: draw every curve.")
 def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed: int,
              scene: str, kind: str | None, people: float, mount_height: float,
              streets_of: int | None, jobs: int | None, resume: bool, force: bool,
@@ -147,8 +147,8 @@ def _compare(real: Path, frames: int, seed: int, scenes: Scenes, json_file: Path
     made = simulated_scans(seed, frames, streets_of=1, scenes=scenes)
     simulated = measured_scans(track(made, "measuring simulated scans", frames), PAPER)
     content = {"data": str(real), "seed": seed, **side_by_side(measured, simulated)}
-    write_json(json_file, content)
     print_realism(content, console)
+    write_json(json_file, content)
     if png:
         draw_realism(png, content)
         console.print(f"picture: {png}", soft_wrap=True)

@@ -84,7 +84,7 @@ def view(path: Path | None, live: bool, weights: tuple[str, ...], results: tuple
 
     def started(url: str) -> None:
         url += f"&frame={frame}&theme={theme}"
-        console.print(url, soft_wrap=True, markup=False)
+        console.print(url, soft_wrap=True)
         if screenshot is None and browser:
             webbrowser.open(url)
     if path is None:
@@ -98,7 +98,7 @@ def view(path: Path | None, live: bool, weights: tuple[str, ...], results: tuple
         asyncio.run(serve(served, port, started))
     else:
         asyncio.run(screenshot_of(served, screenshot, f"frame={frame}&theme={theme}"))
-        console.print(f"{screenshot}", markup=False)
+        console.print(f"{screenshot}")
 
 
 @contextmanager

@@ -9,6 +9,8 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+from rich.text import Text
+
 from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.graph import (
     FINAL,
@@ -108,7 +110,7 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
         memory = processes.memory_mb()
         codes = processes.stop(timeout=30)
     if failed := {node: code for node, code in codes.items() if code}:
-        errors.print(f"[red]exit codes {failed}[/]; see {out}/logs")
+        errors.print(Text(f"exit codes {failed}", "red") + f"; see {out}/logs")
     if watch.frames == 0:
         raise InputError(f"no cloud of {drive} gave a result; see {out}/logs")
     latencies = sorted(watch.latencies_ms) or [0.0]

@@ -13,8 +13,8 @@ from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table as Grid
+from rich.text import Text
 
 from lidar_perception.reproduction.experiment import Cell, Experiment, Figure, Section, Table
 from lidar_perception.reproduction.figures import draw
@@ -157,23 +157,23 @@ def print_report(sections: list[Section], skipped: list[dict[str, Any]], console
             console.print(_grid(table))
     console.print("In brackets: the paper's. The report has the intervals.", style="dim")
     for group in skipped:
-        console.print(f"[yellow]skipped[/] {group['count']}: {escape(group['reason'])}",
+        console.print(Text("skipped", "yellow") + f" {group['count']}: {group['reason']}",
                       soft_wrap=True)
 
 
 def _grid(table: Table) -> Grid:
-    grid = Grid(title=escape(table.title), title_justify="left", box=SIMPLE_HEAD,
+    grid = Grid(title=table.title, title_justify="left", box=SIMPLE_HEAD,
                 padding=(0, 1, 0, 0))
     for i, name in enumerate(table.header):
         right = i > 0 and all(is_number(row[i]) for row in table.rows)
-        grid.add_column(escape(name), justify="right" if right else "left", overflow="fold")
+        grid.add_column(name, justify="right" if right else "left", overflow="fold")
     for row in table.rows:
         grid.add_row(*map(_brief, row))
     return grid
 
 
-def _brief(cell: str | Cell) -> str:
+def _brief(cell: str | Cell) -> str | Text:
     if isinstance(cell, str):
-        return escape(cell)
+        return cell
     value, _, paper = parts(cell)
-    return f"{value} [dim]({paper})[/]" if paper else value
+    return Text(f"{value} ") + Text(f"({paper})", "dim") if paper else value

@@ -18,8 +18,9 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-console = Console(highlight=False)
-errors = Console(stderr=True, highlight=False)
+# A name of a file, or what an error says, may have brackets, so no text is markup.
+console = Console(highlight=False, markup=False)
+errors = Console(stderr=True, highlight=False, markup=False)
 
 EVERY = 15.0  # seconds between lines where there is no terminal
 
@@ -28,9 +29,9 @@ def progress() -> Progress:
     """Progress on standard error: in a terminal a bar with text, count, elapsed and remaining time;
     elsewhere, as in a log, a line of the same every EVERY seconds."""
     return (Progress if errors.is_terminal else _Lines)(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(),
-        TimeRemainingColumn(), console=errors, transient=True, auto_refresh=errors.is_terminal,
-        disable=not errors.is_terminal)
+        TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
+        TimeElapsedColumn(), TimeRemainingColumn(), console=errors, transient=True,
+        auto_refresh=errors.is_terminal, disable=not errors.is_terminal)
 
 
 class _Lines(Progress):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Generic, TypeVar
@@ -12,7 +13,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.results import read_results, write_results
 from lidar_perception.detectors.contract import Detector
-from lidar_perception.scoring.run import RunError
+from lidar_perception.scoring.run import RunError, Start
 from lidar_perception.scoring.thinning import thinned
 from lidar_perception.types import Detections, GroundTruth, InputError
 
@@ -47,11 +48,15 @@ def detected(detector: Detector, frame: Frame, truth: GroundTruth | None,
                     (perf_counter() - begin) * 1e3)
 
 
-def by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
-                recording: Recording) -> Callable[[Frame], Detected[Detections] | None]:
+def by_detector(open_: Callable[[], Detector], keep: float = 1.0, folder: Path | None = None
+                ) -> Start:
     """Runs the detector that open_() gives on every frame with labels; with a folder on all frames,
-    and writes what it says there as KITTI result files. All but the recording given, a Start of
-    scoring.run."""
+    and writes what it says there as KITTI result files. It sees a share `keep` of the points."""
+    return partial(_by_detector, open_, keep, folder)
+
+
+def _by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None,
+                 recording: Recording) -> Callable[[Frame], Detected[Detections] | None]:
     detector = open_()
 
     def measure(frame: Frame) -> Detected[Detections] | None:

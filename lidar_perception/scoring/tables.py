@@ -6,8 +6,8 @@ import math
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 SHOWN = 5  # reasons why frames were skipped
 
@@ -17,9 +17,9 @@ def narrow_table(title: str, first: str, *others: str, width: int = 0,
     """A table whose columns fit into 80 characters: the first one of words, which may fold, the
     others, each at least width wide, of numbers."""
     table = Table(title=title, box=SIMPLE_HEAD, padding=0, caption_justify="left")
-    table.add_column(escape(first), no_wrap=not fold, overflow="fold" if fold else "ellipsis")
+    table.add_column(first, no_wrap=not fold, overflow="fold" if fold else "ellipsis")
     for name in others:
-        table.add_column(escape(name), justify="right", no_wrap=True, min_width=width)
+        table.add_column(name, justify="right", no_wrap=True, min_width=width)
     return table
 
 
@@ -52,6 +52,7 @@ def print_time(ms: float | None, console: Console) -> None:
 def print_skipped(lines: list[str], console: Console) -> None:
     """The first reasons why frames were left out."""
     for line in lines[:SHOWN]:
-        console.print(f"[yellow]skipped[/]: {escape(line)}", soft_wrap=True)
+        console.print(Text("skipped", "yellow") + f": {line}", soft_wrap=True)
     if len(lines) > SHOWN:
-        console.print(f"[yellow]skipped[/]: {len(lines) - SHOWN} more, see the JSON file")
+        console.print(Text("skipped", "yellow")
+                      + f": {len(lines) - SHOWN} more, see the JSON file")

@@ -127,10 +127,13 @@ def test_convert_leaves_out_what_is_broken_and_says_so(tmp_path, monkeypatch, ca
         assert opened.counts[POINTS] == 1
 
 
-def test_convert_replaces_a_bag_only_by_force(kitti, tmp_path, monkeypatch):
-    command = ("convert", kitti, "--out", tmp_path / "bag", "--limit", 1)
+def test_convert_replaces_a_bag_only_by_force(kitti, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "run [/final]"  # which is no markup
+    command = ("convert", kitti, "--out", out, "--limit", 1)
     assert [exit_of(monkeypatch, *command), exit_of(monkeypatch, *command),
-            exit_of(monkeypatch, *command, "--force")] == [0, 2, 0]
+            exit_of(monkeypatch, *command, "--force"), exit_of(monkeypatch, "info", out)
+            ] == [0, 2, 0, 0]
+    assert capsys.readouterr().out.replace("\n", "").count("run [/final]") == 3
 
 
 def test_info_shows_topics_types_counts_and_length(bag, monkeypatch):
@@ -261,9 +264,11 @@ BAD_INPUTS = {
     "missing template": (["evaluate", "candidates", "--data", "{bag}", "--seed-source", "file",
                           "--seed-file", "{tmp}/none"], "{tmp}/none"),
     "json under a file": (["evaluate", "candidates", "--data", "{bag}", "--json",
-                           "{kitti}/training/calib/000000.txt/o"], "cannot write"),
-    "json is a folder": (["evaluate", "candidates", "--data", "{bag}", "--json", "{tmp}"],
-                         "cannot write {tmp}"),
+                           "{kitti}/training/calib/000000.txt/o"], "cannot be written"),
+    "json is a folder": (["evaluate", "candidates", "--data", "{tmp}/none", "--json", "{tmp}"],
+                         "{tmp} cannot be written"),
+    "no standard output": (["compare", "--data", "{tmp}/none", "--json", "-"],
+                           "- cannot be written; give the name of a file"),
 }
 
 

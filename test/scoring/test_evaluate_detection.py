@@ -187,8 +187,12 @@ def test_frames_without_labels_are_written_and_not_scored(kitti, detector, tmp_p
     out = tmp_path / "out"
     content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", out)
     assert content["frames"] == 1 and (out / "000001.txt").exists()
+    line = error_of(monkeypatch, capsys, "--data", kitti, "--weights", "w", "--write-results",
+                    kitti / "training/label_2")
+    assert "label_2 has files already" in line
     (kitti / "training/label_2/000000.txt").unlink()
-    content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results", out)
+    content, _ = evaluate(tmp_path, "--data", kitti, "--weights", "w", "--write-results",
+                          tmp_path / "others")
     assert content["frames"] == 0
     line = error_of(monkeypatch, capsys, "--data", kitti, "--weights", "w")
     assert line == f"Error: {kitti}: no frame with labels"

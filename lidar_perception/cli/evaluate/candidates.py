@@ -10,7 +10,7 @@ import click
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.cli.data import Walk, a_path, no_labels, walk_options
+from lidar_perception.cli.data import Walk, no_labels, out_file, walk_options
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.terminal import console, errors
@@ -27,7 +27,7 @@ def view_as_recorded(recording: Any, params: PipelineParams) -> PipelineParams:
 
 @click.command()
 @walk_options()
-@a_path("--png", "Draw the frame with most pedestrians from above.")
+@out_file("--png", "Draw the frame with most pedestrians from above.")
 @parameter_options(PAPER)
 def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
     """Pedestrian candidates of paper A (STM-CPA) against the Pedestrian labels.
@@ -53,8 +53,8 @@ def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
     if report.frames == 0:
         raise no_labels(recording, report.skipped, "a Pedestrian label")
     content = report.compute()
-    walk.write(content)
     print_candidate_report(content, console)
+    walk.write(content)
     if png is not None:
         _draw(png, recording, report, params)
 

@@ -41,5 +41,5 @@ def clusters(walk: Walk, weights: Path | None) -> None:
     if not scores.frames:
         raise no_labels(recording, scores.skipped)
     content = {"source": str(weights or "the package's own"), **scores.compute()}
-    walk.write(content)
     print_cluster_scores(content, console)
+    walk.write(content)

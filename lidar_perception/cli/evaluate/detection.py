@@ -81,6 +81,8 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
     if write_results is not None and weights is None:
         raise click.UsageError("--write-results writes the detections of a detector; --results DIR "
                                "has its files already")
+    if write_results is not None and write_results.is_dir() and any(write_results.iterdir()):
+        raise InputError(f"{write_results} has files already; give another name")
     if keep != 1 and weights is None:
         raise click.UsageError("--keep thins the scans that a detector sees; --results DIR sees "
                                "none")
@@ -98,7 +100,7 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
             terminal_errors.print(f"{weights}: {other}", soft_wrap=True)
         open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height,
                         where=where)
-        start = partial(by_detector, open_, keep, write_results)
+        start = by_detector(open_, keep, write_results)
     report = DetectionReport()
     walk.fill(report, recording, start)
     if write_results is not None:
@@ -112,7 +114,6 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
         content["reliability"] = {name: reliability(together, name) for name in SCORED}
     if intervals and report.frames:
         content["intervals"] = report.intervals(intervals)
-    walk.write(content)
     if report.frames:
         print_detection_report(content, console)
         if errors:
@@ -120,3 +121,4 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
             print_reliability(content["reliability"], console)
         if intervals:
             print_intervals(content["intervals"], console)
+    walk.write(content)

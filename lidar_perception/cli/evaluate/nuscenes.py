@@ -77,6 +77,6 @@ def nuscenes(walk: Walk, results: Path | None, weights: Path | None, where: str,
         raise no_labels(recording, report.skipped)
     content = {"source": str(results or weights), "version": recording.layout.split()[-1],
                **report.compute()}
-    walk.write(content)
     if report.frames:
         print_nuscenes_report(content, console)
+    walk.write(content)

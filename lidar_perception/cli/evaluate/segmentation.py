@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import click
-from rich.markup import escape
 
-from lidar_perception.cli.data import WHAT, Walk, a_path, no_labels, walk_options
+from lidar_perception.cli.data import WHAT, Walk, a_path, no_labels, out_file, walk_options
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.clustering.params import CLUSTERING_METHODS
 from lidar_perception.ground.params import GROUND_METHODS
@@ -36,7 +35,7 @@ class MethodList(click.ParamType):
 @click.option("--methods", type=MethodList(), default=GROUND_METHODS + CLUSTERING_METHODS,
               help="Methods to score, of ground and of clustering, with commas between. "
               "Default: all.")
-@a_path("--png", "Draw the ground of the first scan with labelled points from above.")
+@out_file("--png", "Draw the ground of the first scan with labelled points from above.")
 @parameter_options(SegmentationParams())
 def segmentation(walk: Walk, methods: tuple, png: Path | None, params: SegmentationParams) -> None:
     """Ground and clusters against labels.
@@ -77,11 +76,11 @@ def segmentation(walk: Walk, methods: tuple, png: Path | None, params: Segmentat
     if not (report.ground or report.clusters):
         raise no_labels(recordings[0], report.skipped)
     content = report.compute()
-    walk.write(content)
     if report.whole:
-        errors.print(f"{escape(', '.join(map(str, walk.data)))}: {report.whole} frames "
+        errors.print(f"{', '.join(map(str, walk.data))}: {report.whole} frames "
                      "without a camera calibration were taken as a whole")
     print_scores(content, params.ground.method, console)
+    walk.write(content)
     if png is not None:
         from lidar_perception.scoring.points.report import ground_of_methods
         for frame in islice(labelled[0], walk.limit):

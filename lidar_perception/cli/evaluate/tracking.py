@@ -64,5 +64,5 @@ def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, d
     if not report.frames:
         raise no_labels(recording, report.skipped)
     content = {"source": str(weights), "ego": ego, **report.compute()}
-    write_json(json_file, content)
     print_tracking_report(content, console)
+    write_json(json_file, content)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from rich.console import Console
-from rich.markup import escape
 
 from lidar_perception.classes import BY_SIZE
 from lidar_perception.scoring.average_precision import FEW
@@ -44,7 +43,7 @@ def print_detection_report(content: dict, console: Console) -> None:
     _print_paper(content, console)
     _print_centres(content["pedestrian_centres"], console)
     for line in content["diagnosis"]:
-        console.print(f"[yellow]{escape(line)}[/]")
+        console.print(line, style="yellow")
     print_time(content["ms"], console)
     print_skipped(content["skipped"], console)
 
