@@ -105,10 +105,13 @@ def _serve(drive: Drive, made: Session, port: int, browser: bool, propose: bool,
     from lidar_perception.labeling.served import Served
     from lidar_perception.labeling.server import serve
 
+    known = made.state.seq  # a journal begun in another folder is not seen here
+
     def started(url: str) -> None:
         console.print(url, soft_wrap=True)
-        errors.print(f"journal: {made.journal.path}; ctrl-C ends", soft_wrap=True,
-                     style="dim")
+        how = f"goes on after {known} actions" if known else "is new"
+        errors.print(f"the journal {made.journal.path.absolute()} {how}; ctrl-C ends",
+                     soft_wrap=True, style="dim")
         if propose:
             made.prepare()
         if browser:
