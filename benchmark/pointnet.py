@@ -80,4 +80,4 @@ def print_pointnet(content: dict) -> None:
     steps = ", ".join(f"{step} {value:.1f}" for step, value in content["steps"].items())
     console.print(f"whole detector {ms['detector']:.1f} ms ({steps}) for {content['points']:.0f} "
                   f"points, {content['all_clusters']:.0f} clusters, target < {WHOLE:.0f}: "
-                  f"{'reached' if ms['detector'] < WHOLE else 'missed'}", soft_wrap=True)
+                  f"{'reached' if ms['detector'] < WHOLE else 'missed'}")

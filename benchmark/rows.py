@@ -8,6 +8,7 @@ how many points differ in the others.
 from __future__ import annotations
 
 from rich.table import Table
+from rich.text import Text
 
 from lidar_perception.runs.terminal import console
 
@@ -56,7 +57,7 @@ def print_measured(content: dict) -> None:
     for name in ("beside", "its ms", "our ms", "measured", "target", "met", "same"):
         table.add_column(name, justify="left" if name == "beside" else "right")
     for r in content["rows"]:
-        met = {True: "yes", False: "[red]no[/red]", None: ""}[r["met"]]
+        met = {True: "yes", False: Text("no", "red"), None: ""}[r["met"]]
         table.add_row(r["name"], _ms(r["peer_ms"]), _ms(r["ours_ms"]),
                       r["note"] or value_text(r["value"], r["unit"]),
                       target_text(r["target"], r["unit"]), met,

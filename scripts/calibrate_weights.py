@@ -50,7 +50,7 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
         found = lines(Comparison.of(report.frames))
         header, network = (load_pointnet if network_of(path) == POINTNET else load_network)(path)
         save_checkpoint(path, network, replace(header, calibration=found), half=True)
-        console.print(f"{path.name}: {found}", soft_wrap=True)
+        console.print(f"{path.name}: {found}")
 
 
 if __name__ == "__main__":

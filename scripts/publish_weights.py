@@ -118,7 +118,7 @@ def main(weights: Path, folders: tuple[Path, ...], before: Path | None) -> None:
         metrics = metrics_of(scored[folders[0].name], "bev", header.config.classes)
         save_checkpoint(out, network, replace(header, metrics=rounded(metrics)), half=True)
     write_text(out.with_suffix(".md"), card(header, out.stem, scored))
-    console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB", soft_wrap=True)
+    console.print(f"{out}: {out.stat().st_size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":

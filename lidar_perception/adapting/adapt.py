@@ -124,7 +124,7 @@ class Adapting:
             raise InputError(f"{data} has no poses, and to find them by the scans needs kiss-icp; "
                              "pip install 'lidar_perception[odometry]'")
         for line in filter(None, (*checked(self.frames, data), mount_problem(recording, clouds))):
-            errors.print(line, soft_wrap=True)
+            errors.print(line)
         self.network = network_to_train(self.header)
         # All sources with weights, opened once while these are looked with.
         self.opened = lru_cache(maxsize=1)(partial(opened_with, header=self.header, device=device))
@@ -178,7 +178,7 @@ class Adapting:
             if different := differences(before["asked"], asked):
                 raise InputError(f"{self.out} holds a run with {'; '.join(different[:3])}; resume "
                                  "it with the same settings, or give another --out")
-            errors.print(f"resuming {self.out}", soft_wrap=True)
+            errors.print(f"resuming {self.out}")
             most = before["frames"]
         else:
             most = self.params.frames or self._affordable()
@@ -186,7 +186,7 @@ class Adapting:
         count = sum(len(piece.numbers) for piece in self.pieces)
         errors.print(f"{count} of {len(self.frames)} frames, pieces: {len(self.pieces)}, rounds: "
                      f"{self.params.rounds}; mixed with {self.params.scene} scans of "
-                     f"{self.params.sensor} at {self.height:g} m", soft_wrap=True)
+                     f"{self.params.sensor} at {self.height:g} m")
         if not path.is_file():
             write_text(path, json.dumps({"asked": asked, "frames": most}, indent=1))
 
@@ -200,7 +200,7 @@ class Adapting:
         each = (time.monotonic() - begun) / MEASURED
         most = int(3600 * self.hours * LOOKING / self.params.rounds / each)
         errors.print(f"a look at a frame takes {each:.2g} s: up to {most} frames a round, "
-                     f"{duration(3600 * self.hours)} in all", soft_wrap=True)
+                     f"{duration(3600 * self.hours)} in all")
         return max(most, 1)
 
     def _poses(self, i: int) -> np.ndarray:
@@ -231,7 +231,7 @@ class Adapting:
                                                                  "scans", len(frames)))))
         counts: Counts = json.loads(read_text(path, 10**6))
         for line in unheard(counts):
-            errors.print(line, soft_wrap=True)
+            errors.print(line)
         return counts
 
     def _round(self, number: int, begun: float) -> bool:
@@ -250,8 +250,7 @@ class Adapting:
             few = (f"the detectors agree on {agreed} object{'s' * (agreed != 1)} only, too few to "
                    "learn from")
             if self.rounds:
-                errors.print(f"round {number} is not made: {few}; {self.best} stays",
-                             soft_wrap=True)
+                errors.print(f"round {number} is not made: {few}; {self.best} stays")
                 return False
             raise Refused(
                 f"{self.data}: {few} ({FEWEST_KEPT}); record more, give --mount-height if it is "
@@ -265,8 +264,7 @@ class Adapting:
         self.rounds.append(Round(counts, after, refused))
         self._record()
         if refused:
-            errors.print(f"round {number} is not taken: {refused}; {self.best} stays",
-                         soft_wrap=True)
+            errors.print(f"round {number} is not taken: {refused}; {self.best} stays")
             return False
         self.best = taught
         return True
@@ -334,7 +332,7 @@ class Adapting:
             f1, confirmed_share(looks, self.heard), found, kept)
         write_text(path, json.dumps(watched.json(), indent=1))
         errors.print(f"{weights}: simulated AP {watched.simulated:.1f}, agreement "
-                     f"{watched.agreement:.2f}, confirmed {watched.confirmed:.2f}", soft_wrap=True)
+                     f"{watched.agreement:.2f}, confirmed {watched.confirmed:.2f}")
         return watched
 
     def _record(self) -> None:

@@ -52,7 +52,7 @@ def adapt(data: Path, weights: Path, out: Path, budget: float, resume: bool, for
     from lidar_perception.runs.resuming import locked
     weights = package_weights(weights)
     begin(out, weights, resume, force)
-    console.print(f"adapting {weights} to {data}", soft_wrap=True, style="dim")
+    console.print(f"adapting {weights} to {data}", style="dim")
     from lidar_perception.adapting.adapt import Adapting
     from lidar_perception.adapting.drives import Refused
     from lidar_perception.adapting.report import write_report
@@ -72,7 +72,7 @@ def adapt(data: Path, weights: Path, out: Path, budget: float, resume: bool, for
                 write_report(run)
             raise
         except KeyboardInterrupt:
-            errors.print(f"stopped; what is in {out} is kept, --resume goes on", soft_wrap=True)
+            errors.print(f"stopped; what is in {out} is kept, --resume goes on")
             raise
         write_report(run)
     tell(run)
@@ -121,9 +121,7 @@ def tell(run: Any) -> None:
     console.print(table)
     for n, each in enumerate(run.rounds, 1):
         if each.refused:
-            console.print(f"round {n}: {each.refused}", soft_wrap=True)
+            console.print(f"round {n}: {each.refused}")
     if run.best == run.weights:
-        console.print("no round was taken: best.safetensors is the file that it began with",
-                      soft_wrap=True)
-    console.print(f"{run.out}: best.safetensors, {RECORD}, report.html, labels", soft_wrap=True,
-                  highlight=False)
+        console.print("no round was taken: best.safetensors is the file that it began with")
+    console.print(f"{run.out}: best.safetensors, {RECORD}, report.html, labels")

@@ -81,12 +81,11 @@ def _print(tallies: list[Tally]) -> None:
     for t in tallies:
         for name, figures in t.figures.items():
             console.print(f"{t.part}, {name}: " + ", ".join(
-                f"{k} {v:g}" for k, v in figures.items()), soft_wrap=True)
+                f"{k} {v:g}" for k, v in figures.items()))
         if t.problem:
-            console.print(t.problem, style="red", soft_wrap=True)
+            console.print(t.problem, style="red")
         for (verdict, reason), count in t.reasons.most_common():
             if verdict in (FAILED, SKIPPED):
-                console.print(Text(t.part, "red") + f" {verdict} {count:,} x: {reason}",
-                              soft_wrap=True)
+                console.print(Text(t.part, "red") + f" {verdict} {count:,} x: {reason}")
         for path in t.files:
-            console.print(f"  lidar-perception campaign --replay {path}", soft_wrap=True)
+            console.print(f"  lidar-perception campaign --replay {path}")

@@ -133,7 +133,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     to be level and leans, or its intensities have no known scale, that is said."""
     from lidar_perception.data.open import open_recording
     recording = open_recording(data, **how)
-    errors.print(str(recording), soft_wrap=True, style="dim")
+    errors.print(str(recording), style="dim")
     if recording.mounted:
         return recording
     from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
@@ -142,11 +142,11 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     if measured is not recording:
         height = next(iter(measured)).sensor_height
         errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds",
-                     soft_wrap=True, style="dim")
+                     style="dim")
     if level and clouds:
         for problem in filter(None, (mount_problem(recording, clouds),
                                      _intensity_problem(recording, clouds[0]))):
-            errors.print(problem, soft_wrap=True, style="yellow")
+            errors.print(problem, style="yellow")
     return measured
 
 

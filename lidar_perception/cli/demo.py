@@ -107,7 +107,7 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
     picture = _draw_best(out, cloud_topic(single, detector), _drawn(found, detector))
     console.print(f"results in {out}: result (bag), scores.json, logs"
                   + (", birdseye.png" if picture else ""))
-    console.print(f"look at it: lidar-perception view {out / 'result'}", soft_wrap=True)
+    console.print(f"look at it: lidar-perception view {out / 'result'}")
     if missing := clouds - content["results"]:
         errors.print(Text(f"{missing} clouds gave no result", "red") + (
             "; without --real-time none is dropped" if real_time else f"; see {out}/logs"))

@@ -79,19 +79,19 @@ def label(data: Path, sequence: str | None, out: Path | None, weights: Path | No
         raise InputError(f"there is no journal in {folder}; give its folder with --out")
     with session(drive, folder, detector) as made:
         if made.journal.message:
-            errors.print(made.journal.message, style="yellow", soft_wrap=True)
+            errors.print(made.journal.message, style="yellow")
         for each in imports:
             named, _, path = each.partition(":")
             try:
                 made.do({"do": "import", "format": named, "path": path})
             except ImportedAlready as error:  # the same command, another day
-                errors.print(str(error), style="yellow", soft_wrap=True)
+                errors.print(str(error), style="yellow")
         if exports is not None:
             written = made.export(exports, os.path.abspath(str(to)), force)
             console.print(f"{written['path']}: {written['boxes']} boxes in {written['frames']} "
-                          "frames", soft_wrap=True)
+                          "frames")
             for each in written["left_out"]:
-                errors.print(f"left out: {each}", style="yellow", soft_wrap=True)
+                errors.print(f"left out: {each}", style="yellow")
         else:
             _serve(drive, made, **page)
 
@@ -108,10 +108,9 @@ def _serve(drive: Drive, made: Session, port: int, browser: bool, propose: bool,
     known = made.state.seq  # a journal begun in another folder is not seen here
 
     def started(url: str) -> None:
-        console.print(url, soft_wrap=True)
+        console.print(url)
         how = f"goes on after {known} actions" if known else "is new"
-        errors.print(f"the journal {made.journal.path.absolute()} {how}; ctrl-C ends",
-                     soft_wrap=True, style="dim")
+        errors.print(f"the journal {made.journal.path.absolute()} {how}; ctrl-C ends", style="dim")
         if propose:
             made.prepare()
         if browser:
@@ -136,15 +135,13 @@ def _simulated(recording: Recording, sequence: str | None, weights: str) -> dict
             found[drive.name] = done = Annotator(made).work()
         console.print(f"{drive.name}: {done['people']} pedestrians, {done['boxes']} boxes: "
                       f"{done['actions']} actions, {done['looked_at']} proposals looked at; by "
-                      f"hand {done['by_hand']}, without tracks {done['without_tracks']}",
-                      soft_wrap=True)
+                      f"hand {done['by_hand']}, without tracks {done['without_tracks']}")
     if not any(done["boxes"] for done in found.values()):
         raise InputError(f"{recording.path} has no labelled pedestrian; give another drive")
     sums = totals(found)
     console.print(f"all: {sums['actions']} actions, {sums['share_of_by_hand']:.0%} of those by "
                   f"hand; {sums['share_corrected_in_full']:.0%} where a box is put right in size "
-                  f"and heading too; without tracks {sums['share_without_tracks']:.0%}",
-                  soft_wrap=True)
+                  f"and heading too; without tracks {sums['share_without_tracks']:.0%}")
     return {"data": str(recording.path), "drives": found, "all": sums}
 
 

@@ -77,7 +77,7 @@ def reproduce(experiment: str, study: str | None, data: Path, split: Path | None
     if all("skipped" in record for record in records):
         raise InputError(f"{data}: no frame could be measured ({records[0]['skipped']})")
     print_report(sections, skipped_groups(records), console)
-    console.print(f"report: {page}", soft_wrap=True)
+    console.print(f"report: {page}")
 
 
 def _load(target: str) -> Any:

@@ -62,7 +62,7 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
 
     clouds = open_clouds(data, topic)
     count = f"{clouds.count} cloud{'s' * (clouds.count != 1)}"
-    errors.print(f"{data}: {clouds.layout}, {count}", soft_wrap=True, style="dim")
+    errors.print(f"{data}: {clouds.layout}, {count}", style="dim")
     numbers, found, skipped = [], [], []
     chosen = spread(clouds.count, scans)
     with progress() as bar:
@@ -88,11 +88,10 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
         write_text(out / name, text)
     _print(findings(m))
     for line in skipped:
-        console.print(Text("left out", "yellow") + f": {line}", soft_wrap=True)
+        console.print(Text("left out", "yellow") + f": {line}")
     for line in doubts(m) + _hint(m, height_hint):
-        console.print(Text("doubt", "yellow") + f": {line}", soft_wrap=True)
-    console.print(f"{out}: {', '.join(name for name in FILES if (out / name).exists())}",
-                  soft_wrap=True, highlight=False)
+        console.print(Text("doubt", "yellow") + f": {line}")
+    console.print(f"{out}: {', '.join(name for name in FILES if (out / name).exists())}")
 
 
 def _hint(m: Any, height: float | None) -> list[str]:

@@ -100,7 +100,7 @@ def _bag(out: Path, plan: Plan, force: bool) -> None:
     except OSError as error:
         raise click.ClickException(f"cannot write {out}: {error.strerror}; finished scans are in "
                                    f"{out}.incomplete") from None
-    console.print(f"{out}: {count} scans", soft_wrap=True)
+    console.print(f"{out}: {count} scans")
 
 
 def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
@@ -129,7 +129,7 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
                                    "--resume") from None
     console.print(f"{out} is complete: there is nothing to do" if complete else
                   f"{out}: {plan.frames} scans" + (f", {plan.frames - len(missing)} of them from "
-                                                   "before" if resume else ""), soft_wrap=True)
+                                                   "before" if resume else ""))
 
 
 def _compare(real: Path, frames: int, seed: int, scenes: Scenes, json_file: Path | None,
@@ -151,5 +151,5 @@ def _compare(real: Path, frames: int, seed: int, scenes: Scenes, json_file: Path
     write_json(json_file, content)
     if png:
         draw_realism(png, content)
-        console.print(f"picture: {png}", soft_wrap=True)
+        console.print(f"picture: {png}")
 

@@ -163,21 +163,21 @@ def tell(progress: Any, steps: int, batches: Any, out: Path) -> None:
     """Say how a run ended; a stopped one ends the process."""
     if batches.skipped:
         console.print(f"{len(batches.skipped)} scenes could not be used, such as: "
-                      f"{next(iter(batches.skipped))}", soft_wrap=True)
+                      f"{next(iter(batches.skipped))}")
     if progress.skipped:
         console.print(f"{progress.skipped} of {progress.step} steps were skipped: not finite")
     if progress.best is not None:
         console.print(f"{out / 'best.safetensors'}: score {progress.best:.2f} at step "
-                      f"{progress.best_step}", soft_wrap=True)
+                      f"{progress.best_step}")
     if progress.left_out:
         console.print(f"{progress.left_out:.0f} of {steps} planned steps were left out, to end "
-                      "within the budget", soft_wrap=True)
+                      "within the budget")
     if progress.late:
         console.print("the budget is spent and the learning rate has not come down: "
                       f"{steps - progress.step - progress.left_out:.0f} of {steps} steps are "
-                      "missing; --resume goes on", soft_wrap=True)
+                      "missing; --resume goes on")
     if progress.stopped:
-        console.print(f"stopped at step {progress.step}; --resume resumes it", soft_wrap=True)
+        console.print(f"stopped at step {progress.step}; --resume resumes it")
         sys.exit(130)
 
 

@@ -84,7 +84,7 @@ def view(path: Path | None, live: bool, weights: tuple[str, ...], results: tuple
 
     def started(url: str) -> None:
         url += f"&frame={frame}&theme={theme}"
-        console.print(url, soft_wrap=True)
+        console.print(url)
         if screenshot is None and browser:
             webbrowser.open(url)
     if path is None:

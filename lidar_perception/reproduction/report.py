@@ -157,8 +157,7 @@ def print_report(sections: list[Section], skipped: list[dict[str, Any]], console
             console.print(_grid(table))
     console.print("In brackets: the paper's. The report has the intervals.", style="dim")
     for group in skipped:
-        console.print(Text("skipped", "yellow") + f" {group['count']}: {group['reason']}",
-                      soft_wrap=True)
+        console.print(Text("skipped", "yellow") + f" {group['count']}: {group['reason']}")
 
 
 def _grid(table: Table) -> Grid:

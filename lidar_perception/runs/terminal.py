@@ -17,10 +17,23 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.text import Text
 
-# A name of a file, or what an error says, may have brackets, so no text is markup.
-console = Console(highlight=False, markup=False)
-errors = Console(stderr=True, highlight=False, markup=False)
+
+class Terminal(Console):
+    """What is printed has names of files, so text is no markup, and only the terminal breaks its
+    lines; tables are as wide as it."""
+
+    def __init__(self, **more: Any) -> None:
+        super().__init__(highlight=False, markup=False, **more)
+
+    def print(self, *objects: Any, **how: Any) -> None:
+        text = all(isinstance(each, str | Text) for each in objects)
+        super().print(*objects, **{"soft_wrap": text, **how})
+
+
+console = Terminal()
+errors = Terminal(stderr=True)
 
 EVERY = 15.0  # seconds between lines where there is no terminal
 
@@ -62,7 +75,7 @@ class _Lines(Progress):
         of = "" if task.total is None else f" of {task.total:.0f}"
         left = task.time_remaining
         errors.print(f"{task.description}: {task.completed:.0f}{of}"
-                     + ("" if left is None else f", {duration(left)} left"), soft_wrap=True)
+                     + ("" if left is None else f", {duration(left)} left"))
 
 
 @contextmanager

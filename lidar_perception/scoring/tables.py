@@ -52,7 +52,7 @@ def print_time(ms: float | None, console: Console) -> None:
 def print_skipped(lines: list[str], console: Console) -> None:
     """The first reasons why frames were left out."""
     for line in lines[:SHOWN]:
-        console.print(Text("skipped", "yellow") + f": {line}", soft_wrap=True)
+        console.print(Text("skipped", "yellow") + f": {line}")
     if len(lines) > SHOWN:
         console.print(Text("skipped", "yellow")
                       + f": {len(lines) - SHOWN} more, see the JSON file")

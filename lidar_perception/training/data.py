@@ -118,7 +118,7 @@ class Batches:
         for items in loaded(self.stream, self.numbers(step), self.jobs):
             for reason in (r for item in items for r in item.skipped):
                 if reason not in self.skipped:
-                    errors.print(f"skipped: {reason}", soft_wrap=True)
+                    errors.print(f"skipped: {reason}")
                 self.skipped[reason] = self.skipped.get(reason, 0) + 1
             yield [item.sample for item in items]
 

@@ -88,7 +88,7 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
                         said = True
                         errors.print(f"slower than planned, {pace.seconds:.2g} s a step: about "
                                      f"{fit:.0f} of {run.steps} steps fit into the budget, so the "
-                                     "learning rate falls faster", soft_wrap=True)
+                                     "learning rate falls faster")
                 run.progress.seconds = time.monotonic() - begun
                 bar.update(line, completed=run.place)
                 if row is not None:
@@ -169,7 +169,7 @@ def _validate(run: Run, log: Log | None) -> None:
         metrics, calibration = run.task.validate(run.average.module)
         log.add("validation", progress.step, metrics)
         shown = ", ".join(f"{name} {value:.4g}" for name, value in metrics.items())
-        errors.print(f"step {progress.step}: {shown}", soft_wrap=True)
+        errors.print(f"step {progress.step}: {shown}")
         if np.isnan(metrics["score"]):
             errors.print("no object in the frames that are validated on, so the latest weights "
                          "count as the best")

@@ -48,8 +48,7 @@ def begun_with(network: Net, init: Path | None, kind: type[Config]) -> Net:
     if init is not None:
         taken, count = adopt(network, init, kind)
         if taken < count:
-            errors.print(f"{taken} of {count} tensors are of {init}, the others begin at random",
-                         soft_wrap=True)
+            errors.print(f"{taken} of {count} tensors are of {init}, the others begin at random")
     return network
 
 

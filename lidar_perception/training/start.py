@@ -166,7 +166,7 @@ def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
     """Plan, say so and write it, unless that was done by an earlier start."""
     path = asked.out / RUN
     if path.is_file():
-        errors.print(f"resuming {asked.out}", soft_wrap=True)
+        errors.print(f"resuming {asked.out}")
         return
     errors.print("measuring this machine with a few scenes ...")
     speed, sources, held_out = _measured(network, asked, params, sensor, device, own)
@@ -220,7 +220,7 @@ def _refit(network: Network, asked: Asked, params: Any, sensor: Sensor, device: 
     if refit != made:
         errors.print(f"the preparation took {duration(passed)}, {slower:.1f} times as long as "
                      f"planned, and a step takes {steps:.1f} times as long: {refit.steps} steps "
-                     f"instead of {made.steps}", soft_wrap=True)
+                     f"instead of {made.steps}")
         known = json.loads(read_text(asked.out / RUN, 10**6))
         write_text(asked.out / RUN, json.dumps({**known, "plan": asdict(refit)}, indent=1))
 
@@ -309,7 +309,7 @@ def _say(network: Network, params: Any, sensor: Sensor, chosen: Plan, speed: Spe
              else "at the end")
     errors.print(f"{network.name}: {scenes}, {chosen.steps} steps of {data.batch} scenes{where}, "
                  f"validated {often} on "
-                 f"{chosen.val_scans + data.val_recorded} other scenes", soft_wrap=True)
+                 f"{chosen.val_scans + data.val_recorded} other scenes")
     steps, validating = training(chosen, speed, data)
     only_cut = replace(chosen, scans=0, val_scans=0)
     cutting = preparing(only_cut, cores(), speed)
@@ -317,10 +317,8 @@ def _say(network: Network, params: Any, sensor: Sensor, chosen: Plan, speed: Spe
              "steps": steps, "validation": validating}
     errors.print(f"about {duration(sum(parts.values()))} on {cores()} cores as busy as now, torch "
                  f"with {torch.get_num_threads()} threads: "
-                 + ", ".join(f"{name} {duration(value)}" for name, value in parts.items()),
-                 soft_wrap=True)
-    errors.print(f"kept in {params.data.cache}; --resume goes on after a stop or a kill",
-                 soft_wrap=True)
+                 + ", ".join(f"{name} {duration(value)}" for name, value in parts.items()))
+    errors.print(f"kept in {params.data.cache}; --resume goes on after a stop or a kill")
 
 
 def _prepare(network: Network, asked: Asked, sources: Sequence[Any], held_out: Sequence[Any],

@@ -128,6 +128,7 @@ def test_convert_leaves_out_what_is_broken_and_says_so(tmp_path, monkeypatch, ca
 
 
 def test_convert_replaces_a_bag_only_by_force(kitti, tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "300")
     out = tmp_path / "run [/final]"  # which is no markup
     command = ("convert", kitti, "--out", out, "--limit", 1)
     assert [exit_of(monkeypatch, *command), exit_of(monkeypatch, *command),

@@ -97,7 +97,7 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
         assert weights is not None  # as there are no --results
         height = recording.frames[0].sensor_height
         if weights.suffix == ".safetensors" and (other := read_header(weights).unlike(height)):
-            terminal_errors.print(f"{weights}: {other}", soft_wrap=True)
+            terminal_errors.print(f"{weights}: {other}")
         open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height,
                         where=where)
         start = by_detector(open_, keep, write_results)

@@ -44,7 +44,8 @@ def print_comparison(content: dict, console: Console) -> None:
     _print_intervals(content, console)
     for reason in dict.fromkeys(each["reason"] for each in content["missing"]):
         names = [each["name"] for each in content["missing"] if each["reason"] == reason]
-        console.print(Text("missing", "yellow") + f": {', '.join(names)}: {reason}")
+        console.print(Text("missing", "yellow") + f": {', '.join(names)}: {reason}",
+                      soft_wrap=False)
     failed = [f"{name}: {line}" for name, row in content["rows"].items() for line in row["failed"]]
     print_skipped([*content["skipped"], *failed], console)
 

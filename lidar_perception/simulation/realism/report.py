@@ -23,12 +23,11 @@ def print_realism(content: dict, console: Console) -> None:
         row = content[side]
         objects = ", ".join(f"{count} {name}" for name, count in row["objects"].items())
         console.print(f"{side}: {row['scans']} scans, {row['whole_scans']} of them whole; "
-                      f"{objects}; {row['pedestrian_frames']} scans with a pedestrian",
-                      soft_wrap=True)
+                      f"{objects}; {row['pedestrian_frames']} scans with a pedestrian")
     _print_curves(content, console)
     _print_worst(content, console)
     print_skipped(content["real"]["skipped"] + content["simulated"]["skipped"], console)
-    console.print(summary(content), style="bold", soft_wrap=True)
+    console.print(summary(content), style="bold")
 
 
 def summary(content: dict) -> str:
