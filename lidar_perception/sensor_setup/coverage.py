@@ -16,6 +16,9 @@ from lidar_perception.sensor_setup.scans import Scan
 SECTORS = 360            # of a turn
 ARM = 1.0                # metres; what is nearer in every scan is the robot's, wherever it stands
 BODY_REACH = 4.0         # metres; a moving robot's own returns are within this
+ROBOT = (5.5, 2.6)       # metres: long and wide is what may be a robot, up to a van
+MAX_SHARE = 0.3          # of all points that are the robot's own; more are walls along its way
+MAX_OTHERS = 0.2         # share of other points in the box of the robot's body
 ALWAYS, STEADY = 0.7, 0.06  # share of the scans with such a return, metres by which it may vary
 OFF_GROUND = 0.15        # metres above the ground, from which on a return may be the body's
 MIN_CELLS = 20           # of sector and beam; fewer are chance
@@ -31,9 +34,10 @@ class Coverage(NamedTuple):
     """rows (R,): elevations in degrees of the beams, or of rows where there are none, descending;
     seen (R, 360): share of the scans with a return there; body (R, 360) bool: returns of the robot
     itself; box (6,) around its points, or empty; others: share of the points in the box that are
-    not the body's; body_share: of all points; still: whether the robot stood still, None where that
-    cannot be told; blind (R, 360) bool: never a return that is not the body's; blocked: [first row,
-    from, to] in degrees, counter-clockwise; view: [from, to] of the azimuths with returns."""
+    not the body's; body_share: of all points; walls: whether more stays where it is than a robot
+    has, as walls along its way do, so that only what is within ARM counts; still: whether the robot
+    stood still, None where that cannot be told; blocked: [first row, from, to] in degrees,
+    counter-clockwise; view: [from, to] of the azimuths with returns."""
 
     rows: np.ndarray
     seen: np.ndarray
@@ -41,10 +45,17 @@ class Coverage(NamedTuple):
     box: np.ndarray
     others: float
     body_share: float
+    walls: bool
     still: bool | None
-    blind: np.ndarray
     blocked: list[tuple[int, float, float]]
     view: tuple[float, float]
+
+    @property
+    def fits(self) -> bool:
+        """Whether the box can be left out, and what the body hides is hidden: it is not of walls,
+        and few other points are in it, or none of it is farther than an arm."""
+        return len(self.box) > 0 and not self.walls and (
+            self.others <= MAX_OTHERS or float(np.abs(self.box).max()) < ARM)
 
 
 def coverage_of(scans: Sequence[Scan], beams: Beams | None, mount: Mount | None) -> Coverage:
@@ -59,23 +70,36 @@ def coverage_of(scans: Sequence[Scan], beams: Beams | None, mount: Mount | None)
     seen = there.mean(axis=0)
     still = _stands_still(near)
     body, middle = _body(near, rows, mount, still)
+    mine, box = _own(scans, labels, body, middle)
+    total = sum(len(scan.xyz) for scan in scans)
+    wide, long = np.sort(box[3:5] - box[:2]) if len(box) else (0.0, 0.0)
+    walls = bool(long > ROBOT[0] or wide > ROBOT[1]
+                 or sum(m.sum() for m in mine) > MAX_SHARE * total)
+    if walls:
+        body = _enough(body & (middle < ARM))
+        mine, box = _own(scans, labels, body, middle)
+    inside = [~kept_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
+    others = float(sum((i & ~m).sum() for i, m in zip(inside, mine))
+                   / max(1, sum(i.sum() for i in inside)))
+    found = Coverage(rows, seen, body, box, others, sum(m.sum() for m in mine) / max(1, total),
+                     walls, still, [], _view(seen))
+    hides = body & found.fits
+    return found._replace(blocked=_blocked((seen == 0) | hides, seen, hides))
+
+
+def _own(scans: Sequence[Scan], labels: Sequence[np.ndarray], body: np.ndarray,
+         middle: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
+    """Which points of each scan, (N,) bool, are those of cells of the body (R, 360), at their
+    ranges; and the box (6,) around them, or empty."""
     mine = [_at(scan, label, body, False)
             & (np.abs(scan.range - _at(scan, label, middle, 0.0)) < 3 * STEADY)
             for scan, label in zip(scans, labels)]
     points = np.concatenate([scan.xyz[m] for scan, m in zip(scans, mine)])
-    total = sum(len(scan.xyz) for scan in scans)
-    box, others = np.zeros(0), 0.0
-    if len(points):
-        # A few returns from beside the body, such as people who stand there, do not widen the box.
-        low, high = np.percentile(points, [0.5, 99.5], axis=0)
-        box = np.concatenate([low - MARGIN, high + MARGIN])
-        crop = CropParams(body=tuple(box.tolist()))
-        inside = [~kept_points(scan.xyz, crop) for scan in scans]
-        others = float(sum((i & ~m).sum() for i, m in zip(inside, mine))
-                       / max(1, sum(i.sum() for i in inside)))
-    blind = (seen == 0) | body
-    return Coverage(rows, seen, body, box, others, len(points) / max(1, total), still, blind,
-                    _blocked(blind, seen, body), _view(seen))
+    if not len(points):
+        return mine, np.zeros(0)
+    # A few returns from beside the body, such as people who stand there, do not widen the box.
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    return mine, np.concatenate([low - MARGIN, high + MARGIN])
 
 
 def _rows(scans: Sequence[Scan], beams: Beams | None) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -122,17 +146,23 @@ def _body(near: np.ndarray, rows: np.ndarray, mount: Mount | None,
     middle = np.nanmedian(filled, axis=0)
     varies = np.nanmedian(np.abs(filled - middle), axis=0)
     steady = (share >= ALWAYS) & (varies <= STEADY) & (len(near) >= 3)
-    if still is False and len(near) >= 5:
+    if still is False and len(near) >= 5 and mount is not None:  # else the floor would be body
         body = steady & (middle < BODY_REACH)
-        if mount is not None:
-            up, aside = np.radians(rows)[:, None], np.radians(np.arange(SECTORS) + 0.5)
-            normal = next(p for p in mount.planes if p is not None).normal
-            way = np.stack(np.broadcast_arrays(np.cos(up) * np.cos(aside), np.cos(up)
-                                               * np.sin(aside), np.sin(up)), axis=-1)
-            body &= middle * (way @ normal) + mount.height > OFF_GROUND
+        body &= middle * (_ways(rows) @ mount.normal) + mount.height > OFF_GROUND
     else:
         body = steady & (middle < ARM)
-    return body if body.sum() >= MIN_CELLS else np.zeros_like(body), middle
+    return _enough(body), middle
+
+
+def _enough(body: np.ndarray) -> np.ndarray:
+    return body if body.sum() >= MIN_CELLS else np.zeros_like(body)
+
+
+def _ways(rows: np.ndarray) -> np.ndarray:
+    """(R, 360, 3) unit vectors to the cells, in the sensor's frame."""
+    up, aside = np.radians(rows)[:, None], np.radians(np.arange(SECTORS) + 0.5)
+    return np.stack(np.broadcast_arrays(np.cos(up) * np.cos(aside), np.cos(up) * np.sin(aside),
+                                        np.sin(up)), axis=-1)
 
 
 def _blocked(blind: np.ndarray, seen: np.ndarray,

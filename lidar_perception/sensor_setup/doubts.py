@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.geometry import wrap_angle
-from lidar_perception.sensor_setup.coverage import ARM, FAR
+from lidar_perception.sensor_setup.coverage import FAR
 from lidar_perception.sensor_setup.measure import FEW_SCANS, SMALL_ROOM, Measured
 from lidar_perception.sensor_setup.motion import Ahead
 from lidar_perception.sensor_setup.told import FOOTPRINT
@@ -22,7 +22,6 @@ TILT_APART = 2.0    # degrees between what TF and the ground say of roll or pitc
 HEIGHT_APART = 0.1  # metres, likewise
 MANY_LOST = 0.01    # share of missing clouds
 SHORTEST_TURN = 0.02  # s; times that span less are no turn
-MAX_OTHERS = 0.2    # share of other points in the box of the robot's body
 
 
 def doubts(m: Measured) -> list[str]:
@@ -77,9 +76,14 @@ def doubts(m: Measured) -> list[str]:
                    "sensor's range; max_range in sensor.yaml is "
                    + ("that of the model" if m.model else "a guess"))
     c = m.coverage
-    if len(c.box) and not body_fits(m):
+    if c.walls:
+        out.append("more stays at the same place around the robot than a body has, as walls along "
+                   "its way do, so that no crop.body and no sector that it hides is set; record "
+                   "one drive through an open place, or set crop.body by hand by the report")
+    elif len(c.box) and not c.fits:
         out.append(f"{100 * c.others:.0f} % of the points in the box around the robot's own "
-                   "returns are not its own, so no crop.body is set; set one by hand by the report")
+                   "returns are not its own, so no crop.body and no sector that it hides is set; "
+                   "set crop.body by hand by the report")
     if m.twice > 0.05:
         out.append(f"{100 * m.twice:.0f} % of the points share the direction of another, as second "
                    "returns do; turn them off if the detectors need not see through dust or glass")
@@ -96,9 +100,10 @@ def _beam_doubts(m: Measured) -> list[str]:
                    "of them meet something to measure them")
     if m.moved:
         out.append(f"points of a beam scatter by {np.median(beams.spread):.2f} deg: the clouds are "
-                   "corrected for motion, or in a frame that is not the sensor's, and steep beams "
-                   "are less sure" + (f", so that sensor.yaml has those of {m.model}"
-                                      if m.as_model else "") + "; record the driver's own cloud")
+                   "corrected for motion, or in a frame that is not the sensor's, whose height it "
+                   "then is, and steep beams are less sure"
+                   + (f", so that sensor.yaml has those of {m.model}" if m.as_model else "")
+                   + "; record the driver's own cloud")
     elif beams.lifts.any() and len(m.scans) < FEW_SCANS:
         out.append("the beams start at different heights, which a few scans do not tell well; "
                    "record more")
@@ -106,6 +111,9 @@ def _beam_doubts(m: Measured) -> list[str]:
 
 
 def _mount_doubts(m: Measured) -> list[str]:
+    if m.on_ground:
+        return ["the clouds are in a frame on the ground, such as base_footprint, so that height, "
+                "roll and pitch of the sensor are not known; give the driver's own cloud"]
     if m.mount is None:
         return ["no ground in sight, so that height, roll and pitch are not known; record where "
                 "the floor is seen for some metres around, or set ground.sensor_pose by hand"]
@@ -188,10 +196,3 @@ def told_doubts(m: Measured) -> list[str]:
                        f"axis, and the robot drives towards {h.degrees:.0f}: correct the yaw in "
                        "the URDF" + ("" if h.base else ", unless it was driven another way"))
     return out
-
-
-def body_fits(m: Measured) -> bool:
-    """Whether the box around the robot's own returns can be left out: few other points are in it,
-    or none of it is farther than an arm."""
-    box = m.coverage.box
-    return len(box) > 0 and (m.coverage.others <= MAX_OTHERS or float(np.abs(box).max()) < ARM)

@@ -14,7 +14,6 @@ from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.sensor_setup.doubts import (
     NOT_AHEAD,
-    body_fits,
     doubts,
     looks_elsewhere,
     may_be_backwards,
@@ -110,7 +109,7 @@ def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
     elif m.scans[0].intensity is not None and m.scans[0].intensity.any():
         out["input.intensity_max"] = (UNREAD, "intensities are always the same, which says nothing:"
                                       " read as 0, as sensor.yaml has it")
-    if body_fits(m):
+    if m.coverage.fits:
         out["crop.body"] = (tuple(round(float(v), 2) for v in m.coverage.box),
                             f"around the robot's own returns, {100 * m.coverage.body_share:.1f} % "
                             f"of all; {100 * m.coverage.others:.0f} % of what is in it is not")

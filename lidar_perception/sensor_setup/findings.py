@@ -63,9 +63,11 @@ def findings(m: Measured) -> list[Finding]:
                        f"{100 * m.coverage.body_share:.1f} % of the points, from "
                        f"{_three(m.coverage.box[:3])} to {_three(m.coverage.box[3:])} m",
                        f"returns that are there in {100 * ALWAYS:.0f} % of the scans at the same "
-                       "range" + ("" if m.coverage.still is False else
+                       "range" + (f", within {ARM:g} m: farther ones are those of walls, too"
+                                  if m.coverage.walls else "" if m.coverage.still is False else
                                   f", within {ARM:g} m: the robot is not known to move"),
-                       FAIR if m.coverage.still is False and not few else DOUBTFUL))
+                       FAIR if m.coverage.still is False and not few and (
+                           m.coverage.fits or not len(m.coverage.box)) else DOUBTFUL))
     out.append(Finding("range", f"{m.least:.2f} to {m.greatest:.1f} m", "of what is not the body",
                        FAIR if m.greatest > SMALL_ROOM else DOUBTFUL))
     out += _columns(m)
@@ -117,7 +119,7 @@ def _mount(m: Measured) -> list[Finding]:
     how = f"plane through the ground around, {found} of {len(m.scans)} scans"
     degrees = np.degrees(q.error)
     sure = SURE if len(m.scans) >= FEW_SCANS and np.degrees(q.spread[1:]).max() < SLOPE and (
-        not m.coverage.still) else FAIR  # of one place the error is that of its ground
+        not m.coverage.still and not m.moved) else FAIR  # of one place it is that of its ground
     return [Finding("height", f"{q.height:.3f} +- {q.error[0]:.3f} m",
                     f"{how}; from scan to scan {q.spread[0]:.3f} m", sure),
             Finding("roll", f"{np.degrees(q.roll):.2f} +- {degrees[1]:.2f} deg",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from lidar_perception.robot.poses import moved_points
 from lidar_perception.sensor_setup.beams import Beams, azimuth_steps, beams_of, range_noise
 from lidar_perception.sensor_setup.coverage import Coverage, coverage_of
 from lidar_perception.sensor_setup.motion import Ahead, ahead_of, driven, pictures_of, shifts_of
-from lidar_perception.sensor_setup.mount import Mount, mount_of
+from lidar_perception.sensor_setup.mount import Mount, mount_of, on_the_ground
 from lidar_perception.sensor_setup.scans import Intensity, Scan, intensity_of, require_space
 from lidar_perception.sensor_setup.timing import Timing, timing_of
 from lidar_perception.sensor_setup.told import NOTHING, Told
@@ -35,7 +35,8 @@ class Measured:
     twice: share of second returns; noise: m, of noise_pieces; least, greatest: m, of what is not
     the robot's own; heading: where the robot drives, None without ground; model: the sensor
     of config/sensors with such beams, "" for none; model_error: degrees, the median over the
-    beams; told: what the recording says itself; hint: the height that somebody knows, m."""
+    beams; told: what the recording says itself; hint: the height that somebody knows, m;
+    on_ground: whether the origin of the clouds lies on the ground, where no mount is known."""
 
     source: str
     scans: tuple[Scan, ...]
@@ -56,6 +57,7 @@ class Measured:
     model_error: float
     told: Told
     hint: float | None = None
+    on_ground: bool = False
 
     @property
     def moved(self) -> bool:
@@ -101,13 +103,16 @@ def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: 
     coverage = coverage_of(scans, beams, mount)
     ranges = np.concatenate([s.range for s in scans])
     away = ranges[kept_points(np.concatenate([s.xyz for s in scans]), CropParams(
-        body=tuple(coverage.box.tolist())))]
+        body=tuple(coverage.box.tolist()) if coverage.fits else ()))]
     least, greatest = np.percentile(away if len(away) else ranges, [0.02, 99.995])
     model, error = model_of(beams)
     heading = _heading(scans, numbers, mount, coverage.still, told)
-    return Measured(source, tuple(scans), total, intensity_of(scans), beams, step, twice, noise,
-                    pieces, coverage, mount, heading, float(least), float(greatest),
-                    timing_of(scans, stamps_ns), model, error, told, hint)
+    found = Measured(source, tuple(scans), total, intensity_of(scans), beams, step, twice, noise,
+                     pieces, coverage, mount, heading, float(least), float(greatest),
+                     timing_of(scans, stamps_ns), model, error, told, hint)
+    # A sensor's own level beams lie in a plane through its origin, too.
+    return found if mount is not None or (beams is not None and not found.moved) else replace(
+        found, on_ground=on_the_ground(scans))
 
 
 def _heading(scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None,

@@ -9,6 +9,7 @@ import numpy as np
 
 from lidar_perception.ground.params import ThresholdParams
 from lidar_perception.ground.threshold import fit_plane, height_above, ransac_plane
+from lidar_perception.robot.placing import tilted
 from lidar_perception.sensor_setup.scans import Scan
 
 # Planes up to this lean against the sensor's own axes; a sensor that leans more has another frame.
@@ -23,6 +24,7 @@ SECTORS = 6                 # of a scan, that are left out in turn for its uncer
 MIN_HEIGHT = 0.1            # metres; what is nearer is what the sensor stands on
 MUCH_MORE = 8.0              # times as many points: a floor overhead, and not a ceiling above one
 MIN_EXTENT = 1.5            # metres that the plane reaches at least
+LOWERED = 1.0               # metres by which clouds are, so that a floor at their origin is seen
 
 
 class Plane(NamedTuple):
@@ -59,6 +61,11 @@ class Mount(NamedTuple):
     spread: np.ndarray
     planes: list[Plane | None]
     upside_down: bool
+
+    @property
+    def normal(self) -> np.ndarray:
+        """(3,) unit vector that points up, in the sensor's frame."""
+        return tilted(self.roll, self.pitch)[2, :3]
 
 
 def ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:
@@ -135,6 +142,14 @@ def _error(xyz: np.ndarray) -> np.ndarray:
         return np.array([np.inf] * 3)
     n = len(found)
     return np.sqrt((n - 1) / n * ((np.array(found) - np.mean(found, axis=0)) ** 2).sum(axis=0))
+
+
+def on_the_ground(scans: Sequence[Scan]) -> bool:
+    """Whether most scans lie on a level plane through their origin, as clouds in base_footprint: on
+    one LOWERED below it once they are."""
+    planes = [ground_plane(scan.xyz - [0.0, 0.0, LOWERED], True) for scan in scans]
+    return 2 * sum(p is not None and abs(p.height - LOWERED) < MIN_HEIGHT
+                   for p in planes) > len(planes)
 
 
 def _points(planes: Sequence[Plane | None]) -> float:

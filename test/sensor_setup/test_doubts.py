@@ -8,11 +8,13 @@ import pytest
 from tilted_samples import clouds_of
 
 from lidar_perception.data.raw_clouds import _of_frame
-from lidar_perception.sensor_setup.doubts import body_fits, doubts
+from lidar_perception.sensor_setup.coverage import coverage_of
+from lidar_perception.sensor_setup.doubts import doubts
 from lidar_perception.sensor_setup.files import node_params
 from lidar_perception.sensor_setup.findings import findings
 from lidar_perception.sensor_setup.measure import measured, sensor_of
-from lidar_perception.sensor_setup.scans import intensity_of, scan_of
+from lidar_perception.sensor_setup.mount import mount_of, on_the_ground
+from lidar_perception.sensor_setup.scans import Scan, intensity_of, scan_of
 from lidar_perception.sensor_setup.timing import timing_of
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import sensor_named
@@ -81,12 +83,52 @@ def test_the_robots_body_is_found_and_left_out():
 
     m = of(all_changed(with_body))
     c = m.coverage
-    assert body_fits(m) and c.body.any() and c.others < 0.1
+    assert c.fits and c.body.any() and c.others < 0.1
     assert (c.box[:2] < [-0.6, -0.1]).all() and (c.box[3:5] > [-0.7, 0.1]).all()
     assert -0.9 < c.box[0] and c.box[3] < 0 and np.abs(c.box[[2, 5]]).max() < 0.4
     behind = [(a, b) for ring, a, b in c.blocked if ring == 0]
     assert any(a <= 168 and b >= 192 for a, b in behind)
     assert len(of(all_changed(None)).coverage.box) == 0
+
+
+def seen(half=np.inf, body=0.0, height=0.6, seed=0):
+    """Scans of a sensor of 16 beams so high between walls half beside it, with other things around
+    in each, and a deck of the robot as far behind as body."""
+    rng = np.random.default_rng(seed)
+    up, aside = np.radians(np.meshgrid(np.arange(-15.0, 16, 2), np.arange(0.0, 360, 0.5)))
+    way = np.stack([np.cos(up) * np.cos(aside), np.cos(up) * np.sin(aside), np.sin(up)], axis=-1)
+    for _ in range(8):
+        with np.errstate(divide="ignore"):
+            reach = np.minimum.reduce([
+                half / np.abs(way[..., 1]), height / np.maximum(-way[..., 2], 1e-3),
+                np.repeat(rng.uniform(5, 50, 72), 10)[:, None] + 0 * up])
+        reach[(np.abs(aside - np.pi) < 0.4) & (up < 0) & (body > 0)] = body
+        yield scan_at((way * reach[..., None]).reshape(-1, 3) + rng.normal(0, 0.005, (up.size, 3)))
+
+
+def scan_at(xyz):
+    r, flat = np.linalg.norm(xyz, axis=1), np.hypot(*xyz[:, :2].T)
+    return Scan(xyz, np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) % 360, np.degrees(
+        np.arctan2(xyz[:, 2], flat)), r, flat, None, None, None, 0, "lidar", ("x", "y", "z"))
+
+
+@pytest.mark.parametrize("half", [0.8, 1.1, 2.0])
+def test_walls_along_the_way_are_no_body(half):
+    """And neither cropped nor blind; what is of the robot in the open is."""
+    scans = list(seen(half))
+    c = coverage_of(scans, None, mount_of(scans))
+    assert c.still is False and c.walls and not c.fits and not c.blocked
+    assert said(of(scans, range(8)), "walls", "crop.body")
+    scans = list(seen(body=1.5))
+    c = coverage_of(scans, None, mount_of(scans))
+    assert c.fits and not c.walls and c.box[0] == pytest.approx(-1.55, abs=0.05) and c.blocked
+
+
+def test_clouds_whose_origin_is_on_the_ground_are_told_and_their_floor_is_no_body():
+    scans = [scan_at(s.xyz + [0, 0, 0.6]) for s in seen()]
+    assert mount_of(scans) is None and on_the_ground(scans) and not on_the_ground(list(seen()))
+    m = of(scans, range(8))
+    assert not m.coverage.body.any() and said(m, "base_footprint", "driver's own cloud")
 
 
 def test_a_sector_that_never_returns_is_the_end_of_the_view():
