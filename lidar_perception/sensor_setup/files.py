@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,6 +13,8 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.clustering.density import followed
 from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams
 from lidar_perception.param_fields import flatten, with_values
+from lidar_perception.robot.placing import tilted
+from lidar_perception.robot.poses import moved_points
 from lidar_perception.sensor_setup.doubts import (
     NOT_AHEAD,
     doubts,
@@ -20,6 +23,7 @@ from lidar_perception.sensor_setup.doubts import (
     turned,
 )
 from lidar_perception.sensor_setup.measure import SMALL_ROOM, Measured, sensor_of
+from lidar_perception.sensor_setup.told import FOOTPRINT
 from lidar_perception.simulation.sensor import Sensor
 
 WIDTH = 98
@@ -112,7 +116,8 @@ def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
     if m.coverage.fits:
         out["crop.body"] = (tuple(round(float(v), 2) for v in m.coverage.box),
                             f"around the robot's own returns, {100 * m.coverage.body_share:.1f} % "
-                            f"of all; {100 * m.coverage.others:.0f} % of what is in it is not")
+                            f"of all; {100 * m.coverage.others:.0f} % of what is in it is not"
+                            + _in_base(m))
     if m.mount is not None:
         q = m.mount
         out["ground.sensor_pose.height"] = (round(q.height, 3), f"+- {q.error[0]:.3f} m")
@@ -133,6 +138,21 @@ def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
         out |= _of_resolution(m)
     with_values(PipelineParams(), {name: value for name, (value, _) in out.items()})
     return out
+
+
+def _in_base(m: Measured) -> str:
+    """Lines about the box around the body in base_frame, which nodes read it in, if they have one:
+    around the corners of that in the sensor's frame."""
+    pose, where = m.told.footprint, f"of '{FOOTPRINT}' by TF"
+    if pose is None and m.mount is not None:
+        pose = tilted(m.mount.roll, m.mount.pitch, m.mount.height)
+        where = "of a frame below the sensor that looks as it does (else add the sensor's place)"
+    if pose is None:
+        return "\nIt is in the sensor's frame. Nodes with base_frame read it in that."
+    low, high = np.reshape(m.coverage.box, (2, 3))
+    corners = moved_points(np.array([*itertools.product(*zip(low, high))]), pose)
+    return (f"\nIt is in the sensor's frame. Nodes with base_frame read it in that; {where}:"
+            f"\nbody: {_text((*corners.min(axis=0).round(2), *corners.max(axis=0).round(2)))}")
 
 
 def node_params(m: Measured) -> dict[str, tuple[Any, str]]:
@@ -201,8 +221,14 @@ def _tree(tree: Mapping[str, Any], indent: int) -> list[str]:
             lines += [f"{pad}{name}:", *_tree(value, indent + 2)]
             continue
         number, why = value
-        text = ("[" + ", ".join(f"{float(v)}" for v in number) + "]" if isinstance(number, tuple)
-                else str(number).lower() if isinstance(number, bool) else str(number))
-        lines += [*textwrap.wrap(why, WIDTH - indent, initial_indent=f"{pad}# ",
-                                 subsequent_indent=f"{pad}# "), f"{pad}{name}: {text}"]
+        lines += [line for part in why.split("\n") for line in textwrap.wrap(
+            part, WIDTH - indent, initial_indent=f"{pad}# ", subsequent_indent=f"{pad}# ")]
+        lines.append(f"{pad}{name}: {_text(number)}")
     return lines
+
+
+def _text(value: Any) -> str:
+    """As YAML has it."""
+    if isinstance(value, tuple):
+        return "[" + ", ".join(f"{float(v)}" for v in value) + "]"
+    return str(value).lower() if isinstance(value, bool) else str(value)

@@ -17,13 +17,13 @@ FOOTPRINT = "base_footprint"  # on the ground below base_link (REP-120)
 
 class Told(NamedTuple):
     """base: the robot's frame, "" for none; mount (4, 4): the sensor's pose in it, None where TF
-    does not say it; height: of the sensor above base_footprint, m, NaN where TF has none; poses:
-    of the base in a frame that stands, by the number of the cloud; left_out: transforms and
-    odometry that are no poses."""
+    does not say it; footprint (4, 4): likewise in base_footprint; poses: of the base in a
+    frame that stands, by the number of the cloud; left_out: transforms and odometry that are no
+    poses."""
 
     base: str = ""
     mount: np.ndarray | None = None
-    height: float = np.nan
+    footprint: np.ndarray | None = None
     poses: Mapping[int, np.ndarray] = {}
     left_out: int = 0
 
@@ -34,6 +34,11 @@ class Told(NamedTuple):
             return np.nan, np.nan
         roll, pitch = np.degrees(roll_pitch(self.mount))
         return float(roll), float(pitch)
+
+    @property
+    def height(self) -> float:
+        """Metres of the sensor above base_footprint; NaN where that is not told."""
+        return np.nan if self.footprint is None else float(self.footprint[2, 3])
 
     @property
     def ahead(self) -> float:
@@ -50,14 +55,13 @@ def told_by(poses: BagPoses | None, numbers: Sequence[int], stamps_ns: np.ndarra
     """What the odometry and TF of a bag say; poses None: nothing is told."""
     if poses is None or stamps_ns is None or not (base := poses.base):
         return NOTHING
-    mount, footprint = poses.mounted(base), poses.mounted(FOOTPRINT)
+    mount = poses.mounted(base)
     moved = {}
     for number in numbers:
         pose = _base_pose(poses, int(stamps_ns[number]), mount)
         if pose is not None:
             moved[number] = pose
-    return Told(base, mount, np.nan if footprint is None else float(footprint[2, 3]), moved,
-                poses.left_out)
+    return Told(base, mount, poses.mounted(FOOTPRINT), moved, poses.left_out)
 
 
 def _base_pose(poses: BagPoses, stamp_ns: int, mount: np.ndarray | None) -> np.ndarray | None:

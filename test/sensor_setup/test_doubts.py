@@ -1,5 +1,7 @@
 """What cannot be told is said, with the remedy; what cannot be used is refused."""
 
+import json
+import re
 from dataclasses import replace
 from functools import cache
 
@@ -8,9 +10,12 @@ import pytest
 from tilted_samples import clouds_of
 
 from lidar_perception.data.raw_clouds import _of_frame
+from lidar_perception.robot.crop import kept_points
+from lidar_perception.robot.params import CropParams
+from lidar_perception.robot.placing import tilted
 from lidar_perception.sensor_setup.coverage import coverage_of
 from lidar_perception.sensor_setup.doubts import doubts
-from lidar_perception.sensor_setup.files import node_params
+from lidar_perception.sensor_setup.files import node_params, params_yaml
 from lidar_perception.sensor_setup.findings import findings
 from lidar_perception.sensor_setup.measure import measured, sensor_of
 from lidar_perception.sensor_setup.mount import mount_of, on_the_ground
@@ -89,6 +94,13 @@ def test_the_robots_body_is_found_and_left_out():
     behind = [(a, b) for ring, a, b in c.blocked if ring == 0]
     assert any(a <= 168 and b >= 192 for a, b in behind)
     assert len(of(all_changed(None)).coverage.box) == 0
+    # In robot.param.yaml also as it is with base_frame, whether TF has that or the ground only.
+    own = m.scans[0].xyz[np.hypot(*m.scans[0].xyz[:, :2].T) < 1.0]
+    by_tf = m.told._replace(footprint=tilted(0.1, -0.2, 0.9))
+    for told, base in ((m.told, tilted(m.mount.roll, m.mount.pitch, m.mount.height)),
+                       (by_tf, by_tf.footprint)):
+        (line,) = re.findall(r"# body: (.*)", params_yaml(replace(m, told=told)))
+        assert kept_points(own, CropParams(body=tuple(json.loads(line))), base).mean() < 0.02
 
 
 def seen(half=np.inf, body=0.0, height=0.6, seed=0):

@@ -49,9 +49,9 @@ def found(told, backwards=False):
     return measured(scans[::-1] if backwards else scans, range(COUNT), "drive", COUNT, None, told)
 
 
-def told(poses, actual, said=None, height=np.nan):
+def told(poses, actual, said=None, height=None):
     """As from a robot whose base is where the sensor's pose says, if its mount is actual."""
-    return Told("base_link", said, height,
+    return Told("base_link", said, None if height is None else tilted(0, 0, height),
                 {i: pose @ inverse(actual) for i, pose in enumerate(poses)})
 
 
@@ -100,9 +100,9 @@ def test_what_tf_says_and_the_clouds_do_not_is_said_with_the_remedy():
     row = next(each for each in findings(right) if each.what == "mount by TF")
     assert row.sure == "sure" and "above 'base_footprint'" in row.how
     assert not any("URDF" in line for line in doubts(right))
-    for said, height, words in ((on_robot(0, roll + 3, pitch), np.nan, "with roll"),
-                                (on_robot(0, roll, pitch - 3), np.nan, "and pitch"),
-                                (on_robot(45, roll, pitch), np.nan, "correct the yaw"),
+    for said, height, words in ((on_robot(0, roll + 3, pitch), None, "with roll"),
+                                (on_robot(0, roll, pitch - 3), None, "and pitch"),
+                                (on_robot(45, roll, pitch), None, "correct the yaw"),
                                 (true, m.mount.height + 0.4, "above the ground")):
         wrong = found(told(poses, true, said, height))
         assert sum("URDF" in line and words in line for line in doubts(wrong)) == 1
