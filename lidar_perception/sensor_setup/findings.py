@@ -132,10 +132,11 @@ def _heading(m: Measured) -> Finding:
     h = m.heading
     if h is None or h.unknown:
         return Finding("ahead", "not known", h.unknown if h else "no ground in sight", DOUBTFUL)
-    what = f"where x of '{m.told.base}' looks, by its motion and" if h.base else (
-        "where the robot drives, by")
-    return Finding("ahead", f"{h.degrees:z.0f} +- {h.error:.0f} deg from x", f"{what} how what "
-                   f"stands around shifts in {h.pairs} pairs of clouds",
+    by = f"how what stands around shifts in {h.pairs} pairs of clouds"
+    what = (f"where x of '{m.told.base}' looks, by its motion and {by}" if h.base else
+            "where the robot drives, by " + ("the sensor's odometry" if m.told.poses and
+                                             not m.told.base else by))
+    return Finding("ahead", f"{h.degrees:z.0f} +- {h.error:.0f} deg from x", what,
                    DOUBTFUL if looks_elsewhere(h) else FAIR)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from lidar_perception.robot.crop import kept_points
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placing import tilted
-from lidar_perception.robot.poses import moved_points
+from lidar_perception.robot.poses import inverse, moved_points
 from lidar_perception.sensor_setup.beams import Beams, azimuth_steps, beams_of, range_noise
 from lidar_perception.sensor_setup.coverage import Coverage, coverage_of
 from lidar_perception.sensor_setup.motion import Ahead, ahead_of, driven, pictures_of, shifts_of
@@ -122,7 +122,11 @@ def _heading(scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None,
     pose = tilted(mount.roll, mount.pitch, mount.height)
     levelled = [moved_points(scan.xyz, pose) for scan in scans]
     shifts = shifts_of(pictures_of(levelled, moves=still is False), numbers)
-    return ahead_of(shifts, driven(told.poses, shifts))
+    if told.base or not told.poses:
+        return ahead_of(shifts, driven(told.poses, shifts))
+    # Odometry of the sensor itself says no base's x, but where it went.
+    return ahead_of(driven({number: sensor @ inverse(pose) for number, sensor
+                            in told.poses.items()}, shifts), {})
 
 
 def model_of(beams: Beams | None) -> tuple[str, float]:

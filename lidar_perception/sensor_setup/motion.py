@@ -17,7 +17,8 @@ LOCKED, FEW_SCANS = 0.7, 5  # share of the scans, if there are so many, in which
 GAPS = (1, 2, 4, 8, 16)  # clouds from one to the one that it is compared with
 AGREED = 0.8             # so long is the mean of the directions at least, 0 .. 1
 STRAIGHT = 5.0           # degrees; what is not at its origin goes elsewhere where the base turns
-ONE = 8.0                # degrees: error of one shift's direction, at least
+ONE = 7.0                # degrees: error of a direction, at least: what stands around may lead all
+                         # pairs of one place alike, as walls do
 
 
 class Shift(NamedTuple):
@@ -138,5 +139,5 @@ def ahead_of(pairs: Pairs, base: Pairs) -> Ahead:
                f"the robot turned, or drove to and fro: {len(turns)} shifts have different "
                "directions")
         return Ahead(np.nan, np.nan, len(turns), went, why, bool(by_base))
-    error = max(float(np.degrees(np.sqrt(-2 * np.log(agree)))), ONE) / np.sqrt(len(turns))
+    error = max(float(np.degrees(np.sqrt(-2 * np.log(agree)) / np.sqrt(len(turns)))), ONE)
     return Ahead(float(np.degrees(np.angle(mean))), error, len(turns), went, "", bool(by_base))

@@ -17,9 +17,9 @@ FOOTPRINT = "base_footprint"  # on the ground below base_link (REP-120)
 
 class Told(NamedTuple):
     """base: the robot's frame, "" for none; mount (4, 4): the sensor's pose in it, None where TF
-    does not say it; footprint (4, 4): likewise in base_footprint; poses: of the base in a
-    frame that stands, by the number of the cloud; left_out: transforms and odometry that are no
-    poses."""
+    does not say it; footprint (4, 4): likewise in base_footprint; poses: of the base, or without
+    one of the sensor, in a frame that stands, by the number of the cloud; left_out: transforms and
+    odometry that are no poses."""
 
     base: str = ""
     mount: np.ndarray | None = None
@@ -53,12 +53,13 @@ NOTHING = Told()
 
 def told_by(poses: BagPoses | None, numbers: Sequence[int], stamps_ns: np.ndarray | None) -> Told:
     """What the odometry and TF of a bag say; poses None: nothing is told."""
-    if poses is None or stamps_ns is None or not (base := poses.base):
+    if poses is None or stamps_ns is None or not (poses.base or poses.carrier):
         return NOTHING
+    base = poses.base
     mount = poses.mounted(base)
     moved = {}
     for number in numbers:
-        pose = _base_pose(poses, int(stamps_ns[number]), mount)
+        pose = _base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))
         if pose is not None:
             moved[number] = pose
     return Told(base, mount, poses.mounted(FOOTPRINT), moved, poses.left_out)

@@ -11,7 +11,7 @@ from lidar_perception.data.raw_clouds import _of_frame, open_clouds
 from lidar_perception.params import ReceptionParams
 from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import inverse
-from lidar_perception.sensor_setup.doubts import doubts
+from lidar_perception.sensor_setup.doubts import doubts, looks_elsewhere
 from lidar_perception.sensor_setup.files import node_params, params_yaml
 from lidar_perception.sensor_setup.findings import findings
 from lidar_perception.sensor_setup.measure import measured
@@ -82,6 +82,17 @@ def test_to_and_fro_is_told_with_odometry_only():
     assert ahead_of(shifts, went).degrees == pytest.approx(90)
     off = {pair: (np.cos(i), np.sin(i)) for i, pair in enumerate(shifts)}
     assert "does not agree" in ahead_of(shifts, off).unknown
+
+
+def test_odometry_of_the_sensor_itself_says_where_it_drives_whatever_the_clouds_look_like():
+    _, poses = drive()
+    m = found(Told(poses={i: pose @ on_robot(30) for i, pose in enumerate(poses)}))
+    assert m.heading.degrees == pytest.approx(-30, abs=1) and not m.heading.base
+
+
+def test_many_pairs_of_one_place_are_led_alike_and_no_surer_than_one():
+    alike = ahead_of({(i, i + 1): np.array([1.0, 0.25]) for i in range(40)}, {})
+    assert alike.error >= 7 and not looks_elsewhere(alike)
 
 
 def test_pairs_in_which_the_base_turned_or_is_not_known_say_nothing():
