@@ -23,6 +23,8 @@ from lidar_perception.simulation.sensor import NAMES, Sensor, sensor_named
 from lidar_perception.types import InputError
 
 SAME_MODEL = 0.15   # degrees between beams, the median, of sensors of one model
+PART = 1 / 6        # of the space between its beams, likewise, of beams that are not as many: those
+                    # of any sensor are a quarter of it from the nearest
 FEW_SCANS = 5       # fewer say little of what is the robot's and what is the place's
 SMALL_ROOM = 30.0   # metres: where nothing is farther, the room ends the range and not the sensor
 TURNED = 0.01       # degrees by which points of a beam scatter, from which on they have been moved
@@ -139,8 +141,11 @@ def model_of(beams: Beams | None) -> tuple[str, float]:
         known = np.degrees(sensor_named(name).elevations)
         if sensor_named(name).wander or not 0.75 <= len(beams.elevations) / len(known) <= 1.05:
             continue
-        off = np.abs(beams.elevations[:, None] - known).min(axis=1)
-        if np.median(off) < error and np.percentile(off, 90) < 5 * SAME_MODEL:
+        alike = len(beams.elevations) == len(known)
+        off = np.abs(beams.elevations - known if alike else
+                     np.abs(beams.elevations[:, None] - known).min(axis=1))
+        limit = error if alike else min(error, PART * float(np.median(-np.diff(known))))
+        if np.median(off) < limit and np.percentile(off, 90) < 5 * SAME_MODEL:
             best, error = name, float(np.median(off))
     return best, error if best else np.nan
 

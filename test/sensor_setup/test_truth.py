@@ -9,14 +9,14 @@ import pytest
 from tilted_samples import BARE, MOUNTS, clouds_of
 
 from lidar_perception.data.raw_clouds import open_clouds, spread
-from lidar_perception.sensor_setup.beams import beams_of
+from lidar_perception.sensor_setup.beams import Beams, beams_of
 from lidar_perception.sensor_setup.doubts import doubts
 from lidar_perception.sensor_setup.files import chosen_params, params_yaml, sensor_yaml
 from lidar_perception.sensor_setup.findings import findings
-from lidar_perception.sensor_setup.measure import measured
+from lidar_perception.sensor_setup.measure import measured, model_of
 from lidar_perception.sensor_setup.mount import ground_plane, mount_of
 from lidar_perception.sensor_setup.scans import intensity_of, scan_of
-from lidar_perception.simulation.sensor import sensor_from_file, sensor_named
+from lidar_perception.simulation.sensor import NAMES, sensor_from_file, sensor_named
 from lidar_perception.wire.params import InputParams
 
 CHECKED = ("hdl-64e", "vlp-16", "pandarxt-32")  # by the order, by rings, and by elevations
@@ -93,6 +93,18 @@ def test_of_a_model_that_is_seen_in_part_all_beams_are_written(tmp_path):
     assert len(m.beams.elevations) == 14 and "14 of the 16 beams" in " ".join(doubts(m))
     assert sensor_from_file(tmp_path / "sensor.yaml").elevations == pytest.approx(
         sensor_named("vlp-16").elevations)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_model_is_known_by_its_beams_and_no_other_sensor_is_taken_for_it(name):
+    sensor = sensor_named(name)
+    up = np.degrees(sensor.elevations)
+    of = Beams(up, 0 * up, 0 * up, 0 * up, [], "ring")
+    known = "" if sensor.wander else name
+    assert model_of(of)[0] == model_of(of._replace(elevations=up[np.arange(len(up)) % 7 != 3]))[
+        0] == model_of(of._replace(elevations=up + 0.05 * (-1) ** np.arange(len(up))))[0] == known
+    for half, rows in ((12.5, 126), (11.25, 112), (12.5, 60)):
+        assert not model_of(of._replace(elevations=np.linspace(half, -half, rows)))[0]
 
 
 def test_a_height_that_is_given_counts_where_no_ground_is_seen():
