@@ -25,6 +25,7 @@ MIN_CELLS = 20           # of sector and beam; fewer are chance
 MARGIN = 0.05            # metres around the body
 FAR, CHANGED = 4.0, 0.3  # metres: returns from beyond that differ so much between scans have moved
 STILL = 0.3              # of them, below which the robot stands still: people move around it
+MET = 20.0               # metres: ground that is nearer gives a return
 MIN_BLIND = 3            # degrees; narrower gaps are chance
 SEEN = 0.35              # of the sectors give a return to a beam that says something of blind ones
 ROW = 2.0                # degrees between rows where there are no beams
@@ -78,13 +79,17 @@ def coverage_of(scans: Sequence[Scan], beams: Beams | None, mount: Mount | None)
     if walls:
         body = _enough(body & (middle < ARM))
         mine, box = _own(scans, labels, body, middle)
+    # Only what should have met the ground is blind: beams of one that leans look at the sky.
+    meets = np.ones(seen.shape, bool) if mount is None else (
+        _ways(rows) @ mount.normal * MET < -mount.height)
+    open_ = (seen > 0).any(axis=0) | ~meets.any(axis=0)
     inside = [~kept_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
     others = float(sum((i & ~m).sum() for i, m in zip(inside, mine))
                    / max(1, sum(i.sum() for i in inside)))
     found = Coverage(rows, seen, body, box, others, sum(m.sum() for m in mine) / max(1, total),
-                     walls, still, [], _view(seen))
+                     walls, still, [], _view(open_))
     hides = body & found.fits
-    return found._replace(blocked=_blocked((seen == 0) | hides, seen, hides))
+    return found._replace(blocked=_blocked(((seen == 0) & meets) | hides, open_, seen, hides))
 
 
 def _own(scans: Sequence[Scan], labels: Sequence[np.ndarray], body: np.ndarray,
@@ -165,11 +170,10 @@ def _ways(rows: np.ndarray) -> np.ndarray:
                                         np.sin(up)), axis=-1)
 
 
-def _blocked(blind: np.ndarray, seen: np.ndarray,
+def _blocked(blind: np.ndarray, open_: np.ndarray, seen: np.ndarray,
              body: np.ndarray) -> list[tuple[int, float, float]]:
-    """Where all beams from one on are blind, as sectors. Beams that hardly see anything, as those
-    to the sky, say nothing."""
-    open_ = (seen > 0).any(axis=0)
+    """Where all beams from one on are blind, as sectors; all of them in what is not open_ (360,).
+    Beams that hardly see anything, as those to the sky, say nothing."""
     says = (seen[:, open_] > 0).mean(axis=1) >= SEEN if open_.any() else np.zeros(len(seen), bool)
     if not says.any():
         return []
@@ -195,9 +199,8 @@ def _blocked(blind: np.ndarray, seen: np.ndarray,
     return sorted(out)
 
 
-def _view(seen: np.ndarray) -> tuple[float, float]:
+def _view(open_: np.ndarray) -> tuple[float, float]:
     """From the end of the widest gap to its beginning; 0, 360 without a gap."""
-    open_ = (seen > 0).any(axis=0)
     if not open_.any() or open_.all():
         return 0.0, 360.0
     turn = int(np.argmax(open_))

@@ -133,6 +133,10 @@ def _mount_doubts(m: Measured) -> list[str]:
     if np.degrees(q.spread[1:]).max() > SLOPE:
         out.append(f"the ground leans by {np.degrees(q.spread[1:]).max():.1f} deg from scan to "
                    "scan: slopes, curves or a swaying robot; record on level ground, or longer")
+    if not q.level:
+        out.append("simulate and train have a level sensor: in sensor.yaml it does not lean, and "
+                   "no sectors are blind but those beside its view; nodes, and convert --robot, "
+                   "level the clouds by robot.param.yaml")
     lean = np.degrees([np.arctan2(np.sin(q.roll), abs(np.cos(q.roll))), q.pitch])
     if np.abs(lean).max() > STEEP_MOUNT and (len(m.scans) < FEW_SCANS or m.coverage.still):
         out.append(f"the sensor leans by {np.abs(lean).max():.0f} deg against the ground, which "

@@ -124,8 +124,9 @@ def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
         for name, value, error in (("roll", q.roll, q.error[1]), ("pitch", q.pitch, q.error[2])):
             out[f"ground.sensor_pose.{name}"] = (
                 round(value, 4), f"{np.degrees(value):.2f} +- {np.degrees(error):.2f} degrees")
-        near = [np.percentile(np.hypot(*s.xyz[p.on][:, :2].T), 1) for s, p in zip(m.scans, q.planes)
-                if p is not None]
+        level = tilted(q.roll, q.pitch)
+        near = [np.percentile(np.hypot(*moved_points(s.xyz[p.on], level)[:, :2].T), 1)
+                for s, p in zip(m.scans, q.planes) if p is not None]
         start = round(NEAREST_GROUND * float(np.median(near)), 1)
         out["ground.patchwork.min_range"] = (start, "the nearest ground is "
                                              f"{float(np.median(near)):.1f} m away")

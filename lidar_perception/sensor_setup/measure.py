@@ -172,8 +172,10 @@ def sensor_of(found: Measured) -> Sensor:
         fields["min_range"] = float(np.floor(100 * min(found.least, Sensor.min_range)) / 100)
     if found.beams is None:
         return _grid(found, fields)
-    # What one place hides is not what the robot hides: there only the ends of the view count.
-    places = found.coverage.still is False and len(found.scans) >= FEW_SCANS
+    # What one place hides is not what the robot hides: there only the ends of the view count, and
+    # so they do where lower beams do not look lower.
+    places = found.coverage.still is False and len(found.scans) >= FEW_SCANS and (
+        found.mount is not None and found.mount.level)
     fields["blocked"] = tuple(b for b in found.coverage.blocked if places or b[0] == 0)
     up, lifts = np.radians(np.round(found.beams.elevations, 4)), np.round(found.beams.lifts, 4)
     if found.as_model and known is not None:

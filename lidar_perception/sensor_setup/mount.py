@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lidar_perception.ground.params import ThresholdParams
+from lidar_perception.ground.segment import MAX_LEAN
 from lidar_perception.ground.threshold import fit_plane, height_above, ransac_plane
 from lidar_perception.robot.placing import tilted
 from lidar_perception.sensor_setup.scans import Scan
@@ -66,6 +67,11 @@ class Mount(NamedTuple):
     def normal(self) -> np.ndarray:
         """(3,) unit vector that points up, in the sensor's frame."""
         return tilted(self.roll, self.pitch)[2, :3]
+
+    @property
+    def level(self) -> bool:
+        """Whether z of the sensor points up, but for as much as roads slope."""
+        return bool(self.normal[2] >= np.cos(np.radians(MAX_LEAN)))
 
 
 def ground_plane(xyz: np.ndarray, below: bool) -> Plane | None:

@@ -103,19 +103,21 @@ def test_the_robots_body_is_found_and_left_out():
         assert kept_points(own, CropParams(body=tuple(json.loads(line))), base).mean() < 0.02
 
 
-def seen(half=np.inf, body=0.0, height=0.6, seed=0):
+def seen(half=np.inf, body=0.0, height=0.6, seed=0, turn=np.eye(3)):
     """Scans of a sensor of 16 beams so high between walls half beside it, with other things around
-    in each, and a deck of the robot as far behind as body."""
+    in each, a deck of the robot as far behind as body, and the sky; turn: from its
+    axes to level ones."""
     rng = np.random.default_rng(seed)
     up, aside = np.radians(np.meshgrid(np.arange(-15.0, 16, 2), np.arange(0.0, 360, 0.5)))
     way = np.stack([np.cos(up) * np.cos(aside), np.cos(up) * np.sin(aside), np.sin(up)], axis=-1)
+    _, y, z = np.moveaxis(way @ turn.T, -1, 0)
     for _ in range(8):
-        with np.errstate(divide="ignore"):
-            reach = np.minimum.reduce([
-                half / np.abs(way[..., 1]), height / np.maximum(-way[..., 2], 1e-3),
-                np.repeat(rng.uniform(5, 50, 72), 10)[:, None] + 0 * up])
+        things = np.repeat(rng.uniform(5, 50, 72), 10)[:, None]
+        reach = np.minimum.reduce([half / np.maximum(np.abs(y), 1e-3), height / np.maximum(
+            -z, 1e-3), np.where(z > 0.2, np.inf, things)])
         reach[(np.abs(aside - np.pi) < 0.4) & (up < 0) & (body > 0)] = body
-        yield scan_at((way * reach[..., None]).reshape(-1, 3) + rng.normal(0, 0.005, (up.size, 3)))
+        met = np.isfinite(reach)
+        yield scan_at(way[met] * reach[met, None] + rng.normal(0, 0.005, (met.sum(), 3)))
 
 
 def scan_at(xyz):
@@ -141,6 +143,17 @@ def test_clouds_whose_origin_is_on_the_ground_are_told_and_their_floor_is_no_bod
     assert mount_of(scans) is None and on_the_ground(scans) and not on_the_ground(list(seen()))
     m = of(scans, range(8))
     assert not m.coverage.body.any() and said(m, "base_footprint", "driver's own cloud")
+
+
+@pytest.mark.parametrize("roll, pitch", [(0, 28), (180, -10)])
+def test_of_a_sensor_that_leans_the_sky_is_not_blind_and_ground_begins_where_it_does(roll, pitch):
+    lean = tilted(*np.radians([roll, pitch]))[:3, :3]
+    m = of(list(seen(turn=lean)), range(8))
+    assert np.degrees(m.mount.pitch) == pytest.approx(pitch, abs=0.5) and not m.mount.level
+    assert m.coverage.view == (0, 360) and not sensor_of(m).blocked and said(m, "level sensor")
+    nearest = min(np.hypot(*(s.xyz[p.on] @ lean.T)[:, :2].T).min()
+                  for s, p in zip(m.scans, m.mount.planes))
+    assert node_params(m)["ground.patchwork.min_range"][0] <= nearest
 
 
 def test_a_sector_that_never_returns_is_the_end_of_the_view():
