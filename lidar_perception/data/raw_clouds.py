@@ -12,7 +12,7 @@ import numpy as np
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.bag_poses import BagPoses
-from lidar_perception.data.cloud_files import cloud_files, to_message
+from lidar_perception.data.cloud_files import cloud_files, named_times, to_message
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording, with_topic
 from lidar_perception.data.to_bag import points_of
@@ -70,8 +70,10 @@ def _of_bag(path: Path, topic: str) -> RawClouds:
 
 
 def _of_files(path: Path, files: list[Path]) -> RawClouds:
+    stamps = named_times(files)
     return RawClouds(path, f"{len(files)} {files[0].suffix} file{'s' * (len(files) != 1)}",
-                     len(files), None, lambda i: to_message(files[i]))
+                     len(files), np.array(stamps) if stamps else None,
+                     lambda i: to_message(files[i], stamps[i] if stamps else 0))
 
 
 def _of_frame(frame: Frame) -> Any:
@@ -84,9 +86,9 @@ def spread(count: int, wanted: int) -> list[int]:
     """Which clouds to look at: up to wanted numbers below count in ascending order, pairs evenly
     over all, so that motion shows within a pair and places differ between them: of a fast robot in
     those of neighbours, of a slow one in every second, whose clouds are APART."""
-    if count <= wanted:
-        return list(range(count))
-    pairs = max(wanted // 2, 1)
+    if count <= wanted or wanted < 2:
+        return list(range(min(count, wanted)))
+    pairs = wanted // 2
     gaps = np.where(np.arange(pairs) % 2 == 1, min(APART, count - 1), 1)
     starts = np.linspace(0, count - 1 - gaps[-1], pairs).astype(int)
     return sorted({*starts.tolist(), *np.minimum(starts + gaps, count - 1).tolist()})

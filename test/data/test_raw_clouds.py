@@ -168,14 +168,24 @@ def test_a_bag_of_one_sensor_is_read_and_of_several_the_one_that_is_named(tmp_pa
         open_clouds(tmp_path / "three", "/other")
 
 
+def test_files_that_are_named_by_times_have_these_as_stamps(tmp_path):
+    for name in ("1700000000.1", "1700000000.2"):
+        (tmp_path / f"{name}.pcd").write_bytes(pcd(points(), "ascii"))
+    clouds = open_clouds(tmp_path)
+    assert clouds.stamps_ns.tolist() == [17 * 10**17 + 10**8, 17 * 10**17 + 2 * 10**8]
+    assert clouds.load(1).header.stamp.nanosec == 2 * 10**8
+    (tmp_path / "another.pcd").write_bytes(pcd(points(), "ascii"))
+    assert open_clouds(tmp_path).stamps_ns is None
+
+
 def test_scans_are_looked_at_in_pairs_spread_over_all():
     assert spread(5, 10) == [0, 1, 2, 3, 4]
     chosen = spread(1000, 40)
     assert len(chosen) == 40 and chosen[:2] == [0, 1] and chosen[-1] == 999
     assert np.diff(chosen)[::2].tolist() == [1, 8] * 10 and (np.diff(chosen)[1::2] > 40).all()
-    assert spread(3, 1) == [0, 1] and spread(1, 1) == [0]
+    assert spread(3, 1) == [0] and spread(1, 1) == [0]
     for count in range(1, 60):
         for wanted in range(1, 45):
             chosen = spread(count, wanted)
             assert chosen == sorted({*chosen}) and chosen[0] == 0 and chosen[-1] < count
-            assert len(chosen) <= max(wanted, 2) and (count == 1 or len(chosen) > 1 or wanted == 1)
+            assert len(chosen) <= wanted and (count == 1 or len(chosen) > 1 or wanted == 1)
