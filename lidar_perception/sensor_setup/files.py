@@ -48,8 +48,8 @@ def sensor_yaml(m: Measured) -> str:
         "not measured: no ground in sight" if m.hint is None else GIVEN,
         "rate": f"from {m.timing.by}" if np.isfinite(m.timing.rate) else "not measured",
         "azimuth_step": f"{sensor.columns} firings in a turn",
-        "min_range": f"not measured; {model}" if m.model or sensor.min_range == Sensor.min_range
-        else "the nearest that is not the robot's own",
+        "min_range": "the nearest that is not the robot's own" if m.least < sensor.min_range + 0.01
+        else f"not measured; {model}",
         "max_range": "the farthest seen" if m.greatest >= SMALL_ROOM else f"not measured; {model}",
         "range_noise": f"not measured; {model}" if np.isnan(m.noise) else "about smooth surfaces",
         "divergence": f"not measured; {model}", "reach": f"not measured; {model}",
