@@ -24,6 +24,7 @@ OFF_GROUND = 0.15        # metres above the ground, from which on a return may b
 MIN_CELLS = 20           # of sector and beam; fewer are chance
 MARGIN = 0.05            # metres around the body
 FAR, CHANGED = 4.0, 0.3  # metres: returns from beyond that differ so much between scans have moved
+USUAL = (0.1, 0.9)       # shares of the scans between which returns differ: people pass by
 STILL = 0.3              # of them, below which the robot stands still: people move around it
 MET = 20.0               # metres: ground that is nearer gives a return
 MIN_BLIND = 3            # degrees; narrower gaps are chance
@@ -53,23 +54,38 @@ class Coverage(NamedTuple):
 
     @property
     def fits(self) -> bool:
-        """Whether the box can be left out, and what the body hides is hidden: it is not of walls,
-        and few other points are in it, or none of it is farther than an arm."""
+        """Whether the box can be left out: it is not of walls, and few other points are in it, or
+        none of it is farther than an arm."""
         return len(self.box) > 0 and not self.walls and (
             self.others <= MAX_OTHERS or float(np.abs(self.box).max()) < ARM)
 
 
-def coverage_of(scans: Sequence[Scan], beams: Beams | None, mount: Mount | None) -> Coverage:
-    """What all scans together see."""
+class Nearest(NamedTuple):
+    """rows (R,) as of Coverage; labels: of each scan (N,) int64, the rows of its points, -1 of
+    none; ranges (S, R, 360) float32: m of the nearest return in each scan, inf without one."""
+
+    rows: np.ndarray
+    labels: list[np.ndarray]
+    ranges: np.ndarray
+
+
+def nearest_of(scans: Sequence[Scan], beams: Beams | None) -> Nearest:
+    """What each scan sees, by rows and sectors."""
     rows, labels = _rows(scans, beams)
     near = np.full((len(scans), len(rows), SECTORS), np.inf, np.float32)
     for image, scan, label in zip(near, scans, labels):
         known = label >= 0
         np.minimum.at(image, (label[known], _sectors(scan)[known]),
                       scan.range[known].astype(np.float32))
-    there = np.isfinite(near)
-    seen = there.mean(axis=0)
-    still = _stands_still(near)
+    return Nearest(rows, labels, near)
+
+
+def coverage_of(scans: Sequence[Scan], nearest: Nearest, mount: Mount | None,
+                still: bool | None) -> Coverage:
+    """What all scans together see; still: as stands_still, or more that is known of the robot's
+    motion, says."""
+    rows, labels, near = nearest
+    seen = np.isfinite(near).mean(axis=0)
     body, middle = _body(near, rows, mount, still)
     mine, box = _own(scans, labels, body, middle)
     total = sum(len(scan.xyz) for scan in scans)
@@ -88,7 +104,7 @@ def coverage_of(scans: Sequence[Scan], beams: Beams | None, mount: Mount | None)
                    / max(1, sum(i.sum() for i in inside)))
     found = Coverage(rows, seen, body, box, others, sum(m.sum() for m in mine) / max(1, total),
                      walls, still, [], _view(open_))
-    hides = body & found.fits
+    hides = body & (found.fits and still is False)  # else it may be who stands beside the robot
     return found._replace(blocked=_blocked(((seen == 0) & meets) | hides, open_, seen, hides))
 
 
@@ -124,16 +140,17 @@ def _at(scan: Scan, labels: np.ndarray, cells: np.ndarray, otherwise: float) -> 
     return np.where(labels >= 0, cells[labels, _sectors(scan)], otherwise).astype(cells.dtype)
 
 
-def _stands_still(near: np.ndarray) -> bool | None:
-    """Whether far returns stay where they are; None with one scan, or too few such returns."""
-    if len(near) < 2:
+def stands_still(ranges: np.ndarray) -> bool | None:
+    """Whether far returns (S, R, 360) m of S scans, inf for none, usually stay where they are; None
+    with one scan, or too few such returns."""
+    if len(ranges) < 2:
         return None
-    there = np.isfinite(near)
-    both = there.sum(axis=0) >= max(2, 0.6 * len(near))
-    first = near.min(axis=0)
-    last = np.where(there, near, -1.0).max(axis=0)
-    middle = (first + last) / 2
-    far = both & (middle > FAR)
+    count = np.isfinite(ranges).sum(axis=0)
+    there = count >= max(2, 0.6 * len(ranges))
+    ordered, last = np.sort(ranges[:, there], axis=0), count[there] - 1
+    first, last = (np.take_along_axis(ordered, np.round(share * last).astype(int)[None], axis=0)[0]
+                   for share in USUAL)
+    far = first + last > 2 * FAR
     if far.sum() < 100:
         return None
     return bool(((last - first)[far] > CHANGED).mean() < STILL)

@@ -13,7 +13,7 @@ from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import inverse, moved_points
 from lidar_perception.sensor_setup.beams import Beams, azimuth_steps, beams_of, range_noise
-from lidar_perception.sensor_setup.coverage import Coverage, coverage_of
+from lidar_perception.sensor_setup.coverage import Coverage, coverage_of, nearest_of, stands_still
 from lidar_perception.sensor_setup.motion import Ahead, ahead_of, driven, pictures_of, shifts_of
 from lidar_perception.sensor_setup.mount import Mount, mount_of, on_the_ground
 from lidar_perception.sensor_setup.scans import Intensity, Scan, intensity_of, require_space
@@ -28,6 +28,7 @@ PART = 1 / 6        # of the space between its beams, likewise, of beams that ar
 FEW_SCANS = 5       # fewer say little of what is the robot's and what is the place's
 SMALL_ROOM = 30.0   # metres: where nothing is farther, the room ends the range and not the sensor
 TURNED = 0.01       # degrees by which points of a beam scatter, from which on they have been moved
+HARDLY = 0.1        # metres: a robot that has gone less stands still
 AROUND = (-15.0, 5.0)  # degrees: where people are, in which the distance of beams is measured
 
 
@@ -102,13 +103,19 @@ def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: 
         step, twice = azimuth_steps(scans, beams)
         noise, pieces = range_noise(scans, beams, step)
     mount = mount_of(scans)
-    coverage = coverage_of(scans, beams, mount)
+    nearest = nearest_of(scans, beams)
+    still = stands_still(nearest.ranges)
+    heading = _heading(scans, numbers, mount, still, told)
+    way = (np.ptp([pose[:2, 3] for pose in told.poses.values()], axis=0).max() if told.poses else
+           np.nan if heading is None else heading.went)
+    # People who pass by, or doors, change what is around a robot that stands.
+    still = True if len(scans) > 1 and way < HARDLY else still
+    coverage = coverage_of(scans, nearest, mount, still)
     ranges = np.concatenate([s.range for s in scans])
     away = ranges[kept_points(np.concatenate([s.xyz for s in scans]), CropParams(
         body=tuple(coverage.box.tolist()) if coverage.fits else ()))]
     least, greatest = np.percentile(away if len(away) else ranges, [0.02, 99.995])
     model, error = model_of(beams)
-    heading = _heading(scans, numbers, mount, coverage.still, told)
     found = Measured(source, tuple(scans), total, intensity_of(scans), beams, step, twice, noise,
                      pieces, coverage, mount, heading, float(least), float(greatest),
                      timing_of(scans, stamps_ns), model, error, told, hint)
@@ -168,8 +175,10 @@ def sensor_of(found: Measured) -> Sensor:
         "rate", 10.0)
     if found.mount is not None or found.hint is not None:
         fields["height"] = found.hint if found.mount is None else round(found.mount.height, 3)
-    if known is None:  # the nearest thing may be far away, as the ground is
-        fields["min_range"] = float(np.floor(100 * min(found.least, Sensor.min_range)) / 100)
+    # The nearest thing may be far away, as the ground is, and nearer than the model's data sheet.
+    least = fields.get("min_range", Sensor.min_range)
+    if found.least < least:
+        fields["min_range"] = float(np.floor(100 * found.least) / 100)
     if found.beams is None:
         return _grid(found, fields)
     # What one place hides is not what the robot hides: there only the ends of the view count, and

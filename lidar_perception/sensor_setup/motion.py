@@ -34,8 +34,8 @@ Pairs = Mapping[tuple[int, int], Shift | None]  # by the numbers of two scans
 class Ahead(NamedTuple):
     """Where the robot drives, or the x axis of its base looks: degrees from x, counter-clockwise,
     NaN where that is not known, and the error of that; pairs: of scans that tell; went: the longest
-    shift, metres; unknown: why it is not known, "" where it is; base: whether it is the base's x
-    axis, whichever way the robot drove."""
+    shift, metres, NaN where most are not clear; unknown: why it is not known, "" where it is; base:
+    whether it is the base's x axis, whichever way the robot drove."""
 
     degrees: float
     error: float
@@ -124,7 +124,7 @@ def ahead_of(pairs: Pairs, base: Pairs) -> Ahead:
            if shift is not None and np.hypot(*shift) >= MIN_SHIFT}
     went = float(np.abs(every).max(initial=0.0))
     if not far and 2 * len(every) <= len(pairs):
-        return Ahead(np.nan, np.nan, 0, went, "what stands around is too little, or too much "
+        return Ahead(np.nan, np.nan, 0, np.nan, "what stands around is too little, or too much "
                      "alike, to see how the robot moved")
     if not far:
         return Ahead(np.nan, np.nan, 0, went, f"the robot moved only {went:.1f} m between the "

@@ -13,7 +13,7 @@ from lidar_perception.data.raw_clouds import _of_frame
 from lidar_perception.robot.crop import kept_points
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placing import tilted
-from lidar_perception.sensor_setup.coverage import coverage_of
+from lidar_perception.sensor_setup.coverage import stands_still
 from lidar_perception.sensor_setup.doubts import doubts
 from lidar_perception.sensor_setup.files import node_params, params_yaml
 from lidar_perception.sensor_setup.findings import findings
@@ -21,6 +21,7 @@ from lidar_perception.sensor_setup.measure import measured, sensor_of
 from lidar_perception.sensor_setup.mount import mount_of, on_the_ground
 from lidar_perception.sensor_setup.scans import Scan, intensity_of, scan_of
 from lidar_perception.sensor_setup.timing import timing_of
+from lidar_perception.sensor_setup.told import NOTHING
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
@@ -129,13 +130,24 @@ def scan_at(xyz):
 @pytest.mark.parametrize("half", [0.8, 1.1, 2.0])
 def test_walls_along_the_way_are_no_body(half):
     """And neither cropped nor blind; what is of the robot in the open is."""
-    scans = list(seen(half))
-    c = coverage_of(scans, None, mount_of(scans))
+    m = of(list(seen(half)), range(8))
+    c = m.coverage
     assert c.still is False and c.walls and not c.fits and not c.blocked
-    assert said(of(scans, range(8)), "walls", "crop.body")
-    scans = list(seen(body=1.5))
-    c = coverage_of(scans, None, mount_of(scans))
+    assert said(m, "walls", "crop.body")
+    c = of(list(seen(body=1.5)), range(8)).coverage
     assert c.fits and not c.walls and c.box[0] == pytest.approx(-1.55, abs=0.05) and c.blocked
+
+
+def test_people_who_pass_by_do_not_move_a_robot_that_stands():
+    around = np.random.default_rng(0).uniform(5, 50, (16, 360))
+    passed = np.array([np.where(np.arange(360) // 36 == i, 4.5, around) for i in range(10)])
+    assert stands_still(passed) and stands_still(np.roll(passed, 1, axis=0)[:2]) is not None
+    assert stands_still(np.array([np.roll(around, 10 * i, axis=1) for i in range(10)])) is False
+    scans = list(seen(body=0.5))
+    poses = {i: tilted(0, 0, 0.6) for i in range(8)}
+    parked = measured(scans, range(8), "parked", 8, None, NOTHING._replace(poses=poses))
+    assert parked.coverage.still and said(parked, "stands still")
+    assert len(parked.coverage.box) and not parked.coverage.blocked
 
 
 def test_clouds_whose_origin_is_on_the_ground_are_told_and_their_floor_is_no_body():
@@ -259,6 +271,14 @@ def test_the_scale_of_intensities(values, full, sure):
     assert (found.full, found.sure) == (full, sure)
     assert intensity_of([scan._replace(intensity=None)]) is None
     assert intensity_of([scan._replace(intensity=np.zeros(9))]) is None
+
+
+def test_whether_intensities_are_whole_is_told_by_all_scans_and_the_nearest_return_counts():
+    scan = all_changed(None)[0]
+    dark = replace_intensity(scan, np.zeros(20_000))
+    assert not intensity_of([dark, replace_intensity(scan, np.linspace(0, 0.9, 9_000))]).whole
+    m = of(all_changed(None))
+    assert m.model and sensor_of(replace(m, least=0.4)).min_range == 0.4
 
 
 def replace_intensity(scan, values):
