@@ -23,6 +23,7 @@ SECTORS = 72        # of a turn
 SMEARED = 0.01      # degrees: beams that scatter more are not told from each other by elevation
 MAX_LIFT_ERROR = 0.01  # metres
 MIN_LIFT = 0.03     # metres; beams that start nearer to each other start together
+MAX_LIFT = 0.5      # metres, more than a sensor is high
 FINER = 1e-3        # degrees: how exactly azimuths are told
 MAX_GAP = 3.5       # steps, up to which it is told how many returns are lost in a gap
 
@@ -50,10 +51,12 @@ def beams_of(scans: Sequence[Scan]) -> Beams | None:
         if labels is None:
             continue
         found = _fitted(scans, labels, how)
-        if found is None:
+        if found is None or len(found.elevations) < 2:
             continue
-        limit = {"ring": STEEP_RING, "order": TIGHT, "elevation": SMEARED}[how]
-        if np.median(found.spread) <= limit:
+        # Points of a scanner whose pattern does not repeat are no beams, whatever its columns say.
+        limit = min({"ring": STEEP_RING, "order": TIGHT, "elevation": SMEARED}[how],
+                    float(np.median(-np.diff(found.elevations))) / 2)
+        if np.median(found.spread) <= limit and np.abs(found.lifts).max() <= MAX_LIFT:
             return found
     return None
 

@@ -124,6 +124,19 @@ def test_beams_are_the_same_by_rings_and_by_elevation():
     assert len(one_label_each) == 16
 
 
+def test_lines_of_a_pattern_that_does_not_repeat_are_no_beams():
+    """As of a Livox, whose four lines look everywhere, indoors: all meet the ceiling."""
+    rng = np.random.default_rng(0)
+    found = []
+    for scan in scans("vlp-16"):
+        away, aside = rng.uniform(2, 12, len(scan.xyz)), np.radians(scan.azimuth)
+        xyz = np.column_stack([away * np.cos(aside), away * np.sin(aside),
+                               2 - 0.02 * away + rng.normal(0, 0.01, len(away))])
+        found.append(scan._replace(xyz=xyz, ground_range=away, ring=np.arange(len(away)) % 4,
+                                   elevation=np.degrees(np.arctan2(xyz[:, 2], away))))
+    assert beams_of(found) is None
+
+
 def test_a_sparser_sensor_gets_wider_neighbourhoods_and_fewer_points():
     sparse, dense = (params_yaml(found(name)) for name in ("vlp-16", "hdl-64e"))
     assert "eps: [0.5, 0.7, 0.9, 1.0]" in sparse and "min_samples: 3" in sparse
