@@ -63,7 +63,7 @@ def checked(frames: Sequence[Frame], source: Path) -> list[str]:
     xyz = np.concatenate([cloud.xyz for cloud in clouds]).astype(np.float64)
     if len(xyz) == 0:
         raise InputError(f"{source}: its clouds have no points; record while the sensor turns")
-    require_metres(np.linalg.norm(xyz, axis=1), str(source))
+    require_metres(xyz, str(source))
     require_space(np.degrees(elevations(xyz)), str(source))
     if any(cloud.intensity is not None and cloud.intensity.any() for cloud in clouds):
         return []

@@ -77,9 +77,10 @@ def doubts(m: Measured) -> list[str]:
                    + ("that of the model" if m.model else "a guess"))
     c = m.coverage
     if c.walls:
-        out.append("more stays at the same place around the robot than a body has, as walls along "
-                   "its way do, so that no crop.body and no sector that it hides is set; record "
-                   "one drive through an open place, or set crop.body by hand by the report")
+        out.append("more stays at the same place around the robot than a body has, as walls and "
+                   "ceilings along its way do, so that no crop.body and no sector that it hides is "
+                   "set; record one drive through an open place, or set crop.body by hand by the "
+                   "report")
     elif len(c.box) and not c.fits:
         out.append(f"{100 * c.others:.0f} % of the points in the box around the robot's own "
                    "returns are not its own, so no crop.body and no sector that it hides is set; "

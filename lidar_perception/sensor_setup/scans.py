@@ -17,7 +17,8 @@ from msg_utils.point_cloud2 import to_array
 # As Velodyne and Ouster, Hesai and Nebula, Livox, RoboSense and others call the number of the beam.
 RINGS = ("ring", "channel", "line", "laser_id", "laser_number", "row")
 SCALES = (1.0, 100.0, 255.0, 65535.0)  # what drivers mean by a full reflection
-FAR = 250.0         # metres; a cloud whose middle range is farther is in millimetres
+FAR = 250.0         # metres; a cloud whose middle range is farther is in millimetres, or far from
+TOGETHER = 200.0    # its origin: if half of its points are so near to their own middle
 FLAT = 1.0          # degrees: a sensor whose returns are within this sees in one plane
 MIN_POINTS = 100    # usable ones, of a cloud that says anything
 RETROREFLECTOR = 0.9  # of the full intensity, from which on returns count as a retroreflector's
@@ -57,7 +58,7 @@ def scan_of(msg: Any, name: str = "the cloud") -> Scan:
                          "record while it turns, in a place with walls or ground in sight")
     xyz = frame.xyz.astype(np.float64)
     ranges = np.linalg.norm(xyz, axis=1)
-    require_metres(ranges, name)
+    require_metres(xyz, name)
     points = to_array(msg)
     columns = points.dtype.names or ()
     seconds, problem = None, ""
@@ -74,12 +75,17 @@ def scan_of(msg: Any, name: str = "the cloud") -> Scan:
                 columns, problem)
 
 
-def require_metres(ranges: np.ndarray, name: str) -> None:
-    """InputError where the ranges (N,) of a cloud's points, N > 0, cannot be metres."""
-    middle = float(np.median(ranges))
-    if middle > FAR:
-        raise InputError(f"{name}: half of its points are farther than {middle:.0f} m, so its "
-                         "coordinates seem to be millimetres; divide x y z by 1000 in the driver")
+def require_metres(xyz: np.ndarray, name: str) -> None:
+    """InputError where the points (N, 3) of a cloud, N > 0, cannot be metres from its sensor."""
+    middle = float(np.median(np.linalg.norm(xyz, axis=1)))
+    if middle <= FAR:
+        return
+    if np.median(np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)) < TOGETHER:
+        raise InputError(f"{name}: half of its points are farther than {middle:.0f} m from the "
+                         "origin and near each other, so it is in a frame such as map; give the "
+                         "driver's own cloud")
+    raise InputError(f"{name}: half of its points are farther than {middle:.0f} m, so its "
+                     "coordinates seem to be millimetres; divide x y z by 1000 in the driver")
 
 
 def require_space(degrees: np.ndarray, name: str) -> None:

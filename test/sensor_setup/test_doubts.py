@@ -237,7 +237,12 @@ def test_millimetres_two_dimensions_few_points_and_mixed_layouts_are_refused():
             points[axis] *= 1000
         return points
 
-    for change, named in ((in_millimetres, "millimetres"), (lambda p: p[:50], "50 usable points")):
+    def on_a_map(points):
+        points["x"], points["y"] = points["x"] + 300, points["y"] - 300
+        return points
+
+    for change, named in ((in_millimetres, "millimetres"), (on_a_map, "frame such as map"),
+                          (lambda p: p[:50], "50 usable points")):
         with pytest.raises(InputError, match=named) as error:
             scan_of(changed(messages()[0], change))
         assert "\n" not in str(error.value)
