@@ -14,7 +14,15 @@ from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import inverse, moved_points
 from lidar_perception.sensor_setup.beams import Beams, azimuth_steps, beams_of, range_noise
 from lidar_perception.sensor_setup.coverage import Coverage, coverage_of, nearest_of, stands_still
-from lidar_perception.sensor_setup.motion import Ahead, ahead_of, driven, pictures_of, shifts_of
+from lidar_perception.sensor_setup.motion import (
+    Ahead,
+    ahead_of,
+    driven,
+    pictures_of,
+    shift_between,
+    shifts_of,
+    spectrum,
+)
 from lidar_perception.sensor_setup.mount import Mount, mount_of, on_the_ground
 from lidar_perception.sensor_setup.scans import Intensity, Scan, intensity_of, require_space
 from lidar_perception.sensor_setup.timing import Timing, timing_of
@@ -106,10 +114,8 @@ def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: 
     nearest = nearest_of(scans, beams)
     still = stands_still(nearest.ranges)
     heading = _heading(scans, numbers, mount, still, told)
-    way = (np.ptp([pose[:2, 3] for pose in told.poses.values()], axis=0).max() if told.poses else
-           np.nan if heading is None else heading.went)
     # People who pass by, or doors, change what is around a robot that stands.
-    still = True if len(scans) > 1 and way < HARDLY else still
+    still = True if len(scans) > 1 and _way(scans, mount, heading, told) < HARDLY else still
     coverage = coverage_of(scans, nearest, mount, still)
     ranges = np.concatenate([s.range for s in scans])
     away = ranges[kept_points(np.concatenate([s.xyz for s in scans]), CropParams(
@@ -129,13 +135,28 @@ def _heading(scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None,
     if mount is None:
         return None
     pose = tilted(mount.roll, mount.pitch, mount.height)
-    levelled = [moved_points(scan.xyz, pose) for scan in scans]
-    shifts = shifts_of(pictures_of(levelled, moves=still is False), numbers)
+    shifts = shifts_of(pictures_of(_levelled(scans, pose), moves=still is False), numbers)
     if told.base or not told.poses:
         return ahead_of(shifts, driven(told.poses, shifts))
     # Odometry of the sensor itself says no base's x, but where it went.
     return ahead_of(driven({number: sensor @ inverse(pose) for number, sensor
                             in told.poses.items()}, shifts), {})
+
+
+def _levelled(scans: Sequence[Scan], pose: np.ndarray) -> list[np.ndarray]:
+    return [moved_points(scan.xyz, pose) for scan in scans]
+
+
+def _way(scans: Sequence[Scan], mount: Mount | None, heading: Ahead | None, told: Told) -> float:
+    """Metres that the robot went, by its poses, else between the clouds that were compared, and
+    from the first to the last: it may be slow. NaN where that is not clear."""
+    if told.poses:
+        return float(np.ptp([pose[:2, 3] for pose in told.poses.values()], axis=0).max())
+    if mount is None or heading is None:
+        return np.nan
+    ends = _levelled([scans[0], scans[-1]], tilted(mount.roll, mount.pitch, mount.height))
+    shift = shift_between(*map(spectrum, pictures_of(ends, moves=False)))
+    return np.nan if shift is None else float(np.maximum(heading.went, np.hypot(*shift)))
 
 
 def model_of(beams: Beams | None) -> tuple[str, float]:

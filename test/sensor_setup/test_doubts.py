@@ -121,6 +121,12 @@ def seen(half=np.inf, body=0.0, height=0.6, seed=0, turn=np.eye(3)):
         yield scan_at(way[met] * reach[met, None] + rng.normal(0, 0.005, (met.sum(), 3)))
 
 
+def trees():
+    rng = np.random.default_rng(7)
+    foot = rng.uniform(-30, 30, (1500, 2))
+    return np.column_stack([np.repeat(foot, 5, axis=0), np.tile(np.linspace(0, 2, 5), 1500)])
+
+
 def scan_at(xyz):
     r, flat = np.linalg.norm(xyz, axis=1), np.hypot(*xyz[:, :2].T)
     return Scan(xyz, np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0])) % 360, np.degrees(
@@ -148,6 +154,12 @@ def test_people_who_pass_by_do_not_move_a_robot_that_stands():
     parked = measured(scans, range(8), "parked", 8, None, NOTHING._replace(poses=poses))
     assert parked.coverage.still and said(parked, "stands still")
     assert len(parked.coverage.box) and not parked.coverage.blocked
+    # Between clouds that follow one another a slow robot hardly moves, either.
+    numbers = [40 * (i // 2) + i % 2 for i in range(8)]
+    slow = [scan_at(np.concatenate([scan.xyz[scan.xyz[:, 2] < -0.5], trees() - [0.04 * n, 0, 0]]))
+            for n, scan in zip(numbers, seen())]
+    m = measured(slow, numbers, "slow", 160, None)
+    assert m.heading.went < 0.1 and m.coverage.still is False
 
 
 def test_clouds_whose_origin_is_on_the_ground_are_told_and_their_floor_is_no_body():
