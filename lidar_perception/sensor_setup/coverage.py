@@ -26,7 +26,7 @@ MARGIN = 0.05            # metres around the body
 FAR, CHANGED = 4.0, 0.3  # metres: returns from beyond that differ so much between scans have moved
 USUAL = (0.1, 0.9)       # shares of the scans between which returns differ: people pass by
 STILL = 0.3              # of them, below which the robot stands still: people move around it
-MET = 20.0               # metres: ground that is nearer gives a return
+MET = 30.0               # metres: ground that is nearer gives a return
 MIN_BLIND = 3            # degrees; narrower gaps are chance
 SEEN = 0.35              # of the sectors give a return to a beam that says something of blind ones
 ROW = 2.0                # degrees between rows where there are no beams
@@ -96,8 +96,9 @@ def coverage_of(scans: Sequence[Scan], nearest: Nearest, mount: Mount | None,
         body = _enough(body & (middle < ARM))
         mine, box = _own(scans, labels, body, middle)
     # Only what should have met the ground is blind: beams of one that leans look at the sky.
-    meets = np.ones(seen.shape, bool) if mount is None else (
+    meets = np.zeros(seen.shape, bool) if mount is None else (
         _ways(rows) @ mount.normal * MET < -mount.height)
+    meets |= not meets.any()  # where that cannot be told, as from high above
     open_ = (seen > 0).any(axis=0) | ~meets.any(axis=0)
     inside = [~kept_points(scan.xyz, CropParams(body=tuple(box.tolist()))) for scan in scans]
     others = float(sum((i & ~m).sum() for i, m in zip(inside, mine))
