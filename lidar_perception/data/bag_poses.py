@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -61,6 +62,8 @@ class BagPoses:
     def at(self, times: np.ndarray) -> np.ndarray:
         """(M, 4, 4) at times (M,) ns, M > 0. Missing where it is not known then."""
         if self.odometry:
+            if self.frame_id == self._first.header.frame_id.lstrip("/"):  # the clouds do not move
+                return np.tile(np.eye(4), (len(times), 1, 1))
             return self._carrier_poses(times) @ self._on_carrier(times)
         if not self.fixed:
             raise Missing(f"{self.path} has neither odometry nor a TF in which "
@@ -80,10 +83,13 @@ class BagPoses:
     @cached_property
     def carrier(self) -> str:
         """The frame that the odometry is of; "" without odometry."""
-        if not self.odometry:
-            return ""
+        return self._first.child_frame_id.lstrip("/") if self.odometry else ""
+
+    @cached_property
+    def _first(self) -> Any:
+        """The first message of the odometry."""
         with Bag(self.path) as bag:
-            return next(msg for *_, msg in bag.messages({self.odometry})).child_frame_id.lstrip("/")
+            return next(msg for *_, msg in bag.messages({self.odometry}))
 
     @cached_property
     def fixed(self) -> str:
@@ -95,8 +101,10 @@ class BagPoses:
     def mounted(self, base: str) -> np.ndarray | None:
         """(4, 4): the sensor's pose in a frame of the robot that it does not move in; None where TF
         does not say it."""
-        frames = self._above[:self._above.index(base)] if base in self._above else None
-        if frames is None or not all(map(self._seen.fixed, frames)):
+        above = self._chain(base)
+        both = next((frame for frame in self._above if frame in above), None)
+        if both is None or not all(map(self._seen.fixed, (
+                *self._above[:self._above.index(both)], *above[:above.index(both)]))):
             return None
         return self._seen.lookup(base, self.frame_id, 0)
 
@@ -120,7 +128,7 @@ class BagPoses:
     def _on_carrier(self, times: np.ndarray) -> np.ndarray:
         """(4, 4), or (M, 4, 4) where it moves on it: where on the carrier the sensor is at times
         (M,) ns; as if in one place where TF does not say."""
-        if self.carrier == self.frame_id or self.carrier not in self._above:
+        if not {*self._above} & {*self._chain(self.carrier)}:
             return np.eye(4)
         if (pose := self.mounted(self.carrier)) is not None:
             return pose
@@ -151,16 +159,19 @@ class BagPoses:
 
     @cached_property
     def _above(self) -> list[str]:
-        """The sensor's frame, its parent, and so on; it alone where they go round."""
+        return self._chain(self.frame_id)
+
+    def _chain(self, frame: str) -> list[str]:
+        """A frame, its parent, and so on; it alone where they go round."""
         try:
-            return self._seen.chain(self.frame_id)
+            return self._seen.chain(frame)
         except Missing:
-            return [self.frame_id]
+            return [frame]
 
     @cached_property
     def _tree(self) -> TransformTree:
-        """All of what moves and what is fixed, above the sensor."""
-        tree, above = TransformTree(keeps_all=True), set(self._above)
+        """All of what moves and what is fixed, above the sensor and what the odometry is of."""
+        tree, above = TransformTree(keeps_all=True), {*self._above, *self._chain(self.carrier)}
         with Bag(self.path) as bag:
             for topic, _, msg in bag.messages(self.transforms):
                 msg.transforms[:] = [each for each in msg.transforms

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from robot_bags import (
     CLOUDS,
+    ON_BASE,
     START,
     base_at,
     check,
@@ -21,6 +22,9 @@ from lidar_perception.data.bag_poses import FILTERED, odometry_topic
 from lidar_perception.data.frame import POSES
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
+from lidar_perception.robot.placing import tilted
+from lidar_perception.robot.poses import inverse
+from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import odometry
 from lidar_perception.wire.topics import ODOMETRY, TF, TF_STATIC
@@ -42,6 +46,20 @@ def test_odometry_of_the_sensor_itself_or_of_what_tf_does_not_know_is_the_sensor
     check(own, np.eye(4))
     check(unknown, np.eye(4))
     assert own.frames.poses.plain and not unknown.frames.poses.plain
+
+
+def test_odometry_of_another_part_of_the_robot_is_carried_to_the_sensor(tmp_path):
+    """As of an inertial sensor beside it, or of a base_footprint below the base."""
+    imu = tilted(0.1, 0.2, 0.3)
+    beside = [(TF_STATIC, TF_MESSAGE, START, tf(transform("base_link", "imu", 0, imu)))]
+    check(recorded(tmp_path / "bag", moving(ODOMETRY, "imu"), mount(), beside),
+          inverse(imu) @ ON_BASE)
+
+
+def test_clouds_in_the_frame_of_the_odometry_do_not_move(tmp_path):
+    still = recorded(tmp_path / "bag", moving(ODOMETRY), cloud=lambda stamp: cloud_message(
+        np.ones((3, 4)), stamp, "odom"))
+    assert all(np.array_equal(frame.pose(), np.eye(4)) for frame in still)
 
 
 def test_as_a_bag_of_ours_the_sensors_poses_are_the_odometry(tmp_path):
