@@ -104,10 +104,10 @@ def _after(means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.n
     return means, (covariances + covariances.transpose(0, 2, 1)) / 2
 
 
-def turned(covariances: np.ndarray, cos: float, sin: float) -> np.ndarray:
-    """The covariances in axes whose x lies at [cos sin] of the old ones' rotation back."""
-    r = np.eye(6)
+def turned(covariances: np.ndarray, cos: float, sin: float, side: float = 1.0) -> np.ndarray:
+    """The covariances in axes in which the old x lies at [cos sin], and the old y to its left, or
+    with side -1 to its right, as seen from below."""
+    r = np.diag([cos, side * cos, cos, side * cos, side, side])
     for a, b in ((X, Y), (VX, VY)):
-        r[a, a] = r[b, b] = cos
-        r[a, b], r[b, a] = -sin, sin
+        r[a, b], r[b, a] = -side * sin, sin
     return r @ covariances @ r.T

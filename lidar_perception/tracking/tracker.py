@@ -168,9 +168,11 @@ def _in_sensor_frame(states: States, ego: Ego, seen: np.ndarray,
     indices = np.flatnonzero((scores >= params.report) & (
         seen | (probability(states.present) >= params.report_unseen)))
     chosen, back = states.take(indices), np.linalg.inv(ego.pose)
-    forward = back[:2, 0] / max(np.hypot(*back[:2, 0]), 1e-9)
-    covariances = motion.turned(chosen.covariances, float(forward[0]), float(forward[1]))
-    velocities = chosen.means[:, 2:4] @ np.array([forward, [-forward[1], forward[0]]])
+    cos, sin = (back[:2, 0] / max(np.hypot(*back[:2, 0]), 1e-9)).tolist()
+    side = -1.0 if back[2, 2] < 0 else 1.0  # a sensor that hangs upside down sees from below
+    covariances = motion.turned(chosen.covariances, cos, sin, side)
+    velocities = chosen.means[:, 2:4] @ np.array([[cos, sin], [-side * sin, side * cos]])
     found = Detections.of(moved_boxes(chosen.boxes(), back), chosen.class_ids, scores[indices])
-    return Tracks(chosen.ids, found, velocities, chosen.moving, covariances, chosen.means[:, 5],
+    return Tracks(chosen.ids, found, velocities, chosen.moving, covariances,
+                  side * chosen.means[:, 5],
                   chosen.height_variances, seen[indices], chosen.ages)

@@ -8,6 +8,7 @@ from tracking_samples import CAR, CYCLIST, START, TENTH, car, cars, crowd, perso
 
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.param_fields import with_values
+from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import moved_boxes
 from lidar_perception.tracking.association import FORBIDDEN, assigned, costs
 from lidar_perception.tracking.ego import Ego, next_ego, usable
@@ -49,9 +50,11 @@ def test_the_same_frames_give_the_same_tracks_and_nothing_given_is_changed():
         np.testing.assert_array_equal(frame.boxes, boxes)
 
 
-def test_a_sensor_that_moves_and_turns_sees_the_same_tracks_as_one_that_stands():
+@pytest.mark.parametrize("hung", [0.0, np.pi])
+def test_a_sensor_that_moves_and_turns_sees_the_same_tracks_as_one_that_stands(hung):
+    """Upside down, too."""
     frames = list(crowd(1))
-    poses = [pose(0.9 * i, 0.1 * i, 0.04 * i) for i in range(len(frames))]
+    poses = [pose(0.9 * i, 0.1 * i, 0.04 * i) @ tilted(hung, 0.0) for i in range(len(frames))]
     moved = [Detections.of(moved_boxes(f.boxes, np.linalg.inv(p)), f.class_ids, f.scores)
              for f, p in zip(frames, poses)]
     standing = followed(frames, [np.eye(4)] * len(frames))
@@ -61,6 +64,11 @@ def test_a_sensor_that_moves_and_turns_sees_the_same_tracks_as_one_that_stands()
         np.testing.assert_allclose(back[:, :6], still.detections.boxes[:, :6], atol=1e-3)
         assert np.abs(wrap_angle(back[:, 6] - still.detections.boxes[:, 6])).max() < 1e-3
         np.testing.assert_allclose(seen.velocities @ p[:2, :2].T, still.velocities, atol=1e-3)
+        side = np.linalg.det(p[:2, :2])
+        np.testing.assert_allclose(side * seen.turn_rates, still.turn_rates, atol=1e-3)
+        np.testing.assert_allclose(
+            p[:2, :2] @ seen.covariances[:, 2:4, 2:4] @ p[:2, :2].T,
+            still.covariances[:, 2:4, 2:4], atol=1e-3)
         np.testing.assert_allclose(seen.moving, still.moving, atol=1e-3)
 
 
