@@ -9,6 +9,7 @@ from setuptools import find_packages, setup
 
 NAME = "lidar_perception"
 NODES = list(run_path("lidar_perception/nodes/__init__.py")["NODES"])
+README = Path(__file__).resolve().with_name("README.md")  # colcon links setup.py elsewhere
 
 
 def node_executables() -> list[str]:
@@ -33,7 +34,7 @@ setup(
     version="0.1.0",
     description="LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned "
                 "detectors, tracks, a simulator and training",
-    long_description=Path("README.md").read_text(),
+    long_description=README.read_text(),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
     maintainer="lidar_perception maintainers",

@@ -43,6 +43,11 @@ def help_text(name: str) -> str:
     return "\n".join(lines)
 
 
+def main() -> int:
+    """The entry point of all executables of setup.py: the node is named by the program's name."""
+    return run(Path(sys.argv[0]).name.removesuffix(".exe"), sys.argv)
+
+
 STOP_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 
 

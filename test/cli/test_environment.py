@@ -5,12 +5,26 @@ from __future__ import annotations
 import fcntl
 import os
 import subprocess
+import sys
+from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
 from samples import write
 
+from lidar_perception.nodes import NODES
+
 ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_each_executable_of_the_package_is_its_node(name, monkeypatch, capsys):
+    """As ros2 run and ros2 launch start them."""
+    executable, = (each for each in distribution("lidar_perception").entry_points
+                   if each.name == name)
+    monkeypatch.setattr(sys, "argv", [f"/opt/ws/lib/lidar_perception/{name}", "--help"])
+    assert executable.load()() == 0
+    assert capsys.readouterr().out.startswith(f"Usage: {name} --ros-args")
 
 
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
