@@ -53,7 +53,7 @@ setup(
         (f"lib/{NAME}", node_executables()),
     ],
     install_requires=[
-        "aiohttp>=3.10", "click>=8.1", "jinja2>=3.1", "matplotlib>=3.7", "lz4>=4.0", "mcap>=1.2",
+        "aiohttp>=3.9", "click>=8.1", "jinja2>=3.1", "matplotlib>=3.7", "lz4>=4.0", "mcap>=1.2",
         "numba>=0.59", "numpy>=1.26", "pypatchworkpp>=1.0", "pyyaml>=6", "rich>=13",
         "rosbags>=0.11.6", "ruamel.yaml.clib>=0.2.12", "safetensors>=0.4", "scikit-learn>=1.3",
         "scipy>=1.11", "threadpoolctl>=3.1", "torch>=2.2", "zstandard>=0.21",

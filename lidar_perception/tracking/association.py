@@ -10,19 +10,22 @@ from lidar_perception.tracking.params import AssociationParams
 
 FORBIDDEN = 1e3  # more than all pairs that are allowed together cost by far
 MAX_COST = 1.0
+TENTH = 0.1  # seconds between frames that max_gate is for
 
 
 def costs(tracks: np.ndarray, spread: np.ndarray, kinds: np.ndarray, reach: np.ndarray,
-          found: np.ndarray, found_kinds: np.ndarray, params: AssociationParams) -> np.ndarray:
+          found: np.ndarray, found_kinds: np.ndarray, params: AssociationParams,
+          seconds: float = TENTH) -> np.ndarray:
     """(N, M) float64, up to MAX_COST where a detection can belong to a track, else FORBIDDEN.
 
     tracks (N, 7) predicted boxes and found (M, 7) detected ones, in the same frame; spread (N,)
     metres, the standard deviation of a predicted centre as it would be measured; kinds (N,),
-    found_kinds (M,) indices in KINDS; reach (N,) metres.
+    found_kinds (M,) indices in KINDS; reach (N,) metres; seconds since the frame before.
     """
     dx, dy = (tracks[:, None, axis] - found[None, :, axis] for axis in (0, 1))
     apart = np.sqrt(dx * dx + dy * dy)
-    gate = np.minimum(np.maximum(params.sigmas * spread, reach), params.max_gate)[:, None]
+    widest = params.max_gate * max(1.0, seconds / TENTH)
+    gate = np.minimum(np.maximum(params.sigmas * spread, reach), widest)[:, None]
     cost = (1.0 - params.overlap) * apart / gate
     if params.overlap > 0:
         cost += params.overlap * (1.0 - bev_iou(tracks, found))

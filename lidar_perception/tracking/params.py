@@ -42,7 +42,8 @@ class AssociationParams(Params):
                            "alone, 1: overlap alone.", low=0.0, high=1.0)
     sigmas: float = param(3.0, "The gate: so many standard deviations of the predicted centre, but "
                           "not less than reach.", low=0.1, high=20.0)
-    max_gate: float = param(5.0, "No gate is wider.", unit="m", low=0.1, high=100.0)
+    max_gate: float = param(5.0, "No gate is wider a tenth of a second after the frame before; "
+                            "later in proportion.", unit="m", low=0.1, high=100.0)
     strong: float = param(0.2, "Detections from this score on look for tracks first, and can start "
                           "one. Weaker ones keep alive what is left.", low=0.0, high=1.0)
     other_kind: float = param(0.8, "Added to the cost, which allows 1, where vehicle and person "
@@ -83,7 +84,7 @@ class ExistenceParams(Params):
 class TrackingParams(Params):
     """Tracks from detections."""
 
-    vehicle: MotionParams = MotionParams(position=0.4)
+    vehicle: MotionParams = MotionParams(first_speed=10.0, position=0.4)
     pedestrian: MotionParams = MotionParams(1.0, 0.0, 1.0, 1.0, 0.7, 0.15, 3.0, 0.7)
     cyclist: MotionParams = MotionParams(2.0, 0.3, 0.2, 4.0, 0.4, 0.2, 1.0, 1.2)
     association: AssociationParams = AssociationParams()

@@ -39,15 +39,16 @@ def predicted(states: States, seconds: float, params: TrackingParams) -> States:
 
 
 def matched(states: States, boxes: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
-            params: TrackingParams) -> tuple[np.ndarray, np.ndarray]:
-    """Tracks (P,) and detections (P,) that belong together. Strong detections choose first, weak
-    ones among the tracks that are left (Zhang et al., ByteTrack, ECCV 2022)."""
+            params: TrackingParams, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """Tracks (P,) and detections (P,) that belong together, so long after the frame before. Strong
+    detections choose first, weak ones among the tracks that are left (Zhang et al., ByteTrack,
+    ECCV 2022)."""
     kinds = KINDS[states.class_ids]
     noise = _by_kind(params, "position")[kinds]
     spread = np.sqrt(np.maximum(states.covariances[:, 0, 0], states.covariances[:, 1, 1])
                      + noise * noise)
     cost = costs(states.boxes(), spread, kinds, _by_kind(params, "reach")[kinds], boxes,
-                 KINDS[class_ids], params.association)
+                 KINDS[class_ids], params.association, seconds)
     strong = scores >= params.association.strong
     i, j = assigned(np.where(strong, cost, FORBIDDEN))
     cost[i] = FORBIDDEN

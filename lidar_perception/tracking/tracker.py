@@ -69,7 +69,7 @@ class Tracker:
         boxes, class_ids, scores = self._usable(detections)
         boxes = moved_boxes(boxes, self._ego.pose)
         states = predicted(self._states, seconds, self.params)
-        i, j = matched(states, boxes, class_ids, scores, self.params)
+        i, j = matched(states, boxes, class_ids, scores, self.params, seconds)
         states = updated(states, i, boxes[j], class_ids[j], scores[j], self.params,
                          self._ego.known)
         free = np.ones(len(boxes), bool)
@@ -148,7 +148,8 @@ class Tracker:
                     & (detections.class_ids >= 0) & (detections.class_ids < len(CLASSES)))
         if not good.all():
             self.problem = (f"{(~good).sum()} of {len(good)} detections are no boxes (not finite, "
-                            "or without a size) and are left out")
+                            f"without a size, or beyond {MAX_RANGE / 1e3:g} km of their frame's "
+                            "origin: give a frame nearby) and are left out")
         indices = np.flatnonzero(good & (scores >= self.params.min_score))
         if len(indices) > self.params.max_detections:
             self.problem = (f"{len(indices)} detections are too many; the best "

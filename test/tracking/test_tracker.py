@@ -38,6 +38,15 @@ def test_ids_stay_and_velocities_are_right():
     assert (last.moving[[0, 1, 2]] > 0.99).all() and last.moving[4] < 0.3
 
 
+@pytest.mark.parametrize("rate", [20, 10, 5, 2])
+def test_a_car_on_a_fast_road_is_one_track_at_any_rate(rate):
+    frames = [cars(car(-60 + 28.0 * i / rate)) for i in range(20)]
+    *_, last = followed(frames, [np.eye(4)] * 20, stamps=[
+        START + i * 10**9 // rate for i in range(20)])
+    assert last.ids.tolist() == [1]
+    np.testing.assert_allclose(last.velocities, [[28, 0]], atol=0.5)
+
+
 def test_the_same_frames_give_the_same_tracks_and_nothing_given_is_changed():
     frames = list(crowd(3))
     before = [f.boxes.copy() for f in frames]
