@@ -230,6 +230,7 @@ def tracks_of(frames: Mapping[int, MarkedObjects], topic: str,
             track = made.setdefault(number, {
                 "id": track_id(tracker, number), "class": label, "state": "accepted", "score": 0.0,
                 "source": topic.strip("/").split("/")[0], "boxes": [], "uncertainty": 0.0})
+            track["class"] = label  # which the tracker knows best at last
             track["score"] = max(track["score"], float(score))
             track["boxes"].append([i, *map(float, box), "proposed"])
     return list(made.values())

@@ -29,6 +29,7 @@ PAGE = Path(__file__).with_name("page")
 MAX_REQUEST = 10**7     # bytes
 MAX_WAITING = 1000      # events that a page may be behind
 AHEAD = 2               # frames on either side that are made ready
+Events = asyncio.Queue[dict[str, Any] | None]  # for a page; None: it is too far behind
 HEADERS = {"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff",
            "Referrer-Policy": "no-referrer",
            "Content-Security-Policy": "default-src 'self'; style-src 'self' 'unsafe-inline'; "
@@ -43,7 +44,7 @@ class Server:
         self.served = served
         self.pool = ThreadPoolExecutor(2, "cloud")
         self.doing = ThreadPoolExecutor(1, "action")  # one after the other
-        self.pages: set[asyncio.Queue[dict[str, Any]]] = set()
+        self.pages: set[Events] = set()
         self.ready: set[int] = set()
         self.app = web.Application(middlewares=[self.guard], client_max_size=MAX_REQUEST)
         self.app.add_routes([
@@ -151,7 +152,7 @@ class Server:
         that has paused says so, and the frames are held for as long as it is there."""
         socket = web.WebSocketResponse(heartbeat=20.0)
         await socket.prepare(request)
-        queue: asyncio.Queue[dict[str, Any]] = asyncio.Queue(MAX_WAITING)
+        queue: Events = asyncio.Queue(MAX_WAITING)
         self.pages.add(queue)
         sender = asyncio.ensure_future(_send(socket, queue))
         try:
@@ -170,12 +171,14 @@ class Server:
         return socket
 
     def tell(self, event: dict[str, Any]) -> None:
-        """All pages; one that is too far behind is left, and reloads."""
+        """All pages; one that is too far behind is disconnected, so that it reloads."""
         for queue in list(self.pages):
             try:
                 queue.put_nowait(event)
             except asyncio.QueueFull:
                 self.pages.discard(queue)
+                queue.get_nowait()
+                queue.put_nowait(None)
 
     async def labels(self, request: web.Request) -> web.StreamResponse:
         """Labels and detections of a frame."""
@@ -239,9 +242,10 @@ async def _object(request: web.Request) -> Mapping[str, Any]:
     return found
 
 
-async def _send(socket: web.WebSocketResponse, queue: asyncio.Queue[dict[str, Any]]) -> None:
-    while not socket.closed:
-        await socket.send_json(await queue.get())
+async def _send(socket: web.WebSocketResponse, queue: Events) -> None:
+    while not socket.closed and (event := await queue.get()) is not None:
+        await socket.send_json(event)
+    await socket.close()
 
 
 def _in_loop(loop: asyncio.AbstractEventLoop, server: Server, event: dict[str, Any]) -> None:

@@ -26,12 +26,11 @@ from msg_utils.stamps import SECOND, header_message, to_ns
 
 def placed(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[Any, np.ndarray]:
     """header and boxes (K, 7), found in the levelled frame of a cloud with this header, in the
-    frame that the results go out in."""
+    frame that the results go out in; float64 there, as a map may be far from its origin."""
     placing = node.transforms.placing(header)
     if placing.frame_id != header.frame_id:
         header = header_message(to_ns(header.stamp), placing.frame_id, bag_message)
-    return header, boxes if placing.out is None else moved_boxes(boxes, placing.out).astype(
-        boxes.dtype)
+    return header, boxes if placing.out is None else moved_boxes(boxes, placing.out)
 
 
 def lifetime_ns(node: LidarNode) -> int:

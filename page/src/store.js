@@ -76,6 +76,7 @@ export function takeTracks(tracks, first) {
     }
     for (const [frame, box] of toTrack(sent).byFrame) track.byFrame.set(frame, box);
     Object.assign(track.trails, sent.trails);
+    track.class = sent.class;
     track.score = Math.max(track.score, sent.score);
     track.last = Math.max(...track.byFrame.keys());
   }

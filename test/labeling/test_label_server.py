@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 from contextlib import asynccontextmanager
+from types import SimpleNamespace
 
 import aiohttp
 import numpy as np
@@ -19,6 +20,8 @@ import pytest
 from labeling_pages import serving
 from samples import WALKER
 from yarl import URL
+
+from lidar_perception.labeling.server import MAX_WAITING, Server, _send
 
 BOX = [*WALKER[:6].tolist(), 0.3]
 ADD = {"do": "add", "frame": 0, "class": "Pedestrian", "box": BOX}
@@ -32,6 +35,25 @@ def label(data, out, *more):
 def alone(*arguments):
     """As a program of its own."""
     return [sys.executable, "-m", "lidar_perception.cli.main", *arguments]
+
+
+def test_a_page_that_is_too_far_behind_is_disconnected_and_so_reloads():
+    async def behind():
+        queue, sent = asyncio.Queue(MAX_WAITING), []
+        page = SimpleNamespace(pages={queue}, closed=False)
+
+        async def send_json(event):
+            sent.append(event)
+
+        async def close():
+            page.closed = True
+        for event in range(MAX_WAITING + 5):
+            Server.tell(page, event)
+        assert not page.pages
+        page.send_json, page.close = send_json, close
+        await asyncio.wait_for(_send(page, queue), 10)
+        assert page.closed and sent == [*range(1, MAX_WAITING)]
+    asyncio.run(behind())
 
 
 class Page:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -97,6 +98,12 @@ def test_no_two_trackers_have_a_track_of_the_same_id(trackers, far):
     assert len(set(every)) == len(every) == sum(map(len, trackers))
     assert all(0 <= number < 2**53 for number in every)  # what a page can count
     assert set(made[0]) >= {n for n in trackers[0] if n >= 0}
+
+
+def test_a_track_is_what_its_tracker_called_it_last():
+    first, then = marked([7]), replace(marked([7]), labels=["Cyclist"])
+    track, = tracks_of({0: first, 1: then}, "/a/output/tracks", 0)
+    assert track["class"] == "Cyclist" and len(track["boxes"]) == 2
 
 
 def marked(numbers):
