@@ -14,6 +14,7 @@ from typing import Any
 from lidar_perception.campaign.case import FAILED, SKIPPED, Case, Outcome
 from lidar_perception.campaign.worker import Limits, Worker
 from lidar_perception.runs.files import make_folder
+from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError
 
 # Part -> its share of the time, what one case may take, and what is tried.
@@ -82,24 +83,25 @@ def run_campaign(out: Path, minutes: float, seed: int, only: Sequence[str] = (),
     """Run the parts, or only some, for so many minutes altogether, with at most `most` cases each.
 
     What a part leaves of its time goes to those after it. watch(tally, share of its time) is called
-    as they go. Failures lie in out/failures. InputError for a part that there is none of, and where
-    the folder cannot be written.
+    as they go. Failures lie in out/failures. InputError for a part that there is none of, where the
+    folder cannot be written, and while another campaign writes into it.
     """
     for name in only:
         if name not in PARTS:
             raise InputError(f"there is no part '{name}'; the parts are {', '.join(PARTS)}")
-    make_folder(out / "failures")
     chosen = [name for name in PARTS if not only or name in only]
     end, tallies = monotonic() + 60.0 * minutes, []
-    for i, name in enumerate(chosen):
-        weight = PARTS[name][0] / sum(PARTS[n][0] for n in chosen[i:])
-        tally = Tally(name)
-        tallies.append(tally)
-        try:
-            _run_part(tally, out, seed, weight * max(0.0, end - monotonic()), most, watch)
-        except KeyboardInterrupt:  # what is known so far is said all the same
-            tally.problem = "interrupted"
-            break
+    with locked(out):  # two at once would take each other's files for what the package did
+        make_folder(out / "failures")
+        for i, name in enumerate(chosen):
+            weight = PARTS[name][0] / sum(PARTS[n][0] for n in chosen[i:])
+            tally = Tally(name)
+            tallies.append(tally)
+            try:
+                _run_part(tally, out, seed, weight * max(0.0, end - monotonic()), most, watch)
+            except KeyboardInterrupt:  # what is known so far is said all the same
+                tally.problem = "interrupted"
+                break
     return tallies
 
 
