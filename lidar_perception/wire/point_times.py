@@ -31,9 +31,10 @@ class PointTimes(NamedTuple):
 
 def point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     """Of the points (N,) of a PointCloud2 at indices (N,). Whether seconds, milli-, micro- or
-    nanoseconds is told by the span of a turn; times that count from 1970 are taken from the stamp.
-    What the column says of other points, such as beams without a return, does not count. InputError
-    where there is no such column, none of the points has a time, or they do not fit the stamp."""
+    nanoseconds is told by the span of the whole cloud, of which indices may be any part, and which
+    is taken for a turn; times that count from 1970 are taken from the stamp. Of other points 0 does
+    not count: drivers fill beams without a return so. InputError where there is no such column,
+    none of the points has a time, or they do not fit the stamp."""
     try:
         points = to_array(msg)
     except CloudError as error:
@@ -46,11 +47,15 @@ def point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     if points.dtype[name].shape:
         raise InputError(f"field '{name}' has count > 1; a single number is needed")
     whole = points[name].dtype.kind in "iu"
-    values = points[name].take(indices).astype(np.int64 if whole else np.float64)
-    known = values if whole else values[np.isfinite(values)]
+    column = points[name].astype(np.int64 if whole else np.float64)
+    finite, values = np.isfinite(column), column.take(indices)
+    known = values[finite.take(indices)]
     if not len(known):
         raise InputError(f"no time in the column '{name}' is a number")
-    low, span = known.min(), known.max() - known.min()
+    counts = column != 0
+    counts[indices] = True
+    turn = column[counts & finite]
+    low, span = known.min(), turn.max() - turn.min()
     unit = _unit_ns(float(span), whole, float(low))
     stamp = to_ns(msg.header.stamp)
     since_stamp = abs(float(low)) * unit <= abs(float(low) * unit - stamp)
@@ -64,14 +69,14 @@ def point_times(msg: Any, indices: np.ndarray) -> PointTimes:
 
 
 def _unit_ns(span: float, whole: bool, low: float) -> int:
-    """Nanoseconds of the unit of times from low on that span a turn."""
+    """Nanoseconds of the unit of times from low on, of a cloud that spans a turn."""
     since_1970 = next((unit for unit in reversed(UNITS_NS) if low * unit > SINCE_1970_NS), None)
     if since_1970 is not None:
         return since_1970
     for unit in UNITS_NS[2:] if whole else UNITS_NS:  # whole seconds would tell nothing
         if SWEEP[0] <= span * unit * 1e-9 <= SWEEP[1]:
             return unit
-    return 1 if whole else 10**9  # a part of a turn, or one moment
+    return 1 if whole else 10**9  # a cloud of less than SWEEP, or one moment
 
 
 def corrected(msg: Any, frame: LidarFrame, indices: np.ndarray, poses: Poses
