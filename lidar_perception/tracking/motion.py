@@ -14,6 +14,7 @@ from lidar_perception.geometry import wrap_angle
 
 X, Y, VX, VY, HEADING, TURN = range(6)
 MEASURED = np.array([X, Y, HEADING])
+OPPOSITE = 1.0   # scores by which measured headings must speak against a heading to turn it
 STRAIGHT = 1e-4  # rad in one step; below this a series takes the place of sin(a) / a
 
 
@@ -61,7 +62,8 @@ def predict(means: np.ndarray, covariances: np.ndarray, seconds: float, accelera
 def update(means: np.ndarray, covariances: np.ndarray, measured: np.ndarray,
            noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """With measured (N, 3) [x y heading], whose standard deviations are noise (N, 3). Of heading
-    and its opposite the one nearer to the state's is taken: detectors confuse front and rear."""
+    and its opposite the one nearer to the state's is taken: detectors confuse front and rear, of
+    which facing_forward() decides."""
     innovation = measured - means[:, MEASURED]
     innovation[:, 2] = wrap_angle(2.0 * innovation[:, 2]) / 2.0
     against = covariances[:, :, MEASURED]
@@ -88,14 +90,17 @@ def keep_to_heading(means: np.ndarray, covariances: np.ndarray,
                   covariances - gain[:, :, None] * against[:, None, :])
 
 
-def facing_forward(means: np.ndarray, backwards: np.ndarray) -> np.ndarray:
-    """The means with the heading turned round where an object goes backwards faster than
-    backwards (N,) m/s."""
+def facing_forward(means: np.ndarray, said: np.ndarray,
+                   backwards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The means, and what measured headings said for theirs, said (N,), turned round where an
+    object goes backwards faster than backwards (N,) m/s, and, unless it goes forward faster than
+    that, where they said the opposite."""
     forward = (np.cos(means[:, HEADING]) * means[:, VX]
                + np.sin(means[:, HEADING]) * means[:, VY])
+    wrong = (forward < -backwards) | (said < -OPPOSITE) & (forward <= backwards)
     turned = means.copy()
-    turned[:, HEADING] = wrap_angle(means[:, HEADING] + np.pi * (forward < -backwards))
-    return turned
+    turned[:, HEADING] = wrap_angle(means[:, HEADING] + np.pi * wrong)
+    return turned, np.where(wrong, -said, said)
 
 
 def _after(means: np.ndarray, covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

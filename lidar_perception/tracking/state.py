@@ -17,7 +17,8 @@ class States:
     centre and height_variances (N,); sizes (N, 3) l w h, means with size_weights (N,);
     class_evidence (N, CLASSES) and class_ids (N,) int32; total, looks (N,) as in
     existence.py; present (N,) log odds of being there; hits, tries (N,); moving (N,) probability;
-    ages (N,) seconds since birth; unseen (N,) seconds since the last hit.
+    ages (N,) seconds since birth; unseen (N,) seconds since the last hit; facing (N,) scores of
+    measured headings that agree with that of means less those opposite to it, faded by each.
     """
 
     ids: np.ndarray
@@ -37,6 +38,7 @@ class States:
     moving: np.ndarray
     ages: np.ndarray
     unseen: np.ndarray
+    facing: np.ndarray
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -18,7 +18,8 @@ HEIGHT_NOISE = 0.2      # m, standard deviation of a measured z
 HEIGHT_DRIFT = 0.3      # m/s^0.5, of the z of an object
 MAX_SIZE_WEIGHT = 20.0  # a size is the mean of so many sure looks at most
 CLASS_LEAD = 0.5        # evidence by which another class must lead to be taken over
-MEMORY_OF_HITS = 20.0   # frames
+MEMORY_OF_HITS = 20.0   # frames, of headings too
+KEEP = 1.0 - 1.0 / MEMORY_OF_HITS
 BACKWARDS = 2.0         # m/s, by kind times speed of walking below
 KINDS = np.array(KIND_OF_CLASS)
 BACKWARDS_BY_KIND = np.array([BACKWARDS, 0.3, 1.0])
@@ -70,8 +71,11 @@ def updated(states: States, i: np.ndarray, boxes: np.ndarray, class_ids: np.ndar
     if fixed:
         means, covariances = motion.keep_to_heading(means, covariances,
                                                     _by_kind(params, "slip")[kinds])
-        means = motion.facing_forward(means, BACKWARDS_BY_KIND[kinds])
-    new.means[i], new.covariances[i] = means, covariances
+    said = states.facing[i] * KEEP + scores * np.sign(
+        np.cos(boxes[:, 6] - means[:, motion.HEADING]))
+    new.means[i], new.facing[i] = motion.facing_forward(
+        means, said, BACKWARDS_BY_KIND[kinds] if fixed else np.full(len(i), np.inf))
+    new.covariances[i] = covariances
     gain = states.height_variances[i] / (states.height_variances[i] + HEIGHT_NOISE ** 2)
     new.heights[i] += gain * (boxes[:, 2] - states.heights[i])
     new.height_variances[i] *= 1.0 - gain
@@ -101,9 +105,8 @@ def _look(new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
     lost = existence.absence(new.hits, new.tries, own)
     new.present[missed] -= lost[missed]
     new.present[i] = np.minimum(new.present[i] + own.seen, own.max_present)
-    keep = 1.0 - 1.0 / MEMORY_OF_HITS
-    new.hits[:] *= keep
-    new.tries[:] *= keep
+    new.hits[:] *= KEEP
+    new.tries[:] *= KEEP
     new.hits[i] += 1.0
     new.tries[:] += 1.0
     new.unseen[i] = 0.0
@@ -128,7 +131,7 @@ def born(first_id: int, boxes: np.ndarray, class_ids: np.ndarray, scores: np.nda
         np.full(count, HEIGHT_NOISE ** 2), boxes[:, 3:6].copy(), scores.copy(), votes,
         class_ids.astype(np.int32), existence.evidence(scores, own), ones,
         np.full(count, own.seen / 2), ones.copy(), ones.copy(),
-        moving(means, covariances, params.moving_speed), zeros.copy(), zeros.copy())
+        moving(means, covariances, params.moving_speed), zeros.copy(), zeros.copy(), scores.copy())
 
 
 def alive(states: States, params: TrackingParams, fixed: bool) -> States:

@@ -82,8 +82,10 @@ def test_what_drives_slips_no_more_and_what_drives_backwards_fast_has_its_rear_i
     across = [np.cos(m[4]) * m[3] - np.sin(m[4]) * m[2] for m in (means[0], kept[0])]
     assert abs(across[1]) < 0.2 * abs(across[0]) and (np.linalg.eigvalsh(p) > 0).all()
     backwards = np.array([[0.0, 0, -5, 0, 0.2, 0], [0, 0, -0.5, 0, 0.2, 0]])
-    assert facing_forward(backwards, np.array([2.0, 2.0]))[:, 4] == pytest.approx(
-        [0.2 - np.pi, 0.2])
+    turned_round, said = facing_forward(backwards, np.array([9.0, 9.0]), np.array([2.0, 2.0]))
+    assert turned_round[:, 4] == pytest.approx([0.2 - np.pi, 0.2])
+    assert said.tolist() == [-9, 9] and facing_forward(turned_round, said, np.full(2, 2.0))[
+        0].tolist() == turned_round.tolist()  # what was measured does not turn it back
 
 
 def test_covariances_turn_with_the_axes():

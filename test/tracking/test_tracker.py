@@ -146,6 +146,25 @@ def test_a_front_taken_for_the_rear_does_not_turn_a_car():
         [0.0] * 14, abs=0.1)
 
 
+@pytest.mark.parametrize("at", [None, pose(0)])
+@pytest.mark.parametrize("speed", [-1.0, 0.0])
+def test_the_front_of_what_stands_or_creeps_is_where_most_scores_say(at, speed):
+    """Not where the first detection said."""
+    flipped = np.random.default_rng(0).random(60) < 0.25
+    flipped[:3] = True
+    tracks = followed([cars(car(10 + 0.1 * speed * i, yaw=np.pi * wrong))
+                       for i, wrong in enumerate(flipped)], [at] * 60)
+    headings = wrap_angle(np.array([t.detections.boxes[0, 6] for t in tracks]))
+    assert np.abs(np.abs(headings[:3]) - np.pi).max() < 0.01
+    assert np.abs(headings[15:]).max() < 0.01 and {t.ids.tolist()[0] for t in tracks} == {1}
+
+
+def test_the_front_of_what_drives_is_ahead_whatever_detections_say():
+    tracks = followed([cars(car(10 + 0.6 * i, yaw=np.pi)) for i in range(40)], [pose(0)] * 40)
+    assert [wrap_angle(t.detections.boxes[0, 6]) for t in tracks[6:]] == pytest.approx(
+        [0.0] * 34, abs=0.1)
+
+
 def test_a_class_that_changes_each_frame_is_one_track_of_the_better_one():
     frames = [cars(person(10 + 0.1 * i), kind=[CYCLIST, PEDESTRIAN][i % 2],
                    scores=[0.6, 0.9][i % 2]) for i in range(30)]
