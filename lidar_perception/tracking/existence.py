@@ -15,6 +15,7 @@ from lidar_perception.tracking.params import ExistenceParams
 CLIP = 0.01          # scores beyond 0.01 .. 0.99 say no more than those
 HITS, TRIES = 1.0, 2.0  # before a track has any
 SURE = 0.95          # no object is hit more surely
+HIDDEN = 0.1         # s, for which max_absence is
 
 
 def log_odds(probability: np.ndarray | float) -> np.ndarray:
@@ -47,8 +48,11 @@ def real(total: np.ndarray, looks: np.ndarray, moving: np.ndarray,
             + params.moves * np.maximum(2.0 * moving - 1.0, 0.0))
 
 
-def absence(hits: np.ndarray, tries: np.ndarray, params: ExistenceParams) -> np.ndarray:
-    """(N,) what a miss takes from the log odds of being there, of tracks with hits (N,) in tries
-    (N,): much where hits are the rule."""
+def absence(hits: np.ndarray, tries: np.ndarray, seconds: float,
+            params: ExistenceParams) -> np.ndarray:
+    """(N,) what a miss, so many seconds after the frame before, takes from the log odds of being
+    there, of tracks with hits (N,) in tries (N,): much where hits are the rule, but not more than
+    max_absence by time. Misses come together, as what hides an object does so for a while, however
+    many frames it takes."""
     rate = np.minimum((hits + HITS) / (tries + TRIES), SURE)
-    return np.minimum(-np.log(1.0 - rate), params.max_absence)
+    return np.minimum(-np.log(1.0 - rate), params.max_absence * (seconds / HIDDEN))

@@ -74,8 +74,8 @@ class ExistenceParams(Params):
                         high=10.0)
     max_present: float = param(3.0, "Upper limit of the log odds of being there still.",
                                low=0.0, high=20.0)
-    max_absence: float = param(0.4, "Most that one miss subtracts from them: what is hidden "
-                               "stays hidden for a while.", low=0.01, high=10.0)
+    max_absence: float = param(0.4, "Most that misses subtract from them in 0.1 s: what is "
+                               "hidden stays hidden for a while.", low=0.01, high=10.0)
     end: float = param(0.02, "A track ends when it is there with a lower probability.", low=0.0,
                        high=0.5)
 

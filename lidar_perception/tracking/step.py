@@ -58,10 +58,10 @@ def matched(states: States, boxes: np.ndarray, class_ids: np.ndarray, scores: np
 
 
 def updated(states: States, i: np.ndarray, boxes: np.ndarray, class_ids: np.ndarray,
-            scores: np.ndarray, params: TrackingParams, fixed: bool) -> States:
-    """The tracks after a frame in which those at i (P,) were hit by boxes (P, 7), and the others
-    missed. fixed: whether the frame stands, so that wheels and feet go
-    forward in it; seen from a car, those of parked cars do not."""
+            scores: np.ndarray, params: TrackingParams, fixed: bool, seconds: float) -> States:
+    """The tracks after a frame, so many seconds after the one before, in which those at i (P,) were
+    hit by boxes (P, 7), and the others missed. fixed: whether the frame stands, so that wheels and
+    feet go forward in it; seen from a car, those of parked cars do not."""
     new = states.copy()
     kinds = KINDS[states.class_ids[i]]
     noise = np.column_stack([*[_by_kind(params, "position")[kinds]] * 2,
@@ -83,12 +83,12 @@ def updated(states: States, i: np.ndarray, boxes: np.ndarray, class_ids: np.ndar
     new.sizes[i] += weight[:, None] * (boxes[:, 3:6] - states.sizes[i])
     new.size_weights[i] = np.minimum(states.size_weights[i] + scores, MAX_SIZE_WEIGHT)
     new.moving[:] = moving(new.means, new.covariances, params.moving_speed)
-    _look(new, i, class_ids, scores, params)
+    _look(new, i, class_ids, scores, params, seconds)
     return new
 
 
 def _look(new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
-          params: TrackingParams) -> None:
+          params: TrackingParams, seconds: float) -> None:
     """The evidence of one frame, into arrays of their own."""
     own = params.existence
     missed = np.ones(len(new), bool)
@@ -102,7 +102,7 @@ def _look(new: States, i: np.ndarray, class_ids: np.ndarray, scores: np.ndarray,
     ahead = new.class_evidence[rows, best] > (
         new.class_evidence[rows, new.class_ids] + CLASS_LEAD)
     new.class_ids[ahead] = best[ahead]
-    lost = existence.absence(new.hits, new.tries, own)
+    lost = existence.absence(new.hits, new.tries, seconds, own)
     new.present[missed] -= lost[missed]
     new.present[i] = np.minimum(new.present[i] + own.seen, own.max_present)
     new.hits[:] *= KEEP

@@ -71,7 +71,7 @@ class Tracker:
         states = predicted(self._states, seconds, self.params)
         i, j = matched(states, boxes, class_ids, scores, self.params, seconds)
         states = updated(states, i, boxes[j], class_ids[j], scores[j], self.params,
-                         self._ego.known)
+                         self._ego.known, seconds)
         free = np.ones(len(boxes), bool)
         free[j] = False
         start = np.flatnonzero(free & (scores >= self.params.association.strong))

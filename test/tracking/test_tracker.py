@@ -113,6 +113,17 @@ def test_what_is_gone_ends():
     assert (tracker.alive, tracker.born, tracker.ended) == (0, 1, 1)
 
 
+@pytest.mark.parametrize("rate", [5, 10, 20, 30])
+def test_what_is_hidden_is_remembered_for_as_long_at_any_rate(rate):
+    def born(hidden):
+        frames = [cars(car(10))] * (4 * rate) + [Detections.none()] * int(hidden * rate)
+        tracker = Tracker()
+        followed([*frames, cars(car(10))], tracker=tracker,
+                 stamps=[START + i * 10**9 // rate for i in range(len(frames) + 1)])
+        return tracker.born
+    assert (born(1.4), born(2.0)) == (1, 2)
+
+
 def test_a_weak_detection_keeps_a_track_alive_and_starts_none():
     weak = TrackingParams().association.strong / 2
     tracker = Tracker()
