@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tracking_samples import START, TENTH, crowd, pose
+from tracking_samples import START, TENTH, car, cars, crowd, pose
 
 from lidar_perception.robot.poses import moved_boxes
 from lidar_perception.tracking.tracker import Tracker
@@ -15,7 +15,7 @@ from msg_utils.detections import to_detection_array
 from msg_utils.stamps import header_message
 
 
-@pytest.mark.parametrize("seconds", [0.0, 0.55, 60.0])
+@pytest.mark.parametrize("seconds", [0.0, 0.55, 2.0])
 def test_trails_end_at_the_tracks_and_lie_where_they_were(seconds):
     tracker, trails, seen = Tracker(), Trails(), {}
     for i, found in enumerate(crowd(2, 40)):
@@ -30,6 +30,20 @@ def test_trails_end_at_the_tracks_and_lie_where_they_were(seconds):
             expected = np.array(seen[number])[-min(int(seconds * 10) + 1, TRAIL_POINTS):]
             np.testing.assert_allclose(way @ at[:3, :3].T + at[:3, 3], expected, atol=1e-4)
     assert len(trails(tracks, tracker.pose, stamp, seconds)) == len(tracks)
+
+
+@pytest.mark.parametrize("rate", [5, 10, 20, 30])
+@pytest.mark.parametrize("seconds", [1.0, 2.0, 5.0])
+def test_trails_last_as_long_at_any_rate(rate, seconds):
+    tracker, trails = Tracker(), Trails()
+    for i in range(8 * rate):
+        stamp = START + i * 10**9 // rate + 1000 * (i % 3)  # 1 or 2 us late
+        tracks = tracker(cars(car(2 * i / rate)), stamp, pose(0))
+        way, = trails(tracks, tracker.pose, stamp, seconds)
+        assert len(way) <= TRAIL_POINTS and way[-1, 0] == tracks.detections.boxes[0, 0]
+        assert (np.diff(way[:, 0]) > 0).all()
+    assert len(way) >= min(TRAIL_POINTS / 2, rate * seconds)
+    assert 0.85 * 2 * seconds < np.ptp(way[:, 0]) < 2 * seconds + 0.01  # at 2 m/s
 
 
 @pytest.fixture(scope="module")
