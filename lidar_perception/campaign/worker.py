@@ -135,7 +135,7 @@ def _serve(part: str, limits: Limits, folder: Path, quiet: bool, connection: Con
         log = os.open(folder / f"{part}.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
         for stream in (1, 2):
             os.dup2(log, stream)
-    work = folder / "work" / part
+    work = (folder / "work" / part).absolute()  # commands run in it
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True, exist_ok=True)
     try:
