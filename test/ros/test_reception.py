@@ -20,7 +20,7 @@ from test_bad_input import CLOUD, MARKERS, cloud
 
 from lidar_perception.nodes import reception as reception_module
 from lidar_perception.nodes import shared_memory
-from lidar_perception.nodes.graph import STAGES
+from lidar_perception.nodes.graph import STAGES, private_domain
 from lidar_perception.nodes.reception import RATE_OF, SHARE_OF, Arrivals, Reception
 from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES, SOCKET_BUFFER, socket_buffer
 from lidar_perception.params import ReceptionParams
@@ -229,25 +229,32 @@ def test_clouds_of_a_driver_come_by_udp_where_a_socket_holds_one(remap, buffer, 
     assert Path(os.environ[PROFILE_VARIABLES[0]]).name == profile
 
 
-def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(peer, capsys):
-    def segments(pid) -> set[Path]:
-        maps = Path(f"/proc/{pid}/maps").read_text()
+def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(capsys):
+    def segments(process) -> set[Path]:
+        maps = Path(f"/proc/{process.pid}/maps").read_text()
         return {Path(p) for p in re.findall(r"/dev/shm/fastrtps_[0-9a-f]{16}$", maps, re.M)}
 
-    code = "import rclpy; rclpy.init(); node = rclpy.create_node('short'); print(); input()"
-    with subprocess.Popen([sys.executable, "-c", code], text=True, stdin=subprocess.PIPE,
-                          stdout=subprocess.PIPE) as process:
-        process.stdout.readline()
-        theirs = segments(process.pid) - segments("self")
-        for segment in theirs | segments("self"):  # as if they were old
+    def short():
+        """A process alone in its domain, or each would have segments of others open, too."""
+        code = "import rclpy; rclpy.init(); node = rclpy.create_node('short'); print(); input()"
+        return subprocess.Popen(
+            [sys.executable, "-c", code], text=True, stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, env={**os.environ, "ROS_DOMAIN_ID": str(private_domain())})
+
+    with short() as killed, short() as living:
+        for process in killed, living:
+            process.stdout.readline()
+        theirs, others = segments(killed), segments(living)
+        for segment in theirs | others:  # as if they were old
             os.utime(f"{segment}_el", (0, 0))
         shared_memory.remove_dead_segments()
-        assert theirs and all(segment.exists() for segment in theirs)
-        process.kill()
-    living = segments("self")
-    shared_memory.remove_dead_segments()
-    assert not any(segment.exists() or Path(f"{segment}_el").exists() for segment in theirs)
-    assert living and all(segment.exists() for segment in living)
+        assert theirs and others and all(segment.exists() for segment in theirs | others)
+        killed.kill()
+        killed.wait()
+        shared_memory.remove_dead_segments()
+        assert not any(segment.exists() or Path(f"{segment}_el").exists() for segment in theirs)
+        assert all(segment.exists() for segment in others)
+        living.kill()
     assert "that killed processes left in /dev/shm" in capsys.readouterr().err
 
 
