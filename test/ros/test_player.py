@@ -139,10 +139,12 @@ def test_the_clock_has_its_rate_where_messages_are_rare(monkeypatch):
 
 def test_looping_starts_again_and_the_clock_follows_the_bag(processes, peer, text_bag):
     heard, clock = peer.listen("/text", TEXT), peer.listen("/clock", "rosgraph_msgs/msg/Clock")
-    start(processes, text_bag, loop=True, rate=10.0, clock_hz=200.0)
-    peer.wait(lambda: (np.diff(np.array(texts(heard), int)) < 0).sum() >= 2, "two rounds")
-    numbers = np.array(texts(heard), int)  # of which a busy listener may miss some
-    assert (np.diff(numbers) != 0).all() and {*numbers} <= {*range(20)} and len(numbers) > 20
+    start(processes, text_bag, loop=True, rate=3.0, clock_hz=200.0)
+    peer.wait(lambda: len(heard) > 45, "two and a half rounds")
+    numbers = np.array(texts(heard), int)
+    again = np.flatnonzero(np.diff(numbers) < 0)  # a busy listener may miss some, but no round
+    assert 2 <= len(again) <= 3 and (np.diff(numbers) != 0).all()
+    assert (numbers[again] > 14).all() and (numbers[again + 1] < 5).all()
     times = np.array([to_ns(c.clock) for c in clock])
     assert (times >= START).all() and (times <= START + 25 * STEP).all()
     back = np.diff(times) < 0
