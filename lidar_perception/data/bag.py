@@ -62,9 +62,9 @@ class BagWriter:
 
     def _may_write(self) -> None:
         check_free(self.path, self.force)
-        if self.path.exists() and not (self.path / "metadata.yaml").is_file():
-            raise InputError(f"{self.path} is no bag, so it is not replaced; give another name")
         if self.path.exists():
+            if not (self.path / "metadata.yaml").is_file():
+                raise InputError(f"{self.path} is no bag, so it is not replaced; give another name")
             refuse_others(self.path, ("metadata.yaml", "*.mcap*", "*.db3*"))
 
     def __enter__(self) -> BagWriter:

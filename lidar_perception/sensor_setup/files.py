@@ -13,7 +13,6 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.clustering.density import followed
 from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams
 from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import moved_points
 from lidar_perception.sensor_setup.doubts import (
     NOT_AHEAD,
@@ -124,8 +123,7 @@ def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
         for name, value, error in (("roll", q.roll, q.error[1]), ("pitch", q.pitch, q.error[2])):
             out[f"ground.sensor_pose.{name}"] = (
                 round(value, 4), f"{np.degrees(value):.2f} +- {np.degrees(error):.2f} degrees")
-        level = tilted(q.roll, q.pitch)
-        near = [np.percentile(np.hypot(*moved_points(s.xyz[p.on], level)[:, :2].T), 1)
+        near = [np.percentile(np.hypot(*moved_points(s.xyz[p.on], q.pose)[:, :2].T), 1)
                 for s, p in zip(m.scans, q.planes) if p is not None]
         start = round(NEAREST_GROUND * float(np.median(near)), 1)
         out["ground.patchwork.min_range"] = (start, "the nearest ground is "
@@ -146,7 +144,7 @@ def _in_base(m: Measured) -> str:
     around the corners of that in the sensor's frame."""
     pose, where = m.told.footprint, f"of '{FOOTPRINT}' by TF"
     if pose is None and m.mount is not None:
-        pose = tilted(m.mount.roll, m.mount.pitch, m.mount.height)
+        pose = m.mount.pose
         where = "of a frame below the sensor that looks as it does (else add the sensor's place)"
     if pose is None:
         return "\nIt is in the sensor's frame. Nodes with base_frame read it in that."

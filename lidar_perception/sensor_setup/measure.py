@@ -10,7 +10,6 @@ import numpy as np
 
 from lidar_perception.robot.crop import kept_points
 from lidar_perception.robot.params import CropParams
-from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import inverse, moved_points
 from lidar_perception.sensor_setup.beams import Beams, azimuth_steps, beams_of, range_noise
 from lidar_perception.sensor_setup.coverage import Coverage, coverage_of, nearest_of, stands_still
@@ -134,17 +133,17 @@ def _heading(scans: Sequence[Scan], numbers: Sequence[int], mount: Mount | None,
              still: bool | None, told: Told) -> Ahead | None:
     if mount is None:
         return None
-    pose = tilted(mount.roll, mount.pitch, mount.height)
-    shifts = shifts_of(pictures_of(_levelled(scans, pose), moves=still is False), numbers)
+    shifts = shifts_of(pictures_of(_levelled(scans, mount), moves=still is False), numbers)
     if told.base or not told.poses:
         return ahead_of(shifts, driven(told.poses, shifts))
     # Odometry of the sensor itself says no base's x, but where it went.
-    return ahead_of(driven({number: sensor @ inverse(pose) for number, sensor
-                            in told.poses.items()}, shifts), {})
+    level = inverse(mount.pose)
+    return ahead_of(driven({number: sensor @ level for number, sensor in told.poses.items()},
+                           shifts), {})
 
 
-def _levelled(scans: Sequence[Scan], pose: np.ndarray) -> list[np.ndarray]:
-    return [moved_points(scan.xyz, pose) for scan in scans]
+def _levelled(scans: Sequence[Scan], mount: Mount) -> list[np.ndarray]:
+    return [moved_points(scan.xyz, mount.pose) for scan in scans]
 
 
 def _way(scans: Sequence[Scan], mount: Mount | None, heading: Ahead | None, told: Told) -> float:
@@ -154,7 +153,7 @@ def _way(scans: Sequence[Scan], mount: Mount | None, heading: Ahead | None, told
         return float(np.ptp([pose[:2, 3] for pose in told.poses.values()], axis=0).max())
     if mount is None or heading is None:
         return np.nan
-    ends = _levelled([scans[0], scans[-1]], tilted(mount.roll, mount.pitch, mount.height))
+    ends = _levelled([scans[0], scans[-1]], mount)
     shift = shift_between(*map(spectrum, pictures_of(ends, moves=False)))
     return np.nan if shift is None else float(np.maximum(heading.went, np.hypot(*shift)))
 

@@ -64,9 +64,14 @@ class Mount(NamedTuple):
     upside_down: bool
 
     @property
+    def pose(self) -> np.ndarray:
+        """(4, 4): takes points of the sensor to a level frame on the ground below it."""
+        return tilted(self.roll, self.pitch, self.height)
+
+    @property
     def normal(self) -> np.ndarray:
         """(3,) unit vector that points up, in the sensor's frame."""
-        return tilted(self.roll, self.pitch)[2, :3]
+        return self.pose[2, :3]
 
     @property
     def level(self) -> bool:

@@ -6,16 +6,15 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from lidar_perception.geometry import bev_iou
-from lidar_perception.tracking.params import AssociationParams
+from lidar_perception.tracking.params import FRAME, AssociationParams
 
 FORBIDDEN = 1e3  # more than all pairs that are allowed together cost by far
 MAX_COST = 1.0
-TENTH = 0.1  # seconds between frames that max_gate is for
 
 
 def costs(tracks: np.ndarray, spread: np.ndarray, kinds: np.ndarray, reach: np.ndarray,
           found: np.ndarray, found_kinds: np.ndarray, params: AssociationParams,
-          seconds: float = TENTH) -> np.ndarray:
+          seconds: float = FRAME) -> np.ndarray:
     """(N, M) float64, up to MAX_COST where a detection can belong to a track, else FORBIDDEN.
 
     tracks (N, 7) predicted boxes and found (M, 7) detected ones, in the same frame; spread (N,)
@@ -24,7 +23,7 @@ def costs(tracks: np.ndarray, spread: np.ndarray, kinds: np.ndarray, reach: np.n
     """
     dx, dy = (tracks[:, None, axis] - found[None, :, axis] for axis in (0, 1))
     apart = np.sqrt(dx * dx + dy * dy)
-    widest = params.max_gate * max(1.0, seconds / TENTH)
+    widest = params.max_gate * max(1.0, seconds / FRAME)
     gate = np.minimum(np.maximum(params.sigmas * spread, reach), widest)[:, None]
     cost = (1.0 - params.overlap) * apart / gate
     if params.overlap > 0:

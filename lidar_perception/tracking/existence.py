@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidar_perception.tracking.params import ExistenceParams
+from lidar_perception.tracking.params import FRAME, ExistenceParams
 
 CLIP = 0.01          # scores beyond 0.01 .. 0.99 say no more than those
 HITS, TRIES = 1.0, 2.0  # before a track has any
 SURE = 0.95          # no object is hit more surely
-HIDDEN = 0.1         # s, for which max_absence is
 
 
 def log_odds(probability: np.ndarray | float) -> np.ndarray:
@@ -55,4 +54,4 @@ def absence(hits: np.ndarray, tries: np.ndarray, seconds: float,
     max_absence by time. Misses come together, as what hides an object does so for a while, however
     many frames it takes."""
     rate = np.minimum((hits + HITS) / (tries + TRIES), SURE)
-    return np.minimum(-np.log(1.0 - rate), params.max_absence * (seconds / HIDDEN))
+    return np.minimum(-np.log(1.0 - rate), params.max_absence * (seconds / FRAME))

@@ -10,6 +10,8 @@ from lidar_perception.param_fields import Params, param
 KINDS = ("vehicle", "pedestrian", "cyclist")  # that move, and are told apart, in the same way
 KIND_OF_CLASS = tuple(KINDS.index(row.moves_as) for row in TABLE)
 
+FRAME = 0.1  # s from frame to frame, for which max_gate and max_absence are
+
 
 @dataclass(frozen=True)
 class MotionParams(Params):
