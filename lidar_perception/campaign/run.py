@@ -13,6 +13,7 @@ from typing import Any
 
 from lidar_perception.campaign.case import FAILED, SKIPPED, Case, Outcome
 from lidar_perception.campaign.worker import Limits, Worker
+from lidar_perception.nodes import require_rclpy
 from lidar_perception.runs.files import make_folder
 from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError
@@ -27,6 +28,7 @@ PARTS: dict[str, tuple[float, Limits, str]] = {
     "load": (1, Limits(2700, 0), "120,000 points at 10, 20 and 40 Hz"),
     "leaks": (3, Limits(3600, 0), "the same frames again and again through all that runs"),
 }
+NEEDS_ROS = {"messages", "live", "faults", "load", "leaks"}
 FOREVER = 2**62
 SAME = 5  # files that are kept of failures that give the same reason
 
@@ -110,7 +112,7 @@ def _run_part(tally: Tally, out: Path, seed: int, seconds: float, most: int | No
     begin = monotonic()
     watch(tally, 0.0)
     try:
-        with Worker(tally.part, PARTS[tally.part][1], out) as worker:
+        with _worker(tally.part, out) as worker:
             for number, outcome, case in worker.cases(
                     seed, 0, FOREVER if most is None else most, begin + seconds):
                 tally.add(outcome)
@@ -134,5 +136,12 @@ def replay(path: Path, out: Path) -> tuple[Case, Outcome]:
         raise InputError(f"{path}: there is no part '{case.part}'; the parts are "
                          f"{', '.join(PARTS)}")
     make_folder(out)
-    with Worker(case.part, PARTS[case.part][1], out, quiet=False) as worker:
+    with _worker(case.part, out, quiet=False) as worker:
         return case, worker.attempt(case)
+
+
+def _worker(part: str, out: Path, quiet: bool = True) -> Worker:
+    """InputError where the part needs rclpy, which is not there."""
+    if part in NEEDS_ROS:
+        require_rclpy()
+    return Worker(part, PARTS[part][1], out, quiet)

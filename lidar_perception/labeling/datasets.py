@@ -149,6 +149,8 @@ def _kitti_tracking(folder: Path, frames: Iterator[Placed], summary: Summary) ->
         texts.setdefault(name, []).append(kitti_tracking.text_of_frame(
             placed.labels, frame, placed.index))
         _remark_losses(summary, placed, "boxes, track ids")
+        if (placed.labels.track_ids == NO_TRACK).any():
+            summary.remark("without a track id, which tracking needs: boxes, written as -1")
         yield placed
     for name, parts in texts.items():
         write_bytes(root / f"label_02/{name}.txt", "".join(parts).encode())

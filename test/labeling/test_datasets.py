@@ -149,7 +149,7 @@ def test_without_a_camera_one_is_assumed_and_numbers_follow_the_time(tmp_path):
     summary = write_dataset("kitti_tracking", frames, tmp_path / "k", labels)
     assert (summary.frames, summary.drives) == (7, 2)
     assert {remark.split(":")[0]: n for remark, n in summary.remarks.items()} == {
-        "assumed": 7, "left out": 7}
+        "assumed": 7, "left out": 7, "without a track id, which tracking needs": 6}
     back = open_recording(tmp_path / "k")
     assert [frame.name for frame in back] == [
         *(f"0000/{i:06}" for i in (0, 1, 3, 4)), *(f"0001/{i:06}" for i in range(3))]
