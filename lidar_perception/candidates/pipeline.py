@@ -22,6 +22,7 @@ from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.groups import renumbered
 from lidar_perception.robot.crop import cropped
+from lidar_perception.robot.placing import levelling, tilted
 from lidar_perception.types import LidarFrame
 
 
@@ -32,7 +33,8 @@ def segment(frame: LidarFrame, camera: Camera | None = None,
     whatever clustering, are computed where they are None. InputError if the view is on and there
     is no camera."""
     t0 = perf_counter()
-    kept, frame = cropped(frame, params.crop)
+    kept, frame = cropped(frame, params.crop, level=levelling(tilted(
+        params.ground.sensor_pose.roll, params.ground.sensor_pose.pitch)))
     indices, seen = points_in_view(frame, camera, params.view)
     indices = kept.take(indices)
     t1 = perf_counter()

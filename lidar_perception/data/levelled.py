@@ -23,7 +23,7 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 class Robot:
     """How a sensor is mounted and read, as the parameters of nodes have it. height: metres above
     the ground, None what the recording says; roll, pitch: of the sensor, as a URDF's rpy, and
-    ahead: counter-clockwise from its x axis, rad; crop: in the sensor's coordinates;
+    ahead: counter-clockwise from its x axis, rad; crop: its body in the sensor's coordinates;
     intensity_max: see wire.messages.to_frame."""
 
     height: float | None = None
@@ -49,7 +49,7 @@ def levelled(frame: Frame, robot: Robot, poses: Poses | None = None) -> Frame:
         """indices of the points that are kept, and these."""
         message = frame.native()
         scan, indices = to_frame(message, robot.intensity_max)
-        kept, scan = cropped(scan, robot.crop)
+        kept, scan = cropped(scan, robot.crop, level=level)
         if poses is not None:
             scan = moved_to_stamp(message, scan, indices.take(kept), poses)
         return kept, scan

@@ -19,6 +19,7 @@ from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
 from lidar_perception.param_fields import with_values
 from lidar_perception.robot.crop import cropped
+from lidar_perception.robot.placing import levelling, tilted
 from lidar_perception.types import InputError, LidarFrame
 
 Result = TypeVar("Result")
@@ -38,7 +39,9 @@ class NetworkDetector:
         take over."""
         require_columns(frame, ground=ground, cluster_ids=cluster_ids)
         if self.params.crop.enabled:
-            kept, frame = cropped(frame, self.params.crop)
+            pose = self.params.ground.sensor_pose
+            kept, frame = cropped(frame, self.params.crop,
+                                  level=levelling(tilted(pose.roll, pose.pitch)))
             ground, cluster_ids = (column if column is None else column.take(kept)
                                    for column in (ground, cluster_ids))
         return self.detect(frame, ground, cluster_ids)

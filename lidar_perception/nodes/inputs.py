@@ -16,7 +16,6 @@ from lidar_perception.candidates.seed_sources import (
     SeedSource,
     automatic_seed,
     clicked_seed,
-    fixed_seed,
     truth_seed,
 )
 from lidar_perception.candidates.seeds import Seed, load_seed
@@ -86,6 +85,7 @@ class CameraInput:
             try:
                 pose = self.node.transforms.tree.lookup(camera, lidar, to_ns(header.stamp))
             except Missing:
+                self.node.transforms.listen()
                 return None
             found = calibrated(self.info, pose).camera()
         return found if level is None else replace(
@@ -174,14 +174,17 @@ class SeedInput:
         elif self.params.source == "click":
             self.deliver(msg, partial(self._from_click, msg.header))
         else:
-            template = self._template()
-            self.deliver(msg, fixed_seed(template) if self.params.source == "file"
-                         else automatic_seed(template, self.node.params))
+            self.deliver(msg, self._from_file)
 
     def _template(self) -> Seed:
         if self.loaded is None or self.loaded[0] != self.params.file:
             self.loaded = (self.params.file, load_seed(self.params.file))
         return self.loaded[1]
+
+    def _from_file(self, segmented: Segmented) -> Seed:
+        template = self._template()
+        return template if self.params.source == "file" else automatic_seed(
+            template, self.node.params)(segmented)
 
     def _on_truth(self, msg: Any) -> None:
         objects = from_marker_array(msg)

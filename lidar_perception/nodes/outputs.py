@@ -78,7 +78,7 @@ class Obstacles:
         msg, in whose frame they are published."""
         if self.publisher.get_subscription_count():
             placing = self.node.transforms.placing(msg.header)
-            params, _ = self.node.transforms.mounted(self.node.params, placing)
+            params = self.node.transforms.mounted(self.node.params, placing)
             chosen = obstacles(xyz, ground, self.node.robot.obstacles, params.ground.sensor_pose)
             self.publisher.publish(encode(thin_cloud(
                 msg, placing.in_cloud(xyz.compress(chosen, axis=0)), indices.compress(chosen),

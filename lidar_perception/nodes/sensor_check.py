@@ -10,7 +10,6 @@ import numpy as np
 
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import height_problem, measured_height
-from lidar_perception.robot.crop import cropped
 from lidar_perception.robot.params import CropParams
 from lidar_perception.types import LidarFrame
 from lidar_perception.wire.messages import intensity_problem, to_frame
@@ -35,10 +34,10 @@ class SensorCheck:
         reads_intensity = with_intensity or params.ground.method == "patchwork"
         frame, indices = to_frame(msg, params.input.intensity_max if reads_intensity else None)
         placing = self.node.transforms.placing(msg.header)
-        params, base = self.node.transforms.mounted(params, placing)
+        params = self.node.transforms.mounted(params, placing)
         self.node.counts.pop("cropped", None)
         if params.crop.enabled:
-            kept, frame = cropped(frame, params.crop, base)
+            kept, frame = self.node.transforms.cropped(frame, params.crop, placing)
             self.node.counts["cropped"] = len(indices) - len(kept)
             indices, params = indices.take(kept), replace(params, crop=CropParams())
         return placing.levelled(frame), indices, params

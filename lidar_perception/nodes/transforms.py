@@ -18,10 +18,11 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.nodes.reception import WARN, Problem
 from lidar_perception.robot.crop import cropped
+from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placing import Placing, levelling, tilted
 from lidar_perception.robot.poses import inverse
 from lidar_perception.robot.tree import Missing, TransformTree
-from lidar_perception.types import InputError
+from lidar_perception.types import InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_frame
 from lidar_perception.wire.point_times import corrected, moved_cloud, point_times
@@ -65,6 +66,7 @@ class Transforms:
         self.lacking: dict[str, str] = {}  # what asked for it -> what is not there
         self.known: dict[str, Any] = {}  # for the diagnostics
         self._last: tuple[tuple[str, int], Placing] = (("", -1), Placing(""))
+        self._met: set[tuple[str, str]] = set()  # frames that have been connected
         self._listening = self._hearing = False
         self._installed = has_tf()
         if self._installed:
@@ -144,13 +146,23 @@ class Transforms:
         frame_id, stamp = cloud.header.frame_id, to_ns(cloud.header.stamp)
         try:
             for frame in filter(None, (self.base_frame, self.target_frame)):
-                self.tree.lookup(frame, frame_id, stamp)
+                self._meet(frame, frame_id, stamp)
             if self.node.robot.input.deskew != "off":
                 self.sensor_poses(self.node.robot.input.deskew, frame_id,
                                   np.array([stamp + round(self._sweep_of(cloud) * SECOND)]))
         except Missing as error:
             return str(error) if error.late else None
         return None
+
+    def _meet(self, frame: str, frame_id: str, stamp: int) -> None:
+        """Missing where the frames are not connected, which may still come where they never were:
+        a driver may be found before robot_state_publisher."""
+        try:
+            self.tree.lookup(frame, frame_id, stamp)
+        except Missing as error:
+            new = (frame, frame_id) not in self._met and "TF" not in self.lacking
+            raise Missing(str(error), error.late or new) from None
+        self._met.add((frame, frame_id))
 
     def _sweep_of(self, cloud: Any) -> float:
         """As of the last cloud that was moved; before there is one, of this one, which could not
@@ -205,9 +217,9 @@ class Transforms:
             self.lacking[what] = f"{what} '{frame}': {error}; {instead}"
             return None
 
-    def mounted(self, params: Any, placing: Placing) -> tuple[Any, np.ndarray | None]:
-        """params, a node's, for a frame that placing has levelled, and the sensor's pose in
-        base_frame for the crop; both by params.ground.sensor_pose where TF has no base_frame."""
+    def mounted(self, params: Any, placing: Placing) -> Any:
+        """params, a node's, for a frame that placing has levelled; its params.ground.sensor_pose
+        stands where TF has no base_frame."""
         height = params.ground.sensor_pose.height
         if placing.base is not None:
             height = float(placing.base[2, 3])
@@ -215,8 +227,24 @@ class Transforms:
         if placing.base is not None or placing.level is not None:
             params = replace(params, ground=replace(
                 params.ground, sensor_pose=SensorPoseParams(height=height)))
-        base = self._by_hand() if placing.base is None and self.base_frame else placing.base
-        return params, base
+        return params
+
+    def cropped(self, frame: LidarFrame, crop: CropParams, placing: Placing
+                ) -> tuple[np.ndarray, LidarFrame]:
+        """As robot.crop.cropped. A body in a base_frame that TF does not have is not cropped, as
+        it could be anything."""
+        self.lacking.pop("crop.body", None)
+        if crop.body and self.base_frame:
+            if placing.base is None:
+                self.lacking["crop.body"] = "crop.body is not left out, as base_frame is not known"
+                crop = replace(crop, body=())
+            elif crop.body[5] <= 0.0:
+                self.lacking["crop.body"] = (
+                    f"crop.body ends {-crop.body[5]:.2f} m below the ground of '{self.base_frame}'"
+                    ", in which it is read; give it in that frame, as a file of setup has it too")
+        pose = self._by_hand()
+        level = levelling(pose) if placing.level is None and pose is not None else placing.level
+        return cropped(frame, crop, placing.base, level)
 
     def to_level(self, header: Any, frame_id: str) -> np.ndarray:
         """(4, 4): takes points of a frame to the level frame of a cloud with this header. Missing
@@ -262,6 +290,7 @@ class Transforms:
         try:
             return self.tree.poses(self.carrier, frame_id, at, max_gap)
         except Missing as error:
+            self.listen()
             pose = self._by_hand() if self.carrier == self.base_frame else None
             if pose is None:
                 raise Missing(f"the odometry is of '{self.carrier}': {error}",
@@ -307,8 +336,7 @@ class Transforms:
         frame, indices = to_frame(msg)
         crop = getattr(self.node.params, "crop", None)
         if crop is not None and crop.enabled:
-            _, base = self.mounted(self.node.params, self.placing(msg.header))
-            kept, frame = cropped(frame, crop, base)
+            kept, frame = self.cropped(frame, crop, self.placing(msg.header))
             indices = indices.take(kept)
         found = corrected(msg, frame, indices, lambda at: self.sensor_poses(
             self.node.robot.input.deskew, frame.frame_id, at))

@@ -9,9 +9,11 @@ from lidar_perception.robot.poses import moved_points
 from lidar_perception.types import LidarFrame
 
 
-def kept_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None = None) -> np.ndarray:
+def kept_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None = None,
+                level: np.ndarray | None = None) -> np.ndarray:
     """(N,) bool: the points (N, 3) of the sensor's frame that are not left out. base (4, 4): the
-    sensor's pose in the frame of params.body; None: that is the sensor's own.
+    sensor's pose in the frame of params.body; level (4, 4): takes its points to the same place with
+    z up and x ahead, where params.sectors are. None: that is the sensor's own frame.
 
     A point on a limit of range or body is kept, one on the edge of a sector is left out. Points
     that are not finite count as far away.
@@ -28,18 +30,19 @@ def kept_points(xyz: np.ndarray, params: CropParams, base: np.ndarray | None = N
             low, high = np.reshape(params.body, (2, 3)).astype(xyz.dtype)
             kept &= ~((at > low) & (at < high)).all(axis=1)
         if params.sectors:
-            azimuth = np.degrees(np.arctan2(xyz[:, 1], xyz[:, 0]))
+            x, y = (xyz if level is None else xyz @ level[:2, :3].T.astype(xyz.dtype)).T[:2]
+            azimuth = np.degrees(np.arctan2(y, x))
             for start, end in np.reshape(params.sectors, (-1, 2)):
                 whole = end - start >= 360
                 kept &= ~(whole | ((azimuth - start) % 360 <= (end - start) % 360))
     return kept
 
 
-def cropped(frame: LidarFrame, params: CropParams, base: np.ndarray | None = None
-            ) -> tuple[np.ndarray, LidarFrame]:
+def cropped(frame: LidarFrame, params: CropParams, base: np.ndarray | None = None,
+            level: np.ndarray | None = None) -> tuple[np.ndarray, LidarFrame]:
     """indices (M,) int64 of the points of the frame that are kept, see kept_points, and the frame
     of these; the frame itself where nothing is to be left out."""
     if not params.enabled:
         return np.arange(len(frame)), frame
-    indices = np.flatnonzero(kept_points(frame.xyz, params, base))
+    indices = np.flatnonzero(kept_points(frame.xyz, params, base, level))
     return indices, frame.take(indices)

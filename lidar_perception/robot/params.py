@@ -22,7 +22,8 @@ class CropParams(Params):
                                   "limit.", unit="m", low=0.0, high=1e5)
     sectors: tuple[float, ...] = param(
         float, "Azimuths that are left out, as seen from the sensor: from, to, from, to ...; 0 is "
-        "straight ahead, 90 to the left. 150, 210 is what is behind.", unit="deg")
+        "straight ahead, where `input.ahead` says, 90 to the left, however the sensor is mounted. "
+        "150, 210 is what is behind.", unit="deg")
 
     @property
     def enabled(self) -> bool:

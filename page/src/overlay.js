@@ -7,7 +7,7 @@ import { commit, dropDraft, setDraft } from "./edits.js";
 import { project, rayAt } from "./picking.js";
 import { resultNames } from "./results.js";
 import { afterDrawing, camera, controls } from "./scene.js";
-import { selectedBox, selectedTrack, store } from "./store.js";
+import { on, selectedBox, selectedTrack, store } from "./store.js";
 
 const layer = document.getElementById("handles");
 const names = document.getElementById("names");
@@ -37,8 +37,13 @@ function place(handle, at) {
   }
 }
 
+const handled = () => store.mode === "label" && store.tool === "select" ? selectedBox()?.box : null;
+
+// At once: a click may come before the next picture.
+on("selection tool", () => { if (!handled()) layer.style.display = "none"; });
+
 function placeHandles() {
-  const box = store.mode === "label" && store.tool === "select" ? selectedBox()?.box : null;
+  const box = handled();
   layer.style.display = box ? "" : "none";
   if (!box) return;
   for (const [k, [name]] of FACES.entries()) {

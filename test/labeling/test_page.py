@@ -134,6 +134,17 @@ def test_a_dragged_face_moves_alone(page, labels, person, where, name, way):
     assert new[name] > old[name]
 
 
+@pytest.mark.parametrize("key", ["s", "Escape"])
+def test_handles_are_gone_with_the_key_and_not_with_the_next_picture(page, labels, person, key):
+    labels.chosen(page, person)
+    page.wait_for_function("() => document.getElementById('handles').style.display === ''")
+    assert page.evaluate("""async key => {
+        document.body.dispatchEvent(new KeyboardEvent('keydown', {key, bubbles: true}));
+        for (let k = 0; k < 10; k++) await null; // no picture comes between
+        return document.getElementById('handles').style.display;
+    }""", key) == "none"
+
+
 def test_the_body_is_dragged_level_and_turns_about_its_centre(page, labels, person):
     number = labels.chosen(page, person)
     before = labels.box(number)

@@ -14,6 +14,8 @@ from lidar_perception.candidates.pipeline import segment
 from lidar_perception.param_fields import with_values
 from lidar_perception.robot.crop import cropped, kept_points
 from lidar_perception.robot.params import CropParams
+from lidar_perception.robot.placing import levelling, tilted
+from lidar_perception.robot.poses import inverse, moved_points
 from lidar_perception.types import LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_frame
@@ -76,6 +78,17 @@ def test_the_body_is_a_box_of_the_base_frame_where_its_pose_is_known():
     np.testing.assert_array_equal(kept_points(xyz, CropParams(body=BODY), base),
                                   kept_points(xyz @ base[:3, :3].T + base[:3, 3],
                                               CropParams(body=BODY)))
+
+
+@pytest.mark.parametrize("roll, pitch, ahead", [(0, 0, 180), (180, 0, 0), (15, -20, 90)])
+def test_sectors_are_of_the_robot_however_its_sensor_is_mounted(roll, pitch, ahead):
+    """What a level sensor that looks ahead keeps, the same points seen by a turned one are."""
+    level = levelling(tilted(*np.radians([roll, pitch])), np.radians(ahead))
+    straight = points().astype(np.float64)
+    params = CropParams(sectors=(150.0, 210.0, 60.0, 90.0), min_range=2.0)
+    np.testing.assert_array_equal(
+        kept_points(moved_points(straight, inverse(level)), params, level=level),
+        kept_points(straight, params))
 
 
 def test_without_a_crop_the_frame_is_the_same_object():

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from detection_samples import eager, frame, lively, tiny
+from rclpy.parameter import Parameter
 from robot_bags import tf, transform
 from samples import WALKER
 from samples import scene as walker_scene
@@ -19,6 +20,7 @@ from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
+from lidar_perception.nodes.transforms import NO_TF
 from lidar_perception.param_fields import flatten, with_values
 from lidar_perception.robot.deskew import skewed, steady
 from lidar_perception.robot.placing import tilted
@@ -165,8 +167,10 @@ def test_a_network_sees_a_tilted_sensors_cloud_as_a_level_ones(start, weights):
 
 @pytest.mark.parametrize("by", ["hand", "TF", "nothing"])
 def test_the_detectors_look_ahead_wherever_x_of_the_clouds_looks(start, weights, by):
-    """Boxes of a sensor that is turned, and leans, are those of one that is not, in its frame."""
+    """Boxes of a sensor that is turned, and leans, are those of one that is not, in its frame; and
+    what is behind is cropped there, too."""
     scan, ahead = frame(), 150.0
+    weights = {**weights, "crop.sectors": [100.0, 260.0]}
     plain = start(PointPillarsNode, **weights)
     give(plain, message(scan.xyz, intensity=scan.intensity))
     expected, _, _ = boxes_of(plain)
@@ -182,6 +186,7 @@ def test_the_detectors_look_ahead_wherever_x_of_the_clouds_looks(start, weights,
     give(node, message(seen, intensity=scan.intensity))
     found, frame_id, _ = boxes_of(node)
     assert frame_id == "lidar" and len(found) == len(expected) > 5
+    assert node.counts["cropped"] == plain.counts["cropped"]
     back = found.boxes.astype(np.float64)
     back[:, :3] = moved_points(back[:, :3], level)
     order, other = (np.lexsort(b[:, 1::-1].round(1).T) for b in (back, expected.boxes))
@@ -226,11 +231,51 @@ def test_without_the_frames_the_parameters_stand_and_the_names_are_said(start):
     assert "odom" not in problems(asks)
 
 
-def test_a_cloud_waits_for_a_transform_that_is_late_and_not_for_one_that_is_missing(start):
+def test_the_body_is_cropped_only_where_the_frame_that_it_is_given_in_is_known(start):
+    """Else it could be a person; and a body under the floor is said to be in another frame."""
+    node = start(GroundSegmentation, base_frame="base", **{
+        "crop.body": [-0.5, -0.4, 0.2, 0.5, 0.4, 1.0]})
+    floor = np.random.default_rng(0).uniform(-20, 20, (2000, 3)) * [1, 1, 0]
+    sensor = mounted(0.5, 0.0, 1.2, 0.0, 0.0, 0.0)  # the base's origin is behind it
+    seen = moved_points(np.vstack([floor, [[0.3, 0.0, 0.8]], [[0.9, 0.0, 0.8]]]), inverse(sensor))
+    give(node, message(seen))
+    assert not node.counts["cropped"] and "crop.body is not left out" in problems(node)
+    node.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
+    give(node, message(seen, START + 1))
+    assert node.counts["cropped"] == 1 and "crop.body" not in problems(node)
+    low = start(GroundSegmentation, base_frame="base", **{
+        "crop.body": [-0.5, -0.4, -1.0, 0.5, 0.4, -0.2]})
+    low.transforms = node.transforms.__class__(low)
+    low.transforms.on_tf(transforms(("base", "lidar", sensor, START)), static=True)
+    give(low, message(seen))
+    assert "crop.body ends 0.20 m below the ground of 'base'" in problems(low)
+
+
+def test_where_tf_does_not_connect_the_odometry_what_moves_is_listened_to(start):
+    node = start(GroundSegmentation, **{"input.deskew": "odometry"})
+    for stamp in (START, START + PERIOD):
+        node.transforms.on_odometry(odometry(np.eye(4), stamp, "base"))
+    assert not node.transforms._listening
+    give(node, message(np.ones((50, 3)), t=np.arange(50, dtype="<u4") * 10**6))
+    assert node.transforms._listening and "'lidar' is not in TF" in problems(node)
+
+
+def test_a_template_that_cannot_be_read_costs_the_candidates_alone(start):
+    node = start(Perception, **{"seed.source": "file"})
+    assert node.set_parameters([Parameter("seed.file", value="/nowhere.npz")])[0].successful
+    give(node, message(walker_scene()[:, :3]))
+    assert len(boxes_of(node)[0]) == 0 and "/nowhere.npz" in node.state[1]
+
+
+def test_a_cloud_waits_for_a_transform_that_is_late_or_that_never_came(start):
+    """Not for one that has stopped; nor where TF cannot be listened to."""
     xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
     node = start(Perception, target_frame="odom")
     deliver, msg = node._receptions()[0].deliver, encode(message(xyz))
-    assert deliver(msg, True) is None and boxes_of(node)[1] == "lidar"  # nothing is known of odom
+    node.transforms.lacking["TF"] = NO_TF
+    assert deliver(msg, True) is None and boxes_of(node)[1] == "lidar"
+    del node.transforms.lacking["TF"]
+    assert "'odom'" in deliver(msg, True) and len(node.sent["detections"]) == 1
     node.transforms.on_tf(transforms(("odom", "lidar", np.eye(4), START - PERIOD)), static=False)
     assert "0.100 s older than needed" in deliver(msg, True)
     assert deliver(encode(message(xyz, START - PERIOD)), True) is None
