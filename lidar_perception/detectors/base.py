@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, Self, TypeVar
 
@@ -25,13 +25,21 @@ from lidar_perception.types import InputError, LidarFrame
 Result = TypeVar("Result")
 
 
+@dataclass
+class Place:
+    """Where a network runs; fallback: why the CPU took over, or None. All detectors of the network
+    share it."""
+
+    device: torch.device
+    fallback: str | None = None
+
+
 class NetworkDetector:
-    """Base of the detectors. params, their parameters, may be replaced at any time. fallback:
-    why the CPU took over, or None."""
+    """Base of the detectors. params, their parameters, may be replaced at any time."""
 
     def __init__(self, header: Header, device: torch.device, params: Any):
-        self.header, self.config, self.params, self.device = header, header.config, params, device
-        self.fallback: str | None = None
+        self.header, self.config, self.params = header, header.config, params
+        self.place = Place(device)
 
     def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
@@ -60,6 +68,16 @@ class NetworkDetector:
     def settings(self) -> NetworkParams:
         """The detector's own group of params."""
         return getattr(self.params, self.group)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the network runs now."""
+        return self.place.device
+
+    @property
+    def fallback(self) -> str | None:
+        """Why the CPU took over, or None."""
+        return self.place.fallback
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -110,7 +128,7 @@ class NetworkDetector:
 
     def move(self, device: torch.device) -> None:
         """Run on another device from now on, or on the CPU if it is out of memory."""
-        self.device = device
+        self.place.device = device
         try:
             self.bring_to(device)
         except torch.cuda.OutOfMemoryError as error:
@@ -129,8 +147,8 @@ class NetworkDetector:
         if self.device == CPU or not self.settings.cpu_fallback:
             raise InputError(f"{self.device} is out of memory; use the CPU or a smaller network"
                              ) from error
-        self.fallback = (f"{self.device} is out of memory, so the network runs on the CPU; close "
-                         "other programs and start again")
+        self.place.fallback = (f"{self.device} is out of memory, so the network runs on the CPU; "
+                               "close other programs and start again")
         self.move(CPU)
 
     def now(self) -> float:

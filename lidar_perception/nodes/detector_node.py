@@ -70,7 +70,7 @@ class DetectorNode(ManagedNode):
                 device, missing = "cpu", f"{error}; the CPU is used"
         with one_at_a_time():
             detector = self.load(weights, device)
-        detector.fallback = detector.fallback or missing
+        detector.place.fallback = detector.fallback or missing
         return detector
 
     def on_points(self, msg: Any) -> None:

@@ -252,6 +252,10 @@ def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(monkeypatch
         found = broken(scan)
         assert same(found, random_detector()(scan)) and "CPU" in found.problem
         assert broken.device == CPU
+    broken = PointPillarsDetector(OutOfMemory(lively(config)), Header(config), meta, eager())
+    others = broken.with_min_score(0.5), broken.raw()  # of the same network
+    broken(scan)
+    assert all(other.device == CPU and "CPU" in other(scan).problem for other in others)
     never = with_values(eager(), {"pointpillars.cpu_fallback": False})
     with pytest.raises(InputError, match="out of memory"):
         PointPillarsDetector(OutOfMemory(lively(config)), Header(config), meta, never)(scan)

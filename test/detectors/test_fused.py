@@ -8,17 +8,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from detection_samples import frame, random_detector, same
 from hypothesis import given
 from hypothesis import strategies as st
 from pointnet_samples import random_detector as random_classifier
 
 from lidar_perception.classes import CAR
+from lidar_perception.detectors.base import Place
+from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.fused.boxes import FRONT, MARGIN, SIDE, on_ground, on_points
 from lidar_perception.detectors.fused.detector import FusedDetector, one_of_each
 from lidar_perception.detectors.fused.evidence import LEAST, clipped_logit
 from lidar_perception.detectors.fused.model import KNOTS, models, probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
+from lidar_perception.detectors.pointnet import rescoring
 from lidar_perception.geometry import points_in_box, points_in_boxes
 from lidar_perception.ground.surface import FEWEST, surface_under
 from lidar_perception.param_fields import with_values
@@ -183,8 +187,21 @@ def test_a_higher_sensor_and_given_columns_change_nothing(detector):
 def test_it_says_so_when_a_part_had_to_leave_its_device(detector):
     other = copy.copy(detector)
     other.classifier = copy.copy(detector.classifier)
-    other.classifier.fallback = "cuda is out of memory"
+    other.classifier.place = Place(CPU, "cuda is out of memory")
     assert other(frame()).problem == "cuda is out of memory" and detector(frame()).problem is None
+
+
+def test_no_part_leaves_its_device_where_it_may_not(detector, monkeypatch):
+    """What the node is told holds for both networks."""
+    def predict(*_, **__):
+        raise torch.cuda.OutOfMemoryError("CUDA out of memory")
+    monkeypatch.setattr(rescoring, "predict", predict)
+    other = copy.copy(detector)
+    other.classifier = copy.copy(detector.classifier)
+    other.classifier.place = Place(torch.device("meta"))
+    other.params = with_values(detector.params, {"fused.cpu_fallback": False})
+    with pytest.raises(InputError, match="meta is out of memory"):
+        other(frame())
 
 
 def test_parameters_may_change_between_two_clouds(detector):

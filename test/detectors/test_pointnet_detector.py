@@ -251,11 +251,11 @@ def test_without_memory_on_the_device_the_cpu_takes_over_and_says_so(ids, monkey
             raise torch.cuda.OutOfMemoryError("CUDA out of memory")
         return real(network, clusters)
     monkeypatch.setattr(module, "predict", predict)
-    broken.device = torch.device("meta")
+    broken.place.device = torch.device("meta")
     for _ in range(2):
         found = broken(scan, cluster_ids=ids)
         assert same(found, expected) and "CPU" in found.problem and broken.device == CPU
-    broken.device = torch.device("meta")
+    broken.place.device = torch.device("meta")
     broken.params = with_values(eager(), {"pointnet.cpu_fallback": False})
     with pytest.raises(InputError, match="out of memory"):
         broken(scan, cluster_ids=ids)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -62,6 +63,7 @@ class FusedDetector(NetworkDetector):
                  params: FusedDetectorParams = FusedDetectorParams()):
         super().__init__(proposer.header, proposer.device, params)
         self.proposer, self.classifier = proposer.raw(), classifier  # the curves know raw scores
+        self.place = proposer.place
 
     @property
     def settings(self) -> FusedParams:
@@ -109,7 +111,7 @@ class FusedDetector(NetworkDetector):
         open_ = scores.passed(replace(found, scores=at_most(found.class_ids, evidence,
                                                             "classifier")))
         evidence["classifier"] = clipped_logit(
-            judged(found, obstacles, floor, self.classifier, open_))
+            judged(found, obstacles, floor, self._classifier(), open_))
         times.append(perf_counter())
         return Look(found, evidence, obstacles.xyz, floor,
                     self.proposer.out_of_sight(frame, seen) or proposed.problem,
@@ -117,13 +119,20 @@ class FusedDetector(NetworkDetector):
 
     def _proposer(self) -> PointPillarsDetector:
         """The proposer, told what this detector is told; what it sees is level already."""
-        settings = self.settings
-        self.proposer.params = DetectorParams(
+        settings, other = self.settings, copy.copy(self.proposer)
+        other.params = DetectorParams(
             ground=replace(self.params.ground, sensor_pose=SensorPoseParams(height=SENSOR_HEIGHT)),
             clustering=self.params.clustering,
             pointpillars=PointPillarsParams(scores=ScoreParams.all_alike(settings.proposals),
                                             nms=settings.nms, cpu_fallback=settings.cpu_fallback))
-        return self.proposer
+        return other
+
+    def _classifier(self) -> PointNetDetector:
+        """Likewise."""
+        other = copy.copy(self.classifier)
+        own = replace(other.settings, cpu_fallback=self.settings.cpu_fallback)
+        other.params = replace(other.params, pointnet=own)
+        return other
 
     def weighed(self, look: Look) -> tuple[Detections, dict[str, float]]:
         """The detections, best first, as from a level sensor at SENSOR_HEIGHT, and where there are
@@ -146,7 +155,7 @@ class FusedDetector(NetworkDetector):
     def bring_to(self, device: torch.device) -> None:
         """Bring both networks to a device."""
         self.proposer.bring_to(device)
-        self.classifier.bring_to(device)
+        self.classifier.move(device)
 
     def warm_up(self) -> None:
         """Run every part once on made-up points, so that what is compiled is compiled."""
@@ -171,9 +180,10 @@ def load_fused_detector(path: str | Path = "", device: str = "auto",
     load_pointnet_detector."""
     settings = params.fused
     proposer = load_detector(path, device, DetectorParams(pointpillars=PointPillarsParams(
-        weights=settings.weights, range=settings.range, threads=settings.threads, warm_up=False)))
+        weights=settings.weights, range=settings.range, threads=settings.threads, warm_up=False,
+        cpu_fallback=settings.cpu_fallback)))
     classifier = load_pointnet_detector(settings.classifier, device, PointNetDetectorParams(
-        pointnet=PointNetParams(warm_up=False)))
+        pointnet=PointNetParams(warm_up=False, cpu_fallback=settings.cpu_fallback)))
     detector = FusedDetector(proposer, classifier, params)
     if settings.warm_up:
         detector.warm_up()

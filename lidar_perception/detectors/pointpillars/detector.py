@@ -175,6 +175,8 @@ class PointPillarsDetector(NetworkDetector):
             valid = valid[best[valid].topk(self.settings.nms.candidates).indices]
         chosen, best, labels = chosen[valid], best[valid], labels[valid]
         codes, directions = boxes_at(chosen)
+        if self.anchors.device != codes.device:  # another detector has moved the network
+            self.anchors = make_anchors(self.look, codes.device)
         boxes = decode(codes.float(), directions.argmax(dim=1), self.anchors[chosen],
                        self.config.direction_offset).cpu().numpy()
         found = Boxes(boxes, best.cpu().numpy(), labels.cpu().numpy())
@@ -218,8 +220,10 @@ class PointPillarsDetector(NetworkDetector):
             look = replace(self.config, **HALF) if where == "around" else None
         except ValueError as error:
             raise InputError(f"this network cannot see {where}: {error}") from None
-        return PointPillarsDetector(self.network, replace(self.header, config=config), self.device,
-                                    self.params, look)
+        other = PointPillarsDetector(self.network, replace(self.header, config=config),
+                                     self.device, self.params, look)
+        other.place = self.place
+        return other
 
     def bring_to(self, device: torch.device) -> None:
         """Bring network and anchors to a device."""
