@@ -67,7 +67,7 @@ class Session:
         self.listeners: list[Listener] = []
         self.busy: dict[str, Any] | None = None
         self.was_proposed = any(line.get("do") == "propose" for line in journal.lines)
-        self._cancelled = False
+        self._end = self._next_end = threading.Event()  # of what goes on, of what waits for that
         self._beside: threading.Thread | None = None
         self._what = ""  # goes on there
         self._lock, self._exporting = threading.RLock(), threading.Lock()
@@ -93,7 +93,8 @@ class Session:
 
     def cancel(self) -> int:
         """End what goes on; the number of the last action."""
-        self._cancelled = True
+        self._end.set()
+        self._next_end.set()
         return self.state.seq
 
     def prepare(self, by: str = "", anew: bool = False) -> int:
@@ -108,13 +109,15 @@ class Session:
 
     def _start(self, what: str, work: Callable[[], None]) -> None:
         """Do what takes long in a thread of its own; what went on before ends."""
-        before, self._cancelled, self._what = self._beside, True, what
+        self.cancel()
+        before, own, self._what = self._beside, threading.Event(), what
+        self._next_end = own
 
         def beside() -> None:
             if before is not None:
                 before.join()
             self.busy = {"what": what, "done": 0, "of": len(self.drive.frames)}
-            self._cancelled = False
+            self._end = own  # set where it was cancelled while it waited
             try:
                 work()
             except Exception as error:  # of a thread nobody waits for: the page is told
@@ -168,7 +171,7 @@ class Session:
         if self.busy is not None:
             self.busy = {**self.busy, "done": count}
             self.tell({"progress": self.progress()})
-        return not self._cancelled
+        return not self._end.is_set()
 
     def _propose_all(self, by: str, seed: int | None, asked: bool = False) -> None:
         """Follow everything through the whole drive, and write that down; with the number of the
@@ -176,7 +179,7 @@ class Session:
         state = self.state
         found = self.proposer.proposals(state, self.motion, None, self._done)
         with self._lock:
-            if found is None or self._cancelled or (seed is not None and not self._waiting()):
+            if found is None or self._end.is_set() or (seed is not None and not self._waiting()):
                 return
             tracks, removed = merged(self.state, found, self.motion)
             # A seed is undone with all that came of it, but never with the first proposals.

@@ -306,6 +306,18 @@ def test_the_annotator_ends_with_every_person_right_and_less_work(made):
     assert done["actions"] == sum(done["kinds"].values()) < done["by_hand"]
 
 
+def test_what_is_cancelled_while_it_waits_for_what_went_on_before_ends_at_once(made):
+    done, go_on = [], threading.Event()
+    made._start("first", go_on.wait)
+    made._start("second", lambda: done.append(made._done(0)))
+    made.cancel()
+    go_on.set()
+    made.wait()
+    made._start("third", lambda: done.append(made._done(0)))
+    made.wait()
+    assert done == [False, True]
+
+
 def test_proposals_that_are_cancelled_write_nothing(made):
     made.busy = {"what": "proposing", "done": 0, "of": FRAMES}
     made.listeners.append(lambda event: made.cancel())
