@@ -217,6 +217,11 @@ class Adapting:
         """Which sources are asked."""
         return heard_of(self.recognised)
 
+    @property
+    def not_asked(self) -> list[str]:
+        """What to say of those that are not."""
+        return unheard(self.recognised)
+
     def _recognised(self) -> Counts:
         path = self.out / HEARD
         if not path.is_file():

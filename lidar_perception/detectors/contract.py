@@ -21,9 +21,9 @@ FUSED = "fused"  # the default where one detector is wanted: all of them togethe
 class Found:
     """What a detector says of one frame.
 
-    detections in the frame's own coordinates; ms: time of each step (on CUDA after
-    synchronisation); problem: why nothing, or little, can be detected, with the remedy, or None;
-    best: where no score reached its threshold, the highest score of each class.
+    detections in the frame's own coordinates, without what carries the sensor; ms: time of each
+    step (on CUDA after synchronisation); problem: why nothing, or little, can be detected, with the
+    remedy, or None; best: where no score reached its threshold, the highest score of each class.
     """
 
     detections: Detections

@@ -12,6 +12,8 @@ from lidar_perception.ground.params import GroundParams, SensorPoseParams
 from lidar_perception.ground.segment import level, segment_ground
 from lidar_perception.types import SENSOR_HEIGHT, Detections, LidarFrame
 
+MAST = 1.0  # metres; a car that passes below a sensor on a gantry is farther away
+
 
 def visible(frame: LidarFrame, config: NetworkConfig,
             pose: SensorPoseParams = SensorPoseParams()) -> tuple[np.ndarray, LidarFrame]:
@@ -45,6 +47,16 @@ def in_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detection
         boxes[:, :3] = boxes[:, :3] @ back
         boxes[:, 6] = np.arctan2(heading[:, 1], heading[:, 0])
     return replace(detections, boxes=boxes)
+
+
+def without_carrier(detections: Detections) -> Detections:
+    """Without the boxes, in the sensor's frame, that the sensor is in or, by less than MAST, above
+    or below: that is what carries it, such as the roof of its own car, and nothing to find."""
+    x, y, z, length, width, height, yaw = detections.boxes.astype(np.float64).T
+    along, aside = np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x
+    own = ((np.abs(along) <= length / 2) & (np.abs(aside) <= width / 2)
+           & (np.abs(z) <= height / 2 + MAST))
+    return detections[~own] if own.any() else detections
 
 
 def turned_about(frame: LidarFrame) -> LidarFrame:

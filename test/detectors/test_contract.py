@@ -9,15 +9,22 @@ import numpy as np
 import pointnet_samples
 import pytest
 from detection_samples import same
+from hypothesis import given
+from hypothesis import strategies as st
 from samples import CALIBRATION, crowd
 
 from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.pointnet import weights_file as pointnet_weights
 from lidar_perception.detectors.pointpillars import weights_file as pointpillars_weights
+from lidar_perception.detectors.pointpillars.params import DetectorParams
+from lidar_perception.detectors.view import without_carrier
+from lidar_perception.geometry import points_in_box
 from lidar_perception.scoring.comparison.contenders import contenders
-from lidar_perception.types import CLASSES, InputError, LidarFrame
+from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 NAMES = ["STM-CPA paper", "STM-CPA best", "STM-CPA best, auto", "PointPillars v0 compact",
@@ -59,6 +66,32 @@ def test_it_says_what_it_can_detect_and_from_which_score_on(detectors, name):
     assert [p.kind for p in columns.values()] == [inspect.Parameter.POSITIONAL_OR_KEYWORD,
                                                   *[inspect.Parameter.KEYWORD_ONLY] * 2]
     assert [*columns][1:] == ["ground", "cluster_ids"]
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_what_carries_the_sensor_is_no_detection_wherever_it_looks(seed):
+    """Of the boxes round any point those that hold it are left out if that is where the sensor
+    is, and but for a mast of 1 m no others."""
+    rng = np.random.default_rng(seed)
+    boxes = np.column_stack([rng.uniform(-4, 4, (50, 3)), rng.uniform(0.5, 5, (50, 3)),
+                             rng.uniform(-4, 4, 50)])
+    left = without_carrier(Detections.of(boxes, np.arange(50) % 3, np.ones(50))).boxes
+    boxes = boxes.astype(np.float32).astype(np.float64)
+    none = [not points_in_box(np.zeros((1, 3)), box + [0, 0, 0, 0, 0, 2.0, 0])[0] for box in boxes]
+    np.testing.assert_array_equal(left, boxes[none].astype(np.float32))
+
+
+class Roof(NetworkDetector):
+    """Finds the car that carries the sensor, and the one ahead."""
+
+    def detect(self, frame, ground, cluster_ids):
+        return Found(Detections.of(np.array([[-0.2, 0.1, -1.0, 3.8, 1.6, 1.5, 0.9],
+                                             [9.0, 0.0, -1.0, 3.8, 1.6, 1.5, 0.0]])))
+
+
+def test_no_detector_finds_the_car_that_carries_the_sensor(frame):
+    roof = Roof(Header(detection_samples.tiny()), CPU, DetectorParams())
+    assert roof(frame.load()).detections.boxes[:, 0].tolist() == [9.0]
 
 
 @each_name
