@@ -248,6 +248,8 @@ class Reception:
             names = ", ".join(sorted(_name(p) for p in publishers))
             found.append(("publishers", WARN, f"{len(publishers)} publishers on {self.topic} "
                           f"({names}): their {self.what}s are mixed; remap all but one"))
+        if unheard := self._unheard(publishers):
+            found.append(unheard)
         if self.waiting and self.needs is not None:
             return [*found, ("waiting", WARN, f"the {self.what} on {self.topic} waits for "
                              f"{self.needs}")]
@@ -272,6 +274,18 @@ class Reception:
                           f"{self.topic} were dropped, as newer ones came before their turn: the "
                           "work on one takes too long for this machine, or it waits for poses"))
         return found
+
+    def _unheard(self, publishers: list[Any]) -> Problem | None:
+        """A best-effort publisher, where adapt() may not make the subscription fit it."""
+        names = [_name(p) for p in publishers if p.qos_profile.reliability == BEST_EFFORT]
+        adapts = not self.fixed and self.params().reliability != "reliable"
+        if not names or adapts or self.subscription.qos_profile.reliability != RELIABLE:
+            return None
+        remedy = (f"set qos_overrides.{self.topic}.subscription.reliability to best_effort"
+                  if self.fixed else "set input.reliability to auto")
+        return ("unheard", WARN, f"{', '.join(sorted(names))} on {self.topic} is not heard, as it "
+                f"offers best effort and reliable is asked for: {remedy}, or let it publish "
+                "reliable")
 
     def _remedy(self, publishers: list[Any]) -> str:
         offered = {p.qos_profile.reliability for p in publishers}

@@ -21,7 +21,15 @@ from test_bad_input import CLOUD, MARKERS, cloud
 from lidar_perception.nodes import reception as reception_module
 from lidar_perception.nodes import shared_memory
 from lidar_perception.nodes.graph import STAGES, private_domain
-from lidar_perception.nodes.reception import RATE_OF, SHARE_OF, Arrivals, Reception
+from lidar_perception.nodes.ground_segmentation import GroundSegmentation
+from lidar_perception.nodes.reception import (
+    BEST_EFFORT,
+    RATE_OF,
+    RELIABLE,
+    SHARE_OF,
+    Arrivals,
+    Reception,
+)
 from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES, SOCKET_BUFFER, socket_buffer
 from lidar_perception.params import ReceptionParams
 from lidar_perception.wire.codec import encode
@@ -256,6 +264,26 @@ def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(capsy
         assert all(segment.exists() for segment in others)
         living.kill()
     assert "that killed processes left in /dev/shm" in capsys.readouterr().err
+
+
+OVERRIDE = f"qos_overrides./{NODE}/input/points.subscription.reliability"
+
+
+@pytest.mark.parametrize("values, remedy", [
+    ({}, ""), ({OVERRIDE: "best_effort"}, ""), ({OVERRIDE: "reliable"}, OVERRIDE),
+    ({"input.reliability": "reliable"}, "input.reliability to auto")])
+def test_a_publisher_is_heard_or_it_is_said_with_the_remedy(start, monkeypatch, values, remedy):
+    reception, = start(GroundSegmentation, **values)._receptions()
+    for offered in ({RELIABLE}, {BEST_EFFORT}, {RELIABLE, BEST_EFFORT}):
+        there = [SimpleNamespace(node_namespace="/", node_name=kind.name.lower(),
+                                 qos_profile=SimpleNamespace(reliability=kind)) for kind in offered]
+        monkeypatch.setattr(reception, "publishers", lambda there=there: there)
+        reception.adapt()
+        asked = reception.subscription.qos_profile.reliability
+        said = [text for kind, _, text in reception.problems() if kind == "unheard"]
+        assert bool(said) == (asked == RELIABLE and BEST_EFFORT in offered)
+        assert all(text.startswith("/best_effort on /") and remedy in text for text in said)
+        assert bool(said) == (remedy != "" and BEST_EFFORT in offered)
 
 
 class Late:
