@@ -31,7 +31,8 @@ from lidar_perception.nodes.reception import (
     Reception,
 )
 from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES, SOCKET_BUFFER, socket_buffer
-from lidar_perception.params import ReceptionParams
+from lidar_perception.nodes.track_outputs import lifetime_ns
+from lidar_perception.params import MarkerParams, ReceptionParams
 from lidar_perception.wire.codec import encode
 from msg_utils.stamps import to_ns
 
@@ -301,7 +302,7 @@ class Late:
         self.reception = Reception(node, None, "points", self.deliver, lambda: asked)
         handle = MagicMock()
         handle.take_message.return_value = None
-        self.reception.subscription = SimpleNamespace(handle=handle)
+        self.reception.subscription = MagicMock(handle=handle)
         self.reception.publishers = lambda: []
 
     def deliver(self, stamp, patient):
@@ -319,6 +320,22 @@ class Late:
             self.reception.try_again()
             while self.todo:
                 self.todo.pop(0)()
+
+
+@pytest.mark.parametrize("given, learned, error, stale, lifetime", [
+    (0.0, None, 2, 10, 2), (10.0, None, 2, 10, 2), (0.4, None, 7.5, 15, 6.25),
+    (0.0, 0.4, 7.5, 15, 6.25), (10.0, 0.4, 2, 10, 2)])
+def test_a_slow_sensor_is_not_silent_between_two_clouds_and_its_boxes_stay(
+        monkeypatch, given, learned, error, stale, lifetime):
+    late = Late(monkeypatch, lambda stamp: 0.0, rate=given)
+    late.reception.arrivals.learned, late.reception.last_time = learned, 1.0
+    for late.now, kinds in ((1 + error, []), (1.1 + error, ["silent"]), (1 + stale, ["silent"]),
+                            (1.1 + stale, ["stale"])):
+        assert [kind for kind, _, _ in late.reception.problems()] == kinds
+    for wanted, stay in ((0, 0), (2, lifetime), (9, 9)):
+        node = SimpleNamespace(_receptions=lambda: [late.reception], robot=SimpleNamespace(
+            output=MarkerParams(marker_lifetime=wanted)))
+        assert lifetime_ns(node) == stay * 10**9
 
 
 @pytest.mark.parametrize("lag, rate", [(0.0, 10), (0.05, 10), (0.13, 10), (0.25, 4), (0.6, 1.6)])
