@@ -168,8 +168,10 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         for name in set(vars(self)) - self._own:
             delattr(self, name)
         self.forget()
+        # rclpy's own of /clock, which it makes whenever use_sim_time is set
+        kept = [*self._kept, self._time_source._clock_sub]
         for kind, destroy in ENTITIES.items():
-            for entity in [e for e in getattr(self, kind) if e not in self._kept]:
+            for entity in [e for e in getattr(self, kind) if e not in kept]:
                 destroy(self, entity)
         give_back_memory()
 

@@ -22,6 +22,7 @@ from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
 from lidar_perception.nodes.reception import Reception
 from lidar_perception.nodes.runtime import ERROR, WAITING
 from lidar_perception.wire.codec import encode
+from msg_utils.messages import ros_message
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 LEADS_TO = {"configure": State.PRIMARY_STATE_INACTIVE, "activate": State.PRIMARY_STATE_ACTIVE,
@@ -157,6 +158,20 @@ def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
         drive(peer, NODE, "cleanup")
         assert [thing() for thing in held] == [None] * len(held)
         assert entities(node) == empty and set(vars(node)) == names
+
+
+def test_the_clock_of_a_simulation_goes_on_after_a_cleanup(here, peer):
+    """Whether it was set before the node was configured or since."""
+    name, clock = "ground_segmentation", "rosgraph_msgs/msg/Clock"
+    node, talker = here(GroundSegmentation, {}, {}), peer.talker("/clock", clock)
+    for second, sim_time in enumerate((False, True, True), start=1):
+        peer.set_parameter(f"/{name}", "use_sim_time", sim_time)
+        drive(peer, name, "deactivate", "cleanup", "configure", "activate")
+        told = ros_message(clock, clock=ros_message("builtin_interfaces/msg/Time", sec=second))
+        assert node.count_subscribers("/clock") == sim_time
+        if sim_time:
+            peer.send(talker, told, lambda s=second: node.get_clock().now().nanoseconds
+                      == s * 10**9, "the time")
 
 
 def test_a_node_without_its_network_waits_for_the_file_and_says_so(nodes, peer, later, weights):
