@@ -20,7 +20,8 @@ from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
 from lidar_perception.nodes.reception import Reception
-from lidar_perception.nodes.runtime import ERROR, WAITING
+from lidar_perception.nodes.runtime import ERROR, OK, WAITING
+from lidar_perception.nodes.tracker import TrackerNode
 from lidar_perception.wire.codec import encode
 from msg_utils.messages import ros_message
 
@@ -114,11 +115,11 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
     """Nothing is heard or said while it is not active; results are those of the offline detector
     each time it is, on the newest cloud; a shutdown can be asked about afterwards."""
     node = f"ready/{NODE}"
-    talker = peer.talker(f"/{node}/input/points", CLOUD)
-    found = peer.listen(f"/{node}/output/detections", MARKERS)
     assert state(peer, node) == State.PRIMARY_STATE_UNCONFIGURED
     peer.wait(lambda: peer.value_of(node, "lifecycle") == "unconfigured", "its diagnostics")
     assert ord(peer.diagnostics[node].level) == 0 and peer.message_of(node) == "not configured"
+    talker = peer.talker(f"/{node}/input/points", CLOUD)
+    found = peer.listen(f"/{node}/output/detections", MARKERS)
     drive(peer, node, "configure")
     assert talker.get_subscription_count() == 0
     for round_ in (10, 20):
@@ -140,6 +141,25 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
     assert not nodes.ended(process) and nodes.end(process) == 0
     assert "asked for, but the node is active\n" in nodes.log(process)
     assert "Traceback" not in nodes.log(process)
+
+
+def test_a_node_that_nobody_asks_for_anything_says_so_while_there_is_input(here, peer, monkeypatch):
+    """As one that was started again behind a manager's back; not one that was asked to rest."""
+    monkeypatch.setattr("lidar_perception.nodes.managed.UNASKED", 0.0)
+    for kind, topic, sent in ((GroundSegmentation, "points", CLOUD),
+                              (TrackerNode, "detections", MARKERS)):
+        node = here(kind, {"autostart": False}, {f"~/input/{topic}": f"/{topic}"})
+        name = node.get_name()
+        peer.wait(lambda n=name: peer.message_of(n) == "not configured", "its diagnostics")
+        talker = peer.talker(f"/{topic}", sent)
+        peer.wait_for_diagnostics(name, f"ros2 lifecycle set /{name} configure", level=1)
+        peer.node.destroy_publisher(talker)
+        peer.wait(lambda n=name: peer.message_of(n) == "not configured", "the end of the input")
+        drive(peer, name, "configure", "cleanup")
+        peer.talker(f"/{topic}", sent)
+        peer.wait(lambda n=node, t=topic: n.count_publishers(f"/{t}"), "the input again")
+        node._tick()
+        assert node.state == (OK, "not configured")
 
 
 def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
