@@ -15,8 +15,9 @@ from launch import LaunchDescription
 GRAPH = Path(__file__).resolve().parent / "detectors.launch.py"
 SIDES = ("left", "right")
 SHARED = {"detectors": "candidates", "single": "false", "tracking": "false",
-          "rviz": "false", "rviz_frame": "", "base_frame": "", "target_frame": "", "deskew": "",
-          "range": "", "odometry": "odom", "use_sim_time": "", "log_level": "info"}
+          "respawn": "false", "rviz": "false", "rviz_frame": "", "base_frame": "",
+          "target_frame": "", "deskew": "", "range": "", "odometry": "odom",
+          "use_sim_time": "", "log_level": "info"}
 
 
 def generate_launch_description():

@@ -42,10 +42,10 @@ class ReceptionParams(Params):
     rate: float = param(0.0, "Clouds a second that the sensor sends; 0 takes what the first 21 "
                         "say.", unit="Hz", low=0.0, high=1000.0)
     min_rate: float = param(0.7, "WARN below this share of the rate.", low=0.0, high=1.0)
-    error_after: float = param(2.0, "ERROR when no cloud has come for this time.", unit="s",
-                               low=0.1, high=1e6)
-    stale_after: float = param(10.0, "STALE when no cloud has come for this time.", unit="s",
-                               low=0.1, high=1e6)
+    error_after: float = param(2.0, "ERROR when no cloud has come for this time, and for three "
+                               "periods of the rate.", unit="s", low=0.1, high=1e6)
+    stale_after: float = param(10.0, "STALE when no cloud has come for this time, and for six "
+                               "periods of the rate.", unit="s", low=0.1, high=1e6)
     max_lost: float = param(0.02, "WARN when more than this share of the last 100 clouds was lost "
                             "on the way.", low=0.0, high=1.0)
     max_dropped: float = param(
@@ -68,7 +68,8 @@ class MarkerParams(Params):
     """Boxes for RViz and Foxglove."""
 
     marker_lifetime: float = param(2.0, "Markers go away when no newer ones have come for this "
-                                   "time, as of a node that has died; 0 keeps them for ever.",
+                                   "time, and for 2.5 periods of the rate (`input.rate`), as of a "
+                                   "node that has died; 0 keeps them for ever.",
                                    unit="s", low=0.0, high=1e6)
 
 

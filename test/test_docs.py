@@ -52,6 +52,8 @@ def test_documented_topics_are_the_nodes_own(generate, name, domain):
     node.start()
     listed = {t for t, _ in [*node.get_publisher_names_and_types_by_node(name, "/"),
                              *node.get_subscriber_names_and_types_by_node(name, "/")]}
+    assert {node.resolve_topic_name(f"~/input/{t}") for t in getattr(node, "waits_for", ())} >= {
+        reception.topic for reception in node._receptions()}
     leave(context, node)
     documented = set()
     entry = generate.PAGES[name]

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
               "MarkerArray or Detection3DArray. Default: all */output/detections that go with the "
               "clouds. May be given several times.")
 @click.option("--namespace", default="", metavar="NAME", help="With --live: follow the nodes in "
-              "this namespace, where several graphs run.")
+              "this namespace, / for those in none, where several graphs run.")
 @click.option("--sequence", metavar="NAME", help="The drive of PATH to show, where it has "
               "several.")
 @range_option

@@ -20,10 +20,21 @@ ENDS = {FOUND: BOXES, TRACKED: TRACKS, TRUTH: LABELS}
 TWIN = "_3d"  # what a topic of markers is called as a Detection3DArray
 
 
+def namespace_of(topic: str) -> str:
+    """Where the node of a topic is, by its name: NS of /NS/NODE/output/NAME and of
+    /NS/ground_truth/detections, of others what is before the last slash; "" is the root."""
+    parts = topic.removesuffix(TWIN).strip("/").split("/")
+    own = 3 if parts[-2:-1] == ["output"] else 2 if parts[-2:] == TRUTH.strip("/").split("/") else 1
+    return "/".join(parts[:-own])
+
+
 def in_namespace(topic: str, namespace: str) -> bool:
-    """Whether a topic is in a namespace, "" or "/" for all."""
+    """Whether a topic is of a node in a namespace: "" for all, "/" for the root alone, else with
+    those inside it."""
     inside = namespace.strip("/")
-    return not inside or topic.startswith(f"/{inside}/")
+    if inside:
+        return topic.startswith(f"/{inside}/")
+    return not namespace or not namespace_of(topic)
 
 
 def resolved(topic: str, namespace: str) -> str:
@@ -61,14 +72,12 @@ def clouds_topic(types: Mapping[str, str], namespace: str = "", wanted: str = ""
 
 def box_topics(types: Mapping[str, str], clouds: str, namespace: str = "",
                wanted: Iterable[str] = ()) -> dict[str, str]:
-    """Topic -> kind (BOXES, TRACKS, LABELS) of what goes with the clouds of a topic: what is in its
-    namespace. wanted: the topics of detections, instead of all that there are. An array that is
-    there as markers too is left out."""
-    end = next((e for e in CLOUDS if clouds.endswith(f"/{e}")), "")
-    inside = namespace or clouds.removesuffix(end).strip("/") if end else namespace
+    """Topic -> kind (BOXES, TRACKS, LABELS) of what goes with the clouds of a topic, see _home().
+    wanted: the topics of detections, instead of all that there are. An array that is there as
+    markers too is left out."""
     found = {}
     for topic, kind in types.items():
-        if kind not in (MARKERS, ARRAY) or not in_namespace(topic, inside):
+        if kind not in (MARKERS, ARRAY):
             continue
         plain = topic.removesuffix(TWIN) if kind == ARRAY else topic
         if kind == ARRAY and types.get(plain) == MARKERS:
@@ -76,8 +85,24 @@ def box_topics(types: Mapping[str, str], clouds: str, namespace: str = "",
         for ending, what in ENDS.items():
             if plain.endswith(ending):
                 found[topic] = what
+    home = namespace or _home(clouds, found)
+    found = {t: k for t, k in found.items() if in_namespace(t, home)}
     asked = [resolved(t, namespace) for t in wanted]
     if asked:
         found = {t: k for t, k in found.items() if k != BOXES}
         found |= {t: BOXES for t in asked if types.get(t) in (MARKERS, ARRAY)}
     return found
+
+
+def _home(clouds: str, found: Mapping[str, str]) -> str:
+    """The namespace, for in_namespace(), of what goes with clouds, where none was given: of a
+    node's clouds that of the node. A driver's may be named after the sensor, as /ouster/points, so
+    with them goes the nearest one above that has boxes; and all there is where that is of one
+    robot, except with NS/points, which may be of another."""
+    own = namespace_of(clouds)
+    if "/output/" in clouds:
+        return own or "/"
+    homes = {namespace_of(topic) for topic, kind in found.items() if kind != LABELS}
+    above = [home for home in homes if not home or clouds.startswith(f"/{home}/")]
+    one_robot = len(homes) < 2 and (above or not own or not clouds.endswith(POINTS))
+    return "" if one_robot else max(above, key=len, default=own) or "/"

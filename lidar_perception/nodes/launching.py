@@ -34,6 +34,8 @@ from lidar_perception.wire.topics import ODOMETRY, POINTS
 CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet",
            "fused": "fused"}
 
+RESPAWN_DELAY = 2.0  # seconds, so that a node that cannot start does not fill the log
+
 SWITCHES: dict[str, Any] = dict(default_value="false", choices=["true", "false"])
 ARGUMENTS: dict[str, dict[str, Any]] = {
     "namespace": dict(default_value="", description="Of all nodes and topics, for one of several "
@@ -71,6 +73,8 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
                    "clusters itself."),
     "autostart": dict(default_value="true", choices=["true", "false"], description="false: a "
                       "lifecycle manager configures and activates the nodes."),
+    "respawn": dict(**SWITCHES, description="Start a node again when it has ended, as after a "
+                    "crash; with autostart:=false it is not configured then."),
     "rviz": dict(**SWITCHES, description="Start RViz with config/lidar_perception.rviz, in the "
                  "same namespace."),
     "rviz_frame": dict(default_value="", description="Fixed frame of RViz; empty: that of its "
@@ -121,6 +125,7 @@ def started(value: dict[str, str], config_folder: Path) -> list[Node]:
                                       _given(value, node.removeprefix(prefix), detectors)])),
         remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_IN}.items()],
         ros_arguments=["--log-level", value["log_level"]],
+        respawn=value["respawn"] == "true", respawn_delay=RESPAWN_DELAY,
     ) for node, remap in graph.items()]
 
 

@@ -8,7 +8,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from time import monotonic
-from typing import Any
+from typing import Any, ClassVar
 
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
@@ -20,6 +20,7 @@ from lidar_perception.types import InputError
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
 RETRY_PERIOD = 5.0  # seconds at least, and RETRY_SHARE times as long as an attempt takes
 RETRY_SHARE = 10.0
+UNASKED = 10.0  # seconds after its start, in which a lifecycle manager asks a node for something
 UNCONFIGURED, INACTIVE = "not configured", "not active"
 ENTITIES: dict[str, Any] = {
     "publishers": Node.destroy_publisher, "subscriptions": Node.destroy_subscription,
@@ -35,8 +36,11 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
     subscribed to while it is active, and a cleanup forgets every attribute that configure() has
     set and destroys every publisher, timer and so on that it has made, so that the memory of a
     network is free again. With the parameter autostart the node goes to active by itself, and
-    where that fails tries again, as a file that is missing may appear.
+    where that fails tries again, as a file that is missing may appear. Without it a node that
+    nobody asks for anything, as of a manager that has not seen it start again, says so.
     """
+
+    waits_for: ClassVar[tuple[str, ...]] = ("points",)  # the ~/input/... that its work comes from
 
     def __init__(self, name: str, params: Any, robot: Any, **options: Any):
         LidarNode.__init__(self, name, params, robot, **options)
@@ -44,6 +48,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         self.active = False
         self.state = (OK, UNCONFIGURED)
         self._retry_at: float | None = None
+        self._unasked_since: float | None = None  # monotonic; None once it was asked
         self._own: set[str] = set()  # attributes that a cleanup leaves
         self._kept: list[Any] = []  # publishers and so on, likewise
         change = self._service_change_state.callback
@@ -61,6 +66,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         if not self.robot.autostart:
             self.get_logger().info(f"{UNCONFIGURED}: waits for a lifecycle manager, as autostart "
                                    "is false")
+            self._unasked_since = monotonic()
             return
         begin = monotonic()
         if (self.state_label() == "inactive" or self.trigger_configure() == SUCCESS) and (
@@ -73,7 +79,19 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
     def _tick(self) -> None:
         if self._retry_at is not None and monotonic() > self._retry_at:
             self.start()
+        if self._unasked_since is not None and monotonic() - self._unasked_since > UNASKED:
+            self.report(*self._unasked())
         super()._tick()
+
+    def _unasked(self) -> tuple[bytes, str]:
+        """The state of a node that was never asked for a transition."""
+        topics = [self.resolve_topic_name(f"~/input/{name}") for name in self.waits_for]
+        if not (sent := [topic for topic in topics if self.count_publishers(topic)]):
+            return OK, UNCONFIGURED
+        name = self.get_fully_qualified_name()
+        return WARN, (f"{UNCONFIGURED}, and nobody has asked for it, but there is a publisher on "
+                      f"{sent[0]}: a lifecycle manager does not see that a node was started again; "
+                      f"let it begin anew, or `ros2 lifecycle set {name} configure`, then activate")
 
     def _change(self, change: Callable, request: Any, response: Any) -> Any:
         """A change that the present state does not allow is refused; rclpy would end the node."""
@@ -105,6 +123,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         super().publish_diagnostics()
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._unasked_since = None
         self._own = set(vars(self))
         self._kept = [entity for kind in ENTITIES for entity in getattr(self, kind)]
         if self._retry_at is None:
@@ -139,6 +158,7 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         return SUCCESS
 
     def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        self._unasked_since = None
         if self.active:
             self._deactivate()
         if self.inputs:
@@ -168,8 +188,10 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
         for name in set(vars(self)) - self._own:
             delattr(self, name)
         self.forget()
+        # rclpy's own of /clock, which it makes whenever use_sim_time is set
+        kept = [*self._kept, self._time_source._clock_sub]
         for kind, destroy in ENTITIES.items():
-            for entity in [e for e in getattr(self, kind) if e not in self._kept]:
+            for entity in [e for e in getattr(self, kind) if e not in kept]:
                 destroy(self, entity)
         give_back_memory()
 

@@ -13,7 +13,12 @@ from lidar_perception.candidates.refine import Candidates
 from lidar_perception.clustering.shapes import class_by_diagonal
 from lidar_perception.ground.above import obstacles
 from lidar_perception.nodes.runtime import CLOUD, MARKERS, OK, RELIABLE, WARN, LidarNode
-from lidar_perception.nodes.track_outputs import DETECTIONS_3D, TrackOutputs, has_detections_3d
+from lidar_perception.nodes.track_outputs import (
+    DETECTIONS_3D,
+    TrackOutputs,
+    has_detections_3d,
+    lifetime_ns,
+)
 from lidar_perception.robot.poses import inverse, moved_boxes
 from lidar_perception.types import CLASSES, Detections, InputError
 from lidar_perception.wire.codec import bag_message, encode
@@ -21,7 +26,7 @@ from lidar_perception.wire.messages import detection_markers, thin_cloud
 from msg_utils.detections import to_detection_array
 from msg_utils.markers import marker_keys, to_marker_array
 from msg_utils.messages import message_class, ros_message
-from msg_utils.stamps import SECOND, header_message, to_ns
+from msg_utils.stamps import header_message, to_ns
 
 
 def placed(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[Any, np.ndarray]:
@@ -31,11 +36,6 @@ def placed(node: LidarNode, header: Any, boxes: np.ndarray) -> tuple[Any, np.nda
     if placing.frame_id != header.frame_id:
         header = header_message(to_ns(header.stamp), placing.frame_id, bag_message)
     return header, boxes if placing.out is None else moved_boxes(boxes, placing.out)
-
-
-def lifetime_ns(node: LidarNode) -> int:
-    """How long the node's markers stay without newer ones; 0 for ever."""
-    return int(node.robot.output.marker_lifetime * SECOND)
 
 
 class ClusterBoxes:

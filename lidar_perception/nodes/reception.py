@@ -27,6 +27,7 @@ HELD = 1.0            # seconds for which a newer cloud does not take the place 
 TRY_AGAIN = 5.0       # seconds between trials where waiting was in vain,
 TRIAL = 0.3           # and how long one takes
 RATE_OF = 10          # intervals, of which the present rate is the mean
+SILENT, STALLED = 3.0, 6.0  # periods without a cloud that are no ERROR, or not STALE, yet
 PROFILE = files("lidar_perception.nodes") / "fastdds.xml"
 
 Problem = tuple[str, bytes, str]  # kind, level, message
@@ -232,11 +233,15 @@ class Reception:
         """For the diagnostics."""
         if self.subscription is None:
             return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped}
-        rate, learned = self.arrivals.rate(), self.params().rate or self.arrivals.learned
+        rate, expected = self.arrivals.rate(), self.expected()
         return {"lost": self.arrivals.lost, "dropped": self.arrivals.dropped,
                 "reliability": self._how(),
                 **({"rate_hz": f"{rate:.1f}"} if rate else {}),
-                **({"expected_rate_hz": f"{learned:.1f}"} if learned else {})}
+                **({"expected_rate_hz": f"{expected:.1f}"} if expected else {})}
+
+    def expected(self) -> float | None:
+        """Clouds a second, as input.rate or the first clouds say; None while too few have come."""
+        return self.params().rate or self.arrivals.learned
 
     def problems(self) -> list[Problem]:
         """What is wrong with the topic now, each with its remedy."""
@@ -248,17 +253,14 @@ class Reception:
             names = ", ".join(sorted(_name(p) for p in publishers))
             found.append(("publishers", WARN, f"{len(publishers)} publishers on {self.topic} "
                           f"({names}): their {self.what}s are mixed; remap all but one"))
+        if unheard := self._unheard(publishers):
+            found.append(unheard)
         if self.waiting and self.needs is not None:
             return [*found, ("waiting", WARN, f"the {self.what} on {self.topic} waits for "
                              f"{self.needs}")]
-        silent = monotonic() - (self.last_time or monotonic())
-        if silent > params.error_after:
-            stale = silent > params.stale_after
-            limit = params.stale_after if stale else params.error_after
-            return [*found, ("stale" if stale else "silent", STALE if stale else ERROR,
-                             f"no {self.what} on {self.topic} for more than {limit:g} s: is the "
-                             "sensor running, and connected?")]
-        expected, rate = params.rate or self.arrivals.learned, self.arrivals.rate()
+        if silence := self._silence():
+            return [*found, silence]
+        expected, rate = self.expected(), self.arrivals.rate()
         if expected and rate and rate < params.min_rate * expected:
             found.append(("rate", WARN, f"{rate:.1f} {self.what}s a second on {self.topic} where "
                           f"{expected:.1f} are expected (input.rate): is the sensor overloaded?"))
@@ -272,6 +274,31 @@ class Reception:
                           f"{self.topic} were dropped, as newer ones came before their turn: the "
                           "work on one takes too long for this machine, or it waits for poses"))
         return found
+
+    def _silence(self) -> Problem | None:
+        """That nothing comes any more. A slow sensor is not silent between two clouds."""
+        params, expected = self.params(), self.expected()
+        period = 1 / expected if expected else 0.0
+        silent = monotonic() - (self.last_time or monotonic())
+        error = max(params.error_after, SILENT * period)
+        stale = max(params.stale_after, STALLED * period)
+        if silent <= error:
+            return None
+        kind, level, limit = ("stale", STALE, stale) if silent > stale else ("silent", ERROR, error)
+        return (kind, level, f"no {self.what} on {self.topic} for more than {round(limit, 1):g} s: "
+                "is the sensor running, and connected?")
+
+    def _unheard(self, publishers: list[Any]) -> Problem | None:
+        """A best-effort publisher, where adapt() may not make the subscription fit it."""
+        names = [_name(p) for p in publishers if p.qos_profile.reliability == BEST_EFFORT]
+        adapts = not self.fixed and self.params().reliability != "reliable"
+        if not names or adapts or self.subscription.qos_profile.reliability != RELIABLE:
+            return None
+        remedy = (f"set qos_overrides.{self.topic}.subscription.reliability to best_effort"
+                  if self.fixed else "set input.reliability to auto")
+        return ("unheard", WARN, f"{', '.join(sorted(names))} on {self.topic} is not heard, as it "
+                f"offers best effort and reliable is asked for: {remedy}, or let it publish "
+                "reliable")
 
     def _remedy(self, publishers: list[Any]) -> str:
         offered = {p.qos_profile.reliability for p in publishers}

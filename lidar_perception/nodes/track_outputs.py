@@ -25,6 +25,8 @@ from msg_utils.messages import message_class, ros_message
 from msg_utils.stamps import SECOND, header_message, to_ns
 
 DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
+OUTLIVED = 2.5    # periods of the input, for which markers stay at least
+LONGEST = 1e6     # seconds; a message has 32 bits for them
 RATE_OVER = 10.0  # seconds, over which births and ends are counted as a rate
 
 
@@ -82,7 +84,7 @@ class TrackOutputs:
         trails = self.trails(tracks, self.tracker.pose, stamp, output.trail)
         message = track_markers(
             tracks.ids, tracks.detections, tracks.velocities, tracks.moving, trails, header,
-            bag_message, previous=self.shown, lifetime_ns=int(output.marker_lifetime * SECOND),
+            bag_message, previous=self.shown, lifetime_ns=lifetime_ns(self.node),
             extras=[{"seen": bool(seen), "age": round(float(age), 3)}
                     for seen, age in zip(tracks.seen, tracks.ages)])
         self.shown = marker_keys(message)
@@ -107,6 +109,16 @@ class TrackOutputs:
         if now > before:
             self.node.counts["born_per_s"] = f"{(tracker.born - born) / (now - before):.2f}"
             self.node.counts["ended_per_s"] = f"{(tracker.ended - ended) / (now - before):.2f}"
+
+
+def lifetime_ns(node: LidarNode) -> int:
+    """How long the node's markers stay without newer ones; 0 for ever. Those of a slow sensor stay
+    until the next come."""
+    seconds = node.robot.output.marker_lifetime
+    rates = [rate for made in node._receptions() if (rate := made.expected())]
+    if seconds and rates:
+        seconds = max(seconds, min(OUTLIVED / min(rates), LONGEST))
+    return int(seconds * SECOND)
 
 
 def has_detections_3d() -> bool:

@@ -20,6 +20,8 @@ class TrackerNode(ManagedNode):
     """A frame without detections is an array that says when it was: of markers a DELETE or
     DELETEALL with its header."""
 
+    waits_for = "detections", "detections_3d"
+
     def __init__(self, **options: Any):
         super().__init__("tracker", TrackerNodeParams(), TrackInputParams(), **options)
 

@@ -16,6 +16,7 @@ from lidar_perception.labeling.live_topics import box_topics, clouds_topic
 from lidar_perception.robot.poses import moved_boxes, moved_points, pose_of
 from lidar_perception.types import Detections, InputError
 from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.topics import TRUTH
 from lidar_perception.wire.track_markers import track_markers
 from msg_utils.markers import MarkedObjects, from_marker_array
 from msg_utils.point_cloud2 import from_array
@@ -219,6 +220,25 @@ def test_the_cloud_with_most_columns_is_chosen_and_the_boxes_of_its_namespace():
         with pytest.raises(InputError) as said:
             clouds_topic(types, wanted=wanted)
         assert "\n" not in str(said.value)
+
+
+def test_boxes_of_another_robot_are_not_shown_with_the_clouds_of_this_one():
+    one = dict.fromkeys([FOUND, TRACKED, TRUTH], MARKERS) | {"/clustering/output/points": CLOUD}
+    both = one | {f"/b{topic}": kind for topic, kind in one.items()}
+    for robot in ("", "/b"):
+        clouds, expected = robot + "/clustering/output/points", {
+            robot + FOUND, robot + TRACKED, robot + TRUTH}
+        assert clouds_topic(both, robot or "/") == clouds
+        assert set(box_topics(both, clouds, robot or "/")) == expected
+        for name in ("clustering/output/points", "a_clustering/output/points", "points",
+                     "velodyne_points", "ouster/points"):
+            assert set(box_topics(both, f"{robot}/{name}")) == expected
+    for clouds, theirs in (("/clustering/output/points", False), ("/a/points", False),
+                           ("/points", True), ("/livox/lidar", True)):
+        alone = {"/b" + FOUND: MARKERS}  # of another robot, or the only one
+        assert bool(box_topics(alone, clouds)) == theirs
+        assert not box_topics(alone | {"/c" + FOUND: MARKERS}, clouds)
+    assert set(box_topics(one, "/ouster/points")) == {FOUND, TRACKED, TRUTH}
 
 
 def test_pages_may_ask_while_topics_come_and_go(live):

@@ -86,6 +86,10 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
         assert node.ros_arguments == ["--log-level", "debug"]
         if not node.name.endswith("_detector"):
             assert node.parameters[0] == config
+    assert not any(node.respawn for node in started.values())
+    again = nodes(respawn="true", rviz="true", tracking="true")
+    assert all(hasattr(node, "respawn") == (kind != "rviz2") for kind, node in again.items())
+    assert all(node.respawn for kind, node in again.items() if kind != "rviz2")
     for node in nodes(autostart="false").values():
         assert node.parameters[1] == {"autostart": False}  # what is not given, the file may say
     mine = str(ROOT / "config" / "best.param.yaml")

@@ -20,8 +20,10 @@ from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
 from lidar_perception.nodes.reception import Reception
-from lidar_perception.nodes.runtime import ERROR, WAITING
+from lidar_perception.nodes.runtime import ERROR, OK, WAITING
+from lidar_perception.nodes.tracker import TrackerNode
 from lidar_perception.wire.codec import encode
+from msg_utils.messages import ros_message
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 LEADS_TO = {"configure": State.PRIMARY_STATE_INACTIVE, "activate": State.PRIMARY_STATE_ACTIVE,
@@ -113,11 +115,11 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
     """Nothing is heard or said while it is not active; results are those of the offline detector
     each time it is, on the newest cloud; a shutdown can be asked about afterwards."""
     node = f"ready/{NODE}"
-    talker = peer.talker(f"/{node}/input/points", CLOUD)
-    found = peer.listen(f"/{node}/output/detections", MARKERS)
     assert state(peer, node) == State.PRIMARY_STATE_UNCONFIGURED
     peer.wait(lambda: peer.value_of(node, "lifecycle") == "unconfigured", "its diagnostics")
     assert ord(peer.diagnostics[node].level) == 0 and peer.message_of(node) == "not configured"
+    talker = peer.talker(f"/{node}/input/points", CLOUD)
+    found = peer.listen(f"/{node}/output/detections", MARKERS)
     drive(peer, node, "configure")
     assert talker.get_subscription_count() == 0
     for round_ in (10, 20):
@@ -141,6 +143,25 @@ def test_a_manager_takes_a_detector_through_its_states(nodes, peer, weights):
     assert "Traceback" not in nodes.log(process)
 
 
+def test_a_node_that_nobody_asks_for_anything_says_so_while_there_is_input(here, peer, monkeypatch):
+    """As one that was started again behind a manager's back; not one that was asked to rest."""
+    monkeypatch.setattr("lidar_perception.nodes.managed.UNASKED", 0.0)
+    for kind, topic, sent in ((GroundSegmentation, "points", CLOUD),
+                              (TrackerNode, "detections", MARKERS)):
+        node = here(kind, {"autostart": False}, {f"~/input/{topic}": f"/{topic}"})
+        name = node.get_name()
+        peer.wait(lambda n=name: peer.message_of(n) == "not configured", "its diagnostics")
+        talker = peer.talker(f"/{topic}", sent)
+        peer.wait_for_diagnostics(name, f"ros2 lifecycle set /{name} configure", level=1)
+        peer.node.destroy_publisher(talker)
+        peer.wait(lambda n=name: peer.message_of(n) == "not configured", "the end of the input")
+        drive(peer, name, "configure", "cleanup")
+        peer.talker(f"/{topic}", sent)
+        peer.wait(lambda n=node, t=topic: n.count_publishers(f"/{t}"), "the input again")
+        node._tick()
+        assert node.state == (OK, "not configured")
+
+
 def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
     node = here(PointPillarsNode, {**DETECTOR.values(weights), "autostart": False}, REMAP)
     talker, found = peer.talker("/in", CLOUD), peer.listen("/found", MARKERS)
@@ -157,6 +178,20 @@ def test_cleanup_leaves_nothing_of_the_network(here, peer, weights):
         drive(peer, NODE, "cleanup")
         assert [thing() for thing in held] == [None] * len(held)
         assert entities(node) == empty and set(vars(node)) == names
+
+
+def test_the_clock_of_a_simulation_goes_on_after_a_cleanup(here, peer):
+    """Whether it was set before the node was configured or since."""
+    name, clock = "ground_segmentation", "rosgraph_msgs/msg/Clock"
+    node, talker = here(GroundSegmentation, {}, {}), peer.talker("/clock", clock)
+    for second, sim_time in enumerate((False, True, True), start=1):
+        peer.set_parameter(f"/{name}", "use_sim_time", sim_time)
+        drive(peer, name, "deactivate", "cleanup", "configure", "activate")
+        told = ros_message(clock, clock=ros_message("builtin_interfaces/msg/Time", sec=second))
+        assert node.count_subscribers("/clock") == sim_time
+        if sim_time:
+            peer.send(talker, told, lambda s=second: node.get_clock().now().nanoseconds
+                      == s * 10**9, "the time")
 
 
 def test_a_node_without_its_network_waits_for_the_file_and_says_so(nodes, peer, later, weights):

@@ -21,9 +21,18 @@ from test_bad_input import CLOUD, MARKERS, cloud
 from lidar_perception.nodes import reception as reception_module
 from lidar_perception.nodes import shared_memory
 from lidar_perception.nodes.graph import STAGES, private_domain
-from lidar_perception.nodes.reception import RATE_OF, SHARE_OF, Arrivals, Reception
+from lidar_perception.nodes.ground_segmentation import GroundSegmentation
+from lidar_perception.nodes.reception import (
+    BEST_EFFORT,
+    RATE_OF,
+    RELIABLE,
+    SHARE_OF,
+    Arrivals,
+    Reception,
+)
 from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES, SOCKET_BUFFER, socket_buffer
-from lidar_perception.params import ReceptionParams
+from lidar_perception.nodes.track_outputs import lifetime_ns
+from lidar_perception.params import MarkerParams, ReceptionParams
 from lidar_perception.wire.codec import encode
 from msg_utils.stamps import to_ns
 
@@ -258,6 +267,26 @@ def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(capsy
     assert "that killed processes left in /dev/shm" in capsys.readouterr().err
 
 
+OVERRIDE = f"qos_overrides./{NODE}/input/points.subscription.reliability"
+
+
+@pytest.mark.parametrize("values, remedy", [
+    ({}, ""), ({OVERRIDE: "best_effort"}, ""), ({OVERRIDE: "reliable"}, OVERRIDE),
+    ({"input.reliability": "reliable"}, "input.reliability to auto")])
+def test_a_publisher_is_heard_or_it_is_said_with_the_remedy(start, monkeypatch, values, remedy):
+    reception, = start(GroundSegmentation, **values)._receptions()
+    for offered in ({RELIABLE}, {BEST_EFFORT}, {RELIABLE, BEST_EFFORT}):
+        there = [SimpleNamespace(node_namespace="/", node_name=kind.name.lower(),
+                                 qos_profile=SimpleNamespace(reliability=kind)) for kind in offered]
+        monkeypatch.setattr(reception, "publishers", lambda there=there: there)
+        reception.adapt()
+        asked = reception.subscription.qos_profile.reliability
+        said = [text for kind, _, text in reception.problems() if kind == "unheard"]
+        assert bool(said) == (asked == RELIABLE and BEST_EFFORT in offered)
+        assert all(text.startswith("/best_effort on /") and remedy in text for text in said)
+        assert bool(said) == (remedy != "" and BEST_EFFORT in offered)
+
+
 class Late:
     """A Reception of clouds at 10 Hz, each of whose poses comes lag(stamp) seconds after it; in a
     time that is made up. answered: (stamp, whether it had its pose)."""
@@ -273,7 +302,7 @@ class Late:
         self.reception = Reception(node, None, "points", self.deliver, lambda: asked)
         handle = MagicMock()
         handle.take_message.return_value = None
-        self.reception.subscription = SimpleNamespace(handle=handle)
+        self.reception.subscription = MagicMock(handle=handle)
         self.reception.publishers = lambda: []
 
     def deliver(self, stamp, patient):
@@ -291,6 +320,22 @@ class Late:
             self.reception.try_again()
             while self.todo:
                 self.todo.pop(0)()
+
+
+@pytest.mark.parametrize("given, learned, error, stale, lifetime", [
+    (0.0, None, 2, 10, 2), (10.0, None, 2, 10, 2), (0.4, None, 7.5, 15, 6.25),
+    (0.0, 0.4, 7.5, 15, 6.25), (10.0, 0.4, 2, 10, 2)])
+def test_a_slow_sensor_is_not_silent_between_two_clouds_and_its_boxes_stay(
+        monkeypatch, given, learned, error, stale, lifetime):
+    late = Late(monkeypatch, lambda stamp: 0.0, rate=given)
+    late.reception.arrivals.learned, late.reception.last_time = learned, 1.0
+    for late.now, kinds in ((1 + error, []), (1.1 + error, ["silent"]), (1 + stale, ["silent"]),
+                            (1.1 + stale, ["stale"])):
+        assert [kind for kind, _, _ in late.reception.problems()] == kinds
+    for wanted, stay in ((0, 0), (2, lifetime), (9, 9)):
+        node = SimpleNamespace(_receptions=lambda: [late.reception], robot=SimpleNamespace(
+            output=MarkerParams(marker_lifetime=wanted)))
+        assert lifetime_ns(node) == stay * 10**9
 
 
 @pytest.mark.parametrize("lag, rate", [(0.0, 10), (0.05, 10), (0.13, 10), (0.25, 4), (0.6, 1.6)])
