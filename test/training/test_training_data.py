@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,9 +26,10 @@ from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import RANGES, network_config
 from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED
-from lidar_perception.geometry import points_in_box, wrap_angle
+from lidar_perception.geometry import points_in_box, within, wrap_angle
 from lidar_perception.simulation import drive
 from lidar_perception.simulation.camera import kitti_labels, turned_camera
+from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training import scenes as scenes_module
 from lidar_perception.training.augment import TrainingScene, raised
@@ -298,7 +300,8 @@ def test_a_scene_that_the_network_cannot_see_is_skipped():
 
 def test_a_perfect_detector_scores_and_a_blind_one_does_not(tmp_path):
     root = broken_folder(tmp_path)
-    scenes = ReadScenes((RecordedScenes(root, names_of(root)),), frame_to_validate)
+    scenes = ReadScenes((RecordedScenes(root, names_of(root)),),
+                        partial(frame_to_validate, tiny()))
     right = validation_report(lambda frame: Found(Detections.of([WALKER])), scenes)
     blind = validation_report(lambda frame: Found(Detections.none()), scenes)
     assert right.compute()["frames"] == 3 and len(right.skipped) == 2
@@ -309,6 +312,17 @@ def test_a_perfect_detector_scores_and_a_blind_one_does_not(tmp_path):
         assert np.isnan(metrics["Car_bev_relaxed"])
         assert metrics_of(blind.compute(), score, names)["score"] == 0.0
         assert np.isnan(metrics_of(right.compute(), score, ["Car"])["score"])  # no such object
+
+
+@pytest.mark.parametrize("where", ["ahead", "around"])
+def test_without_a_camera_only_what_the_network_sees_is_to_be_found(where):
+    config = network_config("v0", "compact", **(RANGES["around"] if where == "around" else {}))
+    source = SimulatedScenes(7, 1, SENSOR, Scenes(None, 3.0, "campus"))
+    known = source.frame(0).truth()
+    truth = frame_to_validate(config, source, 0).truth()
+    seen = within(known.boxes, config.low, config.high)
+    assert np.array_equal(truth.boxes, known.boxes[seen]) and len(truth.extras) == len(truth)
+    assert 0 < len(truth) and (len(truth) < len(known) or where == "around")
 
 
 def test_samples_are_plain_arrays_that_other_processes_can_send():

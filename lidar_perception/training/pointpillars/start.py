@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -88,7 +89,7 @@ class PointPillarsStart:
                 params, device)
         detector = PointPillarsDetector(TorchNetwork(network, device), Header(self.config), device,
                                         VALIDATED)
-        frame = frame_to_validate(held_out, 0).load()
+        frame = frame_to_validate(self.config, held_out, 0).load()
         detector(frame)
         whole = step * np.prod(self.config.grid) / np.prod(seen.grid)
         return cutting / len(scenes), step, float(whole), timed(lambda: detector(frame))[0]
@@ -124,7 +125,7 @@ class PointPillarsStart:
                               params.data.min_points,
                               out / OBJECTS if self.most_cuts(params) else None)
         return (Stream(tuple(sources), prepare, params.seed),
-                ReadScenes(tuple(held_out), frame_to_validate))
+                ReadScenes(tuple(held_out), partial(frame_to_validate, self.config)))
 
     def task(self, params: PointPillarsTraining, batches: Batches, held_out: ReadScenes, out: Path,
              device: torch.device, about: dict[str, Any], commit: str, init: Path | None) -> Task:

@@ -52,7 +52,7 @@ from lidar_perception.training.params import AugmentParams, PointPillarsTraining
 from lidar_perception.training.putting import inside
 from lidar_perception.training.record import begun_with, judged, keeper
 from lidar_perception.training.run import Judged, Task
-from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError, LidarFrame
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 
 # Boxes of low score cost precision only where recall has ended; fewer of them are quicker.
 VALIDATED = DetectorParams(pointpillars=PointPillarsParams(scores=ScoreParams.all_alike(0.1),
@@ -178,10 +178,17 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     return loss
 
 
-def frame_to_validate(source: Any, i: int) -> Frame:
-    """Frame i of a source, read. InputError naming the file that cannot be used."""
+def frame_to_validate(config: NetworkConfig, source: Any, i: int) -> Frame:
+    """Frame i of a source, read. Where no camera says what is labelled, with the labels that a
+    network of the config is taught: those whose centre it sees. InputError naming the file that
+    cannot be used."""
     frame = source.frame(i)
-    return Frame.of(frame.name, frame.load(), frame.truth(), frame.calibration(),
+    truth, calibration = frame.truth(), frame.calibration()
+    if calibration is None and truth is not None:
+        seen = np.flatnonzero(within(truth.boxes, config.low, config.high))
+        truth = GroundTruth.of(truth.boxes[seen], truth.class_ids[seen],
+                               [truth.extras[k] for k in seen], truth.notes)
+    return Frame.of(frame.name, frame.load(), truth, calibration,
                     sensor_height=frame.sensor_height)
 
 
