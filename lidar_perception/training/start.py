@@ -6,7 +6,7 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -22,9 +22,9 @@ from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import duration, errors
 from lidar_perception.simulation.sensor import Sensor, sensor_named
 from lidar_perception.training.asked import Asked
-from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.data import Batches, ReadScenes, Stream
+from lidar_perception.training.data import Batches, Item, ReadScenes, Stream
 from lidar_perception.training.loop import STATE, may_begin, train
+from lidar_perception.training.measuring import MOST
 from lidar_perception.training.plan import (
     STARTING,
     Data,
@@ -65,10 +65,11 @@ class Network(Protocol):
         """The parameters that train on a part of the range, which is quicker; none if there is no
         such choice."""
 
-    def measured(self, params: Any, scenes: Sequence[TrainingScene], held_out: Any,
+    def measured(self, params: Any, scenes: Iterable[Item], held_out: Sequence[Any],
                  device: torch.device) -> tuple[float, float, float, float]:
         """Seconds to cut a scene, of a step on the part and on the whole of the range, without the
-        preparation's share of other cores, and to validate a frame."""
+        preparation's share of other cores, and to validate a frame; with the first scenes that can
+        be used. InputError where none can."""
 
     def cut(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any],
             cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
@@ -190,10 +191,9 @@ def _measured(network: Network, asked: Asked, params: Any, sensor: Sensor,
     """What the machine does now, and the sources of scenes to train with and to validate on."""
     few = _few(params)
     sources, held_out = scenes_of(asked, few, sensor, own)
-    scenes, scan = _some_scenes((*sources, *held_out))
-    cut, step, whole, frame = network.measured(few, scenes, held_out[0], device)
-    speed = Speed(scan, cut, step, whole, frame, scenes[0].points.nbytes * 1.02e-6)
-    return speed, sources, held_out
+    scenes, scan, scan_mb = _some_scenes((*sources, *held_out))
+    cut, step, whole, frame = network.measured(few, scenes, held_out, device)
+    return Speed(scan, cut, step, whole, frame, scan_mb), sources, held_out
 
 
 def _few(params: Any) -> Any:
@@ -264,29 +264,20 @@ def _recorded(sources: Sequence[Any]) -> int:
     return sum(len(source) for source in sources if not isinstance(source, SimulatedScenes))
 
 
-def _some_scenes(sources: Sequence[Any]) -> tuple[list[TrainingScene], float]:
-    """Up to four scenes, and the seconds to simulate one with its share of the scene; 0 where
-    nothing is simulated. No source has a cache. InputError where none can be read."""
+def _some_scenes(sources: Sequence[Any]) -> tuple[Iterable[Item], float, float]:
+    """Items of some scenes, and the seconds to simulate one with its share of the scene, and its
+    MB; 0 where nothing is simulated, and then scenes are read as they are asked for. No source has
+    a cache."""
     for source in sources:
         if isinstance(source, SimulatedScenes):
             many = source.per_scene
             source.scene(0)  # so that what is compiled is there
             begun = time.perf_counter()
-            made = [source.scene(i) for i in range(many, many + min(many, 4))]
-            return made, (time.perf_counter() - begun) / len(made)
-    scenes: list[TrainingScene] = []
-    reason: InputError | None = None
-    for source in sources:
-        for i in range(min(len(source), 50)):
-            try:
-                scenes.append(source.scene(i))
-            except InputError as error:
-                reason = error
-            if len(scenes) == 4:
-                return scenes, 0.0
-    if not scenes:
-        raise reason or InputError("there is no scene")
-    return scenes, 0.0
+            made = [source.scene(i) for i in range(many, many + min(many, MOST))]
+            return ([Item(scene) for scene in made], (time.perf_counter() - begun) / len(made),
+                    made[0].points.nbytes * 1.02e-6)
+    recorded = ReadScenes(tuple(sources), lambda source, i: source.scene(i))
+    return (recorded[n] for n in range(len(recorded))), 0.0, 0.0
 
 
 def _require_room(cache: Path, most_gb: float, chosen: Plan, speed: Speed) -> None:
