@@ -44,9 +44,9 @@ class RecordedScenes:
 
     @cached_property
     def _frames(self) -> dict[str, Frame]:
-        recording = open_recording(self.path)
-        numbers = {frame.name: i for i, frame in enumerate(recording)}
-        return {name: recording.frames[numbers[name]] for name in self.names}
+        frames = open_recording(self.path).frames[:]
+        known = {frame.name: frame for frame in frames}
+        return {name: known[name] for name in self.names}
 
     def __getstate__(self) -> dict:
         return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # open where it is read
@@ -75,19 +75,6 @@ class RecordedScenes:
         if truth is None:
             raise InputError(f"{frame.points or frame.name} has no labels")
         return frame, truth
-
-
-def random_split(names: tuple[str, ...], share: float,
-                 seed: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """names to train on and to validate on, drawn by the seed, each in the order given; both have
-    one at least. InputError if there are not two."""
-    if len(names) < 2:
-        raise InputError("one frame cannot be split into frames to train and to validate on; give "
-                         "--val")
-    held = min(max(round(share * len(names)), 1), len(names) - 1)
-    chosen = set(np.random.default_rng(seed).choice(len(names), held, replace=False).tolist())
-    return (tuple(name for i, name in enumerate(names) if i not in chosen),
-            tuple(name for i, name in enumerate(names) if i in chosen))
 
 
 @dataclass(frozen=True)
