@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.open import open_recording
+from lidar_perception.data.open import open_recording, with_topic
 from lidar_perception.simulation.camera import (
     FORWARD_CAMERA,
     kitti_labels,
@@ -26,7 +26,7 @@ from lidar_perception.simulation.drive import longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.cache import kept, path_in, size_of
+from lidar_perception.training.cache import kept, path_in, size_of, state_of
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
 
 
@@ -52,8 +52,9 @@ class RecordedScenes:
         return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # open where it is read
 
     def key(self, i: int) -> str:
-        """All that scene i depends on, as long as its files stay as they are."""
-        return repr((str(self.path), self.names[i], self.view))
+        """All that scene i depends on: another one once a file of it was written again."""
+        frame = self._frames[self.names[i]]
+        return repr((*map(state_of, frame.files), with_topic(self.path)[1], frame.name, self.view))
 
     def scene(self, i: int) -> TrainingScene:
         """InputError naming the file that cannot be used."""

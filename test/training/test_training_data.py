@@ -181,6 +181,20 @@ def test_of_a_drive_the_end_that_is_labelled_is_held_out(tmp_path):
     assert len(learned.frames) == 8
 
 
+def test_what_is_kept_of_a_recording_is_made_again_once_its_files_are_others(tmp_path, monkeypatch):
+    root = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
+    keys = [labelled_frames(root).scenes().key(i) for i in range(2)]
+    monkeypatch.chdir(tmp_path)
+    assert labelled_frames(Path("kitti/training")).scenes().key(0) == keys[0] != keys[1]
+    write(root / "training/label_2/000000.txt", "")
+    now = labelled_frames(root).scenes()
+    assert now.key(0) != keys[0] and now.key(1) == keys[1]
+    write_bag(tmp_path / "bag", open_recording(root))
+    key = labelled_frames(tmp_path / "bag").scenes().key(0)
+    os.utime(next((tmp_path / "bag").glob("*.mcap")), ns=(0, 0))
+    assert labelled_frames(tmp_path / "bag").scenes().key(0) != key
+
+
 def test_simulated_scans_are_the_same_from_the_cache(tmp_path, monkeypatch):
     plain = SimulatedScenes(7, 2, SENSOR)
     cached = SimulatedScenes(7, 2, SENSOR, cache=tmp_path / "cache")
