@@ -10,8 +10,9 @@ from typing import TypeVar
 import numpy as np
 
 from lidar_perception.data.drives import drives_of
-from lidar_perception.data.frame import BOXES, Frame
+from lidar_perception.data.frame import BOXES, Frame, Recording
 from lidar_perception.data.open import open_recording
+from lidar_perception.ground.segment import first_clouds, mounted
 from lidar_perception.training.scenes import RecordedScenes
 from lidar_perception.types import InputError
 
@@ -21,15 +22,18 @@ TOO_FEW = "one frame cannot be split into frames to train and to validate on; gi
 
 @dataclass(frozen=True)
 class LabelledFrames:
-    """Frames of the recording at path. drives: whether they follow each other in time."""
+    """Frames of the recording at path. drives: whether they follow each other in time; height: of
+    the sensor above the ground, metres, where it is not what the recording says."""
 
     path: Path
     frames: tuple[Frame, ...]
     drives: bool = True
+    height: float | None = None
 
     def scenes(self, view: bool = True) -> RecordedScenes:
         """As a source of scenes."""
-        return RecordedScenes(self.path, tuple(frame.name for frame in self.frames), view)
+        return RecordedScenes(self.path, tuple(frame.name for frame in self.frames), view,
+                              self.height)
 
     def without(self, others: Iterable[LabelledFrames], what: str) -> LabelledFrames:
         """The frames that others do not have, under whatever path. InputError, saying for what, if
@@ -59,12 +63,25 @@ class LabelledFrames:
         return replace(self, frames=parts[0]), replace(self, frames=parts[1])
 
 
-def labelled_frames(path: Path, split: Path | None = None) -> LabelledFrames:
+def labelled_frames(path: Path, split: Path | None = None, height: float = 0.0,
+             mixed: bool = False) -> LabelledFrames:
     """The frames of a recording, or of those that a split file names. InputError names what is not
-    there, and a recording without labelled boxes."""
+    there, and a recording without labelled boxes.
+
+    height: of the sensor, metres, also against what the recording says, unless it is mixed with
+    simulated scans, whose height it is then. 0: what the recording says, or else its first clouds.
+    """
     recording = open_recording(path, split=split)
     recording.require(BOXES, "train")
-    return LabelledFrames(path, tuple(recording.frames[:]), recording.drives)
+    return LabelledFrames(path, tuple(recording.frames[:]), recording.drives,
+                          _height(recording, height, mixed))
+
+
+def _height(recording: Recording, height: float, mixed: bool) -> float | None:
+    if height and not (mixed and recording.mounted):
+        return height
+    measured = mounted(recording, first_clouds(recording))
+    return None if measured is recording else next(iter(measured)).sensor_height
 
 
 def _has_labels(frame: Frame) -> bool:

@@ -145,8 +145,10 @@ class SceneTraining(LoopParams):
                        "or several in turn, such as street,campus.")
     sensor: str = param("hdl64e", "Sensor of the simulated scans: a sensor.yaml, the name of a "
                         "preset, or generic:BEAMS,LOWEST,HIGHEST,STEP,RATE.")
-    mount_height: float = param(0.0, "Height of the sensor above the ground. 0: what its file "
-                                "or preset says.", unit="m", low=0.0, high=10.0)
+    mount_height: float = param(0.0, "Height of the sensor above the ground; beside simulated "
+                                "scans not of a recording that says its own. 0: what its file or "
+                                "preset says, and of a recording what it says or its first clouds "
+                                "show.", unit="m", low=0.0, high=10.0)
 
 
 @dataclass(frozen=True)

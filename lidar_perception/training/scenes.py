@@ -33,28 +33,36 @@ from lidar_perception.types import GroundTruth, InputError, LidarFrame
 @dataclass(frozen=True)
 class RecordedScenes:
     """The frames of a recording with these names. view: the points in the image only, where there
-    is a camera, as the labels end there."""
+    is a camera, as the labels end there. height: of the sensor above the ground, metres, where it
+    is not what the recording says."""
 
     path: Path
     names: tuple[str, ...]
     view: bool = True
+    height: float | None = None
 
     def __len__(self) -> int:
         return len(self.names)
 
     @cached_property
     def _frames(self) -> dict[str, Frame]:
-        frames = open_recording(self.path).frames[:]
+        frames = open_recording(self.path, sensor_height=self.height).frames[:]
         known = {frame.name: frame for frame in frames}
         return {name: known[name] for name in self.names}
 
     def __getstate__(self) -> dict:
         return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # open where it is read
 
+    @property
+    def sensor_height(self) -> float:
+        """Of the first frame, metres above the ground."""
+        return self._frames[self.names[0]].sensor_height
+
     def key(self, i: int) -> str:
         """All that scene i depends on: another one once a file of it was written again."""
         frame = self._frames[self.names[i]]
-        return repr((*map(state_of, frame.files), with_topic(self.path)[1], frame.name, self.view))
+        return repr((*map(state_of, frame.files), with_topic(self.path)[1], frame.name, self.view,
+                     frame.sensor_height))
 
     def scene(self, i: int) -> TrainingScene:
         """InputError naming the file that cannot be used."""
@@ -64,7 +72,7 @@ class RecordedScenes:
         if self.view and camera is not None:
             points = points[camera.in_view(scan.xyz)]
         return TrainingScene(points, truth.boxes, truth.class_ids, np.ones(len(truth), bool),
-                     around=camera is None)
+                     camera is None, frame.sensor_height)
 
     def frame(self, i: int) -> Frame:
         """To validate on: the whole scan. InputError if it has no labels."""

@@ -22,19 +22,20 @@ FIRST_SCENE, FIRST_VALIDATION_SCENE = 10_000_000, 20_000_000  # far from what an
 def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
                     val_split: Path | None, settings: DataParams, seed: int,
                     sensor: Sensor = HDL64E, around: bool = False,
-                    scene: str = "street") -> tuple[tuple, tuple]:
+                    scene: str = "street", height: float = 0.0) -> tuple[tuple, tuple]:
     """Sources to train on and to validate on, which have no frame in common. sensor: of simulated
-    scenes, which are those of scene, see Scenes; around: validate on what lies all around.
-    InputError for what is not there, or an option that would not be used."""
+    scenes, which are those of scene, see Scenes; around: validate on what lies all around; height:
+    see labelled_frames. InputError for what is not there, or an option that would not be used."""
     folders = [Path(name) for name in data if name != SIM]
     val_folders = [Path(name) for name in val if name != SIM] or ([] if val else folders)
     if split is not None and len(folders) != 1:
         raise InputError("--split names frames of one recording in --data; give one")
     if val_split is not None and len(val_folders) != 1:
         raise InputError("--val-split names frames of one recording; give one in --val")
-    learned = [labelled_frames(folder, split) for folder in folders]
+    mixed = SIM in (*data, *val)
+    learned = [labelled_frames(folder, split, height, mixed) for folder in folders]
     if val or val_split is not None:
-        held = [labelled_frames(folder, val_split) for folder in val_folders]
+        held = [labelled_frames(folder, val_split, height, mixed) for folder in val_folders]
     else:
         pairs = [one.held_out(settings.val_share, seed) for one in learned]
         learned, held = [one for one, _ in pairs], [one for _, one in pairs]

@@ -18,7 +18,7 @@ from lidar_perception.runs import terminal
 from lidar_perception.training import start as start_module
 from lidar_perception.training.loop import STATE
 from lidar_perception.training.start import RUN
-from lidar_perception.types import InputError
+from lidar_perception.types import SENSOR_HEIGHT, InputError
 
 pytestmark = pytest.mark.usefixtures("streets")
 SENSOR = "generic:16,-20,5,2,10"
@@ -157,6 +157,9 @@ def test_what_cannot_be_used_is_passed_over_wherever_it_lies(kind, tmp_path, one
     done = small_run(kind, tmp_path / "run", root, "--val-split", str(held))
     assert done.exit_code == 0, done.exception
     assert done.stderr.count("validation: ") == 2
+    header = read_header(tmp_path / "run/last.safetensors")
+    assert header.training["sensor"] == {"height": SENSOR_HEIGHT}  # no sensor was simulated
+    assert header.unlike(SENSOR_HEIGHT) is None and "for a sensor at 1.73" in header.unlike(0.6)
     write(held, "000002\n000003\n")
     refused = small_run(kind, tmp_path / "other", root, "--val-split", str(held)).exception
     assert isinstance(refused, InputError) and "\n" not in str(refused)

@@ -189,6 +189,7 @@ def test_what_is_kept_of_a_recording_is_made_again_once_its_files_are_others(tmp
     write(root / "training/label_2/000000.txt", "")
     now = labelled_frames(root).scenes()
     assert now.key(0) != keys[0] and now.key(1) == keys[1]
+    assert labelled_frames(root, height=0.6).scenes().key(1) != keys[1]
     write_bag(tmp_path / "bag", open_recording(root))
     key = labelled_frames(tmp_path / "bag").scenes().key(0)
     os.utime(next((tmp_path / "bag").glob("*.mcap")), ns=(0, 0))
@@ -389,6 +390,35 @@ def test_workers_end_with_a_process_that_is_killed():
 
 
 # the sensor's height, and what is around
+
+def low_bag(path: Path, height: float, count: int = 2) -> Path:
+    """Level ground that far below the sensor, and a person on it."""
+    rng = np.random.default_rng(0)
+    ground = rng.uniform(-20, 20, (6000, 3)) * [1, 1, 5e-4] - [0, 0, height]
+    person = rng.uniform(-0.25, 0.25, (300, 3)) * [1, 1, 3.4] + [8, 0.5, 0.85 - height]
+    xyz = np.concatenate([ground, person]).astype(np.float32)
+    truth = GroundTruth.of([[8, 0.5, 0.85 - height, 0.6, 0.6, 1.7, 0]], [PEDESTRIAN])
+    write_bag(path, [Frame.of(str(i), LidarFrame(xyz, np.full(len(xyz), 0.3, np.float32),
+                                                 i * 10**8), truth) for i in range(count)])
+    return path
+
+
+def test_a_recording_is_brought_to_the_height_that_the_network_knows(tmp_path):
+    config, samples = tiny(), []
+    for height in SENSOR_HEIGHT, 0.6:
+        source = labelled_frames(low_bag(tmp_path / f"{height}", height)).scenes()
+        again = pickle.loads(pickle.dumps(source))
+        assert again.sensor_height == again.scene(0).height == again.frame(1).sensor_height
+        assert again.sensor_height == pytest.approx(height, abs=0.011)
+        samples.append(Preparation(config, STILL)(source.scene(0), np.random.default_rng(0)))
+    assert len(samples[0].points) == len(samples[1].points)
+    assert np.allclose(samples[0].boxes, samples[1].boxes, atol=0.011)
+    path = tmp_path / "0.6"
+    assert labelled_frames(path, height=1.1, mixed=True).scenes().scene(0).height == 1.1
+    folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 1)
+    assert labelled_frames(folder, height=1.1).scenes().scene(0).height == 1.1
+    assert labelled_frames(folder, height=1.1, mixed=True).scenes().scene(0).height == SENSOR_HEIGHT
+
 
 def test_a_sensor_mounted_elsewhere_gives_the_network_the_same():
     """A scene, and the same as a higher or lower sensor would have it."""
