@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.data.drives import GAP, drives_of
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.geometry import elevations
 from lidar_perception.labeling.interpolation import Motion
@@ -21,7 +22,6 @@ HELD = 5          # one of so many frames is held out, at the end of each piece
 FEWEST = 10       # frames
 CHECKED = 5       # clouds, for what they are
 WENT = 1.0        # metres that the sensor must go
-GAP = 2.0         # seconds without a frame, after which another drive begins
 
 
 class Refused(InputError):
@@ -73,14 +73,8 @@ def checked(frames: Sequence[Frame], source: Path) -> list[str]:
 
 def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
     """All frames by drive; where there are more than `most`, pieces of PIECE, or of `most` if that
-    is less, spread over all. A drive ends where the stamps leave a GAP, or go back. Refused where
-    none has FEWEST."""
-    drives: dict[str, list[list[int]]] = {}
-    for number, frame in enumerate(frames):
-        runs = drives.setdefault(frame.sequence, [])
-        if not runs or not 0 <= frame.stamp_ns - frames[runs[-1][-1]].stamp_ns <= GAP * 1e9:
-            runs.append([])
-        runs[-1].append(number)
+    is less, spread over all. Refused where none has FEWEST."""
+    drives = drives_of(frames)
     if max(len(run) for runs in drives.values() for run in runs) < FEWEST:
         raise Refused(f"no {FEWEST} frames follow each other within {GAP:g} s, so that nothing "
                       "can be followed; record every scan")

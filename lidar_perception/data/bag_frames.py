@@ -165,6 +165,14 @@ class BagFrames(Sequence):
         return truth, infos, transforms
 
     @cached_property
+    def files(self) -> tuple[Path, ...]:
+        """That hold its messages."""
+        if self.path.is_file():
+            return self.path,
+        return tuple(sorted(file for file in self.path.iterdir()
+                            if file.is_file() and file.suffix != ".yaml"))
+
+    @cached_property
     def poses(self) -> BagPoses:
         """Of the frame that the first cloud is in."""
         with Bag(self.path) as bag:
@@ -178,7 +186,7 @@ class BagFrames(Sequence):
                      point_truth=partial(self._point_truth, time, data),
                      calibration=partial(self._calibration, time),
                      pose=lambda: self.poses(stamp), index=i, sensor_height=self.sensor_height,
-                     native=lambda: decode(data(), self.kind))
+                     files=self.files, native=lambda: decode(data(), self.kind))
 
     def _load(self, time: int, data: Callable[[], bytes]) -> LidarFrame:
         try:

@@ -40,7 +40,8 @@ class Frame:
     calibration(): of the camera; pose(): (4, 4) float64 from the frame to a fixed one, metres;
     each None where there is none. sequence: the drive it belongs to, "" without drives; index: its
     number there. sensor_height: metres above the ground. points, image: files, where there are
-    any. native: what the protocol of this data set alone asks for.
+    any. files: those that its points, labels and calibration are read from, there or not; () where
+    nobody can know what was labelled. native: what the protocol of this data set alone asks for.
     """
 
     name: str
@@ -55,6 +56,7 @@ class Frame:
     sensor_height: float = SENSOR_HEIGHT
     points: Path | None = None
     image: Path | None = None
+    files: tuple[Path, ...] = ()
     native: Any = None
 
     def camera(self) -> Camera | None:
@@ -85,6 +87,7 @@ class Recording:
     some frames have. lost: labels whose scan is not there, name -> reason. reopen: opens the same
     recording again, in another process, too; takes what data.open.open_recording does. mounted:
     whether it says how high its sensor is; otherwise the sensor_height of its frames is KITTI's.
+    drives: whether frames follow each other in time; else they were drawn from anywhere.
     """
 
     path: Path
@@ -94,6 +97,7 @@ class Recording:
     lost: tuple[tuple[str, str], ...] = ()
     reopen: Callable[..., Recording] | None = None
     mounted: bool = True
+    drives: bool = True
 
     def __len__(self) -> int:
         return len(self.frames)

@@ -69,14 +69,15 @@ class Header:
         return self.config.network
 
     def unlike(self, height: float) -> str | None:
-        """What to say where weights that were trained on simulated scans are used with a sensor
-        so many metres above the ground, and theirs was elsewhere; None where that is not so."""
+        """What to say where weights are used with a sensor so many metres above the ground, and
+        that of their scans was elsewhere; None where that is not so, or nobody knows."""
         sensor = self.training.get("sensor")
         if not isinstance(sensor, dict) or not isinstance(sensor.get("height"), float) or (
                 abs(sensor["height"] - height) < HEIGHT_APART):
             return None
-        return (f"trained for the sensor {sensor.get('name')} at {sensor['height']:g} m, and used "
-                f"with one at {height:g} m")
+        which = f"the sensor {sensor['name']}" if sensor.get("name") else "a sensor"
+        return (f"trained for {which} at {sensor['height']:g} m, and used with one at {height:g} "
+                "m")
 
     def text(self) -> str:
         """As JSON."""

@@ -31,6 +31,16 @@ def path_in(cache: Path | None, *what: Any) -> Path | None:
     return cache / f"{hashlib.sha1(repr((*what, __version__)).encode()).hexdigest()[:20]}.npz"
 
 
+def state_of(file: Path) -> tuple[str, int, int]:
+    """Another one once the content of a file is another one: where it is, bytes, and when it was
+    written, ns; 0 and 0 where there is none."""
+    try:
+        stat = file.stat()
+    except OSError:
+        return str(file.resolve()), 0, 0
+    return str(file.resolve()), stat.st_size, stat.st_mtime_ns
+
+
 def kept(path: Path | None, make: Callable[[], Made], read: Callable[[Any], Made],
          arrays: Callable[[Made], dict[str, Any]], most_gb: float = np.inf) -> Made:
     """What read() finds in the file at path; if it is not there, or broken, what make() gives,

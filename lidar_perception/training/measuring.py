@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import nullcontext
 from typing import Any, TypeVar
 
@@ -11,8 +11,12 @@ import torch
 from torch import nn
 
 from lidar_perception.runs.machine import cores
+from lidar_perception.training.data import Item, ReadScenes
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.run import number_format
+from lidar_perception.types import InputError
+
+MOST = 4  # scenes with which it is measured
 
 Result = TypeVar("Result")
 
@@ -22,6 +26,46 @@ def timed(work: Callable[[], Result]) -> tuple[float, Result]:
     begun = time.perf_counter()
     result = work()
     return time.perf_counter() - begun, result
+
+
+def usable(scenes: Iterable[Item], prepare: Callable[[Any], Any]) -> list[Any]:
+    """The first scenes, at most MOST, of which prepare(scene) can make something. InputError, with
+    the first reason, where there is none."""
+    chosen: list[Any] = []
+    reasons: list[str] = []
+    for scene, skipped in scenes:
+        reasons += skipped
+        if scene is None:
+            continue
+        try:
+            prepare(scene)
+        except InputError as error:
+            reasons.append(str(error))
+            continue
+        chosen.append(scene)
+        if len(chosen) == MOST:
+            break
+    if not chosen:
+        raise InputError("no scene to train on can be used "
+                         f"({next(iter(reasons), 'there is none')})")
+    return chosen
+
+
+def first_read(scenes: ReadScenes, enough: Callable[[Any], bool] = lambda _: True) -> Any:
+    """The first of the scenes to validate on that can be read and has enough in it; where none has,
+    the first that can be read. InputError, with the first reason, where there is none."""
+    other: Any = None
+    reasons: list[str] = []
+    for n in range(len(scenes)):
+        sample, skipped = scenes[n]
+        reasons += skipped
+        if sample is not None and enough(sample):
+            return sample
+        other = sample if other is None else other
+    if other is None:
+        raise InputError("no frame to validate on can be used "
+                         f"({next(iter(reasons), 'there is none')})")
+    return other
 
 
 def seconds_of_step(module: nn.Module, loss: Callable, prepare: Callable[[], Sequence[Any]],

@@ -130,8 +130,8 @@ class DataParams(Params):
     cache_gb: float = param(20.0, "Scans are added to the cache until it has this size; the others "
                             "are simulated in every epoch.", unit="GB", low=0.0, high=1e6)
     val_share: float = param(PAPER_SHARE, "Share of the frames held out for validation, drawn by "
-                             "the seed, where neither --val nor --val-split is given.", low=0.0,
-                             high=0.9)
+                             "the seed, of drives whole ones and the end of one, where neither "
+                             "--val nor --val-split is given.", low=0.0, high=0.9)
     view: bool = param(True, "Use only the points in KITTI's image, since its labels end there.")
     min_points: int = param(5, "Objects and clusters with fewer points are left out of the "
                               "loss.", low=1, high=1000)
@@ -145,8 +145,10 @@ class SceneTraining(LoopParams):
                        "or several in turn, such as street,campus.")
     sensor: str = param("hdl64e", "Sensor of the simulated scans: a sensor.yaml, the name of a "
                         "preset, or generic:BEAMS,LOWEST,HIGHEST,STEP,RATE.")
-    mount_height: float = param(0.0, "Height of the sensor above the ground. 0: what its file "
-                                "or preset says.", unit="m", low=0.0, high=10.0)
+    mount_height: float = param(0.0, "Height of the sensor above the ground; beside simulated "
+                                "scans not of a recording that says its own. 0: what its file or "
+                                "preset says, and of a recording what it says or its first clouds "
+                                "show.", unit="m", low=0.0, high=10.0)
 
 
 @dataclass(frozen=True)

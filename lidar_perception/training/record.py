@@ -20,6 +20,7 @@ from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.data import Batches
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.run import Judged
+from lidar_perception.types import InputError
 
 
 def record_of(params: LoopParams, batches: Batches, record: dict[str, Any],
@@ -50,6 +51,18 @@ def begun_with(network: Net, init: Path | None, kind: type[Config]) -> Net:
         if taken < count:
             errors.print(f"{taken} of {count} tensors are of {init}, the others begin at random")
     return network
+
+
+def name_skipped(skipped: Sequence[str], left: int, named: set[str]) -> None:
+    """Say of which frames nothing was found, and why, but for the reasons in named, which they are
+    added to. InputError where none is left to validate on."""
+    for reason in dict.fromkeys(skipped):
+        if reason not in named:
+            errors.print(f"validation: {reason}")
+    named.update(skipped)
+    if left == 0:
+        raise InputError("no frame to validate on can be used "
+                         f"({next(iter(skipped), 'there is none')})")
 
 
 def rounded(metrics: dict[str, float]) -> dict[str, float | None]:

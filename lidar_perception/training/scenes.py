@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.open import open_recording
+from lidar_perception.data.open import open_recording, with_topic
 from lidar_perception.simulation.camera import (
     FORWARD_CAMERA,
     kitti_labels,
@@ -26,34 +26,43 @@ from lidar_perception.simulation.drive import longest_drive, scan_at
 from lidar_perception.simulation.scene import ANY, Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
 from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.cache import kept, path_in, size_of
+from lidar_perception.training.cache import kept, path_in, size_of, state_of
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
 
 
 @dataclass(frozen=True)
 class RecordedScenes:
     """The frames of a recording with these names. view: the points in the image only, where there
-    is a camera, as the labels end there."""
+    is a camera, as the labels end there. height: of the sensor above the ground, metres, where it
+    is not what the recording says."""
 
     path: Path
     names: tuple[str, ...]
     view: bool = True
+    height: float | None = None
 
     def __len__(self) -> int:
         return len(self.names)
 
     @cached_property
     def _frames(self) -> dict[str, Frame]:
-        recording = open_recording(self.path)
-        numbers = {frame.name: i for i, frame in enumerate(recording)}
-        return {name: recording.frames[numbers[name]] for name in self.names}
+        frames = open_recording(self.path, sensor_height=self.height).frames[:]
+        known = {frame.name: frame for frame in frames}
+        return {name: known[name] for name in self.names}
 
     def __getstate__(self) -> dict:
         return {k: v for k, v in self.__dict__.items() if k != "_frames"}  # open where it is read
 
+    @property
+    def sensor_height(self) -> float:
+        """Of the first frame, metres above the ground."""
+        return self._frames[self.names[0]].sensor_height
+
     def key(self, i: int) -> str:
-        """All that scene i depends on, as long as its files stay as they are."""
-        return repr((str(self.path), self.names[i], self.view))
+        """All that scene i depends on: another one once a file of it was written again."""
+        frame = self._frames[self.names[i]]
+        return repr((*map(state_of, frame.files), with_topic(self.path)[1], frame.name, self.view,
+                     frame.sensor_height))
 
     def scene(self, i: int) -> TrainingScene:
         """InputError naming the file that cannot be used."""
@@ -63,7 +72,7 @@ class RecordedScenes:
         if self.view and camera is not None:
             points = points[camera.in_view(scan.xyz)]
         return TrainingScene(points, truth.boxes, truth.class_ids, np.ones(len(truth), bool),
-                     around=camera is None)
+                     camera is None, frame.sensor_height)
 
     def frame(self, i: int) -> Frame:
         """To validate on: the whole scan. InputError if it has no labels."""
@@ -75,19 +84,6 @@ class RecordedScenes:
         if truth is None:
             raise InputError(f"{frame.points or frame.name} has no labels")
         return frame, truth
-
-
-def random_split(names: tuple[str, ...], share: float,
-                 seed: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """names to train on and to validate on, drawn by the seed, each in the order given; both have
-    one at least. InputError if there are not two."""
-    if len(names) < 2:
-        raise InputError("one frame cannot be split into frames to train and to validate on; give "
-                         "--val")
-    held = min(max(round(share * len(names)), 1), len(names) - 1)
-    chosen = set(np.random.default_rng(seed).choice(len(names), held, replace=False).tolist())
-    return (tuple(name for i, name in enumerate(names) if i not in chosen),
-            tuple(name for i, name in enumerate(names) if i in chosen))
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lidar_perception.data.frame import BOXES
-from lidar_perception.data.open import open_recording
 from lidar_perception.simulation.drive import longest_drive
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import HDL64E, Sensor
+from lidar_perception.training.frames import labelled_frames
 from lidar_perception.training.params import DataParams
-from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes, random_split
+from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
 from lidar_perception.types import InputError
 
 SIM = "sim"  # the name of simulated scenes where a folder could stand
@@ -23,34 +22,30 @@ FIRST_SCENE, FIRST_VALIDATION_SCENE = 10_000_000, 20_000_000  # far from what an
 def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,
                     val_split: Path | None, settings: DataParams, seed: int,
                     sensor: Sensor = HDL64E, around: bool = False,
-                    scene: str = "street") -> tuple[tuple, tuple]:
-    """Sources to train on and to validate on. sensor: of simulated scenes, which are those of
-    scene, see Scenes; around: validate on what lies all around. InputError for what is not
-    there, or an option that would not be used."""
+                    scene: str = "street", height: float = 0.0) -> tuple[tuple, tuple]:
+    """Sources to train on and to validate on, which have no frame in common. sensor: of simulated
+    scenes, which are those of scene, see Scenes; around: validate on what lies all around; height:
+    see labelled_frames. InputError for what is not there, or an option that would not be used."""
     folders = [Path(name) for name in data if name != SIM]
     val_folders = [Path(name) for name in val if name != SIM] or ([] if val else folders)
     if split is not None and len(folders) != 1:
         raise InputError("--split names frames of one recording in --data; give one")
     if val_split is not None and len(val_folders) != 1:
         raise InputError("--val-split names frames of one recording; give one in --val")
-    train_on: list[RecordedScenes | SimulatedScenes] = []
-    judge_on: list[RecordedScenes | SimulatedScenes] = []
-    held: tuple[str, ...]
-    for folder in folders:
-        names, held = names_of(folder, split), ()
-        if val_split is not None and folder in val_folders:
-            held = names_of(folder, val_split)
-            names = tuple(name for name in names if name not in set(held))
-        elif not val:
-            names, held = random_split(names, settings.val_share, seed)
-        if not names:
-            raise InputError(f"{folder}: no frame is left to train on")
-        train_on.append(RecordedScenes(folder, names, settings.view))
-        if held:
-            judge_on.append(RecordedScenes(folder, held, settings.view))
-    for folder in val_folders if val else ():
-        if folder not in folders or val_split is None:
-            judge_on.append(RecordedScenes(folder, names_of(folder, val_split), settings.view))
+    mixed = SIM in (*data, *val)
+    learned = [labelled_frames(folder, split, height, mixed) for folder in folders]
+    if val or val_split is not None:
+        held = [labelled_frames(folder, val_split, height, mixed) for folder in val_folders]
+    else:
+        pairs = [one.held_out(settings.val_share, seed) for one in learned]
+        learned, held = [one for one, _ in pairs], [one for _, one in pairs]
+    if split is not None and val_split is None:  # what is named stays what it is
+        held = [one.without(learned, "validate on") for one in held]
+    else:
+        learned = [one.without(held, "train on") for one in learned]
+    train_on: list[RecordedScenes | SimulatedScenes] = [
+        one.scenes(settings.view) for one in learned]
+    judge_on: list[RecordedScenes | SimulatedScenes] = [one.scenes(settings.view) for one in held]
     simulated = partial(SimulatedScenes, sensor=sensor, cache_gb=settings.cache_gb,
                         cache=Path(settings.cache) if settings.cache else None)
     if SIM in data:
@@ -61,14 +56,6 @@ def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | N
         judge_on.append(simulated(FIRST_VALIDATION_SCENE, settings.val_scans,
                                   scenes=Scenes(None, settings.val_people, scene), around=around))
     return tuple(train_on), tuple(judge_on)
-
-
-def names_of(path: Path, split: Path | None = None) -> tuple[str, ...]:
-    """The names of the frames of a recording, or of those that a split file names. InputError
-    names what is not there, and a recording without labelled boxes."""
-    recording = open_recording(path, split=split)
-    recording.require(BOXES, "train")
-    return tuple(frame.name for frame in recording)
 
 
 def about_data(data: tuple[str, ...], val: tuple[str, ...], stream: Sized,

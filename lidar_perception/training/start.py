@@ -6,14 +6,15 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from statistics import median
 from typing import Any, NamedTuple, Protocol
 
 import torch
 
-from lidar_perception.detectors.checkpoint import network_of
+from lidar_perception.detectors.checkpoint import HEIGHT_APART, network_of
 from lidar_perception.detectors.devices import chosen_device
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.files import make_folder, read_text, write_text
@@ -22,9 +23,9 @@ from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import duration, errors
 from lidar_perception.simulation.sensor import Sensor, sensor_named
 from lidar_perception.training.asked import Asked
-from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.data import Batches, ReadScenes, Stream
+from lidar_perception.training.data import Batches, Item, ReadScenes, Stream
 from lidar_perception.training.loop import STATE, may_begin, train
+from lidar_perception.training.measuring import MOST
 from lidar_perception.training.plan import (
     STARTING,
     Data,
@@ -39,7 +40,7 @@ from lidar_perception.training.plan import (
 from lidar_perception.training.preparing import keep_all
 from lidar_perception.training.ranks import joined, rank, wait, world
 from lidar_perception.training.run import Progress, Task
-from lidar_perception.training.scenes import SimulatedScenes
+from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
 from lidar_perception.training.sources import about_data, training_scenes
 from lidar_perception.types import InputError
 
@@ -65,10 +66,11 @@ class Network(Protocol):
         """The parameters that train on a part of the range, which is quicker; none if there is no
         such choice."""
 
-    def measured(self, params: Any, scenes: Sequence[TrainingScene], held_out: Any,
+    def measured(self, params: Any, scenes: Iterable[Item], held_out: Sequence[Any],
                  device: torch.device) -> tuple[float, float, float, float]:
         """Seconds to cut a scene, of a step on the part and on the whole of the range, without the
-        preparation's share of other cores, and to validate a frame."""
+        preparation's share of other cores, and to validate a frame; with the first scenes that can
+        be used. InputError where none can."""
 
     def cut(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any],
             cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
@@ -108,7 +110,8 @@ def scenes_of(asked: Asked, params: Any, sensor: Sensor, own: tuple = ()) -> tup
     """Sources to train on, those of one's own last, and to validate on."""
     around = getattr(params, "range", "") == "around"
     sources, held_out = training_scenes(asked.data, asked.val, asked.split, asked.val_split,
-                                        params.data, params.seed, sensor, around, params.scene)
+                                        params.data, params.seed, sensor, around, params.scene,
+                                        params.mount_height)
     return (*sources, *own), held_out
 
 
@@ -152,7 +155,7 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
         stream, to_validate = network.scenes(params, sources, held_out, cut, asked.out)
         batches = Batches(stream, params.batch, asked.jobs, rank(), world())
         about = {**about_data(asked.data, asked.val, stream, held_out, asked.init),
-                 "sensor": {"name": params.sensor, "height": sensor.height, "beams": sensor.rings}}
+                 "sensor": _about_sensor(params, sensor, sources)}
         task = network.task(params, batches, to_validate, asked.out, device, about, commit,
                             init)
         until = math.inf if hours is None else begun + 3600 * hours
@@ -179,7 +182,7 @@ def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
         epoch = max(1, round((chosen.scans + data.recorded) / data.batch))
         chosen = replace(chosen, validate_steps=params.validation_steps(epoch))
     _require_room(Path(params.data.cache), params.data.cache_gb, chosen, speed)
-    _say(network, params, sensor, chosen, speed, data)
+    _say(network, params, sensor, chosen, speed, data, _recorded_height(sources))
     write_text(path, json.dumps({"asked": _decisive(asked, params, sensor, own),
                                  "plan": asdict(chosen),
                                  "speed": asdict(speed), "data": asdict(data)}, indent=1))
@@ -190,10 +193,9 @@ def _measured(network: Network, asked: Asked, params: Any, sensor: Sensor,
     """What the machine does now, and the sources of scenes to train with and to validate on."""
     few = _few(params)
     sources, held_out = scenes_of(asked, few, sensor, own)
-    scenes, scan = _some_scenes((*sources, *held_out))
-    cut, step, whole, frame = network.measured(few, scenes, held_out[0], device)
-    speed = Speed(scan, cut, step, whole, frame, scenes[0].points.nbytes * 1.02e-6)
-    return speed, sources, held_out
+    scenes, scan, scan_mb = _some_scenes((*sources, *held_out))
+    cut, step, whole, frame = network.measured(few, scenes, held_out, device)
+    return Speed(scan, cut, step, whole, frame, scan_mb), sources, held_out
 
 
 def _few(params: Any) -> Any:
@@ -264,29 +266,37 @@ def _recorded(sources: Sequence[Any]) -> int:
     return sum(len(source) for source in sources if not isinstance(source, SimulatedScenes))
 
 
-def _some_scenes(sources: Sequence[Any]) -> tuple[list[TrainingScene], float]:
-    """Up to four scenes, and the seconds to simulate one with its share of the scene; 0 where
-    nothing is simulated. No source has a cache. InputError where none can be read."""
+def _recorded_height(sources: Sequence[Any]) -> float | None:
+    """Metres of the sensor above the ground in the recordings, None where there are none, or they
+    do not agree."""
+    heights = [source.sensor_height for source in sources if isinstance(source, RecordedScenes)]
+    if not heights or max(heights) - min(heights) >= HEIGHT_APART:
+        return None
+    return round(median(heights), 2)
+
+
+def _about_sensor(params: Any, sensor: Sensor, sources: Sequence[Any]) -> dict[str, Any]:
+    """What a header says of the sensor: which one was simulated; else how high it was."""
+    if _simulated(sources):
+        return {"name": params.sensor, "height": sensor.height, "beams": sensor.rings}
+    height = _recorded_height(sources)
+    return {} if height is None else {"height": height}
+
+
+def _some_scenes(sources: Sequence[Any]) -> tuple[Iterable[Item], float, float]:
+    """Items of some scenes, and the seconds to simulate one with its share of the scene, and its
+    MB; 0 where nothing is simulated, and then scenes are read as they are asked for. No source has
+    a cache."""
     for source in sources:
         if isinstance(source, SimulatedScenes):
             many = source.per_scene
             source.scene(0)  # so that what is compiled is there
             begun = time.perf_counter()
-            made = [source.scene(i) for i in range(many, many + min(many, 4))]
-            return made, (time.perf_counter() - begun) / len(made)
-    scenes: list[TrainingScene] = []
-    reason: InputError | None = None
-    for source in sources:
-        for i in range(min(len(source), 50)):
-            try:
-                scenes.append(source.scene(i))
-            except InputError as error:
-                reason = error
-            if len(scenes) == 4:
-                return scenes, 0.0
-    if not scenes:
-        raise reason or InputError("there is no scene")
-    return scenes, 0.0
+            made = [source.scene(i) for i in range(many, many + min(many, MOST))]
+            return ([Item(scene) for scene in made], (time.perf_counter() - begun) / len(made),
+                    made[0].points.nbytes * 1.02e-6)
+    recorded = ReadScenes(tuple(sources), lambda source, i: source.scene(i))
+    return (recorded[n] for n in range(len(recorded))), 0.0, 0.0
 
 
 def _require_room(cache: Path, most_gb: float, chosen: Plan, speed: Speed) -> None:
@@ -298,11 +308,12 @@ def _require_room(cache: Path, most_gb: float, chosen: Plan, speed: Speed) -> No
 
 
 def _say(network: Network, params: Any, sensor: Sensor, chosen: Plan, speed: Speed,
-         data: Data) -> None:
+         data: Data, height: float | None) -> None:
+    at = "" if height is None else f" at {height:g} m"
     scenes = " and ".join(text for count, text in (
         (chosen.scans, f"{chosen.scans} {params.scene} scans of {params.sensor} at "
                        f"{sensor.height:g} m"),
-        (data.recorded, f"{data.recorded} recorded scenes")) if count)
+        (data.recorded, f"{data.recorded} recorded scenes{at}")) if count)
     part = network.part(params) if chosen.part else {}
     where = f" up to {part['ahead']:g} m ahead and {part['aside']:g} m aside" if part else ""
     often = (f"every {chosen.validate_steps} steps" if chosen.validate_steps < chosen.steps

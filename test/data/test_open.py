@@ -105,6 +105,8 @@ def test_what_lies_there_is_recognised_said_and_read(tmp_path, monkeypatch, kind
             assert (frame.camera() is not None) == (CAMERA in has)
             assert (frame.pose() is not None) == (POSES in has)
             assert (frame.point_truth() is not None) == (POINT_LABELS in has)
+            assert bool(frame.files) == (BOXES in has)
+            assert frame.truth() is None or all(file.is_file() for file in frame.files)
         assert any(frame.truth() is not None for frame in recording) == (BOXES in has)
         if (root / part).is_dir():
             monkeypatch.chdir(root / part)

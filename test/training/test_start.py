@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
-from samples import write
+from samples import object_folder, scene, walker_label, write
 
 from lidar_perception.cli.main import cli
 from lidar_perception.detectors.checkpoint import read_header
@@ -18,7 +18,7 @@ from lidar_perception.runs import terminal
 from lidar_perception.training import start as start_module
 from lidar_perception.training.loop import STATE
 from lidar_perception.training.start import RUN
-from lidar_perception.types import InputError
+from lidar_perception.types import SENSOR_HEIGHT, InputError
 
 pytestmark = pytest.mark.usefixtures("streets")
 SENSOR = "generic:16,-20,5,2,10"
@@ -132,6 +132,38 @@ def test_the_plan_is_kept_and_other_settings_are_no_resumed_run(tmp_path, one_th
     assert "0.9" in str(other.exception) and "0.6" in str(other.exception)
     again = [*asked, "--mount-height", "0.6", "--resume", "--budget", "7"]
     assert CliRunner().invoke(cli, again).exit_code == 0
+
+
+def small_run(kind: str, out: Path, root: Path, *more: str):
+    """A step on a folder of KITTI, validated."""
+    return CliRunner().invoke(cli, ["train", kind, *(("--version", "v0", "--ahead", "10", "--aside",
+                                    "10") if kind == "pointpillars" else ()), "--data", str(root),
+                                    "--steps", "1", "--batch", "1", "--jobs", "0", "--out",
+                                    str(out), *more])
+
+
+@pytest.mark.parametrize("kind", ["pointpillars", "pointnet"])
+def test_what_cannot_be_used_is_passed_over_wherever_it_lies(kind, tmp_path, one_thread):
+    """The first scene to train on, and the first frames to validate on: cut, without a label, with
+    nothing in it."""
+    root = object_folder(tmp_path / "kitti", walker_label() + "\n", 6) / "training"
+    for number in (0, 2):
+        write(root / f"velodyne/{number:06}.bin", b"cut")
+    (root / "label_2/000003.txt").unlink()
+    for number in (1, 4):
+        write(root / f"velodyne/{number:06}.bin", scene()[:1000])  # the ground alone
+        write(root / f"label_2/{number:06}.txt", "")
+    held = write(tmp_path / "val.txt", "000002\n000003\n000004\n")
+    done = small_run(kind, tmp_path / "run", root, "--val-split", str(held))
+    assert done.exit_code == 0, done.exception
+    assert done.stderr.count("validation: ") == 2
+    header = read_header(tmp_path / "run/last.safetensors")
+    assert header.training["sensor"] == {"height": SENSOR_HEIGHT}  # no sensor was simulated
+    assert header.unlike(SENSOR_HEIGHT) is None and "for a sensor at 1.73" in header.unlike(0.6)
+    write(held, "000002\n000003\n")
+    refused = small_run(kind, tmp_path / "other", root, "--val-split", str(held)).exception
+    assert isinstance(refused, InputError) and "\n" not in str(refused)
+    assert "no frame to validate on can be used" in str(refused) and "000002.bin" in str(refused)
 
 
 def test_where_there_is_no_terminal_progress_comes_line_by_line(monkeypatch, capsys):

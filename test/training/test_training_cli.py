@@ -10,6 +10,8 @@ from click.testing import CliRunner
 from samples import object_folder, walker_label, write
 
 from lidar_perception.cli.main import cli
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.pointpillars import config as config_module
 from lidar_perception.detectors.pointpillars.detector import load_detector
@@ -123,6 +125,30 @@ def test_what_is_held_out_is_not_trained_on(tmp_path):
         training_scenes(("sim",), (), None, theirs, params, 0)
     with pytest.raises(InputError, match="no frame is left"):
         training_scenes((folder,), (folder,), theirs, theirs, params, 0)
+
+
+def test_a_frame_is_trained_on_or_validated_on_by_whatever_path_it_comes(tmp_path, monkeypatch):
+    root = object_folder(tmp_path / "kitti", walker_label() + "\n", 5)
+    write_bag(tmp_path / "bag", open_recording(root))
+    file, = (tmp_path / "bag").glob("*.mcap")
+    monkeypatch.chdir(tmp_path)
+    some = write(tmp_path / "some.txt", "000000\n000001\n")
+    three = [f"{i:06}" for i in (2, 3, 4)]
+
+    def names(*arguments) -> list[list[str]]:
+        """To train on, and to validate on."""
+        return [sorted(name for source in sources for name in source.names)
+                for sources in training_scenes(*arguments, DataParams(val_share=0.4), 0)]
+
+    for other in (str(root), "kitti", "kitti/training", "../" + tmp_path.name + "/kitti"):
+        assert names((str(root),), (other,), some, None) == [["000000", "000001"], three]
+        assert names((str(root),), (other,), None, some) == [three, ["000000", "000001"]]
+        with pytest.raises(InputError, match="no frame is left to train on"):
+            names((str(root),), (other,), None, None)
+        train_on, held = names((str(root), other), (), None, None)
+        assert len(held) == 4 and not {*train_on} & {*held}
+    with pytest.raises(InputError, match="no frame is left to train on"):
+        names(("bag",), (str(file),), None, None)
 
 
 @pytest.mark.parametrize("arguments, reason", [

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ import torch
 from detection_samples import BOXES, tiny, two_objects
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import WALKER, object_folder, walker_label, write
+from samples import WALKER, object_folder, walker_label, walker_truth, write
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
@@ -25,14 +26,16 @@ from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import RANGES, network_config
 from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED
-from lidar_perception.geometry import points_in_box, wrap_angle
+from lidar_perception.geometry import points_in_box, within, wrap_angle
 from lidar_perception.simulation import drive
 from lidar_perception.simulation.camera import kitti_labels, turned_camera
+from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training import scenes as scenes_module
 from lidar_perception.training.augment import TrainingScene, raised
 from lidar_perception.training.cut_objects import cut
 from lidar_perception.training.data import Batches, Item, ReadScenes, Stream
+from lidar_perception.training.frames import drive_split, labelled_frames, random_split
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pointpillars.task import (
     Preparation,
@@ -44,8 +47,7 @@ from lidar_perception.training.pointpillars.task import (
     validation_report,
 )
 from lidar_perception.training.record import metrics_of
-from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes, random_split
-from lidar_perception.training.sources import names_of
+from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
 from lidar_perception.types import (
     CLASSES,
     PEDESTRIAN,
@@ -82,7 +84,7 @@ def keep_all(scene, rng):
 
 def test_what_is_broken_is_named_skipped_and_counted(tmp_path, capsys):
     root = broken_folder(tmp_path)
-    stream = Stream((RecordedScenes(root, names_of(root)),), keep_all)
+    stream = Stream((labelled_frames(root).scenes(),), keep_all)
     batches = Batches(stream, 5)
     steps = batches(0)
     for _ in range(2):
@@ -115,11 +117,11 @@ def test_kitti_scenes_end_with_the_image_unless_asked(tmp_path):
 def test_a_bag_of_a_folder_has_its_scenes(tmp_path):
     folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
     write_bag(tmp_path / "bag", open_recording(folder))
-    of_bag = RecordedScenes(tmp_path / "bag", names_of(tmp_path / "bag"))
+    of_bag = labelled_frames(tmp_path / "bag").scenes()
     of_bag.scene(0)  # what it has opened stays here
     for source in (of_bag, pickle.loads(pickle.dumps(of_bag))):
         for i in range(2):
-            scene, expected = source.scene(i), RecordedScenes(folder, names_of(folder)).scene(i)
+            scene, expected = source.scene(i), labelled_frames(folder).scenes().scene(i)
             assert np.array_equal(scene.points, expected.points) and not scene.around
             np.testing.assert_allclose(scene.boxes, expected.boxes, atol=1e-9)
             assert np.array_equal(scene.class_ids, expected.class_ids)
@@ -129,38 +131,69 @@ def test_without_a_camera_all_around_is_labelled_and_without_labels_nothing_is_l
     frames = [Frame.of("0", LidarFrame(two_objects()[:, :3].copy()), GroundTruth.of([WALKER],
                                                                                    [PEDESTRIAN]))]
     write_bag(tmp_path / "bag", frames)
-    scene = RecordedScenes(tmp_path / "bag", names_of(tmp_path / "bag")).scene(0)
+    scene = labelled_frames(tmp_path / "bag").scenes().scene(0)
     assert scene.around and np.array_equal(scene.points[:, :3], two_objects()[:, :3])
     assert not scene.points[:, 3].any()  # no intensity
     write_bag(tmp_path / "bare", [Frame.of("0", frames[0].load())])
     with pytest.raises(InputError, match="has no labelled boxes, which train needs"):
-        names_of(tmp_path / "bare")
+        labelled_frames(tmp_path / "bare")
 
 
 def test_splits_name_their_frames(tmp_path):
     root = object_folder(tmp_path, count=4)
     split = write(tmp_path / "train.txt", "000003\n000001\n")
-    assert names_of(root, split) == ("000003", "000001")
-    assert len(names_of(root)) == 4
+    assert labelled_frames(root, split).scenes().names == ("000003", "000001")
+    assert len(labelled_frames(root).frames) == 4
     for text, reason in (("000009", "000009"), ("", "names no frame")):
         with pytest.raises(InputError, match=reason):
-            names_of(root, write(split, text))
+            labelled_frames(root, write(split, text))
     with pytest.raises(InputError, match="cannot read the split"):
-        names_of(root, tmp_path / "missing.txt")
+        labelled_frames(root, tmp_path / "missing.txt")
 
 
-@given(st.integers(2, 200), st.floats(0, 1), seeds)
-def test_a_random_split_is_a_partition_drawn_by_its_seed(count, share, seed):
-    names = tuple(f"{i:06}" for i in range(count))
-    train, held = random_split(names, share, seed)
-    assert sorted(train + held) == list(names) and train and held
-    assert (train, held) == random_split(names, share, seed)
-    assert abs(len(held) - share * count) <= 1
+@given(st.lists(st.integers(1, 60), min_size=1, max_size=8).filter(lambda n: sum(n) > 1),
+       st.floats(0, 1), seeds)
+def test_a_share_is_held_out_by_the_seed_and_of_drives_whole_ones_and_the_end_of_one(
+        lengths, share, seed):
+    ends = np.cumsum(lengths)
+    drives = [range(end - length, end) for end, length in zip(ends, lengths)]
+    for split, items in (random_split, range(ends[-1])), (drive_split, drives):
+        held = split(items, share, seed)
+        assert held == split(items, share, seed) and len(set(held)) == len(held)
+        assert 0 < len(held) < ends[-1] and abs(len(held) - share * ends[-1]) <= 1
+    pieces = [sorted(set(held) & set(drive)) for drive in drives]  # of drive_split
+    cut = [(piece, drive) for piece, drive in zip(pieces, drives) if 0 < len(piece) < len(drive)]
+    assert len(cut) <= 1 and all(piece == [*drive[-len(piece):]] for piece, drive in cut)
 
 
 def test_one_frame_cannot_be_split():
-    with pytest.raises(InputError, match="--val"):
-        random_split(("000000",), 0.5, 0)
+    for split, items in (random_split, ["000000"]), (drive_split, [["000000"]]):
+        with pytest.raises(InputError, match="--val"):
+            split(items, 0.5, 0)
+
+
+def test_of_a_drive_the_end_that_is_labelled_is_held_out(tmp_path):
+    frames = [Frame.of(str(i), replace(LidarFrame(two_objects()[:, :3].copy()), stamp_ns=i * 10**8),
+                       walker_truth() if i < 8 else None) for i in range(10)]
+    write_bag(tmp_path / "bag", frames)
+    learned, held = labelled_frames(tmp_path / "bag").held_out(0.25, 0)
+    assert [frame.stamp_ns // 10**8 for frame in held.frames] == [6, 7]
+    assert len(learned.frames) == 8
+
+
+def test_what_is_kept_of_a_recording_is_made_again_once_its_files_are_others(tmp_path, monkeypatch):
+    root = object_folder(tmp_path / "kitti", walker_label() + "\n", 2)
+    keys = [labelled_frames(root).scenes().key(i) for i in range(2)]
+    monkeypatch.chdir(tmp_path)
+    assert labelled_frames(Path("kitti/training")).scenes().key(0) == keys[0] != keys[1]
+    write(root / "training/label_2/000000.txt", "")
+    now = labelled_frames(root).scenes()
+    assert now.key(0) != keys[0] and now.key(1) == keys[1]
+    assert labelled_frames(root, height=0.6).scenes().key(1) != keys[1]
+    write_bag(tmp_path / "bag", open_recording(root))
+    key = labelled_frames(tmp_path / "bag").scenes().key(0)
+    os.utime(next((tmp_path / "bag").glob("*.mcap")), ns=(0, 0))
+    assert labelled_frames(tmp_path / "bag").scenes().key(0) != key
 
 
 def test_simulated_scans_are_the_same_from_the_cache(tmp_path, monkeypatch):
@@ -298,7 +331,8 @@ def test_a_scene_that_the_network_cannot_see_is_skipped():
 
 def test_a_perfect_detector_scores_and_a_blind_one_does_not(tmp_path):
     root = broken_folder(tmp_path)
-    scenes = ReadScenes((RecordedScenes(root, names_of(root)),), frame_to_validate)
+    scenes = ReadScenes((labelled_frames(root).scenes(),),
+                        partial(frame_to_validate, tiny()))
     right = validation_report(lambda frame: Found(Detections.of([WALKER])), scenes)
     blind = validation_report(lambda frame: Found(Detections.none()), scenes)
     assert right.compute()["frames"] == 3 and len(right.skipped) == 2
@@ -309,6 +343,17 @@ def test_a_perfect_detector_scores_and_a_blind_one_does_not(tmp_path):
         assert np.isnan(metrics["Car_bev_relaxed"])
         assert metrics_of(blind.compute(), score, names)["score"] == 0.0
         assert np.isnan(metrics_of(right.compute(), score, ["Car"])["score"])  # no such object
+
+
+@pytest.mark.parametrize("where", ["ahead", "around"])
+def test_without_a_camera_only_what_the_network_sees_is_to_be_found(where):
+    config = network_config("v0", "compact", **(RANGES["around"] if where == "around" else {}))
+    source = SimulatedScenes(7, 1, SENSOR, Scenes(None, 3.0, "campus"))
+    known = source.frame(0).truth()
+    truth = frame_to_validate(config, source, 0).truth()
+    seen = within(known.boxes, config.low, config.high)
+    assert np.array_equal(truth.boxes, known.boxes[seen]) and len(truth.extras) == len(truth)
+    assert 0 < len(truth) and (len(truth) < len(known) or where == "around")
 
 
 def test_samples_are_plain_arrays_that_other_processes_can_send():
@@ -345,6 +390,35 @@ def test_workers_end_with_a_process_that_is_killed():
 
 
 # the sensor's height, and what is around
+
+def low_bag(path: Path, height: float, count: int = 2) -> Path:
+    """Level ground that far below the sensor, and a person on it."""
+    rng = np.random.default_rng(0)
+    ground = rng.uniform(-20, 20, (6000, 3)) * [1, 1, 5e-4] - [0, 0, height]
+    person = rng.uniform(-0.25, 0.25, (300, 3)) * [1, 1, 3.4] + [8, 0.5, 0.85 - height]
+    xyz = np.concatenate([ground, person]).astype(np.float32)
+    truth = GroundTruth.of([[8, 0.5, 0.85 - height, 0.6, 0.6, 1.7, 0]], [PEDESTRIAN])
+    write_bag(path, [Frame.of(str(i), LidarFrame(xyz, np.full(len(xyz), 0.3, np.float32),
+                                                 i * 10**8), truth) for i in range(count)])
+    return path
+
+
+def test_a_recording_is_brought_to_the_height_that_the_network_knows(tmp_path):
+    config, samples = tiny(), []
+    for height in SENSOR_HEIGHT, 0.6:
+        source = labelled_frames(low_bag(tmp_path / f"{height}", height)).scenes()
+        again = pickle.loads(pickle.dumps(source))
+        assert again.sensor_height == again.scene(0).height == again.frame(1).sensor_height
+        assert again.sensor_height == pytest.approx(height, abs=0.011)
+        samples.append(Preparation(config, STILL)(source.scene(0), np.random.default_rng(0)))
+    assert len(samples[0].points) == len(samples[1].points)
+    assert np.allclose(samples[0].boxes, samples[1].boxes, atol=0.011)
+    path = tmp_path / "0.6"
+    assert labelled_frames(path, height=1.1, mixed=True).scenes().scene(0).height == 1.1
+    folder = object_folder(tmp_path / "kitti", walker_label() + "\n", 1)
+    assert labelled_frames(folder, height=1.1).scenes().scene(0).height == 1.1
+    assert labelled_frames(folder, height=1.1, mixed=True).scenes().scene(0).height == SENSOR_HEIGHT
+
 
 def test_a_sensor_mounted_elsewhere_gives_the_network_the_same():
     """A scene, and the same as a higher or lower sensor would have it."""

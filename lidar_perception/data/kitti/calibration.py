@@ -18,6 +18,7 @@ from lidar_perception.types import InputError
 # and tracking calibration files do not say it.
 IMAGE_SIZES = {721.5377: (1242, 375), 707.0493: (1224, 370), 718.3351: (1238, 374),
                707.0912: (1226, 370), 718.856: (1241, 376)}
+RAW_CALIB = ("calib_cam_to_cam.txt", "calib_velo_to_cam.txt")
 MAX_SKEW = 0.01  # of a rotation that was rounded
 
 
@@ -33,8 +34,8 @@ def read_calibration(path: Path, image: Path | None = None) -> Calibration:
 
 
 def read_raw_calibration(day: Path) -> Calibration:
-    """calib_cam_to_cam.txt and calib_velo_to_cam.txt of a raw recording day."""
-    cameras, lidar = day / "calib_cam_to_cam.txt", day / "calib_velo_to_cam.txt"
+    """RAW_CALIB of a raw recording day."""
+    cameras, lidar = (day / name for name in RAW_CALIB)
     values, pose = matrices(cameras), matrices(lidar)
     velodyne = np.column_stack([matrix(pose, lidar, "R", (3, 3)), matrix(pose, lidar, "T", (3,))])
     width, height = matrix(values, cameras, "S_rect_02", (2,)).astype(int)

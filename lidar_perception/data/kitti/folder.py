@@ -12,7 +12,11 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import BOXES, CAMERA, Frame, Recording
-from lidar_perception.data.kitti.calibration import read_calibration, read_raw_calibration
+from lidar_perception.data.kitti.calibration import (
+    RAW_CALIB,
+    read_calibration,
+    read_raw_calibration,
+)
 from lidar_perception.data.kitti.labels import (
     read_object_labels,
     read_tracking_labels,
@@ -26,6 +30,7 @@ from lidar_perception.wire.topics import LIDAR_FRAME
 START_NS = 1_316_995_200 * 10**9  # 26 September 2011, the first day of KITTI's recordings
 PERIOD_NS = 10**8                 # the sensor turns at 10 Hz
 GAP_NS = 10 * 10**9               # between recordings that share a bag
+OBJECT = "object data"            # the layout whose frames are from anywhere
 SCANS = ("velodyne_reduced", "velodyne")  # of one name, the full scan wins
 
 
@@ -62,7 +67,7 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
                     any(folder.glob(f"{name}/*/")) for name in SCANS):
                 frames, layout = _tracking(folder), "tracking data"
             else:
-                frames, layout = _object(folder, scans), "object data"
+                frames, layout = _object(folder, scans), OBJECT
             labelled = (folder / "label_02").is_dir() or (folder / "label_2").is_dir()
             break
     else:
@@ -78,7 +83,7 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     return Recording(path, f"KITTI {layout}", frames,
                      frozenset({CAMERA} | ({BOXES} if labelled else set())),
                      tuple((label.stem, f"{label} has no scan; download it again")
-                           for label in lost) if scans else ())
+                           for label in lost) if scans else (), drives=layout != OBJECT)
 
 
 def _object(folder: Path, scans: bool) -> list[Frame]:
@@ -88,12 +93,13 @@ def _object(folder: Path, scans: bool) -> list[Frame]:
     frames = []
     for i, (name, points) in enumerate(sorted(files.items())):
         image, label = folder / f"image_2/{name}.png", folder / f"label_2/{name}.txt"
-        calibration = functools.cache(partial(read_calibration, folder / f"calib/{name}.txt",
-                                              image))
+        calib = folder / f"calib/{name}.txt"
+        calibration = functools.cache(partial(read_calibration, calib, image))
         stamp = START_NS + i * PERIOD_NS
         frames.append(Frame(name, stamp, partial(load_velodyne, points, stamp),
                             partial(_object_truth, label, calibration), calibration=calibration,
-                            index=i, points=points, image=image))
+                            index=i, points=points, image=image,
+                            files=(points, label, calib)))
     return frames
 
 
@@ -107,18 +113,18 @@ def _tracking(folder: Path) -> list[Frame]:
     for name, drive in sorted(drives.items()):
         scans = sorted(drive.glob("*.bin"))
         images = folder / "image_02" / name
+        calib, label = folder / f"calib/{name}.txt", folder / f"label_02/{name}.txt"
         calibration = functools.cache(partial(
-            read_calibration, folder / f"calib/{name}.txt",
-            images / f"{scans[0].stem}.png" if scans else None))
-        truth = _truth_by_number(folder / f"label_02/{name}.txt",
-                                 partial(_tracking_truth, calibration))
+            read_calibration, calib, images / f"{scans[0].stem}.png" if scans else None))
+        truth = _truth_by_number(label, partial(_tracking_truth, calibration))
         for points in scans:
             number = number_of(points)
             stamp = start + (number - number_of(scans[0])) * PERIOD_NS
             frames.append(Frame(f"{name}/{points.stem}", stamp,
                                 partial(load_velodyne, points, stamp), partial(truth, number),
                                 calibration=calibration, sequence=name, index=number,
-                                points=points, image=images / f"{points.stem}.png"))
+                                points=points, image=images / f"{points.stem}.png",
+                                files=(points, label, calib)))
         start = frames[-1].stamp_ns + GAP_NS if frames else start
     return frames
 
@@ -135,7 +141,8 @@ def _raw(root: Path) -> list[Frame]:
     frames = []
     for drive in sorted(d.parent for d in drives):
         calibration = functools.cache(partial(read_raw_calibration, drive.parent))
-        truth = _truth_by_number(drive / "tracklet_labels.xml", read_tracklets)
+        label = drive / "tracklet_labels.xml"
+        truth = _truth_by_number(label, read_tracklets)
         stamps = _raw_stamps(drive / "velodyne_points" / "timestamps.txt")
         for points in sorted((drive / "velodyne_points/data").glob("*.bin")):
             number = number_of(points)
@@ -147,6 +154,7 @@ def _raw(root: Path) -> list[Frame]:
                                 partial(load_velodyne, points, stamp), partial(truth, number),
                                 calibration=calibration, sequence=drive.name, index=number,
                                 points=points, image=drive / f"image_02/data/{points.stem}.png",
+                                files=(points, label, *(drive.parent / name for name in RAW_CALIB)),
                                 native=drive))
     return sorted(frames, key=lambda f: f.stamp_ns)
 

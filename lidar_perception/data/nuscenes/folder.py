@@ -98,6 +98,8 @@ def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
     mounts = _poses(tables, "calibrated_sensor", {mount for _, _, _, mount in sweeps.values()})
     poses = _poses(tables, "ego_pose", {pose for _, _, pose, _ in sweeps.values()})
     all_labels = functools.cache(partial(read_labels, tables, times))
+    read = tuple(tables.path(name) for name in (
+        "sample_annotation", "calibrated_sensor", "ego_pose"))
     frames, counts = [], dict.fromkeys(rank.values(), 0)
     for number, (scene, _, token) in enumerate(samples):
         file, time, pose, mount = sweeps[token]
@@ -107,7 +109,8 @@ def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
             f"{scene_names[scene]}/{counts[scene]:02}", time * 1000,
             partial(load_sweep, tables.root / file, turn, time * 1000), partial(_truth, key),
             pose=at_sensor.copy, sequence=scene_names[scene], index=counts[scene],
-            sensor_height=float(mounts[mount][2, 3]), points=tables.root / file, native=key))
+            sensor_height=float(mounts[mount][2, 3]), points=tables.root / file,
+            files=(tables.root / file, *read), native=key))
         counts[scene] += 1
     return frames
 

@@ -17,7 +17,7 @@ from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of, 
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
-from lidar_perception.scoring.points.clusters import labelled
+from lidar_perception.scoring.points.clusters import UNKNOWN, labelled
 from lidar_perception.training.augment import TrainingScene, raised
 from lidar_perception.training.cache import kept, path_in
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, LidarFrame
@@ -73,13 +73,15 @@ class CutScenes:
 def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutScene:
     """The clusters of a scene, as from SENSOR_HEIGHT; after them the points around each object that
     is wanted, and decoys: background cut out in the same way, as the network judges what is in a
-    detector's boxes, too."""
+    detector's boxes, too. A cluster of an object that is not wanted is UNKNOWN."""
     scene = raised(scene, scene.height - SENSOR_HEIGHT)
     frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
     ground = segment_ground(frame, config.ground)
     clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering),
                            min_points, ground)
     labels, owners = labelled(clusters, scene.boxes, scene.class_ids, config.classes)
+    hidden = (owners >= 0) & ~np.append(scene.wanted, False)[owners]
+    labels[hidden], owners[hidden] = UNKNOWN, -1
     boxes = np.zeros((len(clusters), 7))
     boxes[owners >= 0] = scene.boxes[owners[owners >= 0]]
     background = len(config.classes)

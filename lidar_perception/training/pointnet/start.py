@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +16,10 @@ from lidar_perception.detectors.pointnet.network import make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.training.augment import TrainingScene
-from lidar_perception.training.data import Batches, ReadScenes, Stream
-from lidar_perception.training.measuring import seconds_of_step, timed
+from lidar_perception.training.data import Batches, Item, ReadScenes, Stream
+from lidar_perception.training.measuring import first_read, seconds_of_step, timed, usable
 from lidar_perception.training.params import PointNetTraining
-from lidar_perception.training.pointnet.cut_scenes import CutScenes, cut
+from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes, cut
 from lidar_perception.training.pointnet.task import (
     ClusterPreparation,
     clusters_to_validate,
@@ -55,23 +56,28 @@ class PointNetStart:
         """Clusters are looked at wherever they are."""
         return {}
 
-    def measured(self, params: PointNetTraining, scenes: Sequence[TrainingScene], held_out: Any,
+    def measured(self, params: PointNetTraining, scenes: Iterable[Item], held_out: Sequence[Any],
                  device: torch.device) -> tuple[float, float, float, float]:
         """With clusters of these scenes."""
-        cut(scenes[0], self.config, params.data.min_points)  # compiles
-        cutting, parts = timed(
-            lambda: [cut(scene, self.config, params.data.min_points) for scene in scenes])
-        network = make_pointnet(self.config).to(device)
         prepare = ClusterPreparation(self.config, params.augment)
+        rng = partial(np.random.default_rng, 0)
+
+        def cut_out(scene: TrainingScene) -> CutScene:
+            return cut(scene, self.config, params.data.min_points)
+
+        chosen = usable(scenes, lambda scene: prepare(cut_out(scene), rng()))  # compiles, too
+        cutting, parts = timed(lambda: [cut_out(scene) for scene in chosen])
+        network = make_pointnet(self.config).to(device)
         step = seconds_of_step(network, make_loss(self.config, device), lambda: [
-            prepare(part, np.random.default_rng(i)) for i, part in enumerate(parts)],
-            params, device)
-        frame = clusters_to_validate(CutScenes(held_out, self.config, params.data.min_points), 0)
+            prepare(part, rng()) for part in parts], params, device)
+        frame = first_read(ReadScenes(tuple(
+            CutScenes(source, self.config, params.data.min_points) for source in held_out),
+            clusters_to_validate), lambda frame: len(frame.clusters) > 0)
         network.eval()
         with torch.no_grad():
             validated(network, [frame])
             validating = timed(lambda: validated(network, [frame] * MANY))[0] / MANY
-        return cutting / len(scenes), step, step, validating
+        return cutting / len(chosen), step, step, validating
 
     def cut(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any],
             cache: Path) -> tuple[list[Any], list[Sequence[int]]]:

@@ -35,7 +35,7 @@ from lidar_perception.training.augment import noisy, varied
 from lidar_perception.training.data import Batches, ReadScenes, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes
-from lidar_perception.training.record import begun_with, judged, keeper
+from lidar_perception.training.record import begun_with, judged, keeper, name_skipped
 from lidar_perception.training.run import Judged, Task
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
@@ -186,16 +186,18 @@ def clusters_to_validate(source: CutScenes, i: int) -> ValidationClusters:
 
 
 def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> Judged:
-    """Calibrate the network on the scenes and score it, see Task: score, the mean AP from above at
-    the relaxed overlaps (moderate, R40), and each class's; accuracy, the share of clusters of
-    SCORED_POINTS or more, and of the objects among them, whose class is right."""
+    """Calibrate the network on the scenes, one at least, and score it, see Task: score, the mean AP
+    from above at the relaxed overlaps (moderate, R40), and each class's; accuracy, the share of
+    clusters of SCORED_POINTS or more, and of the objects among them, whose class is right, NaN
+    without any. Scenes may have no cluster."""
     config = network.config
     labels = np.concatenate([s.labels for s in scenes])
     sizes = np.concatenate([s.clusters.sizes for s in scenes])
-    logits = torch.cat([
-        outputs_of(network, network_input(s.clusters, config.points)).logits.cpu()
-        for s in scenes if len(s.clusters)])
-    calibrate(network, logits, torch.from_numpy(labels))
+    if len(labels):
+        logits = torch.cat([
+            outputs_of(network, network_input(s.clusters, config.points)).logits.cpu()
+            for s in scenes if len(s.clusters)])
+        calibrate(network, logits, torch.from_numpy(labels))
     report, predictions = DetectionReport(), []
     for scene in track(scenes, "validating", len(scenes)):
         predictions.append(predict(network, scene.clusters))
@@ -222,9 +224,10 @@ def make_task(config: PointNetConfig, params: PointNetTraining, batches: Batches
 
     def validate(module: PointNet) -> Judged:
         if not scenes:
-            for item, in loaded(validation, ([n] for n in range(len(validation))), batches.jobs):
-                if item.sample is not None:
-                    scenes.append(item.sample)
+            items = [item for item, in loaded(validation, ([n] for n in range(len(validation))),
+                                              batches.jobs)]
+            scenes.extend(item.sample for item in items if item.sample is not None)
+            name_skipped([reason for item in items for reason in item.skipped], len(scenes), set())
         return validated(module, scenes)
 
     return Task(network, make_loss(config, device), batches, validate,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -18,15 +19,15 @@ from lidar_perception.detectors.pointpillars.detector import PointPillarsDetecto
 from lidar_perception.detectors.pointpillars.network import channels_last, make_network
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
-from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cut_objects import CutObjects, cut, joined
-from lidar_perception.training.data import Batches, ReadScenes, Stream
+from lidar_perception.training.data import Batches, Item, ReadScenes, Stream
 from lidar_perception.training.database import Database
-from lidar_perception.training.measuring import seconds_of_step, timed
+from lidar_perception.training.measuring import first_read, seconds_of_step, timed, usable
 from lidar_perception.training.params import PointPillarsTraining
 from lidar_perception.training.pointpillars.task import (
     VALIDATED,
     Preparation,
+    found_in,
     frame_to_validate,
     make_loss,
     make_task,
@@ -67,31 +68,34 @@ class PointPillarsStart:
         ahead, aside = PARTS[params.range]
         return {} if params.ahead or params.aside else {"ahead": ahead, "aside": aside}
 
-    def measured(self, params: PointPillarsTraining, scenes: Sequence[TrainingScene],
-                 held_out: Any, device: torch.device) -> tuple[float, float, float, float]:
+    def measured(self, params: PointPillarsTraining, scenes: Iterable[Item],
+                 held_out: Sequence[Any], device: torch.device
+                 ) -> tuple[float, float, float, float]:
         """With objects of the scenes themselves."""
         def objects() -> list[Database]:
-            return [cut(scene, self.config.classes, params.data.min_points) for scene in scenes]
+            return [cut(scene, self.config.classes, params.data.min_points) for scene in chosen]
 
         seen = narrowed(self.config, **(self.part(params) or {"ahead": params.ahead,
                                                               "aside": params.aside}))
-        cut(scenes[0], self.config.classes, params.data.min_points)  # compiles
+        bare = Preparation(seen, params.augment, params.data.min_points)
+        chosen = usable(scenes, lambda scene: bare(scene, np.random.default_rng(0)))
+        cut(chosen[0], self.config.classes, params.data.min_points)  # compiles
         cutting, parts = timed(objects)
         network = make_network(self.config).to(device)
         channels_last(network)
         with tempfile.TemporaryDirectory() as folder:
             joined(parts).save(Path(folder) / OBJECTS)
-            prepare = Preparation(seen, params.augment, params.data.min_points,
-                                  Path(folder) / OBJECTS if self.most_cuts(params) else None)
+            prepare = replace(bare, database=Path(folder) / OBJECTS if self.most_cuts(params)
+                              else None)
             step = seconds_of_step(network, make_loss(seen, device), lambda: [
-                prepare(scene, np.random.default_rng(i)) for i, scene in enumerate(scenes)],
-                params, device)
+                prepare(scene, np.random.default_rng(0)) for scene in chosen], params, device)
         detector = PointPillarsDetector(TorchNetwork(network, device), Header(self.config), device,
                                         VALIDATED)
-        frame = frame_to_validate(held_out, 0).load()
-        detector(frame)
+        frame = first_read(self._to_validate(held_out),
+                           lambda frame: found_in(frame, detector).problem is None)
         whole = step * np.prod(self.config.grid) / np.prod(seen.grid)
-        return cutting / len(scenes), step, float(whole), timed(lambda: detector(frame))[0]
+        validating = timed(lambda: found_in(frame, detector))[0]
+        return cutting / len(chosen), step, float(whole), validating
 
     def cut(self, params: PointPillarsTraining, sources: Sequence[Any], held_out: Sequence[Any],
             cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
@@ -123,8 +127,10 @@ class PointPillarsStart:
         prepare = Preparation(narrowed(self.config, params.ahead, params.aside), params.augment,
                               params.data.min_points,
                               out / OBJECTS if self.most_cuts(params) else None)
-        return (Stream(tuple(sources), prepare, params.seed),
-                ReadScenes(tuple(held_out), frame_to_validate))
+        return Stream(tuple(sources), prepare, params.seed), self._to_validate(held_out)
+
+    def _to_validate(self, held_out: Sequence[Any]) -> ReadScenes:
+        return ReadScenes(tuple(held_out), partial(frame_to_validate, self.config))
 
     def task(self, params: PointPillarsTraining, batches: Batches, held_out: ReadScenes, out: Path,
              device: torch.device, about: dict[str, Any], commit: str, init: Path | None) -> Task:

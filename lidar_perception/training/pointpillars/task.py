@@ -42,7 +42,7 @@ from lidar_perception.detectors.view import visible
 from lidar_perception.geometry import within
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import track
-from lidar_perception.scoring.detections import detected
+from lidar_perception.scoring.detections import Detected, detected
 from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import TrainingScene, augmented, faced, raised
@@ -50,9 +50,16 @@ from lidar_perception.training.data import Batches, ReadScenes, loaded
 from lidar_perception.training.database import Database, with_objects
 from lidar_perception.training.params import AugmentParams, PointPillarsTraining
 from lidar_perception.training.putting import inside
-from lidar_perception.training.record import begun_with, judged, keeper
+from lidar_perception.training.record import begun_with, judged, keeper, name_skipped
 from lidar_perception.training.run import Judged, Task
-from lidar_perception.types import CLASSES, SENSOR_HEIGHT, InputError, LidarFrame
+from lidar_perception.types import (
+    CLASSES,
+    SENSOR_HEIGHT,
+    Detections,
+    GroundTruth,
+    InputError,
+    LidarFrame,
+)
 
 # Boxes of low score cost precision only where recall has ended; fewer of them are quicker.
 VALIDATED = DetectorParams(pointpillars=PointPillarsParams(scores=ScoreParams.all_alike(0.1),
@@ -178,10 +185,17 @@ def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     return loss
 
 
-def frame_to_validate(source: Any, i: int) -> Frame:
-    """Frame i of a source, read. InputError naming the file that cannot be used."""
+def frame_to_validate(config: NetworkConfig, source: Any, i: int) -> Frame:
+    """Frame i of a source, read. Where no camera says what is labelled, with the labels that a
+    network of the config is taught: those whose centre it sees. InputError naming the file that
+    cannot be used."""
     frame = source.frame(i)
-    return Frame.of(frame.name, frame.load(), frame.truth(), frame.calibration(),
+    truth, calibration = frame.truth(), frame.calibration()
+    if calibration is None and truth is not None:
+        seen = np.flatnonzero(within(truth.boxes, config.low, config.high))
+        truth = GroundTruth.of(truth.boxes[seen], truth.class_ids[seen],
+                               [truth.extras[k] for k in seen], truth.notes)
+    return Frame.of(frame.name, frame.load(), truth, calibration,
                     sensor_height=frame.sensor_height)
 
 
@@ -192,11 +206,15 @@ def validation_report(detector: Detector, scenes: ReadScenes, jobs: int = 0) -> 
     for item, in track(items, "validating", len(scenes)):
         report.skipped += item.skipped
         if item.sample is not None:
-            frame = item.sample
-            height = frame.sensor_height
-            at = detector if height == SENSOR_HEIGHT else detector.mounted_at(height)
-            report.update(detected(at, frame, frame.truth(), frame.calibration()))
+            report.update(found_in(item.sample, detector))
     return report
+
+
+def found_in(frame: Frame, detector: Detector) -> Detected[Detections]:
+    """What a detector says of a frame that is read, as from the height of its sensor."""
+    height = frame.sensor_height
+    at = detector if height == SENSOR_HEIGHT else detector.mounted_at(height)
+    return detected(at, frame, frame.truth(), frame.calibration())
 
 
 def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batches,
@@ -208,12 +226,14 @@ def make_task(config: NetworkConfig, params: PointPillarsTraining, batches: Batc
     torch.manual_seed(params.seed)
     network = begun_with(make_network(config), init, NetworkConfig)
     network = channels_last(network.to(device))
+    named: set[str] = set()
 
     def validate(module: PointPillars) -> Judged:
         detector = PointPillarsDetector(TorchNetwork(module, device), Header(config), device,
                                         VALIDATED)
-        return judged(validation_report(detector, validation, batches.jobs), params.score,
-                      config.classes)
+        report = validation_report(detector, validation, batches.jobs)
+        name_skipped(report.skipped, len(report.frames), named)
+        return judged(report, params.score, config.classes)
 
     seen = narrowed(config, params.ahead, params.aside)
     return Task(network, make_loss(seen, device), batches, validate,
