@@ -68,6 +68,14 @@ def data() -> Path:
 
 
 @pytest.fixture
+def carrier_too(monkeypatch):
+    """Networks of random weights see things anywhere, also round the sensor: with this they say so.
+    What is left out there otherwise: test_contract.py."""
+    from lidar_perception.detectors import view
+    monkeypatch.setattr(view, "without_carrier", lambda detections, height: detections)
+
+
+@pytest.fixture
 def one_thread():
     """torch with one thread: small networks are slower with more, and wait for busy cores."""
     import torch

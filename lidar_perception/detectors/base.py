@@ -17,7 +17,6 @@ from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found, require_columns
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
-from lidar_perception.detectors.view import without_carrier
 from lidar_perception.param_fields import with_values
 from lidar_perception.robot.crop import cropped
 from lidar_perception.robot.placing import levelling, tilted
@@ -53,8 +52,7 @@ class NetworkDetector:
                                   level=levelling(tilted(pose.roll, pose.pitch)))
             ground, cluster_ids = (column if column is None else column.take(kept)
                                    for column in (ground, cluster_ids))
-        found = self.detect(frame, ground, cluster_ids)
-        return replace(found, detections=without_carrier(found.detections))
+        return self.detect(frame, ground, cluster_ids)
 
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:

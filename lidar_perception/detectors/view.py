@@ -6,13 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from lidar_perception.classes import CAR
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.ground.params import GroundParams, SensorPoseParams
 from lidar_perception.ground.segment import level, segment_ground
 from lidar_perception.types import SENSOR_HEIGHT, Detections, LidarFrame
 
-MAST = 1.0  # metres; a car that passes below a sensor on a gantry is farther away
+MAST = 1.0   # metres; a car that passes below a sensor on a gantry is farther away
+ASIDE = 1.0  # metres; half of a car's width and the gap to the next one are more
 
 
 def visible(frame: LidarFrame, config: NetworkConfig,
@@ -49,14 +51,24 @@ def in_sensor_frame(detections: Detections, pose: SensorPoseParams) -> Detection
     return replace(detections, boxes=boxes)
 
 
-def without_carrier(detections: Detections) -> Detections:
-    """Without the boxes, in the sensor's frame, that the sensor is in or, by less than MAST, above
-    or below: that is what carries it, such as the roof of its own car, and nothing to find."""
-    x, y, z, length, width, height, yaw = detections.boxes.astype(np.float64).T
-    along, aside = np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x
-    own = ((np.abs(along) <= length / 2) & (np.abs(aside) <= width / 2)
-           & (np.abs(z) <= height / 2 + MAST))
+def without_carrier(detections: Detections, height: float) -> Detections:
+    """Without what carries the sensor, which is nothing to find. Boxes as from a level sensor at
+    SENSOR_HEIGHT that is so high in truth: those that it is in or, by less than MAST, above or
+    below; and, as a roof is seen in parts, cars that it looks down on from so near and from less
+    than ASIDE away."""
+    x, y, z, length, width, high, yaw = detections.boxes.astype(np.float64).T
+    z = z - (height - SENSOR_HEIGHT)
+    along = np.abs(np.cos(yaw) * x + np.sin(yaw) * y) - length / 2
+    aside = np.abs(np.cos(yaw) * y - np.sin(yaw) * x) - width / 2
+    off = np.hypot(along.clip(0), aside.clip(0))
+    roof = (detections.class_ids == CAR) & (z + high / 2 < 0) & (off < ASIDE)
+    own = ((off == 0) | roof) & (np.abs(z) <= high / 2 + MAST)
     return detections[~own] if own.any() else detections
+
+
+def as_found(detections: Detections, pose: SensorPoseParams) -> Detections:
+    """What a detector finds, as from a level sensor at SENSOR_HEIGHT, as its user gets it."""
+    return in_sensor_frame(without_carrier(detections, pose.height), pose)
 
 
 def turned_about(frame: LidarFrame) -> LidarFrame:

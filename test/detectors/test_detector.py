@@ -30,7 +30,7 @@ from lidar_perception.ground.segment import level, segment_ground
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
 
-pytestmark = pytest.mark.usefixtures("one_thread")
+pytestmark = pytest.mark.usefixtures("one_thread", "carrier_too")
 each_version = pytest.mark.parametrize("version", VERSIONS)
 
 

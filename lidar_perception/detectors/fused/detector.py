@@ -26,7 +26,7 @@ from lidar_perception.detectors.pointnet.params import PointNetDetectorParams, P
 from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, load_detector
 from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
 from lidar_perception.detectors.view import (
-    in_sensor_frame,
+    as_found,
     levelled_ground,
     made_up_frame,
     visible,
@@ -80,7 +80,7 @@ class FusedDetector(NetworkDetector):
         look = self.look(frame, ground, cluster_ids, self.settings.scores)
         begin = perf_counter()
         detections, best = self.weighed(look)
-        detections = in_sensor_frame(detections, self.params.ground.sensor_pose)
+        detections = as_found(detections, self.params.ground.sensor_pose)
         ms = {**look.ms, STEPS[-1]: (perf_counter() - begin) * 1e3}
         return Found(detections, ms, look.problem or self.fallback or self.classifier.fallback,
                      best)

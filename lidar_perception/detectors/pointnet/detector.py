@@ -21,7 +21,7 @@ from lidar_perception.detectors.pointnet.params import STEPS, PointNetDetectorPa
 from lidar_perception.detectors.pointnet.predict import Predictions, found, predict
 from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.detectors.view import (
-    in_sensor_frame,
+    as_found,
     levelled,
     levelled_ground,
     made_up_frame,
@@ -69,7 +69,7 @@ class PointNetDetector(NetworkDetector):
         predicted = self.guarded(lambda: predict(self.network, clusters))
         t5 = self.now()
         detections, best, broken = self._detections(predicted)
-        detections = in_sensor_frame(detections, pose)
+        detections = as_found(detections, pose)
         t6 = perf_counter()
         ms = {step: seconds * 1e3 for step, seconds in zip(
             STEPS, (t1 - t0 + t4 - t3, t2 - t1, t3 - t2, t5 - t4, t6 - t5))}

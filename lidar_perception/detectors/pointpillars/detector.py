@@ -33,7 +33,7 @@ from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
 from lidar_perception.detectors.pointpillars.pillars import Pillars, make_pillars
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.detectors.view import (
-    in_sensor_frame,
+    as_found,
     made_up_frame,
     turned_about,
     turned_boxes,
@@ -115,7 +115,7 @@ class PointPillarsDetector(NetworkDetector):
                          problem or self.fallback)
         with torch.inference_mode():
             t3, t4, detections, best, broken = self.guarded(lambda: self._predict(looks))
-            detections = in_sensor_frame(detections, pose)
+            detections = as_found(detections, pose)
         t5 = perf_counter()
         ms = dict(zip(STEPS, (
             (t1 - t0 + t3 - t2) * 1e3, (t2 - t1) * 1e3, (t4 - t3) * 1e3, (t5 - t4) * 1e3)))

@@ -25,7 +25,7 @@ from lidar_perception.detectors.pointnet.clusters import (
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import PointNet, make_pointnet
 from lidar_perception.detectors.pointnet.predict import found, outputs_of, predict
-from lidar_perception.detectors.view import in_sensor_frame, without_carrier
+from lidar_perception.detectors.view import as_found
 from lidar_perception.geometry import points_in_box
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.runs.terminal import track
@@ -202,7 +202,7 @@ def validated(network: PointNet, scenes: Sequence[ValidationClusters]) -> Judged
     for scene in track(scenes, "validating", len(scenes)):
         predictions.append(predict(network, scene.clusters))
         boxes = found(predictions[-1], config, [MIN_SCORE] * len(config.classes))
-        boxes = without_carrier(in_sensor_frame(boxes, SensorPoseParams(height=scene.height)))
+        boxes = as_found(boxes, SensorPoseParams(height=scene.height))
         report.update(Detected(scene.name, scene.truth, boxes, scene.calibration))
     metrics, calibration = judged(report, "bev", config.classes)
     known = (labels >= 0) & (sizes >= SCORED_POINTS)
