@@ -78,7 +78,7 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
                     _save(path, run)
                 if run.done or run.progress.late:
                     break
-                row = run.step(next(batches))
+                row = run.step(_next(batches, path, run))
                 step = run.progress.step
                 pace.step()
                 if until < math.inf:
@@ -186,10 +186,25 @@ def _validate(run: Run, log: Log | None) -> None:
 
 def _save(path: Path, run: Run) -> None:
     if rank() == 0:
-        content = io.BytesIO()
-        torch.save(run.state(), content)
-        write_bytes(path, content.getbuffer())
+        _write(path, run)
     wait()
+
+
+def _write(path: Path, run: Run) -> None:
+    content = io.BytesIO()
+    torch.save(run.state(), content)
+    write_bytes(path, content.getbuffer())
+
+
+def _next(batches: Iterator[Any], path: Path, run: Run) -> Any:
+    """The next batch. Where there is none, as a process that prepares them was killed, what was
+    learned so far is saved, by rank 0: the others may not have come so far."""
+    try:
+        return next(batches)
+    except InputError:
+        if rank() == 0 and run.progress.step:
+            _write(path, run)
+        raise
 
 
 def _read(path: Path, asked: dict[str, Any]) -> dict[str, Any]:
