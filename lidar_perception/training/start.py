@@ -24,8 +24,9 @@ from lidar_perception.runs.terminal import duration, errors
 from lidar_perception.simulation.sensor import Sensor, sensor_named
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.data import Batches, Item, ReadScenes, Stream
-from lidar_perception.training.loop import STATE, may_begin, train
+from lidar_perception.training.loop import train
 from lidar_perception.training.measuring import MOST
+from lidar_perception.training.out import RUN, SCANS, STATE, alone, may_hold
 from lidar_perception.training.plan import (
     STARTING,
     Data,
@@ -44,7 +45,6 @@ from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
 from lidar_perception.training.sources import about_data, training_scenes
 from lidar_perception.types import InputError
 
-RUN = "run.json"  # what was asked for, measured and planned at the first start
 BUDGET = 2.0      # hours
 PACKAGE = Path("package")  # in --init: the weights that come with the package
 ROOM = 0.5        # GB that stay free on the disk
@@ -102,8 +102,7 @@ def check(asked: Asked, init: Path | None) -> None:
         raise InputError(f"--budget {asked.budget:g} must be a number of hours above 0")
     if init is not None:
         network_of(init)
-    for name in RUN, STATE:
-        may_begin(asked.out, asked.resume, name)
+    may_hold(asked.out, asked.resume)
 
 
 def scenes_of(asked: Asked, params: Any, sensor: Sensor, own: tuple = ()) -> tuple[tuple, tuple]:
@@ -128,10 +127,11 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
     init = network.own_weights(params) if asked.init == PACKAGE else asked.init
     check(asked, init)
     if not params.data.cache:
-        params = with_values(params, {"data.cache": str(asked.out / "scans")})
+        params = with_values(params, {"data.cache": str(asked.out / SCANS)})
     decided = bool(params.steps or params.epochs)
     hours = asked.budget if decided else asked.budget or BUDGET
-    with joined(chosen_device(asked.device)) as device:
+    with joined(chosen_device(asked.device)) as device, alone(asked.out):
+        wait()  # until all have looked at what rank 0 is going to write
         sensor = sensor_named(params.sensor, params.mount_height)
         if rank() == 0:
             scenes_of(asked, _few(params), sensor, own)  # what cannot be is said before any work

@@ -14,10 +14,12 @@ from samples import object_folder, scene, walker_label, write
 
 from lidar_perception.cli.main import cli
 from lidar_perception.detectors.checkpoint import read_header
+from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.runs import terminal
+from lidar_perception.runs.resuming import locked
 from lidar_perception.training import start as start_module
-from lidar_perception.training.loop import STATE
-from lidar_perception.training.start import RUN
+from lidar_perception.training.out import RUN, STATE, alone
 from lidar_perception.types import SENSOR_HEIGHT, InputError
 
 pytestmark = pytest.mark.usefixtures("streets")
@@ -84,6 +86,28 @@ def refuse(tmp_path: Path, *more: str) -> str:
     line = str(result.exception)
     assert "\n" not in line
     return line
+
+
+def test_a_run_is_written_by_one_process_at_a_time(tmp_path):
+    with locked(tmp_path / "run"):
+        assert "another process" in refuse(tmp_path, "--resume", "--sensor", SENSOR)
+
+
+@pytest.mark.parametrize("more", [[], ["--resume"]])
+def test_weights_of_no_run_in_out_are_not_replaced(tmp_path, more):
+    weights = tmp_path / "run/best.safetensors"
+    weights.parent.mkdir()
+    shutil.copy(weights_file(PointNetParams()), weights)
+    assert "would be replaced" in refuse(tmp_path, "--init", str(weights), *more)
+
+
+def test_only_what_a_killed_run_was_writing_is_removed(tmp_path):
+    ours = [".last.pt.7-1.tmp", "scans/.ab.npz.7-1.tmp", "scans/clusters/.ab.npz.7-2.tmp"]
+    theirs = ["notes/.draft.tmp", ".draft.tmp", ".draft.7-1.tmp", "notes/.last.pt.7-1.tmp"]
+    for name in (*ours, *theirs):
+        write(tmp_path / name, "half")
+    with alone(tmp_path):
+        assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.tmp")} == {*theirs}
 
 
 @pytest.mark.parametrize("hours", ["0", "-1", "nan", "inf"])

@@ -15,7 +15,8 @@ from training_toy import PARAMS, Toy, equals, rows, same, weights
 
 from lidar_perception.runs import files
 from lidar_perception.training import loop
-from lidar_perception.training.loop import STATE, train
+from lidar_perception.training.loop import train
+from lidar_perception.training.out import STATE
 from lidar_perception.training.params import LoopParams, PointPillarsTraining
 from lidar_perception.training.ranks import joined, rank, world
 from lidar_perception.training.run import Run, Task
