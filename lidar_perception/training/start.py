@@ -8,6 +8,7 @@ import shutil
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
+from hashlib import sha256
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple, Protocol
@@ -19,7 +20,7 @@ from lidar_perception.detectors.devices import chosen_device
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.files import make_folder, read_text, write_text
 from lidar_perception.runs.machine import cores
-from lidar_perception.runs.resuming import differences
+from lidar_perception.runs.resuming import differences, digest
 from lidar_perception.runs.terminal import duration, errors
 from lidar_perception.simulation.sensor import Sensor, sensor_named
 from lidar_perception.training.asked import Asked
@@ -133,12 +134,12 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
     with joined(chosen_device(asked.device)) as device, alone(asked.out):
         wait()  # until all have looked at what rank 0 is going to write
         sensor = sensor_named(params.sensor, params.mount_height)
+        settings = _settings(asked, params, sensor, own, init)
         if rank() == 0:
-            scenes_of(asked, _few(params), sensor, own)  # what cannot be is said before any work
             make_folder(Path(params.data.cache))
-            _settle(network, asked, params, sensor, device, own)
+            _settle(network, asked, params, settings, sensor, device, own)
         wait()
-        given, params = params, _settled(network, asked, params, sensor, own)
+        given, params = params, _settled(network, asked, params, settings)
         sources, held_out = scenes_of(asked, params, sensor, own)
         cut = network.cut(params, sources, held_out, Path(params.data.cache))
         if rank() == 0:
@@ -151,7 +152,7 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
                 errors.print("stopped; what is prepared is kept, --resume goes on")
                 raise
         wait()
-        params = _settled(network, asked, given, sensor, own)
+        params = _settled(network, asked, given, settings)
         stream, to_validate = network.scenes(params, sources, held_out, cut, asked.out)
         batches = Batches(stream, params.batch, asked.jobs, rank(), world())
         about = {**about_data(asked.data, asked.val, stream, held_out, asked.init),
@@ -164,7 +165,7 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
         return Ended(progress, params.steps, batches) if rank() == 0 else None
 
 
-def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
+def _settle(network: Network, asked: Asked, params: Any, settings: dict[str, Any], sensor: Sensor,
             device: torch.device, own: tuple) -> None:
     """Plan, say so and write it, unless that was done by an earlier start."""
     path = asked.out / RUN
@@ -183,7 +184,7 @@ def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
         chosen = replace(chosen, validate_steps=params.validation_steps(epoch))
     _require_room(Path(params.data.cache), params.data.cache_gb, chosen, speed)
     _say(network, params, sensor, chosen, speed, data, _recorded_height(sources))
-    write_text(path, json.dumps({"asked": _decisive(asked, params, sensor, own),
+    write_text(path, json.dumps({"asked": settings,
                                  "plan": asdict(chosen),
                                  "speed": asdict(speed), "data": asdict(data)}, indent=1))
 
@@ -233,16 +234,15 @@ def _planned(asked: Asked) -> tuple[Plan, Speed, Data]:
     return Plan(**known["plan"]), Speed(**known["speed"]), Data(**known["data"])
 
 
-def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor, own: tuple) -> Any:
-    """params with the plan of the first start. InputError where something else was asked for."""
+def _settled(network: Network, asked: Asked, params: Any, settings: dict[str, Any]) -> Any:
+    """params with the plan of the first start. InputError where that had other settings."""
     path = asked.out / RUN
     try:
         known = json.loads(read_text(path, 10**6))
         before, chosen = known["asked"], Plan(**known["plan"])
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"cannot read {path}: {error}; give another --out") from None
-    now = json.loads(json.dumps(_decisive(asked, params, sensor, own)))
-    if different := differences(before, now):
+    if different := differences(before, json.loads(json.dumps(settings))):
         raise InputError(f"{asked.out} holds a run with {'; '.join(different[:3])}; resume it with "
                          "the same settings, or give another --out")
     values = {"steps": chosen.steps, "validate_steps": chosen.validate_steps,
@@ -251,11 +251,21 @@ def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor, own: t
     return with_values(params, values)
 
 
-def _decisive(asked: Asked, params: Any, sensor: Sensor, own: tuple) -> dict[str, Any]:
+def _settings(asked: Asked, params: Any, sensor: Sensor, own: tuple,
+              init: Path | None) -> dict[str, Any]:
+    """What a resumed run must have in common, of files what is in them: a split may name other
+    frames now, and weights be others. InputError for scenes that are not there."""
+    sources, held_out = scenes_of(asked, _few(params), sensor, own)
     others = {"own": [[source.key(0), len(source)] for source in own]} if own else {}
+    weights = sha256(init.read_bytes()).hexdigest()[:12] if init else ""
     return {**others, **params.decisive(), "data": list(asked.data), "val": list(asked.val),
             "split": str(asked.split or ""), "val_split": str(asked.val_split or ""),
-            "init": str(asked.init or ""), "sensor": asdict(sensor)}
+            "frame_names": _names(sources), "val_frame_names": _names(held_out),
+            "init": str(asked.init or ""), "init_weights": weights, "sensor": asdict(sensor)}
+
+
+def _names(sources: Sequence[Any]) -> list[str]:
+    return [digest(source.names) for source in sources if isinstance(source, RecordedScenes)]
 
 
 def _simulated(sources: Sequence[Any]) -> bool:

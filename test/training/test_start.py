@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import shutil
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,7 +14,7 @@ from click.testing import CliRunner
 from samples import object_folder, scene, walker_label, write
 
 from lidar_perception.cli.main import cli
-from lidar_perception.detectors.checkpoint import read_header
+from lidar_perception.detectors.checkpoint import read_header, save_header
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.runs import terminal
@@ -188,6 +189,29 @@ def test_what_cannot_be_used_is_passed_over_wherever_it_lies(kind, tmp_path, one
     refused = small_run(kind, tmp_path / "other", root, "--val-split", str(held)).exception
     assert isinstance(refused, InputError) and "\n" not in str(refused)
     assert "no frame to validate on can be used" in str(refused) and "000002.bin" in str(refused)
+
+
+def test_a_run_is_not_resumed_with_other_frames_or_weights_under_the_same_names(tmp_path,
+                                                                                monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(start_module, "_prepare", stop)
+    split = write(tmp_path / "split.txt", "000000\n000001\n000002\n")
+    init = Path(shutil.copy(weights_file(PointNetParams()), tmp_path / "init.safetensors"))
+    asked = ["train", "pointnet", "--data", str(object_folder(tmp_path / "kitti", count=5)),
+             "--split", str(split), "--init", str(init), "--steps", "2", "--jobs", "0",
+             "--out", str(tmp_path / "run"), "--resume"]
+
+    def said() -> str:
+        return str(CliRunner().invoke(cli, asked).exception)
+
+    assert "holds a run" not in said() + said()
+    write(split, "000000\n000001\n000003\n")
+    assert "frame_names" in said() and "init" not in said()
+    write(split, "000000\n000001\n000002\n")
+    save_header(init, replace(read_header(init), commit="another"))
+    assert "init_weights" in said() and "frame" not in said()
 
 
 def test_where_there_is_no_terminal_progress_comes_line_by_line(monkeypatch, capsys):
