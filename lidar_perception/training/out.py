@@ -8,6 +8,7 @@ from pathlib import Path
 
 from lidar_perception.runs.files import make_folder, remove_temporaries
 from lidar_perception.runs.resuming import locked
+from lidar_perception.runs.stopping import terminated_as_interrupted
 from lidar_perception.training.ranks import rank
 from lidar_perception.types import InputError
 
@@ -42,12 +43,12 @@ def may_hold(out: Path, resume: bool) -> None:
 
 @contextmanager
 def alone(out: Path) -> Iterator[None]:
-    """Keeps a second run from writing into out, and removes what a killed one was writing; in the
-    first of the processes that train together."""
+    """Keeps a second run from writing into out, removes what a killed one was writing, and ends at
+    SIGTERM as at ctrl-C; in the first of the processes that train together."""
     if rank() > 0:
         yield
         return
-    with locked(out):
+    with locked(out), terminated_as_interrupted():
         remove_temporaries(out, *WRITTEN)
         for folder in (out / SCANS, *(out / SCANS).glob("*/")):
             remove_temporaries(folder, "*.npz")

@@ -6,7 +6,8 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
@@ -137,20 +138,18 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
         settings = _settings(asked, params, sensor, own, init)
         if rank() == 0:
             make_folder(Path(params.data.cache))
-            _settle(network, asked, params, settings, sensor, device, own)
+            with _said_when_stopped():
+                _settle(network, asked, params, settings, sensor, device, own)
         wait()
         given, params = params, _settled(network, asked, params, settings)
         sources, held_out = scenes_of(asked, params, sensor, own)
         cut = network.cut(params, sources, held_out, Path(params.data.cache))
         if rank() == 0:
-            try:
+            with _said_when_stopped():
                 _prepare(network, asked, sources, held_out, cut)
                 network.gather(params, cut, asked.out)
                 if not decided:
                     _refit(network, asked, given, sensor, device, own, begun, hours or BUDGET)
-            except KeyboardInterrupt:
-                errors.print("stopped; what is prepared is kept, --resume goes on")
-                raise
         wait()
         params = _settled(network, asked, given, settings)
         stream, to_validate = network.scenes(params, sources, held_out, cut, asked.out)
@@ -163,6 +162,15 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
         progress = train(task, params, asked.out, device, asked.resume, until,
                          validation(*_planned(asked)))
         return Ended(progress, params.steps, batches) if rank() == 0 else None
+
+
+@contextmanager
+def _said_when_stopped() -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        errors.print("stopped; what is prepared is kept, --resume goes on")
+        raise
 
 
 def _settle(network: Network, asked: Asked, params: Any, settings: dict[str, Any], sensor: Sensor,

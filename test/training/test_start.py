@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import shutil
+import signal
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -189,6 +190,19 @@ def test_what_cannot_be_used_is_passed_over_wherever_it_lies(kind, tmp_path, one
     refused = small_run(kind, tmp_path / "other", root, "--val-split", str(held)).exception
     assert isinstance(refused, InputError) and "\n" not in str(refused)
     assert "no frame to validate on can be used" in str(refused) and "000002.bin" in str(refused)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("part", ["_settle", "_prepare"])
+def test_a_preparation_that_is_stopped_says_how_it_goes_on(tmp_path, monkeypatch, part, number):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # as in test_training.py
+    monkeypatch.setattr(start_module, part, lambda *_: signal.raise_signal(number))
+    try:
+        result = CliRunner().invoke(cli, words(tmp_path / "run"))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert result.exit_code == 130 and "--resume goes on" in result.stderr
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
 def test_a_run_is_not_resumed_with_other_frames_or_weights_under_the_same_names(tmp_path,
