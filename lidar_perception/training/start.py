@@ -245,12 +245,14 @@ def _planned(asked: Asked) -> tuple[Plan, Speed, Data]:
 def _settled(network: Network, asked: Asked, params: Any, settings: dict[str, Any]) -> Any:
     """params with the plan of the first start. InputError where that had other settings."""
     path = asked.out / RUN
+    text = read_text(path, 10**6)
     try:
-        known = json.loads(read_text(path, 10**6))
-        before, chosen = known["asked"], Plan(**known["plan"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"cannot read {path}: {error}; give another --out") from None
-    if different := differences(before, json.loads(json.dumps(settings))):
+        known = json.loads(text)
+        chosen = Plan(**known["plan"])
+        different = differences(known["asked"], json.loads(json.dumps(settings)))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"cannot read {path}: {error!r}; give another --out") from None
+    if different:
         raise InputError(f"{asked.out} holds a run with {'; '.join(different[:3])}; resume it with "
                          "the same settings, or give another --out")
     values = {"steps": chosen.steps, "validate_steps": chosen.validate_steps,
