@@ -52,14 +52,16 @@ PACKAGE = Path("package")  # in --init: the weights that come with the package
 ROOM = 0.5        # GB that stay free on the disk
 
 
-class Network(Protocol):
-    """What a network brings to a start; params are those of its training, planned or not."""
+class Planning(Protocol):
+    """What a plan is made by; params are those of a training, planned or not."""
 
-    name: str
-    cutting: str  # what is cut from the scenes before the training
+    @property
+    def name(self) -> str:
+        """What is trained, for people."""
 
-    def own_weights(self, params: Any) -> Path:
-        """Those that come with the package. InputError if there are none."""
+    @property
+    def cutting(self) -> str:
+        """What is cut from the scenes before the training, for people."""
 
     def most_cuts(self, params: Any) -> int:
         """Scenes that are cut at most."""
@@ -73,6 +75,13 @@ class Network(Protocol):
         """Seconds to cut a scene, of a step on the part and on the whole of the range, without the
         preparation's share of other cores, and to validate a frame; with the first scenes that can
         be used. InputError where none can."""
+
+
+class Network(Planning, Protocol):
+    """What a network brings to a start."""
+
+    def own_weights(self, params: Any) -> Path:
+        """Those that come with the package. InputError if there are none."""
 
     def cut(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any],
             cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
@@ -96,6 +105,11 @@ class Ended(NamedTuple):
     progress: Progress
     steps: int
     batches: Batches
+
+
+def begins_with(network: Network, asked: Asked, params: Any) -> Path | None:
+    """The file of --init, if there is one."""
+    return network.own_weights(params) if asked.init == PACKAGE else asked.init
 
 
 def check(asked: Asked, init: Path | None) -> None:
@@ -126,7 +140,7 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
     InputError for what cannot be used, before much is computed.
     """
     begun = time.monotonic()
-    init = network.own_weights(params) if asked.init == PACKAGE else asked.init
+    init = begins_with(network, asked, params)
     check(asked, init)
     if not params.data.cache:
         params = with_values(params, {"data.cache": str(asked.out / SCANS)})
@@ -135,13 +149,8 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
     with joined(chosen_device(asked.device)) as device, alone(asked.out):
         wait()  # until all have looked at what rank 0 is going to write
         sensor = sensor_named(params.sensor, params.mount_height)
-        settings = _settings(asked, params, sensor, own, init)
-        if rank() == 0:
-            make_folder(Path(params.data.cache))
-            with _said_when_stopped():
-                _settle(network, asked, params, settings, sensor, device, own)
-        wait()
-        given, params = params, _settled(network, asked, params, settings)
+        settings = settings_of(asked, params, sensor, init, own)
+        given, params = params, planned(network, asked, params, settings, sensor, device, own)
         sources, held_out = scenes_of(asked, params, sensor, own)
         cut = network.cut(params, sources, held_out, Path(params.data.cache))
         if rank() == 0:
@@ -173,7 +182,19 @@ def _said_when_stopped() -> Iterator[None]:
         raise
 
 
-def _settle(network: Network, asked: Asked, params: Any, settings: dict[str, Any], sensor: Sensor,
+def planned(network: Planning, asked: Asked, params: Any, settings: dict[str, Any],
+            sensor: Sensor, device: torch.device, own: tuple = ()) -> Any:
+    """params with the plan of the first start, which may be this one. InputError where that had
+    other settings."""
+    if rank() == 0:
+        make_folder(Path(params.data.cache))
+        with _said_when_stopped():
+            _settle(network, asked, params, settings, sensor, device, own)
+    wait()
+    return _settled(network, asked, params, settings)
+
+
+def _settle(network: Planning, asked: Asked, params: Any, settings: dict[str, Any], sensor: Sensor,
             device: torch.device, own: tuple) -> None:
     """Plan, say so and write it, unless that was done by an earlier start."""
     path = asked.out / RUN
@@ -197,7 +218,7 @@ def _settle(network: Network, asked: Asked, params: Any, settings: dict[str, Any
                                  "speed": asdict(speed), "data": asdict(data)}, indent=1))
 
 
-def _measured(network: Network, asked: Asked, params: Any, sensor: Sensor,
+def _measured(network: Planning, asked: Asked, params: Any, sensor: Sensor,
               device: torch.device, own: tuple) -> tuple[Speed, Sequence[Any], Sequence[Any]]:
     """What the machine does now, and the sources of scenes to train with and to validate on."""
     few = _few(params)
@@ -242,8 +263,7 @@ def _planned(asked: Asked) -> tuple[Plan, Speed, Data]:
     return Plan(**known["plan"]), Speed(**known["speed"]), Data(**known["data"])
 
 
-def _settled(network: Network, asked: Asked, params: Any, settings: dict[str, Any]) -> Any:
-    """params with the plan of the first start. InputError where that had other settings."""
+def _settled(network: Planning, asked: Asked, params: Any, settings: dict[str, Any]) -> Any:
     path = asked.out / RUN
     text = read_text(path, 10**6)
     try:
@@ -261,17 +281,19 @@ def _settled(network: Network, asked: Asked, params: Any, settings: dict[str, An
     return with_values(params, values)
 
 
-def _settings(asked: Asked, params: Any, sensor: Sensor, own: tuple,
-              init: Path | None) -> dict[str, Any]:
+def settings_of(asked: Asked, params: Any, sensor: Sensor, init: Path | None, own: tuple = (),
+                compared: int = 0) -> dict[str, Any]:
     """What a resumed run must have in common, of files what is in them: a split may name other
-    frames now, and weights be others. InputError for scenes that are not there."""
+    frames now, and weights be others. compared: networks that share the plan. InputError for scenes
+    that are not there."""
     sources, held_out = scenes_of(asked, _few(params), sensor, own)
     others = {"own": [[source.key(0), len(source)] for source in own]} if own else {}
     weights = sha256(init.read_bytes()).hexdigest()[:12] if init else ""
     return {**others, **params.decisive(), "data": list(asked.data), "val": list(asked.val),
             "split": str(asked.split or ""), "val_split": str(asked.val_split or ""),
             "frame_names": _names(sources), "val_frame_names": _names(held_out),
-            "init": str(asked.init or ""), "init_weights": weights, "sensor": asdict(sensor)}
+            "init": str(asked.init or ""), "init_weights": weights, "sensor": asdict(sensor),
+            "compared": compared}
 
 
 def _names(sources: Sequence[Any]) -> list[str]:
@@ -327,7 +349,7 @@ def _require_room(cache: Path, most_gb: float, chosen: Plan, speed: Speed) -> No
                          "give fewer --data-scans, a smaller --data-cache-gb or another --out")
 
 
-def _say(network: Network, params: Any, sensor: Sensor, chosen: Plan, speed: Speed,
+def _say(network: Planning, params: Any, sensor: Sensor, chosen: Plan, speed: Speed,
          data: Data, height: float | None) -> None:
     at = "" if height is None else f" at {height:g} m"
     scenes = " and ".join(text for count, text in (
