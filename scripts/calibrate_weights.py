@@ -1,5 +1,6 @@
 """Make the scores of weights probabilities: fit the lines in their headers to scans of streets that
-they were not trained on. Weights, and the order of the scores, stay as they are.
+they were not trained on. Weights, and the order of the scores, stay as they are, and so does a file
+some of whose classes have too few objects in the scans for a line.
 
     lidar-perception simulate --format kitti --frames 360 --people 2.5 --seed 700000 --out scans
     python scripts/calibrate_weights.py scans v4.safetensors pointnet.safetensors
@@ -15,10 +16,8 @@ import click
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.base import NetworkDetector
-from lidar_perception.detectors.checkpoint import POINTNET, network_of, save_checkpoint
+from lidar_perception.detectors.checkpoint import read_header, save_header
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.detectors.pointnet.network import load_pointnet
-from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.runs.terminal import console
 from lidar_perception.scoring.detections import by_detector
 from lidar_perception.scoring.kitti.protocol import Comparison
@@ -47,9 +46,12 @@ def main(scans: Path, weights: tuple[Path, ...], jobs: int, limit: int | None) -
         report = DetectionReport()
         fill(report, open_recording(scans),
              by_detector(partial(uncalibrated, path)), jobs=jobs, limit=limit)
-        found = lines(Comparison.of(report.frames))
-        header, network = (load_pointnet if network_of(path) == POINTNET else load_network)(path)
-        save_checkpoint(path, network, replace(header, calibration=found), half=True)
+        found = lines(Comparison.of(report.frames)) if report.frames else {}
+        header = read_header(path)
+        if lost := sorted({*header.calibration} - {*found}):
+            raise click.ClickException(f"{path} stays as it is: {scans} has too few "
+                                       f"{', '.join(lost)} that are found, or wrongly found")
+        save_header(path, replace(header, calibration=found))
         console.print(f"{path.name}: {found}")
 
 

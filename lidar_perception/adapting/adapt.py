@@ -174,12 +174,17 @@ class Adapting:
         asked = json.loads(json.dumps(self.asked()))
         make_folder(self.out)
         if path.is_file():
-            before = json.loads(read_text(path, 10**8))
-            if different := differences(before["asked"], asked):
+            text = read_text(path, 10**8)
+            try:
+                known = json.loads(text)
+                most, different = int(known["frames"]), differences(known["asked"], asked)
+            except (ValueError, KeyError, TypeError, AttributeError) as error:
+                raise InputError(f"cannot read {path}: {error!r}; give another --out, or start "
+                                 "again with --force") from None
+            if different:
                 raise InputError(f"{self.out} holds a run with {'; '.join(different[:3])}; resume "
                                  "it with the same settings, or give another --out")
             errors.print(f"resuming {self.out}")
-            most = before["frames"]
         else:
             most = self.params.frames or self._affordable()
         self.pieces = pieces_of(self.frames, most)

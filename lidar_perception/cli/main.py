@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+from typing import Any
 
 import click
 
@@ -45,6 +46,13 @@ class LazyGroup(click.Group):
         module, _, function = COMMANDS[name][0].rpartition(".")
         return getattr(importlib.import_module(f"lidar_perception.cli.{module}"), function)
 
+    def invoke(self, ctx: click.Context) -> Any:
+        """A command that is stopped ends with 130, as everywhere; click would say 1, an error."""
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            ctx.exit(130)
+
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         with formatter.section("Commands"):
             formatter.write_dl([(name, text) for name, (_, text) in COMMANDS.items()])
@@ -65,7 +73,8 @@ def cli() -> None:
       lidar-perception reproduce stm-cpa --data /data/kitti/object --out report
       lidar-perception run perception --ros-args -r '~/input/points:=/points'
 
-    Exit codes: 0 done, 1 ran but something failed, 2 the command or its input cannot be used.
+    Exit codes: 0 done, 1 ran but something failed, 2 the command or its input cannot be used, 130
+    stopped by ctrl-C.
     """
 
 
@@ -78,8 +87,6 @@ def main() -> None:
     except InputError as error:
         click.echo(f"Error: {error}", err=True)
         sys.exit(2)
-    except KeyboardInterrupt:
-        sys.exit(130)
 
 
 if __name__ == "__main__":

@@ -15,11 +15,11 @@ import click
 from lidar_perception import __version__
 from lidar_perception.cli.data import a_path, device_option
 from lidar_perception.cli.options import parameter_options
-from lidar_perception.param_fields import with_values
 from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.params import PointNetTraining, PointPillarsTraining
+from lidar_perception.types import InputError
 
 PAPER_ABLATION = (75.52, 80.15, 81.33, 83.44, 85.10, 86.33, 86.89, 88.96)  # paper C, Table 5
 
@@ -114,23 +114,22 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
           --val-split val.txt --epochs 20 --out pointnet --resume
       lidar-perception train pointnet --ablation --data sim --steps 1000 --out ablation
     """
-    from lidar_perception.detectors.devices import chosen_device
     from lidar_perception.detectors.pointnet.config import ABLATIONS, pointnet_config
+    from lidar_perception.training.ablation import compared
     from lidar_perception.training.pointnet.start import PointNetStart
-    from lidar_perception.training.ranks import joined, rank
+    from lidar_perception.training.ranks import rank
     if not ablation:
         run(PointNetStart(pointnet_config(params.network)), asked, params)
         return
-    if not params.data.cache:
-        params = with_values(params, {"data.cache": str(asked.out / "scans")})
-    if asked.budget:
-        asked = replace(asked, budget=asked.budget / len(ABLATIONS))
-    with joined(chosen_device(asked.device)):
-        for name in ABLATIONS:
+    if params.network != PointNetTraining().network or (
+            click.get_current_context().params.get("network")):
+        raise InputError("--ablation trains a network for each row; leave out --network")
+    networks = {name: PointNetStart(pointnet_config(name)) for name in ABLATIONS}
+    with compared([*networks.values()], asked, params) as (share, planned):
+        for name, network in networks.items():
             if rank() == 0:
                 console.print(f"{name}:", style="bold")
-            run(PointNetStart(pointnet_config(name)), replace(asked, out=asked.out / name),
-                replace(params, network=name))
+            run(network, replace(share, out=asked.out / name), replace(planned, network=name))
         if rank() == 0:
             print_ablation(asked.out)
 

@@ -150,6 +150,11 @@ def save_checkpoint(path: str | Path, network: torch.nn.Module, header: Header,
     write_bytes(path, save(tensors, {KEY: header.text()}))
 
 
+def save_header(path: Path, header: Header) -> None:
+    """Write another header into a checkpoint, whose tensors stay as they are stored."""
+    write_bytes(path, save(_read(path)[1], {KEY: header.text()}))
+
+
 def _stored(value: torch.Tensor, half: bool) -> torch.Tensor:
     value = value.detach().cpu()
     if value.is_floating_point():

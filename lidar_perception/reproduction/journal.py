@@ -17,8 +17,9 @@ from lidar_perception.runs.resuming import differences, locked
 from lidar_perception.types import InputError
 
 NAME = "frames.jsonl"
-# All that a run and its report write.
-OURS = (NAME, "report.html", "report.md", "report.json", "tables/*.csv", "figures/*.png")
+REPORT = "report.json"  # written before the tables and figures that it names
+PAGES = ("report.html", "report.md", REPORT)
+FOLDERS = {"tables": ".csv", "figures": ".png"}
 SYNC_S = 1.0  # at most this much is lost when the machine stops
 
 
@@ -64,8 +65,8 @@ def journal(folder: Path, plan: dict[str, Any], *, force: bool = False) -> Itera
         path = folder / NAME
         lines = {} if force else _begun(folder, plan)
         if force and path.exists():  # or what has our names there is somebody else's
-            for old in (old for pattern in OURS for old in folder.glob(pattern)):
-                old.unlink()
+            for old in written(folder):
+                old.unlink(missing_ok=True)
         for old in folder.glob(f".{NAME}.*.tmp"):  # of a process that was killed while it wrote
             old.unlink()
         write_text(path, "\n".join([_head(plan), *lines.values()]))
@@ -77,6 +78,17 @@ def journal(folder: Path, plan: dict[str, Any], *, force: bool = False) -> Itera
             for last in (opened.sync, stream.close):
                 with suppress(OSError):  # of a disk that is full; add() has said so
                     last()
+
+
+def written(folder: Path) -> list[Path]:
+    """All that a run and its report have written: tables and figures are those that the report
+    names, so that others in their folders stay."""
+    names = []
+    with suppress(OSError, ValueError, KeyError, TypeError):  # no report, or not ours
+        report = json.loads((folder / REPORT).read_text())
+        names = [f"{kind}/{Path(each['name']).name}{ending}" for section in report["sections"]
+                 for kind, ending in FOLDERS.items() for each in section[kind]]
+    return [folder / name for name in (*names, *PAGES, NAME)]
 
 
 def _head(plan: dict[str, Any]) -> str:

@@ -18,6 +18,7 @@ from rich.text import Text
 
 from lidar_perception.reproduction.experiment import Cell, Experiment, Figure, Section, Table
 from lidar_perception.reproduction.figures import draw
+from lidar_perception.reproduction.journal import REPORT
 from lidar_perception.runs.files import write_bytes, write_text
 from lidar_perception.runs.page import data_url, render
 
@@ -36,14 +37,14 @@ def write_report(out: Path, experiment: Experiment, records: list[dict[str, Any]
     counts["skipped"] = len(records) - counts["measured"]
     about = {"frames": f"{counts['measured']} measured, {counts['skipped']} skipped", **about}
     groups = skipped_groups(records)
+    content = {"experiment": experiment.name, "title": experiment.title,
+               "question": experiment.question, "about": about, **counts,
+               "skipped_frames": [r for r in records if "skipped" in r], "sections": sections}
+    write_text(out / REPORT, json.dumps(plain(content), indent=1, allow_nan=False))
     for table in (table for section in sections for table in section.tables):
         write_text(out / "tables" / f"{table.name}.csv", to_csv(table))
     for figure in (figure for section in sections for figure in section.figures):
         write_bytes(out / "figures" / f"{figure.name}.png", draw(figure, "png"))
-    content = {"experiment": experiment.name, "title": experiment.title,
-               "question": experiment.question, "about": about, **counts,
-               "skipped_frames": [r for r in records if "skipped" in r], "sections": sections}
-    write_text(out / "report.json", json.dumps(plain(content), indent=1, allow_nan=False))
     write_text(out / "report.md", to_markdown(experiment, sections, about, groups))
     write_text(out / "report.html", to_html(experiment, sections, about, groups))
     return out / "report.html"

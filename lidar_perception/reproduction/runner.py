@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import hashlib
 import json
 from collections.abc import Callable
 from contextlib import closing
@@ -17,6 +16,7 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.reproduction.experiment import Experiment
 from lidar_perception.reproduction.journal import journal
+from lidar_perception.runs.resuming import digest
 from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.run import Skipped, results
 
@@ -36,7 +36,7 @@ def run(experiment: Experiment, recording: Recording, out: Path, *, jobs: int = 
     names = [frame.name for frame in recording]
     plan = {"experiment": experiment.name, "version": __version__,
             "data": str(recording.path.resolve()), "frames": len(names),
-            "frame_names": hashlib.sha256("\n".join(names).encode()).hexdigest()[:12],
+            "frame_names": digest(names),
             "settings": experiment.settings}
     with journal(out, plan, force=force) as done:
         missing = [i for i, name in enumerate(names[:limit]) if name not in done.lines]

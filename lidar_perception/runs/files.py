@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import itertools
 import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -135,7 +136,10 @@ def make_folder(path: Path) -> None:
         raise InputError(f"cannot write into the folder {path}: {error.strerror}") from None
 
 
-def remove_temporaries(folder: Path) -> None:
-    """Remove what a killed process left in folder of the files it was writing."""
-    for path in folder.rglob(".*.tmp"):
-        path.unlink(missing_ok=True)
+def remove_temporaries(folder: Path, *names: str) -> None:
+    """Remove what a killed process left in folder, not in those below, of files that it was writing
+    under names that fit one of these patterns. Nobody may be writing there."""
+    for path in folder.glob(".*.tmp"):
+        written = re.fullmatch(r"\.(.+)\.\d+-\d+\.tmp", path.name)  # see _beside
+        if written and any(fnmatch(written[1], name) for name in names) and path.is_file():
+            path.unlink(missing_ok=True)

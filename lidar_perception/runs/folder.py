@@ -9,6 +9,7 @@ how the folder was made, and .parts goes.
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -39,7 +40,8 @@ def unfinished(folder: Path, asked: dict, made: Iterable[str], *, resume: bool =
     with locked(folder):
         _begin(folder, asked, made, resume, force)
         if not is_finished(folder):
-            remove_temporaries(folder)
+            for path, _, _ in os.walk(folder):
+                remove_temporaries(Path(path), "*")
             yield [i for i in range(asked["frames"]) if not _part(folder, i).exists()]
             _join(folder, asked["frames"])
             (folder / MARK).replace(folder / RECORD)

@@ -4,13 +4,20 @@ a kill, out of memory."""
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
-from collections.abc import Callable, Generator, Iterator, Sequence
+import sys
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
+from itertools import islice
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
-from multiprocessing.context import ForkServerProcess
+from multiprocessing.context import ForkServerContext, ForkServerProcess
+from multiprocessing.reduction import ForkingPickler
+from queue import SimpleQueue
+from threading import Thread
 from typing import Any, cast
 
 from lidar_perception.types import InputError
@@ -31,26 +38,66 @@ def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, job
         if items:
             yield from map(start(), items)
         return
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([*_modules(start)])
+    context = _context(start)
     running: dict[Connection, ForkServerProcess] = {}
     try:
         for j in range(jobs):
             receiver, sender = context.Pipe(duplex=False)
-            process = context.Process(target=_work, daemon=True,
-                                      args=(start, items[j::jobs], sender))
-            with _without_interrupts():
-                process.start()
-            sender.close()
-            running[receiver] = process
+            running[receiver] = _begun(context, _work, start, items[j::jobs], sender)
         while running:
             for receiver in cast(list[Connection], wait(list(running))):
                 yield from _receive(receiver, running, what)
     finally:
-        for process in running.values():
-            process.terminate()
-        for process in running.values():
-            process.join()
+        _end(running)
+
+
+def in_order(start: Callable[[], Callable[[Any], Any]], items: Iterable, jobs: int, ahead: int,
+             what: str) -> Generator:
+    """start()(item) of all items, of which there may be no end, in their order. As in_processes,
+    with a new process for a single job too; each makes up to `ahead` items that nobody has asked
+    for yet."""
+    waiting = iter(items)
+    first = list(islice(waiting, jobs * ahead))
+    context = _context(start)
+    crew: dict[Connection, ForkServerProcess] = {}
+    try:
+        for _ in first[:jobs]:
+            here, there = context.Pipe()
+            crew[here] = _begun(context, _serve, start, there)
+        pipes = list(crew)
+        asked = deque(_asked(pipes[k % len(pipes)], item) for k, item in enumerate(first))
+        while asked:
+            pipe = asked.popleft()
+            for result in _receive(pipe, crew, what):
+                asked += [_asked(pipe, item) for item in islice(waiting, 1)]
+                yield result
+    finally:
+        _end(crew)
+
+
+def _context(start: Callable) -> ForkServerContext:
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload([*_modules(start)])
+    return context
+
+
+def _begun(context: ForkServerContext, work: Callable, *args: Any) -> ForkServerProcess:
+    """A process that does work(*args). The last argument is its end of a pipe, which nobody else
+    keeps: so the pipe ends with the process, even one that is killed in the middle of a result."""
+    process = context.Process(target=work, args=args, daemon=True)
+    with _without_interrupts():
+        process.start()
+    args[-1].close()
+    return process
+
+
+def _end(running: dict[Connection, ForkServerProcess]) -> None:
+    for process in running.values():
+        process.terminate()
+    for pipe in running:
+        pipe.close()
+    for process in running.values():
+        process.join()
 
 
 def _modules(work: Any) -> set[str]:
@@ -62,9 +109,10 @@ def _modules(work: Any) -> set[str]:
 
 def _receive(receiver: Connection, running: dict[Connection, ForkServerProcess],
              what: str) -> Iterator:
+    """The next result. None where a process has ended as it should; InputError where it did not."""
     try:
         result, error = receiver.recv()
-    except EOFError:
+    except (EOFError, OSError):  # the latter in the middle of a result
         process = running.pop(receiver)
         process.join()
         if process.exitcode:
@@ -88,6 +136,40 @@ def _work(start: Callable, items: Sequence, sender: Connection) -> None:
                 sender.send((work(item), None))
         except InputError as error:
             sender.send((None, str(error)))
+
+
+def _asked(pipe: Connection, item: Any) -> Connection:
+    """The pipe, through which the item was sent."""
+    with suppress(OSError):  # of a process that has ended, which is said when it is heard
+        pipe.send(item)
+    return pipe
+
+
+def _serve(start: Callable, pipe: Connection) -> None:
+    # Its end is always asked for, so it gives back what it holds of the system.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    results: SimpleQueue[Any] = SimpleQueue()
+    Thread(target=_send, args=(results, pipe), daemon=True).start()
+    work = start()
+    while True:
+        try:
+            item = pipe.recv()
+        except (EOFError, OSError):
+            return  # nobody is there any more
+        try:
+            results.put(ForkingPickler.dumps((work(item), None)))
+        except InputError as error:
+            results.put(ForkingPickler.dumps((None, str(error))))
+
+
+def _send(results: SimpleQueue[Any], pipe: Connection) -> None:
+    """Beside the work: the reader may be at something else for long."""
+    while True:
+        try:
+            pipe.send_bytes(results.get())
+        except OSError:
+            os.kill(os.getpid(), signal.SIGTERM)  # nobody is there any more
+            return
 
 
 @contextmanager

@@ -4,8 +4,9 @@ settings."""
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -53,3 +54,8 @@ def differences(before: dict[str, Any], asked: dict[str, Any]) -> list[str]:
         elif old != value:
             found.append(f"{key} {old!r}, not {value!r}")
     return found
+
+
+def digest(names: Iterable[str]) -> str:
+    """Short for the names of many frames: that of others, or in another order, is another."""
+    return hashlib.sha256("\n".join(names).encode()).hexdigest()[:12]

@@ -5,20 +5,17 @@ So neither the number of worker processes nor a stop in between changes what is 
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 import torch
-from torch.utils.data import DataLoader
 
+from lidar_perception.runs.processes import in_order
 from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
@@ -124,28 +121,20 @@ class Batches:
 
 
 def loaded(items: Any, numbers: Iterator[list[int]], jobs: int) -> Iterator[list[Any]]:
-    """[items[n] for n in each], in order, made by so many processes; 0 makes them here."""
+    """[items[n] for n in each], in order, made by so many processes; 0 makes them here. InputError
+    where one of these ends, as when memory is short."""
     if jobs == 0:
-        yield from ([items[n] for n in each] for each in numbers)
-        return
-    # Processes that were forked from one with threads may hang, so a fresh one is forked.
-    context = torch.multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__])
-    yield from DataLoader(items, batch_sampler=numbers, num_workers=jobs, collate_fn=list,
-                          multiprocessing_context=context, worker_init_fn=_begin_work,
-                          prefetch_factor=AHEAD)
+        yield from map(_maker(items), numbers)
+    else:
+        yield from in_order(partial(_alone, items), numbers, jobs, AHEAD, "prepared scenes")
 
 
-def _begin_work(_: int) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the main process ends its workers
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def _maker(items: Any) -> Callable[[list[int]], list[Any]]:
+    return lambda each: [items[n] for n in each]
+
+
+def _alone(items: Any) -> Callable[[list[int]], list[Any]]:
+    """As _maker, in a process beside others."""
+    torch.set_num_threads(1)
     numba.set_num_threads(1)
-
-
-def _end_with_parent() -> None:
-    """torch's workers ask whether their parent lives, which here is the fork server, and would
-    outlive a main process that was killed."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None  # this is a worker
-    parent.join()
-    os._exit(1)
+    return _maker(items)

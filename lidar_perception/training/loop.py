@@ -20,16 +20,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidar_perception.runs.files import make_folder, remove_temporaries, write_bytes
+from lidar_perception.runs.files import write_bytes
 from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import errors, paused, progress
 from lidar_perception.training.log import Log
+from lidar_perception.training.out import may_begin
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.ranks import any_of, least, rank, wait
 from lidar_perception.training.run import Progress, Run, Task
 from lidar_perception.types import InputError
 
-STATE = "last.pt"
 SETTLING = 60.0  # seconds until the pace of a run is known
 MEMORY = 600.0   # seconds after which a step counts 1 / e in it
 SPARE = 2        # steps whose time is kept, as no two steps take as long
@@ -53,9 +53,6 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
     if path.exists():
         run.load(_read(path, run.asked()))
     wait()  # until all have read what rank 0 is going to replace
-    if rank() == 0:
-        out.mkdir(parents=True, exist_ok=True)
-        remove_temporaries(out)
     log = Log(out, run.progress.step) if rank() == 0 else None
     begun = time.monotonic() - run.progress.seconds
     pace, said = Pace(until, run.every, validation), False
@@ -78,7 +75,7 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
                     _save(path, run)
                 if run.done or run.progress.late:
                     break
-                row = run.step(next(batches))
+                row = run.step(_next(batches, path, run))
                 step = run.progress.step
                 pace.step()
                 if until < math.inf:
@@ -148,18 +145,6 @@ class Pace:
         self.before += self.validation
 
 
-def may_begin(out: Path, resume: bool, name: str = STATE) -> Path:
-    """The path in out of a file that a run writes. InputError if there is one, and resume is not
-    asked for; or if out cannot be a folder that is written into, before hours are spent on the
-    data."""
-    path = out / name
-    make_folder(out)
-    if path.exists() and not resume:
-        raise InputError(f"{out} holds a training run already; give --resume to resume it, or "
-                         "another --out")
-    return path
-
-
 def _validate(run: Run, log: Log | None) -> None:
     """Score the averaged weights, in rank 0, which has the log, and keep them if they are the best
     so far, or the last."""
@@ -186,10 +171,25 @@ def _validate(run: Run, log: Log | None) -> None:
 
 def _save(path: Path, run: Run) -> None:
     if rank() == 0:
-        content = io.BytesIO()
-        torch.save(run.state(), content)
-        write_bytes(path, content.getbuffer())
+        _write(path, run)
     wait()
+
+
+def _write(path: Path, run: Run) -> None:
+    content = io.BytesIO()
+    torch.save(run.state(), content)
+    write_bytes(path, content.getbuffer())
+
+
+def _next(batches: Iterator[Any], path: Path, run: Run) -> Any:
+    """The next batch. Where there is none, as a process that prepares them was killed, what was
+    learned so far is saved, by rank 0: the others may not have come so far."""
+    try:
+        return next(batches)
+    except InputError:
+        if rank() == 0 and run.progress.step:
+            _write(path, run)
+        raise
 
 
 def _read(path: Path, asked: dict[str, Any]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ def one_cycle(step: float, steps: int, lr: float, warm_share: float) -> tuple[fl
     first, last = lr / START, lr / START / END
     top = warm_share * steps - 1
     if step <= top:
-        share = _ramp(step / top)
+        share = _ramp(step / top) if top > 0 else 1.0  # of one step up: it is the highest
         return first + (lr - first) * share, SLOW + (FAST - SLOW) * share
     share = _ramp((step - top) / (steps - 1 - top)) if steps - 1 > top else 1.0
     return lr + (last - lr) * share, FAST + (SLOW - FAST) * share

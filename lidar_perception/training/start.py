@@ -6,8 +6,10 @@ import json
 import math
 import shutil
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, replace
+from hashlib import sha256
 from pathlib import Path
 from statistics import median
 from typing import Any, NamedTuple, Protocol
@@ -19,13 +21,14 @@ from lidar_perception.detectors.devices import chosen_device
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.files import make_folder, read_text, write_text
 from lidar_perception.runs.machine import cores
-from lidar_perception.runs.resuming import differences
+from lidar_perception.runs.resuming import differences, digest
 from lidar_perception.runs.terminal import duration, errors
 from lidar_perception.simulation.sensor import Sensor, sensor_named
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.data import Batches, Item, ReadScenes, Stream
-from lidar_perception.training.loop import STATE, may_begin, train
+from lidar_perception.training.loop import train
 from lidar_perception.training.measuring import MOST
+from lidar_perception.training.out import RUN, SCANS, STATE, alone, may_hold
 from lidar_perception.training.plan import (
     STARTING,
     Data,
@@ -44,20 +47,21 @@ from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
 from lidar_perception.training.sources import about_data, training_scenes
 from lidar_perception.types import InputError
 
-RUN = "run.json"  # what was asked for, measured and planned at the first start
 BUDGET = 2.0      # hours
 PACKAGE = Path("package")  # in --init: the weights that come with the package
 ROOM = 0.5        # GB that stay free on the disk
 
 
-class Network(Protocol):
-    """What a network brings to a start; params are those of its training, planned or not."""
+class Planning(Protocol):
+    """What a plan is made by; params are those of a training, planned or not."""
 
-    name: str
-    cutting: str  # what is cut from the scenes before the training
+    @property
+    def name(self) -> str:
+        """What is trained, for people."""
 
-    def own_weights(self, params: Any) -> Path:
-        """Those that come with the package. InputError if there are none."""
+    @property
+    def cutting(self) -> str:
+        """What is cut from the scenes before the training, for people."""
 
     def most_cuts(self, params: Any) -> int:
         """Scenes that are cut at most."""
@@ -71,6 +75,13 @@ class Network(Protocol):
         """Seconds to cut a scene, of a step on the part and on the whole of the range, without the
         preparation's share of other cores, and to validate a frame; with the first scenes that can
         be used. InputError where none can."""
+
+
+class Network(Planning, Protocol):
+    """What a network brings to a start."""
+
+    def own_weights(self, params: Any) -> Path:
+        """Those that come with the package. InputError if there are none."""
 
     def cut(self, params: Any, sources: Sequence[Any], held_out: Sequence[Any],
             cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
@@ -96,14 +107,18 @@ class Ended(NamedTuple):
     batches: Batches
 
 
+def begins_with(network: Network, asked: Asked, params: Any) -> Path | None:
+    """The file of --init, if there is one."""
+    return network.own_weights(params) if asked.init == PACKAGE else asked.init
+
+
 def check(asked: Asked, init: Path | None) -> None:
     """InputError, before anything is made, for what cannot be."""
     if asked.budget is not None and not 0 < asked.budget < math.inf:
         raise InputError(f"--budget {asked.budget:g} must be a number of hours above 0")
     if init is not None:
         network_of(init)
-    for name in RUN, STATE:
-        may_begin(asked.out, asked.resume, name)
+    may_hold(asked.out, asked.resume)
 
 
 def scenes_of(asked: Asked, params: Any, sensor: Sensor, own: tuple = ()) -> tuple[tuple, tuple]:
@@ -125,33 +140,27 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
     InputError for what cannot be used, before much is computed.
     """
     begun = time.monotonic()
-    init = network.own_weights(params) if asked.init == PACKAGE else asked.init
+    init = begins_with(network, asked, params)
     check(asked, init)
     if not params.data.cache:
-        params = with_values(params, {"data.cache": str(asked.out / "scans")})
+        params = with_values(params, {"data.cache": str(asked.out / SCANS)})
     decided = bool(params.steps or params.epochs)
     hours = asked.budget if decided else asked.budget or BUDGET
-    with joined(chosen_device(asked.device)) as device:
+    with joined(chosen_device(asked.device)) as device, alone(asked.out):
+        wait()  # until all have looked at what rank 0 is going to write
         sensor = sensor_named(params.sensor, params.mount_height)
-        if rank() == 0:
-            scenes_of(asked, _few(params), sensor, own)  # what cannot be is said before any work
-            make_folder(Path(params.data.cache))
-            _settle(network, asked, params, sensor, device, own)
-        wait()
-        given, params = params, _settled(network, asked, params, sensor, own)
+        settings = settings_of(asked, params, sensor, init, own)
+        given, params = params, planned(network, asked, params, settings, sensor, device, own)
         sources, held_out = scenes_of(asked, params, sensor, own)
         cut = network.cut(params, sources, held_out, Path(params.data.cache))
         if rank() == 0:
-            try:
+            with _said_when_stopped():
                 _prepare(network, asked, sources, held_out, cut)
                 network.gather(params, cut, asked.out)
                 if not decided:
                     _refit(network, asked, given, sensor, device, own, begun, hours or BUDGET)
-            except KeyboardInterrupt:
-                errors.print("stopped; what is prepared is kept, --resume goes on")
-                raise
         wait()
-        params = _settled(network, asked, given, sensor, own)
+        params = _settled(network, asked, given, settings)
         stream, to_validate = network.scenes(params, sources, held_out, cut, asked.out)
         batches = Batches(stream, params.batch, asked.jobs, rank(), world())
         about = {**about_data(asked.data, asked.val, stream, held_out, asked.init),
@@ -164,7 +173,28 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
         return Ended(progress, params.steps, batches) if rank() == 0 else None
 
 
-def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
+@contextmanager
+def _said_when_stopped() -> Iterator[None]:
+    try:
+        yield
+    except KeyboardInterrupt:
+        errors.print("stopped; what is prepared is kept, --resume goes on")
+        raise
+
+
+def planned(network: Planning, asked: Asked, params: Any, settings: dict[str, Any],
+            sensor: Sensor, device: torch.device, own: tuple = ()) -> Any:
+    """params with the plan of the first start, which may be this one. InputError where that had
+    other settings."""
+    if rank() == 0:
+        make_folder(Path(params.data.cache))
+        with _said_when_stopped():
+            _settle(network, asked, params, settings, sensor, device, own)
+    wait()
+    return _settled(network, asked, params, settings)
+
+
+def _settle(network: Planning, asked: Asked, params: Any, settings: dict[str, Any], sensor: Sensor,
             device: torch.device, own: tuple) -> None:
     """Plan, say so and write it, unless that was done by an earlier start."""
     path = asked.out / RUN
@@ -183,12 +213,12 @@ def _settle(network: Network, asked: Asked, params: Any, sensor: Sensor,
         chosen = replace(chosen, validate_steps=params.validation_steps(epoch))
     _require_room(Path(params.data.cache), params.data.cache_gb, chosen, speed)
     _say(network, params, sensor, chosen, speed, data, _recorded_height(sources))
-    write_text(path, json.dumps({"asked": _decisive(asked, params, sensor, own),
+    write_text(path, json.dumps({"asked": settings,
                                  "plan": asdict(chosen),
                                  "speed": asdict(speed), "data": asdict(data)}, indent=1))
 
 
-def _measured(network: Network, asked: Asked, params: Any, sensor: Sensor,
+def _measured(network: Planning, asked: Asked, params: Any, sensor: Sensor,
               device: torch.device, own: tuple) -> tuple[Speed, Sequence[Any], Sequence[Any]]:
     """What the machine does now, and the sources of scenes to train with and to validate on."""
     few = _few(params)
@@ -233,16 +263,16 @@ def _planned(asked: Asked) -> tuple[Plan, Speed, Data]:
     return Plan(**known["plan"]), Speed(**known["speed"]), Data(**known["data"])
 
 
-def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor, own: tuple) -> Any:
-    """params with the plan of the first start. InputError where something else was asked for."""
+def _settled(network: Planning, asked: Asked, params: Any, settings: dict[str, Any]) -> Any:
     path = asked.out / RUN
+    text = read_text(path, 10**6)
     try:
-        known = json.loads(read_text(path, 10**6))
-        before, chosen = known["asked"], Plan(**known["plan"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"cannot read {path}: {error}; give another --out") from None
-    now = json.loads(json.dumps(_decisive(asked, params, sensor, own)))
-    if different := differences(before, now):
+        known = json.loads(text)
+        chosen = Plan(**known["plan"])
+        different = differences(known["asked"], json.loads(json.dumps(settings)))
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"cannot read {path}: {error!r}; give another --out") from None
+    if different:
         raise InputError(f"{asked.out} holds a run with {'; '.join(different[:3])}; resume it with "
                          "the same settings, or give another --out")
     values = {"steps": chosen.steps, "validate_steps": chosen.validate_steps,
@@ -251,11 +281,23 @@ def _settled(network: Network, asked: Asked, params: Any, sensor: Sensor, own: t
     return with_values(params, values)
 
 
-def _decisive(asked: Asked, params: Any, sensor: Sensor, own: tuple) -> dict[str, Any]:
+def settings_of(asked: Asked, params: Any, sensor: Sensor, init: Path | None, own: tuple = (),
+                compared: int = 0) -> dict[str, Any]:
+    """What a resumed run must have in common, of files what is in them: a split may name other
+    frames now, and weights be others. compared: networks that share the plan. InputError for scenes
+    that are not there."""
+    sources, held_out = scenes_of(asked, _few(params), sensor, own)
     others = {"own": [[source.key(0), len(source)] for source in own]} if own else {}
+    weights = sha256(init.read_bytes()).hexdigest()[:12] if init else ""
     return {**others, **params.decisive(), "data": list(asked.data), "val": list(asked.val),
             "split": str(asked.split or ""), "val_split": str(asked.val_split or ""),
-            "init": str(asked.init or ""), "sensor": asdict(sensor)}
+            "frame_names": _names(sources), "val_frame_names": _names(held_out),
+            "init": str(asked.init or ""), "init_weights": weights, "sensor": asdict(sensor),
+            "compared": compared}
+
+
+def _names(sources: Sequence[Any]) -> list[str]:
+    return [digest(source.names) for source in sources if isinstance(source, RecordedScenes)]
 
 
 def _simulated(sources: Sequence[Any]) -> bool:
@@ -307,7 +349,7 @@ def _require_room(cache: Path, most_gb: float, chosen: Plan, speed: Speed) -> No
                          "give fewer --data-scans, a smaller --data-cache-gb or another --out")
 
 
-def _say(network: Network, params: Any, sensor: Sensor, chosen: Plan, speed: Speed,
+def _say(network: Planning, params: Any, sensor: Sensor, chosen: Plan, speed: Speed,
          data: Data, height: float | None) -> None:
     at = "" if height is None else f" at {height:g} m"
     scenes = " and ".join(text for count, text in (

@@ -136,6 +136,14 @@ def test_other_settings_are_no_resumed_run(bag, weights, whole):
         adapted(bag, weights, whole, replace(SMALL, seed=1))
 
 
+@pytest.mark.parametrize("record", ["{}", "[]", '{"asked": {"da', '{"asked": [], "frames": 9}',
+                                    '{"asked": {}, "frames": null}'])
+def test_a_record_that_is_none_is_no_resumed_run(bag, weights, tmp_path, record):
+    write(tmp_path / RECORD, record)
+    with pytest.raises(InputError, match=rf"cannot read \S*{RECORD}.*--force"):
+        adapted(bag, weights, tmp_path)
+
+
 def test_a_round_that_makes_simulated_validation_worse_is_not_taken(bag, weights, whole, tmp_path,
                                                                     monkeypatch):
     out = tmp_path / "out"

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+import runpy
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from detection_samples import eager, frame, lively, random_detector, same, tiny
 from hypothesis import given
 from hypothesis import strategies as st
 from pointnet_samples import random_detector as random_pointnet
+from samples import object_folder
 
 from lidar_perception.detectors.calibration import calibrated, raw_score
-from lidar_perception.detectors.checkpoint import Header, read_header, save_checkpoint
+from lidar_perception.detectors.checkpoint import (
+    Header,
+    read,
+    read_header,
+    save_checkpoint,
+    save_header,
+)
 from lidar_perception.types import CLASSES, Detections, InputError
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -64,3 +74,22 @@ def test_lines_that_do_not_rise_are_refused(tmp_path, broken):
     save_checkpoint(tmp_path / "w.safetensors", lively(tiny("v0")), header)
     with pytest.raises(InputError, match="calibration that cannot be used"):
         read_header(tmp_path / "w.safetensors")
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_another_calibration_leaves_the_weights_as_they_are_stored(tmp_path, half):
+    path, config = tmp_path / "some.safetensors", tiny()
+    save_checkpoint(path, lively(config), Header(config, calibration=LINES), half)
+    _, before = read(path, type(config))
+    save_header(path, Header(config, calibration={"Car": (1.0, 0.0)}))
+    header, after = read(path, type(config))
+    assert header.calibration == {"Car": (1.0, 0.0)} and after.keys() == before.keys()
+    assert all(value.dtype == before[name].dtype and value.equal(before[name])
+               for name, value in after.items())
+    # scans without enough objects give no line, and the file keeps those that it has
+    whole = path.read_bytes()
+    script = runpy.run_path(str(Path(__file__).parents[2] / "scripts/calibrate_weights.py"))
+    result = CliRunner().invoke(script["main"], [str(object_folder(tmp_path / "scans", count=1)),
+                                                 str(path)])
+    assert result.exit_code == 1 and "too few Car" in result.output
+    assert path.read_bytes() == whole

@@ -192,12 +192,13 @@ def test_a_folder_of_something_else_is_left_alone(few, tmp_path):
         runner.run(SMALL, open_recording(few), out / "letter.txt/deeper")
 
 
-def test_force_begins_anew_and_leaves_no_old_table(whole, few, tmp_path):
-    shutil.copytree(whole, tmp_path / "out")
-    records = runner.run(SMALL, open_recording(few), tmp_path / "out", force=True)
-    assert [p.name for p in (tmp_path / "out").rglob("*.*")] == [journal.NAME]
-    write_report(tmp_path / "out", SMALL, records, points_table(records), {})
-    assert [p.stem for p in (tmp_path / "out").rglob("*.csv")] == ["points"]
+def test_force_begins_anew_and_leaves_no_old_table_and_what_is_not_the_runs(whole, few, tmp_path):
+    out = shutil.copytree(whole, tmp_path / "out")
+    theirs = {write(out / "tables/mine.csv", "me"), write(out / "figures/photo.png", "me")}
+    records = runner.run(SMALL, open_recording(few), out, force=True)
+    assert {*out.rglob("*.*")} == {out / journal.NAME, *theirs}
+    write_report(out, SMALL, records, points_table(records), {})
+    assert {p.stem for p in out.rglob("*.csv")} == {"points", "mine"}
 
 
 @pytest.mark.parametrize("first", ["", "{", "[]", '{"frame": "000000"}'])
@@ -341,8 +342,7 @@ def test_every_table_and_figure_is_in_every_format(whole):
         picture = whole / f"figures/{figure['name']}.png"
         assert picture.read_bytes().startswith(b"\x89PNG")
         assert figure["title"] in page and f"(figures/{figure['name']}.png)" in markdown
-    assert {p.relative_to(whole).as_posix() for p in whole.rglob("*") if p.is_file()} == {
-        p.relative_to(whole).as_posix() for pattern in journal.OURS for p in whole.glob(pattern)}
+    assert {p for p in whole.rglob("*") if p.is_file()} == {*journal.written(whole)}
 
 
 def test_the_page_needs_no_other_file_and_says_what_was_run(whole, crowds):

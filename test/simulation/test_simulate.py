@@ -109,7 +109,7 @@ def test_after_a_kill_nothing_runs_on_and_it_goes_on_where_it_was(start, tmp_pat
     wait_for_the_end(process.pid)
     assert "Traceback" not in process.communicate()[1]
     assert (out / "INCOMPLETE").exists()
-    (out / "training/velodyne/0000/.000299.bin.1.tmp").write_bytes(b"half")  # as a kill leaves it
+    (out / "training/velodyne/0000/.000299.bin.1-0.tmp").write_bytes(b"half")  # as a kill leaves it
     assert 3 <= len(list(out.glob(".parts/*.json"))) < frames
     again = run(out, "kitti-tracking", frames, 1, "--streets-of", 30, "--resume")
     assert again.exit_code == 0

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import multiprocessing
 import shutil
+import signal
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,11 +15,13 @@ from click.testing import CliRunner
 from samples import object_folder, scene, walker_label, write
 
 from lidar_perception.cli.main import cli
-from lidar_perception.detectors.checkpoint import read_header
+from lidar_perception.detectors.checkpoint import read_header, save_header
+from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.runs import terminal
+from lidar_perception.runs.resuming import locked
 from lidar_perception.training import start as start_module
-from lidar_perception.training.loop import STATE
-from lidar_perception.training.start import RUN
+from lidar_perception.training.out import RUN, STATE, alone
 from lidar_perception.types import SENSOR_HEIGHT, InputError
 
 pytestmark = pytest.mark.usefixtures("streets")
@@ -84,6 +88,28 @@ def refuse(tmp_path: Path, *more: str) -> str:
     line = str(result.exception)
     assert "\n" not in line
     return line
+
+
+def test_a_run_is_written_by_one_process_at_a_time(tmp_path):
+    with locked(tmp_path / "run"):
+        assert "another process" in refuse(tmp_path, "--resume", "--sensor", SENSOR)
+
+
+@pytest.mark.parametrize("more", [[], ["--resume"]])
+def test_weights_of_no_run_in_out_are_not_replaced(tmp_path, more):
+    weights = tmp_path / "run/best.safetensors"
+    weights.parent.mkdir()
+    shutil.copy(weights_file(PointNetParams()), weights)
+    assert "would be replaced" in refuse(tmp_path, "--init", str(weights), *more)
+
+
+def test_only_what_a_killed_run_was_writing_is_removed(tmp_path):
+    ours = [".last.pt.7-1.tmp", "scans/.ab.npz.7-1.tmp", "scans/clusters/.ab.npz.7-2.tmp"]
+    theirs = ["notes/.draft.tmp", ".draft.tmp", ".draft.7-1.tmp", "notes/.last.pt.7-1.tmp"]
+    for name in (*ours, *theirs):
+        write(tmp_path / name, "half")
+    with alone(tmp_path):
+        assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.tmp")} == {*theirs}
 
 
 @pytest.mark.parametrize("hours", ["0", "-1", "nan", "inf"])
@@ -164,6 +190,42 @@ def test_what_cannot_be_used_is_passed_over_wherever_it_lies(kind, tmp_path, one
     refused = small_run(kind, tmp_path / "other", root, "--val-split", str(held)).exception
     assert isinstance(refused, InputError) and "\n" not in str(refused)
     assert "no frame to validate on can be used" in str(refused) and "000002.bin" in str(refused)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("part", ["_settle", "_prepare"])
+def test_a_preparation_that_is_stopped_says_how_it_goes_on(tmp_path, monkeypatch, part, number):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # as in test_training.py
+    monkeypatch.setattr(start_module, part, lambda *_: signal.raise_signal(number))
+    try:
+        result = CliRunner().invoke(cli, words(tmp_path / "run"))
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert result.exit_code == 130 and "--resume goes on" in result.stderr
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_a_run_is_not_resumed_with_other_frames_or_weights_under_the_same_names(tmp_path,
+                                                                                monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(start_module, "_prepare", stop)
+    split = write(tmp_path / "split.txt", "000000\n000001\n000002\n")
+    init = Path(shutil.copy(weights_file(PointNetParams()), tmp_path / "init.safetensors"))
+    asked = ["train", "pointnet", "--data", str(object_folder(tmp_path / "kitti", count=5)),
+             "--split", str(split), "--init", str(init), "--steps", "2", "--jobs", "0",
+             "--out", str(tmp_path / "run"), "--resume"]
+
+    def said() -> str:
+        return str(CliRunner().invoke(cli, asked).exception)
+
+    assert "holds a run" not in said() + said()
+    write(split, "000000\n000001\n000003\n")
+    assert "frame_names" in said() and "init" not in said()
+    write(split, "000000\n000001\n000002\n")
+    save_header(init, replace(read_header(init), commit="another"))
+    assert "init_weights" in said() and "frame" not in said()
 
 
 def test_where_there_is_no_terminal_progress_comes_line_by_line(monkeypatch, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
@@ -16,6 +17,8 @@ from lidar_perception.detectors.pointnet.network import load_pointnet
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.params import PointNetTraining
+from lidar_perception.training.pointnet.start import PointNetStart
+from lidar_perception.training.start import BUDGET
 from lidar_perception.types import InputError
 
 # Others run these lines.
@@ -62,6 +65,29 @@ def test_a_network_is_trained_on_clusters_and_finds_its_way_into_the_detector(ca
 def _weights(out):
     network = load_pointnet(out / "last.safetensors")[1]
     return {name: value.tolist() for name, value in network.state_dict().items()}
+
+
+def test_rows_that_are_compared_have_the_same_steps_and_scenes_and_share_the_budget(
+        cache, tmp_path, monkeypatch):
+    def measured(network, *_):  # a fast row, and slow ones
+        return (0.1, 1.0, 1.0, 0.1) if network.config.name == "base" else (0.2, 4.0, 4.0, 0.5)
+
+    rows = []
+    monkeypatch.setattr(PointNetStart, "measured", measured)
+    monkeypatch.setattr(train_module, "run", lambda *each: rows.append(each))
+    monkeypatch.setattr(train_module, "print_ablation", lambda out: None)
+    of_budget = {"--steps": 0, "--validate-steps": 0, "--data-scans": 0, "--data-val-scans": 0}
+    for more in (), ("--resume",):
+        assert train(cache, tmp_path, "--ablation", *more, **of_budget).exit_code == 0
+    (_, asked, first), *_ = rows
+    assert 0 < first.steps * 4.0 < 3600 * BUDGET / len(ABLATIONS)
+    assert first.data.scans > 0 and first.data.val_scans > 0 and first.validate_steps > 0
+    assert asked.budget * len(ABLATIONS) == BUDGET
+    assert [(name, asked.budget, replace(first, network=name), tmp_path / name)
+            for name in ABLATIONS] * 2 == [
+        (network.config.name, row.budget, params, row.out) for network, row, params in rows]
+    refused = train(cache, tmp_path / "other", "--ablation", "--network", "improved")
+    assert "leave out --network" in str(refused.exception)
 
 
 def test_every_row_of_the_ablation_is_trained_and_shown(cache, tmp_path, monkeypatch):

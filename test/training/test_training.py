@@ -7,6 +7,7 @@ import multiprocessing
 import os
 import signal
 import socket
+from itertools import islice
 
 import pytest
 import torch
@@ -14,7 +15,8 @@ from training_toy import PARAMS, Toy, equals, rows, same, weights
 
 from lidar_perception.runs import files
 from lidar_perception.training import loop
-from lidar_perception.training.loop import STATE, train
+from lidar_perception.training.loop import train
+from lidar_perception.training.out import STATE
 from lidar_perception.training.params import LoopParams, PointPillarsTraining
 from lidar_perception.training.ranks import joined, rank, world
 from lidar_perception.training.run import Run, Task
@@ -111,6 +113,19 @@ def test_a_killed_run_loses_one_interval_at_most(unbroken, tmp_path, step):
         done = torch.load(tmp_path / STATE, weights_only=True)["progress"]["step"]
     assert step - PARAMS.save_steps < done <= step
     assert len(rows(tmp_path)) == step  # these are written at once
+    train(Toy().task(), PARAMS, tmp_path, resume=True)
+    assert equals(tmp_path, unbroken[0])
+
+
+def test_where_a_process_that_prepares_batches_dies_what_was_learned_is_kept(unbroken, tmp_path):
+    class Short(Toy):
+        def batches(self, step):
+            yield from islice(super().batches(step), 5)
+            raise InputError("a process ended")
+
+    with pytest.raises(InputError, match="a process ended"):
+        train(Short().task(), PARAMS, tmp_path)
+    assert torch.load(tmp_path / STATE, weights_only=True)["progress"]["step"] == 5
     train(Toy().task(), PARAMS, tmp_path, resume=True)
     assert equals(tmp_path, unbroken[0])
 

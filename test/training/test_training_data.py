@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
 import subprocess
 import sys
 import time
@@ -34,7 +35,7 @@ from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training import scenes as scenes_module
 from lidar_perception.training.augment import TrainingScene, raised
 from lidar_perception.training.cut_objects import cut
-from lidar_perception.training.data import Batches, Item, ReadScenes, Stream
+from lidar_perception.training.data import Batches, Item, ReadScenes, Stream, loaded
 from lidar_perception.training.frames import drive_split, labelled_frames, random_split
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.pointpillars.task import (
@@ -387,6 +388,24 @@ def test_workers_end_with_a_process_that_is_killed():
     while worker.exists() and worker.read_text().split()[2] != "Z":
         assert time.monotonic() < end, "the worker lives on"
         time.sleep(0.05)
+
+
+class Large:
+    """items[n]: the process that makes them, and more than a pipe holds."""
+
+    def __getitem__(self, n: int) -> tuple[int, bytes]:
+        return os.getpid(), bytes(10**7)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_worker_that_is_killed_in_the_middle_of_a_batch_ends_the_training_with_a_reason(jobs):
+    batches = loaded(Large(), ([n] for n in range(10**6)), jobs)
+    pid = next(batches)[0][0]
+    time.sleep(0.2)  # it is sending the next one
+    os.kill(pid, signal.SIGKILL)
+    with pytest.raises(InputError, match=r"prepared scenes.*code -9.*try fewer --jobs"):
+        for _ in range(20):
+            next(batches)
 
 
 # the sensor's height, and what is around

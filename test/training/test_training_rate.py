@@ -41,9 +41,10 @@ def test_the_rate_is_that_of_one_cycle_in_torch(steps, warm):
             scheduler.step()
 
 
-@pytest.mark.parametrize("steps", [1, 2, 3])
-def test_the_shortest_runs_have_a_rate(steps):
-    assert all(0 < one_cycle(i, steps, 0.1, 0.01)[0] <= 0.1 for i in range(steps))
+@pytest.mark.parametrize("warm", [0.01, 0.25, 0.5, 0.99])
+@pytest.mark.parametrize("steps", [1, 2, 3, 4, 100])
+def test_the_shortest_runs_have_a_rate_and_so_have_those_with_one_step_up(steps, warm):
+    assert all(0 < one_cycle(i, steps, 0.1, warm)[0] <= 0.1 for i in range(steps))
 
 
 @given(st.lists(st.floats(-10, 10), min_size=1, max_size=30), st.floats(0, 0.99))

@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from lidar_perception.training.loop import STATE
+from lidar_perception.training.out import STATE
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.ranks import rank, world
 from lidar_perception.training.run import Task
