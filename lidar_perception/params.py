@@ -230,4 +230,4 @@ class EvaluatorParams(Params):
     file: str = param("", "Write the scores to this JSON file at the end and every few seconds; "
                       "empty writes none.", fixed=True)
     only_with_pedestrians: bool = param(True, "Score only frames with a Pedestrian in the ground "
-                                        "truth (paper A's protocol).")
+                                        "truth (protocol of the STM-CPA paper).")

@@ -59,7 +59,7 @@ def convert(source: Path, format: str, out: Path, data: Path | None, given: str 
     \b
     Examples:
       lidar-perception convert /data/kitti/tracking --out tracking.bag
-      lidar-perception convert drive.bag --robot robot/robot.param.yaml --deskew --out level.bag
+      lidar-perception convert drive.bag --robot robot/robot.param.yaml --out level.bag
       lidar-perception convert drive --to kitti_tracking --out drive_kitti
       lidar-perception convert result --detections /fused_detector/output/detections \\
         --to kitti_object --out detected

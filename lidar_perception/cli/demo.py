@@ -45,7 +45,8 @@ REPLACED = ("drive", "result", "logs")    # by the next demo
 
 
 @click.command()
-@a_path("--data", f"Replay this instead of the simulated drive: {WHAT}", "PATH")
+@a_path("--data", f"Replay this instead of the simulated drive; it needs labelled boxes: {WHAT}",
+        "PATH")
 @click.option("--detector", type=click.Choice(list(ALONE)), help="What detects. Default: fused; "
               f"{CANDIDATES} if one of their parameters, below, is given.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("out/demo"),
@@ -71,6 +72,9 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
     prints the scores. Leaves in --out: the bag, the result bag, scores.json, birdseye.png and the
     logs. With --detector candidates, pedestrians alone, by the protocol of the STM-CPA paper.
 
+    As it scores, --data needs labelled boxes. A recording without labels is looked at with
+    `view PATH --weights fused`, and its sensor is measured with `setup`.
+
     \b
     Examples:
       lidar-perception demo
@@ -90,7 +94,7 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
     played = open_recording(drive)
     clouds = len(played)
     from lidar_perception.nodes.replay import TRACKS, replay
-    with errors.status("loading compiled code (the first time: compiling, about a minute)"):
+    with errors.status("loading compiled code (the first time: compiling, half a minute or more)"):
         own = _params_of(detector, played, params)
     content = replay(drive, clouds, out, own, detector=detector, rate=rate, single=single,
                      real_time=real_time)

@@ -24,7 +24,8 @@ def info(bag: Path) -> None:
         seconds = max(0, opened.end_ns - opened.start_ns) / 1e9
         table = Table(title=f"{bag}: {seconds:.1f} s", title_justify="left")
         for column in ("topic", "type", "messages", "QoS"):
-            table.add_column(column, justify="right" if column == "messages" else "left")
+            table.add_column(column, justify="right" if column == "messages" else "left",
+                             overflow="fold")
         for topic, kind in sorted(opened.topics.items()):
             profile = "; ".join(f"{q.reliability.name.lower()}, {q.durability.name.lower()}"
                                 for q in opened.qos(topic)[:1])

@@ -41,7 +41,7 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
     \b
     Examples:
       lidar-perception seed --data /data/kitti/object --out pedestrian.json
-      lidar-perception seed --data drive --frame 12 --at 8.2 -1.5 -0.8 --out pedestrian.json
+      lidar-perception seed --data drive --frame 40 --at 18.0 8.6 -0.9 --out pedestrian.json
     """
     frame = _pick(opened(data), number, labelled=at is None)
     camera = frame.camera()

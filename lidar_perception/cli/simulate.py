@@ -27,7 +27,8 @@ from lidar_perception.types import InputError
 @click.option("--format", "layout", type=click.Choice(["mcap", *LAYOUTS]), default="mcap",
               show_default=True, help="A rosbag2 bag, or the folders of one of these data sets.")
 @click.option("--sensor", "sensor_name", default="hdl64e", show_default=True,
-              help=f"One of {', '.join(NAMES)}, a .yaml file (`setup` writes one), or {GENERIC}.")
+              help=f"One of {', '.join(NAMES)}, in any spelling (hdl64e is hdl-64e), a .yaml "
+              f"file (`setup` writes one), or {GENERIC}.")
 @click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
               help="Height of the sensor above the ground. Default: what its file or preset says.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
@@ -63,7 +64,7 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
 
     \b
     Examples:
-      lidar-perception simulate --frames 100 --seed 7 --out drive
+      lidar-perception simulate --frames 100 --seed 4 --out drive
       lidar-perception simulate --format kitti --frames 1000 --out training_data
       lidar-perception simulate --scene campus --sensor vlp-16 --mount-height 0.6 --out robot
       lidar-perception simulate --compare /data/kitti/object --png realism.png

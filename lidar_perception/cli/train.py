@@ -99,7 +99,7 @@ def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
               "a folder in --out, and compare them.")
 @parameter_options(PointNetTraining())
 def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
-    """The cluster network of paper C, on labelled frames, simulated streets, or both.
+    """The cluster network (PointNet), on labelled frames, simulated streets, or both.
 
     Scenes are cut into clusters by the package's own ground and clustering. Scans and steps are
     chosen so that all ends within --budget hours on this machine. The best weights so far lie in

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
               "checkpoint, or one by its name: fused, pointpillars or pointnet. May be given "
               "several times.")
 @click.option("--results", multiple=True, type=click.Path(path_type=Path), metavar="FOLDER",
-              help="KITTI result files, FOLDER/NAME.txt. May be given several times.")
+              help="KITTI result files, FOLDER/NAME.txt, such as `evaluate detection "
+              "--write-results FOLDER` writes. May be given several times.")
 @click.option("--points", "--topic", "points", metavar="TOPIC", help="Topic of the clouds of a bag "
               "or of the running graph. Default: clustered ones, else /points, else the only one "
               "there.")
@@ -65,7 +66,8 @@ def view(path: Path | None, live: bool, weights: tuple[str, ...], results: tuple
     Examples:
       lidar-perception view out/demo/result
       lidar-perception view /data/kitti/tracking --sequence 0000 --weights fused
-      lidar-perception view /data/kitti/object --results labels --screenshot frame.png --frame 12
+      lidar-perception view drive.bag --weights fused
+      lidar-perception view /data/kitti/object --results out/data --screenshot frame.png --frame 12
       lidar-perception view --live --namespace front
     """
     import asyncio

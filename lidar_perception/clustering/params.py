@@ -57,8 +57,9 @@ FULL_DENSITY = 10.0  # points a square degree that our numbers need; the HDL-64E
 class ClusteringParams(Params):
     """Which points that are not ground belong together."""
 
-    method: str = param("dbscan", "dbscan: distance-aware DBSCAN (paper A). euclidean: adaptive "
-                        "Euclidean clustering (paper C).", choices=CLUSTERING_METHODS)
+    method: str = param("dbscan", "dbscan: distance-aware DBSCAN (STM-CPA paper). euclidean: "
+                        "adaptive Euclidean clustering (improved-PointNet paper).",
+                        choices=CLUSTERING_METHODS)
     density: float = param(0.0, "Points per square degree of view from which on the values below "
                            "apply unchanged. In sparser clouds neighbourhoods widen and least "
                            "sizes shrink. 0: they apply to every cloud.", low=0.0, high=10_000.0)
@@ -73,6 +74,6 @@ BOX_SHAPES = ("axis_aligned", "min_area", "l_shape")
 class BoxParams(Params):
     """Boxes of clusters."""
 
-    shape: str = param("axis_aligned", "axis_aligned: along x and y (paper A). min_area: the "
+    shape: str = param("axis_aligned", "axis_aligned: along x and y (STM-CPA paper). min_area: the "
                        "smallest rectangle. l_shape: along the two visible sides.",
                        choices=BOX_SHAPES)

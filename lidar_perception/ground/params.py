@@ -92,8 +92,9 @@ GROUND_METHODS = ("threshold", "patchwork", "cloth")
 class GroundParams(Params):
     """Which points are ground."""
 
-    method: str = param("threshold", "threshold: one plane (paper A). patchwork: Patchwork++ "
-                        "(paper B). cloth: cloth simulation (paper C).", choices=GROUND_METHODS)
+    method: str = param("threshold", "threshold: one plane (STM-CPA paper). patchwork: "
+                        "Patchwork++ (EG-PointPillars paper). cloth: cloth simulation "
+                        "(improved-PointNet paper).", choices=GROUND_METHODS)
     sensor_pose: SensorPoseParams = SensorPoseParams()
     threshold: ThresholdParams = ThresholdParams()
     patchwork: PatchworkParams = PatchworkParams()

@@ -201,9 +201,9 @@ class ClusterAugmentParams(ThingParams):
 class PointNetTraining(SceneTraining):
     """All settings of train pointnet."""
 
-    network: str = param("improved", "improved: paper C's. pointnet, pointnet2: plain PointNet and "
-                         "PointNet++ (single-scale grouping), to compare with. The others are rows "
-                         "of the paper's ablation.", choices=(
+    network: str = param("improved", "improved: that of the paper. pointnet, pointnet2: plain "
+                         "PointNet and PointNet++ (single-scale grouping), to compare with. The "
+                         "others are rows of the paper's ablation.", choices=(
                              "improved", "pointnet", "pointnet2", "base", "dynamic-threshold",
                              "log-point-count", "skip", "msg-mrg", "msg-skip", "mrg-skip"))
     augment: ClusterAugmentParams = ClusterAugmentParams()

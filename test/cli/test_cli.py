@@ -137,6 +137,17 @@ def test_convert_replaces_a_bag_only_by_force(kitti, tmp_path, monkeypatch, caps
     assert capsys.readouterr().out.replace("\n", "").count("run [/final]") == 3
 
 
+def test_info_cuts_no_name_on_a_narrow_terminal(bag, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    text = run("info", bag)
+    columns = [[cell.strip() for cell in line.split("│")[1:3]] for line in text.splitlines()
+               if line.startswith("│")]
+    topics, kinds = ("".join(cells) for cells in zip(*columns))
+    assert "…" not in text and max(map(len, text.splitlines())) <= 80
+    with Bag(bag) as opened:
+        assert all(topic in topics and kind in kinds for topic, kind in opened.topics.items())
+
+
 def test_info_shows_topics_types_counts_and_length(bag, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     text = run("info", bag)

@@ -16,7 +16,7 @@ from lidar_perception.runs.terminal import console
 @a_path("--weights", "Checkpoint of a cluster network. Default: the one that comes with the "
         "package.")
 def clusters(walk: Walk, weights: Path | None) -> None:
-    """Classes that the cluster network (paper C) assigns to clusters and their points.
+    """Classes that the cluster network (PointNet) assigns to clusters and their points.
 
     Clusters are made as for its training. A cluster is an object if at least half of its points lie
     in the object's box, and background if less than 15 percent lie in any; the others do not count,

@@ -34,7 +34,7 @@ def print_cluster_scores(content: dict[str, Any], out: Console) -> None:
     for name, row in points["by_class"].items():
         table.add_row(f"  {name}", "", *(_number(row[key]) for key in
                                          ("precision", "recall", "f1", "iou")))
-    table.add_row("paper C, KITTI", *(_number(value) for value in PAPER.values()), style="dim")
+    table.add_row("its paper, KITTI", *(_number(value) for value in PAPER.values()), style="dim")
     table.caption = "The paper does not say how it counts points."
     out.print(table)
     print_skipped(content["skipped"], out)
