@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lidar_perception.classes import CAR
+from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import network_of
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.weights_file import WEIGHTS as POINTNET
@@ -56,3 +58,14 @@ def test_each_finds_most_cars_that_are_plain_to_see(file, scans):
         found += len(boxes)
         hits += len(match_centres(mine[:, :3], boxes[:, :3], 1.0)[0])
     assert found >= 4 and hits >= 0.7 * found
+
+
+def test_no_car_is_seen_where_the_recording_car_is(data):
+    """All around, in whole scans of KITTI, whose roof returns some points."""
+    frames = [frame for frame in open_recording(data / "kitti_object")
+              if (frame.load().xyz[:, 0] < -5).any()][:3]
+    for detector in open_detector("fused", "cpu", where="around"), open_detector("pointnet", "cpu"):
+        for frame in frames:
+            found = detector(frame.load()).detections
+            cars = found.boxes[found.class_ids == CAR]
+            assert (np.hypot(cars[:, 0], cars[:, 1]) > 2.0).all()
