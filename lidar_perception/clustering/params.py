@@ -15,7 +15,8 @@ class DbscanParams(Params):
         (15.0, 30.0), "Horizontal ranges at which eps changes, ascending.", unit="m",
         low=0.0, high=1e6)
     eps: tuple[float, ...] = param(
-        (0.15, 0.30, 0.50), "Neighbourhood radius in each range band, one more than range_limits.",
+        (0.15, 0.30, 0.50), "Neighbourhood radius in each range band, one more than range_limits; "
+        "of a running node both are set in one call of set_parameters_atomically.",
         unit="m", low=0.001, high=100.0)
     min_samples: int = param(10, "Points within eps, itself included, that make a core point.",
                              low=1, high=MAX_INT)
@@ -25,7 +26,8 @@ class DbscanParams(Params):
     def check(self) -> None:
         if len(self.eps) != len(self.range_limits) + 1:
             raise ValueError(f"eps has {len(self.eps)} values for {len(self.range_limits)} "
-                             "range_limits; give one more eps than range_limits")
+                             "range_limits; give one more eps than range_limits (of a running "
+                             "node both in one call of set_parameters_atomically)")
         if any(b <= a for a, b in zip(self.range_limits, self.range_limits[1:])):
             raise ValueError(f"range_limits = {list(self.range_limits)} must ascend")
 
