@@ -249,7 +249,8 @@ async def _send(socket: web.WebSocketResponse, queue: Events) -> None:
 
 
 def _in_loop(loop: asyncio.AbstractEventLoop, server: Server, event: dict[str, Any]) -> None:
-    loop.call_soon_threadsafe(server.tell, event)
+    with suppress(RuntimeError):  # the loop is closed: the server ends before what it listens to
+        loop.call_soon_threadsafe(server.tell, event)
 
 
 async def serve(served: Served, port: int, started: Callable[[str], None]) -> None:

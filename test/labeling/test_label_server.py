@@ -21,7 +21,7 @@ from labeling_pages import serving
 from samples import WALKER
 from yarl import URL
 
-from lidar_perception.labeling.server import MAX_WAITING, Server, _send
+from lidar_perception.labeling.server import MAX_WAITING, Server, _in_loop, _send
 
 BOX = [*WALKER[:6].tolist(), 0.3]
 ADD = {"do": "add", "frame": 0, "class": "Pedestrian", "box": BOX}
@@ -236,6 +236,13 @@ def test_only_files_of_the_page_are_served(served):
         async with page.http.post(f"{page.base}/api/do", data=b"[]") as answer:
             assert answer.status == 400
     asked(served, questions)
+
+
+def test_what_is_told_to_a_server_that_has_ended_does_no_harm():
+    """As by the thread that listens to a running graph, which ends a little later."""
+    loop = asyncio.new_event_loop()
+    loop.close()
+    _in_loop(loop, SimpleNamespace(tell=None), {})
 
 
 @pytest.mark.no_cover
