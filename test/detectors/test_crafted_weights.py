@@ -143,7 +143,7 @@ def test_onnx_files_with_other_inputs_are_refused(tmp_path):
             [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1]) for name in outputs])
         made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
         helper.set_model_props(made, {KEY: header} if header else {})
-        path.write_bytes(made.SerializeToString())
+        path.write_bytes(made.SerializeToString().replace(b"NO UTF-8", b"\xff" * 8))
 
     right = [("points", TensorProto.FLOAT, ["n", 4]), ("offsets", TensorProto.FLOAT, ["n", 5]),
              ("cells", TensorProto.INT64, ["n"])]
@@ -157,6 +157,7 @@ def test_onnx_files_with_other_inputs_are_refused(tmp_path):
             (dict(inputs=right, outputs=("logits",)), "other inputs or outputs"),
             (dict(inputs=right, header="[" * 99_999), "no header"),
             (dict(inputs=right, header=""), "no header"),
+            (dict(inputs=right, header="NO UTF-8"), "cannot read"),
             (dict(inputs=right), "n.onnx")):  # outputs of a shape that no cloud has
         model(path, **change)
         with pytest.raises(InputError, match=words) as error:

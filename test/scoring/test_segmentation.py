@@ -129,6 +129,13 @@ def test_neutral_points_speak_neither_for_nor_against_their_own_object_only():
     assert other.iou.tolist() == [1, 0.5]
 
 
+@pytest.mark.parametrize("counted", [0, 10, 20])
+def test_clusters_of_which_no_point_counts_are_not_judged(counted):
+    """The last ones, or all of them: as of labels that say of most points nothing."""
+    truth = objects(np.repeat([1, 0, 2], 10), near=np.ones(30), counted=np.arange(30) < counted)
+    assert score_clusters(np.repeat([1, 2, 3], 10), truth).judged == counted / 10
+
+
 @given(seeds)
 def test_order_of_points_and_numbers_of_clusters_do_not_matter(seed):
     found, truth = some(seed)

@@ -111,10 +111,10 @@ class OnnxNetwork:
         try:
             session = onnxruntime.InferenceSession(str(path), options,
                                                    providers=["CPUExecutionProvider"])
+            text = session.get_modelmeta().custom_metadata_map.get(KEY)
         except Exception as error:  # its errors have no common base
             reason = str(error).splitlines()[0]
             raise InputError(f"ONNX Runtime cannot read {path}: {reason}") from None
-        text = session.get_modelmeta().custom_metadata_map.get(KEY)
         header = Header.of_text(text, str(path), NetworkConfig)
         wanted = {name: (f"tensor({kind})", len(shape)) for name, (kind, shape) in
                   _inputs(header.config).items()}

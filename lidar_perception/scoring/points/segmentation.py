@@ -187,7 +187,7 @@ def score_clusters(cluster_ids: np.ndarray, objects: Objects) -> ClusterScore:
     np.maximum.at(best, thing, iou)
     several = np.bincount(cluster[piece], minlength=len(size)) > 1
     shared = np.bincount(thing[(iou == best[thing]) & piece & several[cluster]], minlength=rows) > 0
-    judged = 2 * np.bincount(ids, near, minlength=1)[1:] > size[1:]
+    judged = 2 * np.bincount(ids, near, minlength=len(size))[1:] > size[1:]
     return ClusterScore(best[1:], np.bincount(thing[piece], minlength=rows)[1:], shared[1:],
                         len(numbers), int(judged.sum()))
 
