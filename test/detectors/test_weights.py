@@ -6,6 +6,7 @@ import importlib.util
 import json
 import os
 import struct
+import zipfile
 
 import pytest
 import torch
@@ -278,7 +279,11 @@ def test_files_that_hold_no_such_weights_are_refused(big, tmp_path, capsys):
             import_weights(tmp_path / "x.pth", classes)
         assert "\n" not in str(error.value)
     (tmp_path / "x.pth").write_bytes(b"no pickle")
-    for name, words in ("x.pth", "weights only"), ("none.pth", "no file"):
+    with zipfile.ZipFile(tmp_path / "damaged.pth", "w") as file:  # takes what nobody has put there
+        file.writestr("x/data.pkl", b"\x80\x02R.")
+        file.writestr("x/version", "3")
+    for name, words in (("x.pth", "weights only"), ("damaged.pth", "weights only"),
+                        ("none.pth", "no file")):
         with pytest.raises(InputError, match=words):
             import_weights(tmp_path / name)
     assert capsys.readouterr().out == ""

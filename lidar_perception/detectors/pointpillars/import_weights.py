@@ -15,7 +15,6 @@ Both hold the same network under other names. What differs is converted where it
 from __future__ import annotations
 
 import math
-import pickle
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -108,7 +107,7 @@ def _state(path: Path) -> dict[str, Tensor]:
         raise InputError(f"there is no file {path}")
     try:
         content: Any = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError, OSError) as error:
+    except Exception as error:  # of a damaged file torch's reader may raise any
         raise InputError(f"{path} cannot be read as weights only: "
                          f"{str(error).splitlines()[0] if str(error) else type(error).__name__}; "
                          "save its state_dict alone with torch.save and take that file") from None
