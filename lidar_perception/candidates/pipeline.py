@@ -19,10 +19,8 @@ from lidar_perception.candidates.refine import Candidates, refine
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import Segmented, grounded_boxes, points_in_view
 from lidar_perception.clustering.cluster import cluster_obstacles
-from lidar_perception.ground.segment import segment_ground
+from lidar_perception.ground.segment import cropped_as_mounted, segment_ground
 from lidar_perception.groups import renumbered
-from lidar_perception.robot.crop import cropped
-from lidar_perception.robot.placing import levelling, tilted
 from lidar_perception.types import LidarFrame
 
 
@@ -33,8 +31,7 @@ def segment(frame: LidarFrame, camera: Camera | None = None,
     whatever clustering, are computed where they are None. InputError if the view is on and there
     is no camera."""
     t0 = perf_counter()
-    kept, frame = cropped(frame, params.crop, level=levelling(tilted(
-        params.ground.sensor_pose.roll, params.ground.sensor_pose.pitch)))
+    kept, frame = cropped_as_mounted(frame, params.crop, params.ground.sensor_pose)
     indices, seen = points_in_view(frame, camera, params.view)
     indices = kept.take(indices)
     t1 = perf_counter()

@@ -17,9 +17,8 @@ from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found, require_columns
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
+from lidar_perception.ground.segment import cropped_as_mounted
 from lidar_perception.param_fields import with_values
-from lidar_perception.robot.crop import cropped
-from lidar_perception.robot.placing import levelling, tilted
 from lidar_perception.types import InputError, LidarFrame
 
 Result = TypeVar("Result")
@@ -47,9 +46,8 @@ class NetworkDetector:
         take over."""
         require_columns(frame, ground=ground, cluster_ids=cluster_ids)
         if self.params.crop.enabled:
-            pose = self.params.ground.sensor_pose
-            kept, frame = cropped(frame, self.params.crop,
-                                  level=levelling(tilted(pose.roll, pose.pitch)))
+            kept, frame = cropped_as_mounted(frame, self.params.crop,
+                                             self.params.ground.sensor_pose)
             ground, cluster_ids = (column if column is None else column.take(kept)
                                    for column in (ground, cluster_ids))
         return self.detect(frame, ground, cluster_ids)

@@ -12,7 +12,9 @@ from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.params import GroundParams, SensorPoseParams, ThresholdParams
 from lidar_perception.ground.patchwork import segment_by_patchwork
 from lidar_perception.ground.threshold import ransac_plane, segment_by_threshold
-from lidar_perception.robot.placing import tilted
+from lidar_perception.robot.crop import cropped
+from lidar_perception.robot.params import CropParams
+from lidar_perception.robot.placing import levelling, tilted
 from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame, usable_returns
 
 METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
@@ -56,6 +58,12 @@ def level(xyz: np.ndarray, pose: SensorPoseParams) -> np.ndarray:
     if pose.roll == pose.pitch == 0.0:
         return xyz
     return xyz @ tilted(pose.roll, pose.pitch)[:3, :3].T.astype(np.float32)
+
+
+def cropped_as_mounted(frame: LidarFrame, crop: CropParams,
+                       pose: SensorPoseParams) -> tuple[np.ndarray, LidarFrame]:
+    """As robot.crop.cropped, the sectors as a level sensor at the same place would see them."""
+    return cropped(frame, crop, level=levelling(tilted(pose.roll, pose.pitch)))
 
 
 def measured_height(xyz: np.ndarray, pose: SensorPoseParams = SensorPoseParams()) -> float | None:

@@ -1,4 +1,5 @@
-"""A training that is small enough to be compared bit by bit, and what it wrote."""
+"""What tests of training share: one that is small enough to be compared bit by bit, what it wrote,
+scenes that nothing changes, and a folder some of whose frames are broken."""
 
 from __future__ import annotations
 
@@ -6,10 +7,11 @@ import csv
 from pathlib import Path
 
 import torch
+from samples import object_folder, walker_label, write
 from torch import nn
 
 from lidar_perception.training.out import STATE
-from lidar_perception.training.params import LoopParams
+from lidar_perception.training.params import AugmentParams, LoopParams
 from lidar_perception.training.ranks import rank, world
 from lidar_perception.training.run import Task
 
@@ -74,3 +76,22 @@ def equals(folder: Path, other: Path) -> bool:
     """Whether two runs wrote the same, but for times."""
     return (same(weights(folder), weights(other)) and rows(folder) == rows(other)
             and rows(folder, "validation.csv") == rows(other, "validation.csv"))
+
+
+STILL = AugmentParams(cars=0, pedestrians=0, cyclists=0, things=0, object_turn=0, object_shift=0,
+                      flip=0, turn=0, scale=0, beam_noise=0, range_noise=0, dropout=0, intensity=0,
+                      height=0, tilt=0)
+
+
+def broken_folder(root):
+    """Five frames, of which 1 has a broken label and 3 a scan that was cut."""
+    object_folder(root, walker_label() + "\n", 5)
+    write(root / "training/label_2/000001.txt", "Pedestrian 0 0 x\n")
+    scan = root / "training/velodyne/000003.bin"
+    scan.write_bytes(scan.read_bytes()[:-5])
+    return root
+
+
+def keep_all(scene, rng):
+    """Stands for a network's preparation: what it is given, and a number of the rng."""
+    return scene.points.sum(), scene.boxes, rng.random()

@@ -175,7 +175,7 @@ class PointPillarsDetector(NetworkDetector):
             valid = valid[best[valid].topk(self.settings.nms.candidates).indices]
         chosen, best, labels = chosen[valid], best[valid], labels[valid]
         codes, directions = boxes_at(chosen)
-        if self.anchors.device != codes.device:  # another detector has moved the network
+        if self.anchors.device != codes.device:  # the network was moved, maybe by another detector
             self.anchors = make_anchors(self.look, codes.device)
         boxes = decode(codes.float(), directions.argmax(dim=1), self.anchors[chosen],
                        self.config.direction_offset).cpu().numpy()
@@ -226,9 +226,8 @@ class PointPillarsDetector(NetworkDetector):
         return other
 
     def bring_to(self, device: torch.device) -> None:
-        """Bring network and anchors to a device."""
+        """Bring the network to a device; the anchors follow."""
         self.network.to(device)
-        self.anchors = make_anchors(self.look, device)
 
     def warm_up(self) -> None:
         """Run every part once on made-up points, so that what is compiled is compiled."""
