@@ -15,7 +15,6 @@ from multiprocessing import Pool
 from pathlib import Path
 
 import numpy as np
-from curves import fit
 
 from lidar_perception.candidates import confidence as module
 from lidar_perception.candidates.confidence import SEED_KNOTS, SHAPE_KNOTS, shape_features
@@ -30,6 +29,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.groups import group_points
 from lidar_perception.runs.files import write_text
 from lidar_perception.scoring.centres.matching import match_centres, range_bins
+from lidar_perception.training.curves import fit
 from lidar_perception.types import PEDESTRIAN, InputError
 
 KITTI_RANGES = np.array([2093, 1771, 468, 118, 37])  # paper A, Table 1

@@ -31,7 +31,6 @@ from lidar_perception.adapting.labels import ConcludedLabels, labels_of
 from lidar_perception.adapting.learning import (
     network_to_train,
     opened_with,
-    settled,
     simulated_frames,
     simulated_score,
     training_params,
@@ -66,6 +65,7 @@ from lidar_perception.training.cache import kept as made_once
 from lidar_perception.training.plan import TooShort
 from lidar_perception.training.sources import SIM
 from lidar_perception.training.start import start
+from lidar_perception.training.trained_for import as_trained
 from lidar_perception.types import InputError
 
 LAST = "last.safetensors"
@@ -117,7 +117,7 @@ class Adapting:
         clouds = first_clouds(recording)
         self.frames = frames_of(mounted(recording, clouds))
         self.height = self.frames[0].sensor_height
-        self.params = settled(params, self.header)
+        self.params = as_trained(params, self.header)
         Scenes(scene=self.params.scene).sorts()  # InputError for what is none
         self.sensor = sensor_named(self.params.sensor, self.height)
         if recorded_source(self.frames[0].pose() is not None) == NO_SOURCE:

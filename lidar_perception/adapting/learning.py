@@ -22,10 +22,8 @@ from lidar_perception.training.pointnet.start import PointNetStart
 from lidar_perception.training.pointpillars.start import PointPillarsStart
 from lidar_perception.training.preparing import keep_all
 from lidar_perception.training.start import scenes_of
-from lidar_perception.types import InputError
 
 AT_THE_END = 10**9  # steps between validations: one, after the last
-HDL, STREET = "hdl64e", "street"  # of weights that do not say
 
 
 def network_to_train(header: Header) -> Any:
@@ -42,20 +40,6 @@ def opened_with(weights: Path, header: Header, device: str) -> FusedDetector:
         return load_fused_detector(weights, device)
     return load_fused_detector("", device, FusedDetectorParams(
         fused=FusedParams(classifier=str(weights)))).seeing("around")
-
-
-def settled(params: AdaptParams, header: Header) -> AdaptParams:
-    """The params, sensor and scene those of a header where they are not given. InputError where the
-    file of that sensor is not there."""
-    known = header.training
-    sensor, given = known.get("sensor"), known.get("params")
-    name = (sensor.get("name") if isinstance(sensor, dict) else "") or HDL
-    if not params.sensor and Path(name).suffix in (".yaml", ".yml") and not Path(name).is_file():
-        raise InputError(f"the weights are for the sensor {name}, which is not there; say where it "
-                         "is, or what sensor this is, with --sensor")
-    return replace(
-        params, sensor=params.sensor or name,
-        scene=params.scene or (given.get("scene") if isinstance(given, dict) else "") or STREET)
 
 
 def training_params(header: Header, params: AdaptParams, frames: int, height: float,

@@ -37,9 +37,10 @@ class OutFile(click.Path):
         return path
 
 
-def out_file(name: str, what: str, *names: str) -> Callable:
+def out_file(name: str, what: str, *names: str, **more: Any) -> Callable:
     """An option that takes the path of a file to write."""
-    return click.option(name, *names, type=OutFile(path_type=Path), metavar="FILE", help=what)
+    return click.option(name, *names, type=OutFile(path_type=Path), metavar="FILE", help=what,
+                        **more)
 
 
 data_option = a_path("--data", WHAT, "PATH", required=True)

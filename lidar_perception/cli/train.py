@@ -13,12 +13,12 @@ from typing import Any
 import click
 
 from lidar_perception import __version__
-from lidar_perception.cli.data import a_path, device_option
+from lidar_perception.cli.data import a_path, device_option, out_file
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console
 from lidar_perception.training.asked import Asked
-from lidar_perception.training.params import PointNetTraining, PointPillarsTraining
+from lidar_perception.training.params import FusedTraining, PointNetTraining, PointPillarsTraining
 from lidar_perception.types import InputError
 
 PAPER_ABLATION = (75.52, 80.15, 81.33, 83.44, 85.10, 86.33, 86.89, 88.96)  # paper C, Table 5
@@ -134,12 +134,73 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
             print_ablation(asked.out)
 
 
+@train.command()
+@a_path("--weights", "PointPillars' checkpoint, or an exported one (.onnx). Default: the one that "
+        "comes with the package.")
+@a_path("--classifier", "Checkpoint of the cluster network. Default: the one that comes with the "
+        "package.")
+@out_file("--out", "File to write (.json), which is then what --weights and `fused.weights` take.",
+          required=True)
+@click.option("--force", is_flag=True, help="Replace --out.")
+@click.option("--jobs", type=click.IntRange(1), default=lambda: min(cores(), 8),
+              show_default="one for each core, 8 at most",
+              help="Processes that look at scans. The result is the same.")
+@parameter_options(FusedTraining())
+def fused(weights: Path | None, classifier: Path | None, out: Path, force: bool, jobs: int,
+          params: FusedTraining) -> None:
+    """The fused detector of your own weights: fit how much each source counts.
+
+    PointPillars, silhouettes and the cluster network look at simulated scans of the sensor that
+    the weights were trained for. What they say together becomes a probability, so that the
+    threshold holds. Takes some minutes. The file names both networks and leaves them where they
+    are.
+
+    \b
+    Examples:
+      lidar-perception train fused --weights robot/v4/best.safetensors \\
+          --classifier robot/pointnet/best.safetensors --out robot/fused.json
+      lidar-perception train fused --sensor vlp-16 --mount-height 0.6 --scene campus \\
+          --range around --out vlp16.json
+      lidar-perception evaluate detection --data drive --weights robot/fused.json
+      lidar-perception run fused_detector --ros-args -p fused.weights:=$PWD/robot/fused.json
+    """
+    from lidar_perception.detectors.fused.fusion import SUFFIX
+    if out.suffix != SUFFIX:
+        raise InputError(f"--out {out} must end with {SUFFIX}")
+    if out.exists() and not force:
+        raise InputError(f"{out} exists already; give another name, or --force")
+    from lidar_perception.training.fusing import fuse
+    judged = fuse(weights, classifier, out, params, jobs)
+    print_fused(judged)
+    console.print(f"{out}: --weights of commands, and fused.weights of the node, take it")
+
+
 def run(network: Any, asked: Asked, params: Any) -> None:
     """Train, and say how it ended."""
     from lidar_perception.training.start import start
     ended = start(network, asked, params, commit())
     if ended is not None:
         tell(*ended, asked.out)
+
+
+def print_fused(judged: Any) -> None:
+    """How the curves do, by class."""
+    from lidar_perception.scoring.tables import narrow_table
+    table = narrow_table("Curves, on scans that they were not fitted to", "", "proposals", "right",
+                         ">= 0.4", "right", "log loss")
+    few = []
+    for name, own in judged.items():
+        rows = [("package", own.before)]
+        rows += [("fitted", own.after)] if own.after else []
+        few += [] if own.after else [name]
+        for k, (which, said) in enumerate(rows):
+            table.add_row(f"{name}, {which}", *(
+                (str(own.proposals), str(own.right)) if k == 0 else ("", "")),
+                str(said.right + said.wrong), str(said.right), f"{said.loss:.3f}")
+    console.print(table)
+    if few:
+        console.print(f"{', '.join(few)}: too few to fit curves to; those of the package stay. "
+                      "More --scans, or another --scene, have more")
 
 
 def print_ablation(out: Path) -> None:

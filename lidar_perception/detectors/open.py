@@ -6,9 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from lidar_perception.detectors.checkpoint import POINTNET, POINTPILLARS, network_of
+from lidar_perception.detectors.checkpoint import POINTNET, POINTPILLARS, network_of, read_header
 from lidar_perception.detectors.contract import FUSED, Detector
 from lidar_perception.detectors.fused.detector import load_fused_detector
+from lidar_perception.detectors.fused.fusion import SUFFIX, read_fusion
 from lidar_perception.detectors.params import SEEN
 from lidar_perception.detectors.pointnet.detector import load_pointnet_detector
 from lidar_perception.detectors.pointpillars.detector import load_detector
@@ -37,7 +38,8 @@ def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
                   sensor_height: float | None = None, min_score: float | None = None,
                   where: str = "auto") -> Configured:
     """A detector by its name, a key of LOAD, with what comes with the package; or by its weights: a
-    checkpoint of any network, or an exported one (.onnx). Parameters are the defaults.
+    checkpoint of any network, an exported one (.onnx), or a file of `train fused` (.json).
+    Parameters are the defaults.
 
     sensor_height: metres of the sensor above the ground, if not KITTI's; min_score: the threshold
     of every class, if not the default; where: what it sees, ahead, around, or what the weights were
@@ -50,9 +52,24 @@ def open_detector(weights: str | Path = FUSED, device: str = "auto", *,
         detector = LOAD[str(weights)]("", device)
     else:
         path = Path(weights)
-        detector = LOAD[POINTPILLARS if path.suffix == ".onnx" else network_of(path)](path, device)
+        detector = LOAD[kind_of(path)](path, device)
     if where != "auto":
         detector = detector.seeing(where)
     if sensor_height is not None:
         detector = detector.mounted_at(sensor_height)
     return detector if min_score is None else detector.with_min_score(min_score)
+
+
+def kind_of(path: Path) -> str:
+    """The key in LOAD of a file of weights. InputError if it is none."""
+    return {".onnx": POINTPILLARS, SUFFIX: FUSED}.get(path.suffix) or network_of(path)
+
+
+def doubts(path: Path, height: float) -> list[str]:
+    """What to say of weights that are used with a sensor so many metres above the ground: that they
+    are for one at another height, or that their scores are no probabilities."""
+    if path.suffix == SUFFIX:
+        fusion = read_fusion(path)
+        return [*filter(None, [fusion.doubt]), *doubts(fusion.proposer, height)]
+    other = read_header(path).unlike(height) if path.suffix == ".safetensors" else None
+    return [f"{path}: {other}"] if other else []

@@ -36,8 +36,10 @@ class DetectorNode(ManagedNode):
         config = self.detector.config
         self.counts.update(network=f"{self.name_of(config)}, {' '.join(config.classes)}",
                            device=str(self.detector.device))
-        if self.detector.fallback:
-            self.report(WARN, self.detector.fallback)
+        if self.detector.doubt:
+            self.counts["scores"] = "not calibrated"
+        for said in filter(None, (self.detector.fallback, self.detector.doubt)):
+            self.report(WARN, said)
         self.input("points", CLOUD, self.on_points)
 
     def weights(self) -> Path:

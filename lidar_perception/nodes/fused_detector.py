@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from lidar_perception.detectors.fused.fusion import weights_file
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
-from lidar_perception.detectors.fused.weights_file import weights_file
 from lidar_perception.nodes.detector_node import DetectorNode
 from lidar_perception.params import DetectionNodeParams
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
+from lidar_perception.detectors.params import seen_range
 from lidar_perception.param_fields import Params, flatten, param
 
 INDIFFERENT = ("log_steps", "save_steps", "max_skipped", "data.cache", "data.cache_gb")
@@ -208,3 +209,21 @@ class PointNetTraining(SceneTraining):
                              "log-point-count", "skip", "msg-mrg", "msg-skip", "mrg-skip"))
     augment: ClusterAugmentParams = ClusterAugmentParams()
     data: DataParams = DataParams()
+
+
+@dataclass(frozen=True)
+class FusedTraining(Params):
+    """All settings of train fused."""
+
+    scans: int = param(240, "Simulated scans that curves are fitted to, each of scenes of its own.",
+                       low=2, high=100_000)
+    people: float = param(2.5, "Pedestrians and cyclists in them, as a multiple of the usual "
+                               "number.", low=0.0, high=100.0)
+    scene: str = param("", "Where the scans are taken: street, campus or indoor, or several in "
+                       "turn, such as street,campus. Empty: where those were that the weights were "
+                       "trained on.")
+    sensor: str = param("", "Sensor of the scans: a sensor.yaml, or the name of a preset. Empty: "
+                        "the one that the weights were trained for.")
+    mount_height: float = param(0.0, "Height of the sensor above the ground. 0: that of the scans "
+                                "that the weights were trained on.", unit="m", low=0.0, high=10.0)
+    range: str = seen_range()

@@ -16,7 +16,8 @@ from lidar_perception.training.scenes import RecordedScenes, SimulatedScenes
 from lidar_perception.types import InputError
 
 SIM = "sim"  # the name of simulated scenes where a folder could stand
-FIRST_SCENE, FIRST_VALIDATION_SCENE = 10_000_000, 20_000_000  # far from what anybody else takes
+# Of scenes to train on, to validate on, and to fit curves to: far from what anybody else takes.
+FIRST_SCENE, FIRST_VALIDATION_SCENE, FIRST_FITTED_SCENE = 10_000_000, 20_000_000, 30_000_000
 
 
 def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | None,

@@ -20,7 +20,8 @@ from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.fused.boxes import FRONT, MARGIN, SIDE, on_ground, on_points
 from lidar_perception.detectors.fused.detector import FusedDetector, one_of_each
 from lidar_perception.detectors.fused.evidence import LEAST, clipped_logit
-from lidar_perception.detectors.fused.model import KNOTS, models, probabilities
+from lidar_perception.detectors.fused.fusion import KNOTS, package_models
+from lidar_perception.detectors.fused.model import probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.pointnet import rescoring
 from lidar_perception.geometry import points_in_box, points_in_boxes
@@ -116,17 +117,17 @@ def test_boxes_stand_on_the_ground_where_it_is_known():
 @given(SEEDS)
 def test_more_evidence_is_never_less_likely_and_silence_is_neither(seed):
     rng = np.random.default_rng(seed)
-    class_ids = rng.choice([CLASSES.index(name) for name in models()], 50)
+    class_ids = rng.choice([CLASSES.index(name) for name in package_models()], 50)
     evidence = {source: clipped_logit(rng.uniform(0, 1, 50)) for source in KNOTS}
-    before = probabilities(class_ids, evidence)
+    before = probabilities(package_models(), class_ids, evidence)
     assert ((before >= 0) & (before <= 1)).all() and before.dtype == np.float32
     for source in KNOTS:
         more = {**evidence, source: evidence[source] + rng.uniform(0, 3, 50)}
-        assert (probabilities(class_ids, more) >= before - 1e-6).all()
+        assert (probabilities(package_models(), class_ids, more) >= before - 1e-6).all()
         silent = {**evidence, source: np.full(50, np.nan)}
-        assert np.isfinite(probabilities(class_ids, silent)).all()
+        assert np.isfinite(probabilities(package_models(), class_ids, silent)).all()
     unknown = np.full(50, CLASSES.index("Tram"))
-    assert not probabilities(unknown, evidence).any()
+    assert not probabilities(package_models(), unknown, evidence).any()
     least = clipped_logit(LEAST)
     np.testing.assert_allclose(clipped_logit([0, 0.5, 1]), [least, 0, -least], atol=1e-9)
 

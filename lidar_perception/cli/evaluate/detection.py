@@ -64,8 +64,7 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
       lidar-perception evaluate detection --data drive --weights v4.safetensors --keep 0.1
     """
     from lidar_perception.data.frame import BOXES
-    from lidar_perception.detectors.checkpoint import read_header
-    from lidar_perception.detectors.open import open_detector
+    from lidar_perception.detectors.open import doubts, open_detector
     from lidar_perception.scoring.detections import by_detector, by_files
     from lidar_perception.scoring.kitti.box_errors import box_errors, print_box_errors
     from lidar_perception.scoring.kitti.protocol import SCORED, Comparison
@@ -96,8 +95,8 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
     else:
         assert weights is not None  # as there are no --results
         height = recording.frames[0].sensor_height
-        if weights.suffix == ".safetensors" and (other := read_header(weights).unlike(height)):
-            terminal_errors.print(f"{weights}: {other}")
+        for doubt in doubts(weights, height):
+            terminal_errors.print(doubt)
         open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height,
                         where=where)
         start = by_detector(open_, keep, write_results)

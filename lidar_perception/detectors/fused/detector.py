@@ -17,6 +17,7 @@ from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.fused.boxes import on_ground, on_points
 from lidar_perception.detectors.fused.evidence import Evidence, clipped_logit, judged, silhouette_at
+from lidar_perception.detectors.fused.fusion import Models, fusion_of, package_models
 from lidar_perception.detectors.fused.model import at_most, probabilities, sources
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.nms import first_of_each, suppressed
@@ -53,17 +54,20 @@ class Look(NamedTuple):
 class FusedDetector(NetworkDetector):
     """A detector, see contract.py, of what PointPillars detects, where its range is.
 
-    proposer, classifier: loaded; their thresholds and mounting are this detector's.
+    proposer, classifier: loaded; their thresholds and mounting are this detector's. models: the
+    curves of what they say.
     """
 
     group = "fused"  # of its params
     params: FusedDetectorParams
 
     def __init__(self, proposer: PointPillarsDetector, classifier: PointNetDetector,
-                 params: FusedDetectorParams = FusedDetectorParams()):
+                 params: FusedDetectorParams = FusedDetectorParams(),
+                 models: Models | None = None):
         super().__init__(proposer.header, proposer.device, params)
         self.proposer, self.classifier = proposer.raw(), classifier  # the curves know raw scores
         self.place = proposer.place
+        self.models = package_models() if models is None else models
 
     @property
     def settings(self) -> FusedParams:
@@ -72,7 +76,10 @@ class FusedDetector(NetworkDetector):
 
     def seeing(self, where: str) -> FusedDetector:
         """See base; the range is PointPillars'."""
-        return FusedDetector(self.proposer.seeing(where), self.classifier, self.params)
+        other = FusedDetector(self.proposer.seeing(where), self.classifier, self.params,
+                              self.models)
+        other.doubt = self.doubt
+        return other
 
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:
@@ -108,7 +115,8 @@ class FusedDetector(NetworkDetector):
         found = proposed.detections
         evidence = {"network": clipped_logit(found.scores), "silhouette": clipped_logit(
             silhouette_at(found.boxes, obstacles.xyz, floor, people))}
-        open_ = scores.passed(replace(found, scores=at_most(found.class_ids, evidence,
+        open_ = scores.passed(replace(found, scores=at_most(self.models, found.class_ids,
+                                                            evidence,
                                                             "classifier")))
         evidence["classifier"] = clipped_logit(
             judged(found, obstacles, floor, self._classifier(), open_))
@@ -138,8 +146,8 @@ class FusedDetector(NetworkDetector):
         """The detections, best first, as from a level sensor at SENSOR_HEIGHT, and where there are
         none the highest score of each class."""
         settings, class_ids = self.settings, look.proposed.class_ids
-        every = replace(look.proposed, scores=probabilities(class_ids, look.evidence),
-                        sources=sources(class_ids, look.evidence))
+        every = replace(look.proposed, scores=probabilities(self.models, class_ids, look.evidence),
+                        sources=sources(self.models, class_ids, look.evidence))
         found = every[settings.scores.passed(every)]
         if len(found) == 0:
             return found, {
@@ -175,16 +183,18 @@ def one_of_each(found: Detections, params: FusedParams) -> np.ndarray:
 
 def load_fused_detector(path: str | Path = "", device: str = "auto",
                         params: FusedDetectorParams = FusedDetectorParams()) -> FusedDetector:
-    """The detector with the weights of PointPillars at path; with an empty one those that params
-    name, or else those that come with the package. InputError as of load_detector and
-    load_pointnet_detector."""
+    """The detector of a file of `train fused`, or with the weights of PointPillars at path; with an
+    empty one what params name, or else what comes with the package. InputError as of fusion_of,
+    load_detector and load_pointnet_detector."""
     settings = params.fused
-    proposer = load_detector(path, device, DetectorParams(pointpillars=PointPillarsParams(
-        weights=settings.weights, range=settings.range, threads=settings.threads, warm_up=False,
-        cpu_fallback=settings.cpu_fallback)))
-    classifier = load_pointnet_detector(settings.classifier, device, PointNetDetectorParams(
+    fusion = fusion_of(path, settings)
+    proposer = load_detector(fusion.proposer, device, DetectorParams(
+        pointpillars=PointPillarsParams(range=settings.range, threads=settings.threads,
+                                        warm_up=False, cpu_fallback=settings.cpu_fallback)))
+    classifier = load_pointnet_detector(fusion.classifier, device, PointNetDetectorParams(
         pointnet=PointNetParams(warm_up=False, cpu_fallback=settings.cpu_fallback)))
-    detector = FusedDetector(proposer, classifier, params)
+    detector = FusedDetector(proposer, classifier, params, fusion.models)
+    detector.doubt = fusion.doubt
     if settings.warm_up:
         detector.warm_up()
     return detector

@@ -15,6 +15,7 @@ from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import explain_nothing
 from lidar_perception.detectors.contract import Found, require_columns
 from lidar_perception.detectors.fused.evidence import clipped_logit
+from lidar_perception.detectors.fused.fusion import package_models
 from lidar_perception.detectors.fused.model import probabilities, sources
 from lidar_perception.detectors.hybrid.params import RescoringParams
 from lidar_perception.detectors.nms import suppressed
@@ -82,8 +83,9 @@ class RescoredCandidates:
         evidence = {"network": np.zeros(len(judged)),
                     "silhouette": clipped_logit(candidates.final.scores),
                     "classifier": clipped_logit(judged.scores)}
-        result = replace(judged, scores=probabilities(judged.class_ids, evidence), sources={
-            name: said for name, said in sources(judged.class_ids, evidence).items()
+        models = package_models()
+        result = replace(judged, scores=probabilities(models, judged.class_ids, evidence), sources={
+            name: said for name, said in sources(models, judged.class_ids, evidence).items()
             if name != "network"})
         result = result[result.scores >= params.threshold] if params.box == "cluster" else (
             self._whole(result, whole))

@@ -1,0 +1,196 @@
+"""The fused detector of one's own weights: curves that are probabilities, in a file that names both
+networks, and any file that somebody wrote is used or refused in one line."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from cli_samples import error_line, exit_of
+from detection_samples import frame, random_detector, same
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import expit
+
+from lidar_perception.camera import Camera
+from lidar_perception.campaign.mutation import mutate_text
+from lidar_perception.classes import CAR, DETECTED
+from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.fused.detector import FusedDetector, Look, load_fused_detector
+from lidar_perception.detectors.fused.fusion import (
+    KNOTS,
+    PACKAGE,
+    fusion_of,
+    package_models,
+    read_fusion,
+    weights_file,
+    write_fusion,
+)
+from lidar_perception.detectors.fused.model import probabilities
+from lidar_perception.detectors.fused.params import FusedParams
+from lidar_perception.detectors.open import doubts, open_detector
+from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.pointnet.weights_file import weights_file as classifier_file
+from lidar_perception.detectors.pointpillars.params import PointPillarsParams
+from lidar_perception.detectors.pointpillars.weights_file import weights_file as proposer_file
+from lidar_perception.simulation.camera import FORWARD_CAMERA
+from lidar_perception.training.fusing import FEWEST, Samples, fitted, samples_of
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
+
+pytestmark = pytest.mark.usefixtures("one_thread")
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def drawn(rng, count: int, class_id: int, odds: float = -1.5) -> Samples:
+    """Proposals of which the sources know as much as odds says, each with its own error."""
+    true = rng.normal(odds, 2.0, count)
+    evidence = {name: np.clip(true + rng.normal(0, 0.5, count), -6.5, 6.5) for name in KNOTS}
+    evidence["silhouette"][rng.random(count) < 0.2] = np.nan
+    return Samples(np.full(count, class_id), rng.random(count) < expit(true),
+                   rng.integers(0, 60, count), evidence)
+
+
+@settings(max_examples=5)
+@given(SEEDS)
+def test_fitted_scores_are_probabilities_and_the_order_of_scans_does_not_matter(seed):
+    rng = np.random.default_rng(seed)
+    own = drawn(rng, 4000, PEDESTRIAN)
+    models, judged = fitted(own, package_models())
+    other = drawn(rng, 20_000, PEDESTRIAN)
+    scores = probabilities(models, other.class_ids, other.evidence)
+    for low in np.arange(0.1, 0.9, 0.2):
+        chosen = (scores >= low) & (scores < low + 0.2)
+        assert abs(other.right[chosen].mean() - scores[chosen].mean()) < 0.08
+    assert judged["Pedestrian"].after.loss < judged["Pedestrian"].before.loss
+    assert judged["Pedestrian"].proposals == 4000
+    assert judged["Pedestrian"].right == own.right.sum()
+    again, _ = fitted(own.take(rng.permutation(4000)), package_models())
+    for curve, before in zip(again["Pedestrian"]["curves"].values(),
+                             models["Pedestrian"]["curves"].values()):
+        np.testing.assert_allclose(curve["values"], before["values"], atol=0.02)
+    # Of what there is too little of, the curves from before stay.
+    assert models["Car"] == package_models()["Car"] and judged["Car"].after is None
+
+
+def test_curves_are_not_fitted_to_too_little():
+    rng = np.random.default_rng(0)
+    for right in (0, FEWEST // 2 - 1, FEWEST * 3):
+        own = drawn(rng, 500, CAR)
+        own.right[:] = np.arange(500) < right
+        own.scans[:] = np.arange(500) % 2
+        models, judged = fitted(own, package_models())
+        assert (models["Car"] == package_models()["Car"]) == (right < FEWEST)
+        assert (judged["Car"].after is None) == (right < FEWEST)
+
+
+@pytest.mark.parametrize("camera", [None, FORWARD_CAMERA], ids=["all around", "in an image"])
+def test_an_object_is_found_once_and_only_where_all_is_labelled(camera: Camera | None):
+    car, person = [10, 0, -0.9, 4, 1.7, 1.5, 0], [12, 4, -0.8, 0.6, 0.6, 1.8, 0]
+    behind = [-10, 0, -0.9, 4, 1.7, 1.5, 0]
+    boxes = np.array([car, car, behind, person, np.add(person, [0.3, 0.2, 0, 0, 0, 0, 0]), car])
+    found = Detections.of(boxes, [CAR] * 3 + [PEDESTRIAN] * 3, [0.3, 0.8, 0.9, 0.2, 0.5, 0.7])
+    truth = GroundTruth.of(np.array([car, behind, person]), [CAR, CAR, PEDESTRIAN])
+    scan = frame()
+    look = Look(found, {"network": np.arange(6.0)}, scan.xyz, scan.xyz[:0], None, {})
+    own = samples_of(Frame.of("street", scan, truth, camera), look, 7)
+    expected = {1.0: True, 2.0: True, 4.0: True, 5.0: False}
+    if camera is not None:
+        del expected[2.0]  # the car behind
+    assert dict(zip(own.evidence["network"].tolist(), own.right.tolist())) == expected
+    assert set(own.scans.tolist()) == {7}
+
+
+@pytest.fixture
+def others(tmp_path):
+    """A file with flatter curves than the package's, of a copy of the cluster network."""
+    classifier = tmp_path / "own/pointnet.safetensors"
+    classifier.parent.mkdir()
+    classifier.write_bytes(classifier_file(PointNetParams()).read_bytes())
+    models = json.loads(json.dumps(package_models()))
+    for model in models.values():
+        model["bias"] += 1.0
+    write_fusion(tmp_path / "fused.json", (None, classifier), models, {"scans": 3})
+    return tmp_path / "fused.json", models
+
+
+def test_a_file_is_read_as_it_was_written_wherever_its_folder_is(others, tmp_path, monkeypatch):
+    path, models = others
+    fusion = read_fusion(path)
+    assert fusion.models == models and fusion.fitted_to == {"scans": 3} and fusion.doubt is None
+    assert fusion.proposer == proposer_file(PointPillarsParams())
+    moved = tmp_path.parent / f"{tmp_path.name}-moved"
+    tmp_path.rename(moved)
+    again = read_fusion(moved / "fused.json")
+    assert again.classifier == moved / "own/pointnet.safetensors" and again.doubt is None
+    monkeypatch.chdir(moved)
+    assert open_detector("fused.json", "cpu").models == models
+    assert weights_file(FusedParams(weights="fused.json")).name == "fused.json"
+    # Weights that are trained on, or lost.
+    again.classifier.write_bytes(again.classifier.read_bytes() + b"\0")
+    assert "pointnet.safetensors, so that its scores" in read_fusion(moved / "fused.json").doubt
+    again.classifier.unlink()
+    with pytest.raises(InputError, match=r"is made of .*pointnet.safetensors, which is not there"):
+        read_fusion(moved / "fused.json")
+
+
+def test_the_curves_of_the_package_are_those_of_its_weights_and_of_no_others(others):
+    path, _ = others
+    assert fusion_of().doubt is None and doubts(PACKAGE, 1.73) == []
+    assert open_detector("fused", "cpu").doubt is None
+    other = str(proposer_file(PointPillarsParams(version="v1")))
+    for params in FusedParams(weights=other), FusedParams(classifier=other):
+        assert f"other weights than {other}" in fusion_of("", params).doubt
+        assert fusion_of("", params).models == package_models()
+    with pytest.raises(InputError, match=r"names its own cluster network; leave fused.classifier"):
+        fusion_of(path, FusedParams(classifier=other))
+    for group in "weights", "classifier":
+        with pytest.raises(InputError, match=rf"no checkpoint nowhere; .* fused.{group}"):
+            fusion_of("", FusedParams(**{group: "nowhere"}))
+
+
+def test_a_detector_weighs_by_its_own_curves(others):
+    """The same boxes, each as likely as these curves say; whatever it is told to see."""
+    path, models = others
+    loaded, package = load_fused_detector(path, "cpu"), load_fused_detector("", "cpu")
+    mine = FusedDetector(random_detector("v4"), loaded.classifier, loaded.params, models)
+    theirs = FusedDetector(mine.proposer, package.classifier, package.params)
+    scan = frame()
+    odds = [detector.with_min_score(0.0)(scan).detections for detector in (mine, theirs)]
+    assert len(odds[0]) and not same(*odds)
+    assert mine.seeing("around").models is models and loaded.seeing("around").doubt is None
+
+
+def test_a_damaged_file_is_used_or_refused_with_one_line(tmp_path):
+    rng, path, refused = np.random.default_rng(0), tmp_path / "damaged.json", 0
+    evidence = {name: np.array([-9.0, 0.0, np.nan, np.inf]) for name in KNOTS}
+    for _ in range(300):
+        path.write_text(mutate_text(PACKAGE.read_text(), rng)[0])
+        try:
+            models = read_fusion(path).models
+        except InputError as error:
+            assert "damaged.json" in str(error) and "\n" not in str(error)
+            refused += 1
+            continue
+        for name in DETECTED:
+            scores = probabilities(models, np.full(4, CLASSES.index(name)), evidence)
+            assert ((scores >= 0) & (scores <= 1)).all()
+    assert 50 < refused < 300
+
+
+def test_train_fused_writes_what_commands_and_nodes_take(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "made/fused.json"
+    command = ["train", "fused", "--sensor", "vlp-16", "--mount-height", "1.0", "--scans", "2",
+               "--range", "around", "--jobs", "1", "--out", out]
+    assert exit_of(monkeypatch, *command) == 0
+    said = capsys.readouterr()
+    assert "2 street scans of vlp-16 at 1 m, all around" in said.err
+    assert "too few to fit curves to" in " ".join(said.out.split())
+    fusion = read_fusion(out)
+    assert fusion.models == package_models() and fusion.doubt is None
+    assert fusion.fitted_to["sensor"] == "vlp-16" and fusion.fitted_to["range"] == "around"
+    before = out.read_bytes()
+    assert exit_of(monkeypatch, *command) == 2 and "exists already" in error_line(capsys)
+    assert exit_of(monkeypatch, "train", "fused", "--out", tmp_path / "fused") == 2
+    assert "must end with .json" in error_line(capsys)
+    assert out.read_bytes() == before
