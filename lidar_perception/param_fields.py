@@ -76,7 +76,7 @@ def _checked(f: dataclasses.Field[Any], value: Any) -> Any:
 
 def _scalar(f: dataclasses.Field[Any], kind: type[Any], value: Any) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value) if abs(value) < 2**63 else math.copysign(math.inf, value)
+        value = float(value) if abs(value) < 2**63 else math.inf if value > 0 else -math.inf
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise ValueError(f"{f.name} = {value!r} must be of type {kind.__name__}")
     low, high = f.metadata["low"], f.metadata["high"]

@@ -222,6 +222,13 @@ def test_range_limits_ascend(limits):
         DbscanParams(range_limits=limits)
 
 
+@pytest.mark.parametrize("value", [10**400, -10**400, 2**63, float("inf")])
+def test_numbers_beyond_all_bounds_are_out_of_them(value):
+    """Ints of YAML may be larger than any float."""
+    with pytest.raises(ValueError, match=r"eps = .* is outside"):
+        DbscanParams(eps=[0.1, 0.2, value])
+
+
 @each_params
 def test_an_unknown_name_is_answered_with_the_known_ones(kind):
     with pytest.raises(ValueError, match="unknown parameter 'nonsense'") as error:

@@ -34,6 +34,7 @@ COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
                       "--seed-file", "{}")]),
     "yaml": (3, [("evaluate", "candidates", *KITTI, "--config", "{}")]),
     "weights": (3, [("evaluate", "detection", *KITTI, "--limit", "1", "--weights", "{}")]),
+    "fused": (1, [("evaluate", "detection", *KITTI, "--limit", "1", "--weights", "{}")]),
     "onnx": (1, [("evaluate", "detection", *KITTI, "--limit", "1", "--weights", "{}")]),
     "pth": (1, [("import-weights", "{}", "--out", "made.safetensors")]),
 }

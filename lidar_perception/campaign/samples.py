@@ -78,6 +78,8 @@ def write_samples(root: Path) -> None:
     package = files("lidar_perception")
     write_bytes(root / "template/seed.json",
                 (package / "candidates/pedestrian.json").read_bytes())
+    write_bytes(root / "fused/fused.json", (
+        package / "detectors/fused/fusion.json").read_bytes())
     write_text(root / "yaml/best.yaml", _yaml(BEST_VALUES))
     for name in ("pointpillars_v0_compact", "pointnet"):
         write_bytes(root / f"weights/{name}.safetensors", (

@@ -64,9 +64,9 @@ intervals_option = click.option("--intervals", type=click.IntRange(0), default=0
                                 help="Also print bootstrap intervals from N resamples of the "
                                 "drives, or of runs of 10 frames where there are few drives. 200 "
                                 "are plenty.")
-weights_option = a_path("--weights", "Run the detector of this checkpoint, or one by its name: "
-                        "fused, pointpillars or pointnet, with the weights that come with the "
-                        "package.",
+weights_option = a_path("--weights", "Run the detector of this checkpoint, or of this file of "
+                        "`train fused`, or one by its name: fused, pointpillars or pointnet, with "
+                        "the weights that come with the package.",
                         "FILE|NAME")
 
 port_option = click.option("--port", type=click.IntRange(0, 65535), default=0, show_default=True,

@@ -234,6 +234,7 @@ def put(table, **values):
     (lambda t: t["sample"].clear(), "no key frame"),
     (lambda t: t["sample"][2].pop("timestamp"), "sample.json: row 2 has no timestamp"),
     (lambda t: t["sample"].insert(1, 7), "sample.json: row 1 has no token"),
+    (put("sample", token="s0k1"), "sample.json has rows with the same token"),
     (drop("sample_data", "s0k1topTrue"), "no LIDAR_TOP of 1 of 8 key frames, such as s0k1"),
     (drop("ego_pose", "s0k1topTrue"), "ego_pose.json has no row s0k1topTrue"),
     (drop("instance", "s0o0"), "the instance s0o0 of s0o0k"),
@@ -260,6 +261,7 @@ def test_tables_that_are_wrong_are_named(changed, change, words):
 @pytest.mark.parametrize("damage", [
     lambda text: text[:len(text) // 2], lambda text: "", lambda text: "{}",
     lambda text: text.replace("token", "tok\x00en", 1), lambda text: text.rstrip("]\n"),
+    lambda text: text.replace("[", "[" * 100_000, 2),
 ])
 def test_tables_that_are_cut_are_named(changed, damage):
     root = changed()

@@ -174,7 +174,8 @@ def test_a_version_without_labels_is_written_and_not_scored(tmp_path, detector, 
 
 
 @pytest.mark.parametrize("text, words", [
-    (None, "cannot read the results"), ("{", "is no JSON file"), ("[]", "has no 'results'"),
+    (None, "cannot read the results"), ("{", "is no JSON file"),
+    ("[" * 100_000, "is no JSON file"), ("[]", "has no 'results'"),
     ('{"results": []}', "has no 'results'")])
 def test_files_that_are_no_results_are_named(root, tmp_path, monkeypatch, capsys, text, words):
     path = tmp_path / "r.json"

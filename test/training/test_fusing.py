@@ -34,6 +34,7 @@ from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file as classifier_file
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as proposer_file
+from lidar_perception.scoring.comparison.contenders import contenders
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.training.fusing import FEWEST, Samples, fitted, samples_of
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, GroundTruth, InputError
@@ -176,6 +177,12 @@ def test_a_damaged_file_is_used_or_refused_with_one_line(tmp_path):
             scores = probabilities(models, np.full(4, CLASSES.index(name)), evidence)
             assert ((scores >= 0) & (scores <= 1)).all()
     assert 50 < refused < 300
+
+
+def test_it_is_compared_as_a_detector_of_its_own(others):
+    found = {each.name: each.source for each in contenders([others[0]], "cpu")[0]}
+    assert found["fused #2"] == str(others[0]) and found["fused"] != found["fused #2"]
+    assert str(others[0]) not in found["PP v4 compact + PointNet"]  # it proposes nothing there
 
 
 def test_train_fused_writes_what_commands_and_nodes_take(tmp_path, monkeypatch, capsys):

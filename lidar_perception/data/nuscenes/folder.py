@@ -94,6 +94,8 @@ def open_nuscenes(root: str | Path, version: str = "v1.0-mini") -> list[Frame]:
     if not samples:
         raise InputError(f"{tables.folder} has no key frame; download it again")
     scene_names, times = list(rank), {token: time for _, time, token in samples}
+    if len(times) < len(samples):
+        raise InputError(f"{tables.path('sample')} has rows with the same token; download it again")
     sweeps = _sweeps(tables, times)
     mounts = _poses(tables, "calibrated_sensor", {mount for _, _, _, mount in sweeps.values()})
     poses = _poses(tables, "ego_pose", {pose for _, _, pose, _ in sweeps.values()})

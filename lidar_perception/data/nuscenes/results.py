@@ -11,7 +11,7 @@ import numpy as np
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.nuscenes.boxes import ATTRIBUTES, NAMES, GlobalBoxes, in_global
-from lidar_perception.runs.files import regular, write_text
+from lidar_perception.runs.files import regular, short, write_text
 from lidar_perception.types import CLASSES, Detections, InputError
 
 MAX_BOXES = 500    # of a frame
@@ -67,8 +67,9 @@ def read_results(path: Path, frames: Sequence[Frame]) -> dict[str, GlobalBoxes]:
         content = json.loads(regular(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"cannot read the results {path}: {error.strerror}") from None
-    except ValueError as error:
-        raise InputError(f"{path} is no JSON file ({error}); write the results again") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is no JSON file ({short(error)}); write the results again"
+                         ) from None
     results = content.get("results") if isinstance(content, dict) else None
     if not isinstance(results, dict):
         raise InputError(f"{path} has no 'results'; it needs them in the format of nuScenes' "

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.runs.files import regular
+from lidar_perception.runs.files import regular, short
 from lidar_perception.types import InputError
 
 CHUNK = 2**22        # characters read at a time; no row is longer
@@ -90,9 +90,9 @@ class Tables:
         except OSError as error:
             raise InputError(f"cannot read the table {path}: {error.strerror}; unpack the "
                              f"metadata of {self.version} there") from None
-        except UnicodeDecodeError as error:
-            raise InputError(f"{path} is damaged ({error}); download the tables of {self.version} "
-                             "again") from None
+        except (UnicodeDecodeError, RecursionError) as error:
+            raise InputError(f"{path} is damaged ({short(error)}); download the tables of "
+                             f"{self.version} again") from None
 
     def numbers(self, table: str, field: str, values: list, width: int) -> np.ndarray:
         """(K, width) float64 of a field's values. InputError where one is not that many finite

@@ -20,7 +20,7 @@ from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.hybrid.candidates import RescoredCandidates
 from lidar_perception.detectors.hybrid.params import ConfirmingParams, RescoringParams
 from lidar_perception.detectors.hybrid.proposals import ConfirmedProposals
-from lidar_perception.detectors.open import FUSED, open_detector
+from lidar_perception.detectors.open import FUSED, LOAD, open_detector
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.params import PointNetParams
@@ -57,7 +57,7 @@ class Opened:
 
     @property
     def network(self) -> str:
-        return self.detector.header.network
+        return self.detector.group
 
     def contender(self) -> Contender:
         """By itself."""
@@ -81,9 +81,10 @@ def contenders(weights: Sequence[Path] = (), device: str = "auto",
     opened: list[Opened] = []
     for path in [*files, *weights]:
         detector = open_detector(path, device, sensor_height=sensor_height)
-        if not isinstance(detector, NetworkDetector):
+        if str(path) in LOAD or not isinstance(detector, NetworkDetector):
             raise InputError(f"{path} takes part anyway; give files of weights")
-        opened.append(Opened(_name(detector, [each.name for each in opened]), detector, path))
+        opened.append(Opened(_name(detector, [FUSED, *(each.name for each in opened)]), detector,
+                             path))
     found = [each.contender() for each in opened]
     missing = [Missing(name, reason) for name, reason in absent.items()
                if name not in [each.name for each in opened]]
@@ -119,9 +120,10 @@ def _own_files() -> tuple[list[Path], dict[str, str]]:
 
 
 def _name(detector: NetworkDetector, taken: Sequence[str]) -> str:
-    """What the network is called, and a number where the name is taken."""
-    title, config = NETWORKS[detector.header.network][0], detector.config
-    name = f"{title} {config.title}".strip()
+    """What the detector is called, and a number where the name is taken."""
+    name = detector.group
+    if name in NETWORKS:
+        name = f"{NETWORKS[name][0]} {detector.config.title}".strip()
     base, number = name, 2
     while name in taken:
         name, number = f"{base} #{number}", number + 1
