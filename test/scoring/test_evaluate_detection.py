@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import types
 
 import numpy as np
@@ -67,9 +66,7 @@ def detector(monkeypatch):
             return Found(made.find(frame))
         return detect
 
-    module = types.ModuleType("lidar_perception.detectors.open")
-    module.open_detector = open_detector
-    monkeypatch.setitem(sys.modules, "lidar_perception.detectors.open", module)
+    monkeypatch.setattr("lidar_perception.detectors.open.open_detector", open_detector)
     return made
 
 
