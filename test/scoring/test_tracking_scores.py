@@ -121,6 +121,11 @@ def test_neighbour_classes_and_what_is_cut_off_neither_help_nor_harm():
     cut = [(GroundTruth.of(t.boxes, t.class_ids, [{**e, "truncated": 2.0} for e in t.extras]), k)
            for t, k in drive()]
     assert scored(cut) is None
+    behind = [(GroundTruth.of(t.boxes - [60.0, 0, 0, 0, 0, 0, 0], t.class_ids, t.extras),
+               tracked_labels(np.arange(1), Detections.of(t.boxes[:1] - 30.0, CAR, 0.9)))
+              for t, _ in drive()]
+    assert scored(behind, calibration=FORWARD_CAMERA) is None
+    assert scored(behind)["misses"] == 2 * scored(behind)["false"] == 20
 
 
 def test_a_track_in_a_dont_care_region_is_excused():
