@@ -105,6 +105,15 @@ def test_frames_of_a_bag_are_not_drawn_one_by_one(kitti, detector, tmp_path):
     assert content["intervals"]["Car"] == dict.fromkeys(INTERVALS)
 
 
+def test_a_label_without_its_scan_is_skipped_by_name(kitti, detector, found, tmp_path):
+    (kitti / "training/velodyne/000001.bin").unlink()
+    content, text = evaluate(tmp_path, "--data", kitti, "--weights", "any")
+    assert content["frames"] == 1 and "000001.txt has no scan" in content["skipped"][0]
+    assert "has no scan" in " ".join(text.split())
+    assert evaluate(tmp_path, "--data", kitti, "--weights", "any", "--limit", 1)[0][
+        "skipped"] == evaluate(tmp_path, "--data", kitti, "--results", found)[0]["skipped"] == []
+
+
 def test_scans_are_not_needed_for_result_files(kitti, found, tmp_path):
     before, _ = evaluate(tmp_path, "--data", kitti, "--results", found)
     for path in (kitti / "training/velodyne").iterdir():
