@@ -11,9 +11,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.camera import Calibration
+from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import format_label, to_labels
 from lidar_perception.data.kitti.write import write_object
-from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth
+from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from msg_utils.messages import ros_message
 from msg_utils.stamps import header_message
@@ -155,6 +156,15 @@ def crowd(seed: int, people: int = 4) -> tuple[np.ndarray, GroundTruth]:
     xyz = np.concatenate(parts)
     return np.column_stack([xyz, rng.uniform(0, 1, len(xyz))]).astype(np.float32), GroundTruth.of(
         boxes, ids)
+
+
+def lowered_crowd(seed: int, by: float) -> Frame:
+    """The frame of a crowd as seen by a sensor so many metres lower; a tenth of a second a seed."""
+    cloud, truth = crowd(seed)
+    up = np.array([0, 0, by], np.float32)
+    scan = LidarFrame.of(cloud[:, :3] + up, cloud[:, 3].copy(), 10**9 + seed * 10**8, "velodyne")
+    return Frame.of(str(seed), scan, GroundTruth.of(truth.boxes + np.pad(up, (0, 4)),
+                                                    truth.class_ids))
 
 
 def crowd_folder(root: Path, count: int = 6) -> Path:

@@ -55,7 +55,7 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, device: str
         height = recording.frames[0].sensor_height
         found, missing = contenders(weights, device, height)
     open_ = (lambda: found) if walk.here else partial(opened_in_a_process, weights, device, height)
-    report = ComparisonReport(found, intervals)
+    report = ComparisonReport(found, intervals, recording.drives)
     walk.fill(report, recording, partial(by_contenders, open_), title="comparing")
     if not report.first.frames:
         raise no_labels(recording, report.skipped)

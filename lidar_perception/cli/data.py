@@ -151,6 +151,15 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     return measured
 
 
+def as_mounted(recording: Any, params: Any) -> Any:
+    """params with the height of the recording's sensor, unless they have another than KITTI's."""
+    from lidar_perception.param_fields import with_values
+    from lidar_perception.types import SENSOR_HEIGHT
+    if params.ground.sensor_pose.height != SENSOR_HEIGHT:
+        return params
+    return with_values(params, {"ground.sensor_pose.height": recording.frames[0].sensor_height})
+
+
 def _intensity_problem(recording: Any, cloud: Any) -> str | None:
     from lidar_perception.wire.messages import intensity_problem
     problem = intensity_problem(cloud)

@@ -17,7 +17,7 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.classes import DETECTED
 from lidar_perception.cli.data import WHAT, a_path, opened
-from lidar_perception.cli.evaluate.candidates import view_as_recorded
+from lidar_perception.cli.evaluate.candidates import as_recorded
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.bag_frames import BagFrames
@@ -91,7 +91,7 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
         recording.require(BOXES, "demo")
     _make_room(out, data, detector)
     drive = _bag(out / "drive", recording, frames, drive_seed)
-    played = open_recording(drive)
+    played = _as_replayed(drive, recording)
     clouds = len(played)
     from lidar_perception.nodes.replay import TRACKS, replay
     with errors.status("loading compiled code (the first time: compiling, half a minute or more)"):
@@ -133,11 +133,17 @@ def _make_room(out: Path, data: Path | None, detector: str) -> None:
     write_text(out / RECORD, json.dumps({"data": data and str(data), "detector": detector}))
 
 
+def _as_replayed(drive: Path, recording: Recording | None) -> Recording:
+    """The bag of a recording, whose sensor is as high as there, or else of a simulated drive."""
+    return open_recording(drive, sensor_height=None if recording is None else
+                          recording.frames[0].sensor_height)
+
+
 def _params_of(detector: str, played: Recording, params: PipelineParams) -> Any:
     """The parameters of the nodes; compiles what they share, once instead of in each of them."""
     if detector == CANDIDATES:
         warm_up()
-        return view_as_recorded(played, params)
+        return as_recorded(played, params)
     from lidar_perception.detectors.open import open_detector
     return open_detector(detector, sensor_height=played.frames[0].sensor_height).params
 

@@ -14,7 +14,7 @@ from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.seed_sources import clicked_seed, truth_seed
 from lidar_perception.candidates.seeds import save_seed
 from lidar_perception.candidates.silhouette import to_pixels
-from lidar_perception.cli.data import data_option, opened
+from lidar_perception.cli.data import as_mounted, data_option, opened
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.runs.terminal import console
@@ -43,7 +43,8 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
       lidar-perception seed --data /data/kitti/object --out pedestrian.json
       lidar-perception seed --data drive --frame 40 --at 18.0 8.6 -0.9 --out pedestrian.json
     """
-    frame = _pick(opened(data), number, labelled=at is None)
+    recording = opened(data)
+    params, frame = as_mounted(recording, params), _pick(recording, number, labelled=at is None)
     camera = frame.camera()
     if camera is None:
         params = replace(params, view=ViewParams(enabled=False))

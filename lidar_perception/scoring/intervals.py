@@ -15,12 +15,13 @@ DRIVES, RUN = 8, 10
 SHARE = 90  # percent of the resamplings that lie within an interval
 
 
-def blocks(names: Sequence[str]) -> list[np.ndarray]:
-    """Indices of the frames with these names that belong together, DRIVE/FRAME; a frame without a
-    drive, as in KITTI's object layout, is one of its own."""
+def blocks(names: Sequence[str], follow: bool = False) -> list[np.ndarray]:
+    """Indices of the frames with these names that belong together, DRIVE/FRAME. Frames without a
+    drive are one drive where they follow each other, as in a bag; else each is one of its own, as
+    in KITTI's object layout."""
     drives: dict[str, list[int]] = {}
     for i, name in enumerate(names):
-        drives.setdefault(name.rpartition("/")[0] or f"/{i}", []).append(i)
+        drives.setdefault(name.rpartition("/")[0] or ("" if follow else f"/{i}"), []).append(i)
     if len(drives) >= DRIVES:
         return [*map(np.array, drives.values())]
     return [np.array(frames[i:i + RUN]) for frames in drives.values()

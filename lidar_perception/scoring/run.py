@@ -55,8 +55,9 @@ class RunError(InputError):
 
 def fill(report: Report, recording: Recording, start: Start, *, limit: int | None = None,
          jobs: int = 1, dask: str | None = None, title: str = "evaluating") -> None:
-    """Update a report with the first `limit` frames of a recording, or all, under a progress bar.
-    InputError if a process or a cluster fails."""
+    """Update a report with the first `limit` frames of a recording, or all, under a progress bar;
+    of all, labels whose scan is lost are skipped by name, too. InputError if a process or a cluster
+    fails."""
     count = min(len(recording), limit or len(recording))
     found = results(recording, start, range(count), jobs=jobs, dask=dask)
     with closing(found):
@@ -65,6 +66,8 @@ def fill(report: Report, recording: Recording, start: Start, *, limit: int | Non
                 report.skipped.append(str(result))
             elif result is not None:
                 report.update(result)
+    if limit is None:
+        report.skipped.extend(reason for _, reason in recording.lost)
 
 
 def results(recording: Recording, start: Start, numbers: Sequence[int] | None = None, *,

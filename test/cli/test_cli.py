@@ -12,13 +12,16 @@ import click
 import pytest
 from cli_samples import error_line, exit_of
 from click.testing import CliRunner
-from samples import LABELS, WALKER, object_folder, walker_label, write
+from samples import LABELS, WALKER, lowered_crowd, object_folder, walker_label, write
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.cli.data import opened
+from lidar_perception.cli.demo import _as_replayed, _params_of
 from lidar_perception.cli.main import COMMANDS, cli
 from lidar_perception.cli.options import read_config
 from lidar_perception.data.bag import Bag, BagWriter
+from lidar_perception.data.to_bag import write_bag
 from lidar_perception.param_fields import parameter_fields
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS, TRUTH
@@ -363,3 +366,12 @@ def test_without_rclpy_the_remedy_is_said_before_any_work(command, tmp_path):
         "cannot load rclpy (not for this Python): source ROS 2 Jazzy, or pip install "
         "'lidar_perception[ros]'")
     assert not (tmp_path / "out").exists()
+
+
+def test_demo_tells_its_nodes_how_high_the_sensor_is(tmp_path):
+    """As measured in the bag that it replays, which says nothing of it."""
+    write_bag(tmp_path / "bag", [lowered_crowd(i, 1.0) for i in range(3)])
+    recording = opened(tmp_path / "bag")
+    played = _as_replayed(recording.path, recording)
+    assert _params_of("candidates", played, PAPER).ground.sensor_pose.height == pytest.approx(
+        0.7, abs=0.02)

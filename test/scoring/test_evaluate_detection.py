@@ -12,6 +12,7 @@ from samples import CALIBRATION, LABELS, object_folder, write
 
 from lidar_perception.data.kitti.results import read_results, write_results
 from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES, SCORED
@@ -89,6 +90,25 @@ def test_the_labels_as_results_score_100_and_are_printed(kitti, found, tmp_path,
     for words in ("Table 5", "67.09", "here, R40", "Pedestrians within 1.0 m", "from above"):
         assert words in text
     assert max(map(len, text.splitlines())) <= 80
+
+
+def test_frames_of_a_bag_are_not_drawn_one_by_one(kitti, detector, tmp_path):
+    """A second of one drive is one thing to draw, so there is no interval."""
+    detector.find = lambda frame: truth_of(kitti)
+    write_bag(tmp_path / "bag", open_recording(kitti))
+    arguments = "--weights", "any", "--intervals", 10
+    assert evaluate(tmp_path, "--data", kitti, *arguments)[0]["intervals"]["Car"]["bev"]
+    content, _ = evaluate(tmp_path, "--data", tmp_path / "bag", *arguments)
+    assert content["intervals"]["Car"] == dict.fromkeys(INTERVALS)
+
+
+def test_a_label_without_its_scan_is_skipped_by_name(kitti, detector, found, tmp_path):
+    (kitti / "training/velodyne/000001.bin").unlink()
+    content, text = evaluate(tmp_path, "--data", kitti, "--weights", "any")
+    assert content["frames"] == 1 and "000001.txt has no scan" in content["skipped"][0]
+    assert "has no scan" in " ".join(text.split())
+    assert evaluate(tmp_path, "--data", kitti, "--weights", "any", "--limit", 1)[0][
+        "skipped"] == evaluate(tmp_path, "--data", kitti, "--results", found)[0]["skipped"] == []
 
 
 def test_scans_are_not_needed_for_result_files(kitti, found, tmp_path):

@@ -26,6 +26,7 @@ from lidar_perception.data.nuscenes.results import (
 from lidar_perception.detectors.checkpoint import Header, save_checkpoint
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.scoring.nuscenes.report import OURS
 from lidar_perception.types import CLASSES, Detections, InputError
 
@@ -53,8 +54,8 @@ def detector(monkeypatch):
     """A stand-in for the detector of a checkpoint."""
     made = types.SimpleNamespace(asked=[], find=lambda scan: Detections.none())
 
-    def opened(path, device, *, sensor_height, where):
-        made.asked.append((path, device, sensor_height))
+    def opened(path, device, *, min_score, sensor_height, where):
+        made.asked.append((path, device, min_score, sensor_height))
         return lambda scan: Found(made.find(scan))
     monkeypatch.setattr("lidar_perception.detectors.open.open_detector", opened)
     return made
@@ -83,8 +84,8 @@ def test_a_checkpoint_is_run_and_its_results_score_the_same(root, detector, tmp_
     detector.find = lambda scan: detections(frames[scan.stamp_ns])
     direct, text = evaluate(tmp_path, "--data", root, "--weights", "w.safetensors", "--device",
                             "cpu", "--write-results", out)
-    (path, device, height), = detector.asked
-    assert (str(path), device, height) == ("w.safetensors", "cpu", folder.SENSOR[2])
+    (path, *asked), = detector.asked
+    assert (str(path), *asked) == ("w.safetensors", "cpu", MIN_SCORE, folder.SENSOR[2])
     assert direct["frames"] == 8 and direct["ms"] >= 0 and direct["version"] == "v1.0-mini"
     car, person = (direct["classes"][n] for n in ("car", "pedestrian"))
     assert car["mean_ap"] > 99 and car["ate"] < 0.3 and person["mean_ap"] > 99

@@ -26,6 +26,12 @@ def test_every_frame_is_in_one_block_and_a_block_is_of_one_drive(lengths, named)
         assert all(len(part) <= RUN for part in parts)
 
 
+@given(st.integers(1, 45))
+def test_a_bag_whose_frames_are_named_by_time_is_one_drive(count):
+    times, named = [f"{10**9 * i}" for i in range(count)], [f"0000/{i}" for i in range(count)]
+    assert [*map(list, blocks(times, follow=True))] == [*map(list, blocks(named))]
+
+
 @given(st.integers(0, 2**32 - 1), st.integers(2, 40))
 def test_an_interval_holds_the_score_and_repeats_itself(seed, count):
     values = np.random.default_rng(seed).normal(0, 1, count)

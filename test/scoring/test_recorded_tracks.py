@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from tracking_samples import START, TENTH, crowd
@@ -52,6 +54,11 @@ def test_recorded_tracks_are_counted_and_scored_where_labels_have_ids(recorded):
         scores = result.scores["Pedestrian"]
         assert (scores["true_tracks"], scores["switches"], result.problem) == (3, 0, None)
         assert scores["HOTA"] > 0.8
+        frames = answered(path, TRACKS)[0]
+        later = [replace(f, stamp_ns=f.stamp_ns + 600 * TENTH,
+                         found=replace(f.found, ids=np.asarray(f.found.ids) + 100)) for f in frames]
+        both = recorded_tracks([*frames, *later], None).scores["Pedestrian"]  # two drives
+        assert (both["true_tracks"], both["switches"], both["HOTA"]) == (6, 0, scores["HOTA"])
     else:
         assert result.scores == {} and "track id" in result.problem
     assert answered(path, "/nothing")[0] == []

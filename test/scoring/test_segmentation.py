@@ -11,12 +11,15 @@ import pytest
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
-from samples import DATA, needs_data, object_folder, walker_label, write
+from samples import DATA, lowered_crowd, needs_data, object_folder, walker_label, write
 
+from lidar_perception.candidates.refine import STAGES
+from lidar_perception.cli.evaluate.candidates import candidates
 from lidar_perception.cli.evaluate.segmentation import segmentation
 from lidar_perception.clustering.params import CLUSTERING_METHODS
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import GROUND, MOVING, THINGS
+from lidar_perception.data.to_bag import write_bag
 from lidar_perception.ground.params import GROUND_METHODS
 from lidar_perception.scoring.points.segmentation import (
     PROTOCOLS,
@@ -363,3 +366,22 @@ def test_calls_that_cannot_be_answered_say_why(tmp_path):
     write(root / "sequences/00/labels/000000.label", b"")
     with pytest.raises(InputError, match="no frame with labels"):
         raise run("--data", root).exception
+
+
+@pytest.mark.parametrize("command", [segmentation, candidates])
+def test_a_bag_whose_sensor_is_lower_is_scored_alike(command, tmp_path):
+    """Its height is measured, and what is scored is told so, unless flags say another one."""
+    def scores(name, lower, *flags):
+        path, bag = tmp_path / f"{name}.json", tmp_path / name
+        write_bag(bag, [lowered_crowd(i, lower) for i in range(3)])
+        call = "--data", str(bag), "--json", str(path), *flags
+        result = CliRunner().invoke(command, call, catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        content = json.loads(path.read_text())
+        return [content[stage]["all"]["tp"] for stage in STAGES] if command is candidates else [
+            (row["hits"], row["clusters"])
+            for rows in content["clusters"].values() for row in rows.values()]
+
+    usual = scores("usual", 0.0)
+    assert np.min(usual) > 0 and scores("lower", 1.0) == usual
+    assert scores("told", 1.0, "--ground-sensor-pose-height", "1.6") != usual

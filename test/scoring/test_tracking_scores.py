@@ -10,13 +10,15 @@ import tracking_reference as slow
 
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.results import read_tracking_results, write_tracking_results
+from lidar_perception.detectors.contract import Found
+from lidar_perception.scoring.run import fill
 from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
 from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
 from lidar_perception.scoring.tracking.over_recall import over_recall
 from lidar_perception.scoring.tracking.pairs import Pairs, pairs_of, tracked_labels, without_ignored
 from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, observe
 from lidar_perception.simulation.camera import FORWARD_CAMERA
-from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError
+from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError, LidarFrame
 
 CAR, VAN = CLASSES.index("Car"), CLASSES.index("Van")
 
@@ -115,12 +117,36 @@ def test_the_order_in_which_frames_come_does_not_matter():
     assert scored(frames, order=[9, 3, 1, 0, 2, 8, 7, 4, 5, 6]) == scored(frames)
 
 
+def test_drives_that_share_a_bag_are_scored_as_if_they_had_names():
+    """Labels of each have numbers of their own."""
+    def content(named):
+        frames, found = [], {}
+        for k in range(2):
+            for i, (truth, _) in enumerate(drive()):
+                scan = LidarFrame(np.ones((1, 3), np.float32), None, k * 10**10 + i * 10**8)
+                truth = GroundTruth.of(truth.boxes[::1 - 2 * k], truth.class_ids, truth.extras)
+                found[scan.stamp_ns] = Found(Detections.of(truth.boxes, CAR, 0.9))
+                frames.append(Frame.of(f"{k}/{i}", scan, truth, sequence=str(k) * named,
+                                       index=i if named else len(frames)))
+        recording, report = Recording("a", "", frames), TrackingReport()
+        fill(report, recording, by_tracker(lambda: lambda scan: found[scan.stamp_ns], ego="none"))
+        return report.compute()
+
+    assert content(False) == content(True)
+    assert content(False)["sequences"] == 2 and content(False)["classes"]["Car"]["switches"] == 0
+
+
 def test_neighbour_classes_and_what_is_cut_off_neither_help_nor_harm():
     vans = drive(kind=VAN)
     assert scored(vans) is None
     cut = [(GroundTruth.of(t.boxes, t.class_ids, [{**e, "truncated": 2.0} for e in t.extras]), k)
            for t, k in drive()]
     assert scored(cut) is None
+    behind = [(GroundTruth.of(t.boxes - [60.0, 0, 0, 0, 0, 0, 0], t.class_ids, t.extras),
+               tracked_labels(np.arange(1), Detections.of(t.boxes[:1] - 30.0, CAR, 0.9)))
+              for t, _ in drive()]
+    assert scored(behind, calibration=FORWARD_CAMERA) is None
+    assert scored(behind)["misses"] == 2 * scored(behind)["false"] == 20
 
 
 def test_a_track_in_a_dont_care_region_is_excused():

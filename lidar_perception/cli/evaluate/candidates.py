@@ -10,15 +10,17 @@ import click
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.cli.data import Walk, no_labels, out_file, walk_options
+from lidar_perception.cli.data import Walk, as_mounted, no_labels, out_file, walk_options
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.param_fields import with_values
 from lidar_perception.runs.terminal import console, errors
 
 
-def view_as_recorded(recording: Any, params: PipelineParams) -> PipelineParams:
-    """params with the crop to the camera off, and a note, if the recording has no camera."""
+def as_recorded(recording: Any, params: PipelineParams) -> PipelineParams:
+    """params with the height of the recording's sensor, see as_mounted, and with the crop to the
+    camera off, and a note, if it has no camera."""
     from lidar_perception.data.frame import CAMERA
+    params = as_mounted(recording, params)
     if params.view.enabled and CAMERA not in recording.has:
         errors.print(f"{recording.path} has no camera calibration: the whole scan is processed")
         return with_values(params, {"view.enabled": False})
@@ -45,7 +47,7 @@ def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
     from lidar_perception.scoring.centres.tables import print_candidate_report
 
     recording = walk.opened(BOXES)
-    params = view_as_recorded(recording, params)
+    params = as_recorded(recording, params)
     if params.seed.source == "click":
         raise click.UsageError("there is nobody to click here; use --seed-source file")
     report = CandidateReport()

@@ -100,7 +100,7 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
         open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height,
                         where=where)
         start = by_detector(open_, keep, write_results)
-    report = DetectionReport()
+    report = DetectionReport(follow=recording.drives)
     walk.fill(report, recording, start)
     if write_results is not None:
         console.print(f"result files: {write_results}")

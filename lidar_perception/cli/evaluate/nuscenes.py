@@ -16,6 +16,7 @@ from lidar_perception.cli.data import (
     walk_options,
     weights_option,
 )
+from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
 
@@ -65,8 +66,8 @@ def nuscenes(walk: Walk, results: Path | None, weights: Path | None, where: str,
         start = partial(by_file, results)
     else:
         assert weights is not None  # as there are no --results
-        open_ = partial(open_detector, weights, device, sensor_height=first.sensor_height,
-                        where=where)
+        open_ = partial(open_detector, weights, device, min_score=MIN_SCORE,
+                        sensor_height=first.sensor_height, where=where)
         start = partial(by_detector, open_, write_results is not None)
     report = NuscenesReport()
     walk.fill(report, recording, start)

@@ -9,7 +9,15 @@ from typing import Any
 
 import click
 
-from lidar_perception.cli.data import WHAT, Walk, a_path, no_labels, out_file, walk_options
+from lidar_perception.cli.data import (
+    WHAT,
+    Walk,
+    a_path,
+    as_mounted,
+    no_labels,
+    out_file,
+    walk_options,
+)
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.clustering.params import CLUSTERING_METHODS
 from lidar_perception.ground.params import GROUND_METHODS
@@ -71,7 +79,8 @@ def segmentation(walk: Walk, methods: tuple, png: Path | None, params: Segmentat
     report = SegmentationReport()
     for recording in recordings:
         report.source = recording.layout
-        walk.fill(report, recording, partial(by_methods, params, grounds, clusterings),
+        own = as_mounted(recording, params)
+        walk.fill(report, recording, partial(by_methods, own, grounds, clusterings),
                   recording.layout)
     if not (report.ground or report.clusters):
         raise no_labels(recordings[0], report.skipped)
@@ -83,8 +92,9 @@ def segmentation(walk: Walk, methods: tuple, png: Path | None, params: Segmentat
     walk.write(content)
     if png is not None:
         from lidar_perception.scoring.points.report import ground_of_methods
+        own = as_mounted(labelled[0], params)
         for frame in islice(labelled[0], walk.limit):
-            scan, labels, found = ground_of_methods(frame, params, grounds)
+            scan, labels, found = ground_of_methods(frame, own, grounds)
             if labels is not None:
                 draw_ground(png, frame.name, scan, labels.classes, found)
                 break

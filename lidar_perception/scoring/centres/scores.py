@@ -56,9 +56,10 @@ class CentreScores:
             total.update(boxes[scores >= min_score], truth)
         return total.table()
 
-    def f1_interval(self, min_score: float, count: int) -> list[float] | None:
-        """[low, high] of F1 in percent for detections that score min_score or more; see
-        intervals.py."""
+    def f1_interval(self, min_score: float, count: int, follow: bool = False
+                    ) -> list[float] | None:
+        """[low, high] of F1 in percent for detections that score min_score or more, from `count`
+        drawings of blocks(names, follow); see intervals.py."""
         found = [boxes[scores >= min_score] for _, boxes, scores in self.frames]
         counts = np.array([[len(match_centres(boxes, truth)[0]), len(boxes), len(truth)]
                            for boxes, (truth, _, _) in zip(found, self.frames)]).reshape(-1, 3)
@@ -67,7 +68,7 @@ class CentreScores:
             hits, boxes, true = counts[frames].sum(axis=0)
             return 200 * hits / (boxes + true)
 
-        return interval(f1, blocks(self.names), count)
+        return interval(f1, blocks(self.names, follow), count)
 
     def compute(self) -> dict:
         """What the JSON file holds."""

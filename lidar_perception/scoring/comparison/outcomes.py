@@ -81,15 +81,16 @@ def in_turn(items: list, turn: int) -> list:
 @dataclass
 class ComparisonReport:
     """The report of each contender, by name; drawings: of drives, for intervals, 0 for none;
-    skipped: frames that could not be read."""
+    follow: as of DetectionReport; skipped: frames that could not be read."""
 
     contenders: list[Contender]
     reports: dict[str, DetectionReport] = field(init=False)
     drawings: int = 0
+    follow: bool = False
     skipped: list[str] = field(default_factory=list)
 
     def __post_init__(self) -> None:
-        self.reports = {each.name: DetectionReport() for each in self.contenders}
+        self.reports = {each.name: DetectionReport(follow=self.follow) for each in self.contenders}
 
     @property
     def first(self) -> DetectionReport:
@@ -120,7 +121,8 @@ def outcome(contender: Contender, report: DetectionReport, drawings: int = 0) ->
     intervals = {"intervals": {
         "ap": {name: rows if name in contender.classes else None
                for name, rows in report.intervals(drawings).items()},
-        "f1": centres.f1_interval(contender.operating, drawings)}} if drawings else {}
+        "f1": centres.f1_interval(contender.operating, drawings, report.follow)}
+        } if drawings else {}
     return {
         "weights": contender.source, "classes": list(contender.classes),
         "ap": precision, "mean_ap": {row: mean_moderate(precision, row) for row in AP_ROWS},

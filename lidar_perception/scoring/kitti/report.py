@@ -38,7 +38,8 @@ INTERVALS = "bev_relaxed", "bev", "3d"
 
 @dataclass
 class DetectionReport:
-    """Frames, and what could not be scored; ms of the detector by frame, where it was run here."""
+    """Frames, and what could not be scored; ms of the detector by frame, where it was run here.
+    follow: whether frames whose names say no drive follow each other, see intervals.blocks."""
 
     frames: list[ComparedFrame] = field(default_factory=list)
     names: list[str] = field(default_factory=list)
@@ -46,6 +47,7 @@ class DetectionReport:
     ms: list[float] = field(default_factory=list)
     skipped: list[str] = field(default_factory=list)
     with_camera: bool = True
+    follow: bool = False
 
     def update(self, result: Detected) -> None:
         """One frame, as detections.py measures it.
@@ -94,7 +96,7 @@ class DetectionReport:
         of the drives; see intervals.py. None without objects."""
         found: dict[tuple[str, str], list[float | None]] = {
             (name, row): [] for name in SCORED for row in INTERVALS}
-        for frames in drawings(blocks(self.names), count):
+        for frames in drawings(blocks(self.names, self.follow), count):
             together = Comparison.of([self.frames[i] for i in frames])
             for (name, row), scores in found.items():
                 metric, overlaps = ROWS[row]

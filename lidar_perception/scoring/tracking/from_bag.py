@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.camera import Calibration
+from lidar_perception.data.drives import goes_on
 from lidar_perception.scoring.recorded import Answered
 from lidar_perception.scoring.tracking.pairs import tracked_labels
 from lidar_perception.scoring.tracking.report import TrackingReport, observe
@@ -33,10 +34,12 @@ def recorded_tracks(frames: Sequence[Answered], calibration: Calibration | None
               for i, label in zip(frame.found.ids.tolist(), frame.found.labels)]
     count = {name: len({i for label, i in labels if label == name})
              for name in sorted({label for label, _ in labels})}
-    report = TrackingReport()
+    report, drive, before = TrackingReport(), 0, 0
     try:
         for i, frame in enumerate(frames):
-            report.update(observe("bag", i, to_truth(frame.truth), tracked_labels(
+            drive += not goes_on(before, frame.stamp_ns)
+            before = frame.stamp_ns
+            report.update(observe(f"drive {drive}", i, to_truth(frame.truth), tracked_labels(
                 np.asarray(frame.found.ids), to_detections(frame.found)), calibration))
     except InputError as error:
         return RecordedTracks(count, {}, str(error))

@@ -2,7 +2,7 @@
 
 What counts follows KITTI's tracking benchmark as TrackEval runs it: neighbour classes, labels that
 are cut off by the image's border or hardly visible, DontCare regions and small boxes neither help
-nor harm.
+nor harm; nor do labels outside the image, of which KITTI has none.
 """
 
 from __future__ import annotations
@@ -72,6 +72,7 @@ def pairs_of(truth: GroundTruth, tracks: GroundTruth, calibration: Calibration |
     true_objects, objects = true.take(np.arange(len(truth))), found.take(np.arange(len(tracks)))
     ignored = np.array([extra.get("occluded", 0) > MAX_OCCLUSION or round(
         extra.get("truncated", 0)) > MAX_TRUNCATION for extra in truth.extras], bool)
+    ignored |= true_objects.pixels_high == 0
     excused = (objects.pixels_high <= MIN_HEIGHT + EPS) | _in_regions(
         objects.image_boxes, true.regions)
     return {name: _of_class(name, true_objects, objects, true_ids, track_ids, ignored, excused,

@@ -8,6 +8,7 @@ from functools import partial
 
 from lidar_perception.camera import Calibration
 from lidar_perception.classes import DETECTED
+from lidar_perception.data.drives import goes_on
 from lidar_perception.data.frame import POSES, Frame, Recording
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.run import Start
@@ -54,7 +55,8 @@ def ego_of(recording: Recording, wanted: str = "auto") -> str:
 def by_tracker(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
                ego: str = "auto") -> Start:
     """Track what the detector of open_() finds, one tracker a sequence, whose frames must come in
-    their order in one process; ego, one of RECORDED_EGO, says whence the poses are, see ego_of."""
+    their order in one process; without sequences, as in a bag, one a drive, see drives.goes_on.
+    ego, one of RECORDED_EGO, says whence the poses are, see ego_of."""
     return partial(_by_tracker, open_, params, ego)
 
 
@@ -62,12 +64,14 @@ def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, ego: str,
                 recording: Recording) -> Callable[[Frame], Observation | None]:
     ego = ego_of(recording, ego)
     detector = open_()
-    last, tracker, pose_of = None, Tracker(params), recorded_poses(ego)
+    last, number = ("", -1), 0  # sequence and stamp of the frame before; of the drive
+    tracker, pose_of = Tracker(params), recorded_poses(ego)
 
     def measure(frame: Frame) -> Observation | None:
-        nonlocal last, tracker, pose_of
-        if frame.sequence != last:
-            last, tracker, pose_of = frame.sequence, Tracker(params), recorded_poses(ego)
+        nonlocal last, number, tracker, pose_of
+        if frame.sequence != last[0] or not (frame.sequence or goes_on(last[1], frame.stamp_ns)):
+            tracker, pose_of, number = Tracker(params), recorded_poses(ego), number + 1
+        last = frame.sequence, frame.stamp_ns
         truth = frame.truth()
         if truth is not None:
             ids_of(truth, "label")  # before the detector's work
@@ -75,7 +79,7 @@ def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, ego: str,
         tracks = tracker(detector(scan).detections, frame.stamp_ns, pose_of(frame, scan.xyz))
         if truth is None:
             return None
-        return observe(frame.sequence, frame.index, truth,
+        return observe(frame.sequence or f"drive {number}", frame.index, truth,
                        tracked_labels(tracks.ids, tracks.detections), frame.calibration())
     return measure
 
