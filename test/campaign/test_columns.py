@@ -54,6 +54,10 @@ def test_every_input_of_a_node_is_tried(tried):
                                and topic not in ("clock", "tf", "tf_static")}
 
 
+def test_a_node_says_that_its_curves_are_of_other_weights(tried):
+    assert tried["fused_detector"].node.counts["scores"] == "not calibrated"
+
+
 def outcome_of(node, name, message, then_good=False):
     """Of one cloud, with the node's first settings."""
     return node.attempt(Case("messages", name, 1, 0, {

@@ -14,6 +14,7 @@ from detector_node import DetectorUnderTest, assert_equal, message, received, sm
 from test_bad_input import BAD, cloud
 
 from lidar_perception.detectors.fused.detector import load_fused_detector
+from lidar_perception.detectors.fused.fusion import package_models, write_fusion
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams
 from lidar_perception.nodes.graph import graph_of
 from lidar_perception.param_fields import with_values
@@ -30,7 +31,12 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory) -> Path:
-    return small_v4(tmp_path_factory.mktemp("weights"))
+    """A file of `train fused` of small weights, with curves of its own."""
+    folder = tmp_path_factory.mktemp("weights")
+    models = {name: {**model, "bias": model["bias"] + 1}
+              for name, model in package_models().items()}
+    write_fusion(folder / "fused.json", (small_v4(folder), None), models, {})
+    return folder / "fused.json"
 
 
 def test_detections_over_dds_are_those_of_the_offline_detector(found, talker, shared_peer, weights):
