@@ -30,6 +30,19 @@ def test_a_gap_of_the_stamps_ends_a_drive():
         pieces_of(frames(*range(0, 100, 5)), 100)
 
 
+@pytest.mark.parametrize("runs", [(3, *[20] * 5), (2, 2, *[25] * 10, 4), (75,), (5, 70, 9, 64)])
+def test_where_not_all_is_looked_at_pieces_are_long_enough_and_together_as_many(runs):
+    starts = np.cumsum([0, *runs[:-1]])
+    frames = [Frame("", int((30 * k + i / 10) * 1e9), lambda: None)
+              for k, run in enumerate(runs) for i in range(run)]
+    pieces = pieces_of(frames, 60)
+    numbers = [n for piece in pieces for n in piece.numbers]
+    assert len(set(numbers)) == len(numbers) and 40 <= len(numbers) <= 60
+    for piece in pieces:
+        assert len(piece.numbers) >= FEWEST and len(piece.held)  # followed, and judged
+        assert len(np.unique(np.searchsorted(starts, piece.numbers, "right"))) == 1  # of one drive
+
+
 def clouds(scale: tuple[float, float, float], count: int = 500) -> list[Frame]:
     """Frames of points all around within 20 m, their coordinates times scale."""
     xyz = np.random.default_rng(0).uniform(-20, 20, (count, 3)) * scale
