@@ -154,8 +154,9 @@ class Adapting:
         self._record()
 
     def clear(self) -> None:
-        """Remove what a refused run has made, and the folder if nothing else is in it."""
-        for path in (self.out / name for name in (RECORD, HEARD, POSES, SCANS, ROUND.format(1))):
+        """Remove what a refused run has made, its record last, and the folder if nothing else is in
+        it."""
+        for path in (self.out / name for name in (HEARD, POSES, SCANS, ROUND.format(1), RECORD)):
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
             else:

@@ -42,6 +42,7 @@ from lidar_perception.detectors.pointpillars.network import Outputs
 from lidar_perception.detectors.pointpillars.targets import stacked
 from lidar_perception.labeling.exchange import import_labels
 from lidar_perception.runs.files import refuse_others
+from lidar_perception.runs.resuming import locked
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cache import write_arrays
 from lidar_perception.training.out import STATE
@@ -302,6 +303,20 @@ def test_a_folder_of_somebody_else_stays_as_it_is(bag, weights, tmp_path):
     assert "such as thesis.txt" in refused(tmp_path / "out", "--data", bag, "--weights", weights,
                                            "--force")
     assert sorted(p.name for p in file.parent.iterdir()) == [RECORD, "thesis.txt"]
+
+
+def test_a_run_that_replaces_another_keeps_others_out_too(bag, weights, whole, tmp_path,
+                                                         monkeypatch):
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+
+    def run(self) -> None:
+        assert not any(out.iterdir())
+        with locked(out):
+            pass
+    monkeypatch.setattr(Adapting, "run", run)
+    assert "another process is writing" in refused(out, "--data", bag, "--weights", weights,
+                                                   "--force")
 
 
 def test_too_little_agreement_is_said_with_a_report(bag, weights, tmp_path):
