@@ -16,6 +16,7 @@ from lidar_perception.labeling.interpolation import Motion
 from lidar_perception.sensor_setup.scans import require_metres, require_space
 from lidar_perception.tracking.ego import Odometry, recorded_source, usable
 from lidar_perception.types import InputError
+from lidar_perception.wire.messages import recorded_intensity_problem
 
 PIECE = 60        # frames of a piece, where not all are looked at
 HELD = 5          # one of so many frames is held out, at the end of each piece
@@ -65,8 +66,9 @@ def checked(frames: Sequence[Frame], source: Path) -> list[str]:
         raise InputError(f"{source}: its clouds have no points; record while the sensor turns")
     require_metres(xyz, str(source))
     require_space(np.degrees(elevations(xyz)), str(source))
-    if any(cloud.intensity is not None and cloud.intensity.any() for cloud in clouds):
-        return []
+    lit = [cloud for cloud in clouds if cloud.intensity is not None and cloud.intensity.any()]
+    if lit:
+        return [*filter(None, [recorded_intensity_problem(source, lit[0])])]
     return [f"{source} has no intensity, which the networks were trained with, so that they may "
             "find little: turn it on in the driver"]
 

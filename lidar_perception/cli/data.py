@@ -137,6 +137,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     if recording.mounted:
         return recording
     from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
+    from lidar_perception.wire.messages import recorded_intensity_problem
     clouds = first_clouds(recording)
     measured = mounted(recording, clouds)
     if measured is not recording:
@@ -145,15 +146,9 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
                      style="dim")
     if level and clouds:
         for problem in filter(None, (mount_problem(recording, clouds),
-                                     _intensity_problem(recording, clouds[0]))):
+                                     recorded_intensity_problem(recording.path, clouds[0]))):
             errors.print(problem, style="yellow")
     return measured
-
-
-def _intensity_problem(recording: Any, cloud: Any) -> str | None:
-    from lidar_perception.wire.messages import intensity_problem
-    problem = intensity_problem(cloud)
-    return problem and f"{recording.path}: {problem}, and use convert --robot"
 
 
 def write_json(path: Path | None, content: dict) -> None:

@@ -59,10 +59,12 @@ def test_clouds_that_no_detector_can_read_are_refused(frames, named):
     assert "\n" not in str(error.value)
 
 
-def test_clouds_without_intensity_are_taken_and_it_is_said():
+def test_clouds_without_intensity_or_its_scale_are_taken_and_it_is_said():
     frames = clouds((1, 1, 0.1))
     assert checked(frames, BAG) == []
     dark = [Frame.of(f.name, LidarFrame(f.load().xyz, None)) for f in frames]
     assert "no intensity" in checked(dark, BAG)[0]
+    odd = [Frame.of(f.name, LidarFrame(f.load().xyz, f.load().intensity * 10)) for f in frames]
+    assert "input.intensity_max" in checked(odd, BAG)[0]
     one_empty = [Frame.of("0", LidarFrame(np.zeros((0, 3), np.float32), None)), *frames[1:]]
     assert checked(one_empty, BAG) == []
