@@ -89,6 +89,8 @@ class Measured:
         if self.beams is None:
             return np.nan
         up = self.beams.elevations
+        if self.mount is not None and self.mount.upside_down:
+            up = -up[::-1]
         middle = up[(up >= AROUND[0]) & (up <= AROUND[1])]
         apart = -np.diff(middle if len(middle) > 2 else up)
         return float(np.median(apart)) if len(apart) else np.nan

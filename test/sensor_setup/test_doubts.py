@@ -206,11 +206,16 @@ def test_a_sensor_that_is_upside_down_is_described_as_it_hangs(beams):
         to = np.arctan2(points["y"], points["x"])
         return points[(up < np.radians(4)) & (to > np.radians(-30))]
 
-    level, hung = (sensor_of(of(all_changed(lambda p, axes=axes: turned(np.diag(axes))(part(p)))))
-                   for axes in ([1, 1, 1], [1, -1, -1]))
+    own, other = (of(all_changed(lambda p, axes=axes: turned(np.diag(axes))(part(p))))
+                  for axes in ([1, 1, 1], [1, -1, -1]))
+    level, hung = sensor_of(own), sensor_of(other)
     np.testing.assert_allclose(hung.elevations, level.elevations, atol=np.radians(0.1))
     np.testing.assert_allclose(hung.blocked, level.blocked, atol=1.01)
     assert hung.wander == pytest.approx(level.wander, rel=0.05) and bool(hung.wander) != beams
+    if beams:  # closer to each other where people are than above
+        up = np.array([14.0, 11, 8, 5, 3, 1, -6, -8, -10, -12, -14])
+        assert replace(own, beams=own.beams._replace(elevations=up)).elevation_step == replace(
+            other, beams=other.beams._replace(elevations=-up[::-1])).elevation_step == 2
 
 
 DRIVES = {"at a robot's speed": (501, "campus", 0.92, 14), "at a car's": (502, "street", 11.15, 8),
