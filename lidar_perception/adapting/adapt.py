@@ -55,7 +55,7 @@ from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
 from lidar_perception.runs.files import make_folder, read_text, write_bytes, write_text
-from lidar_perception.runs.resuming import differences
+from lidar_perception.runs.resuming import differences, digest
 from lidar_perception.runs.terminal import duration, errors, track
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import sensor_named
@@ -154,8 +154,9 @@ class Adapting:
         self._record()
 
     def clear(self) -> None:
-        """Remove what a refused run has made, and the folder if nothing else is in it."""
-        for path in (self.out / name for name in (RECORD, HEARD, POSES, SCANS, ROUND.format(1))):
+        """Remove what a refused run has made, its record last, and the folder if nothing else is in
+        it."""
+        for path in (self.out / name for name in (HEARD, POSES, SCANS, ROUND.format(1), RECORD)):
             if path.is_dir():
                 shutil.rmtree(path, ignore_errors=True)
             else:
@@ -166,7 +167,8 @@ class Adapting:
     def asked(self) -> dict[str, Any]:
         """What a resumed run must have in common."""
         return {"data": str(self.data), "weights": sha1(self.weights.read_bytes()).hexdigest(),
-                "params": asdict(self.params), "height": self.height}
+                "params": asdict(self.params), "height": self.height,
+                "frame_names": digest(f"{frame.sequence} {frame.name}" for frame in self.frames)}
 
     def _choose(self) -> None:
         """Which frames, by the time that one takes, unless an earlier start chose."""
@@ -244,22 +246,24 @@ class Adapting:
         folder = self.out / ROUND.format(number)
         errors.print(f"round {number} of {self.params.rounds}", style="bold")
         looker = Looker(self.opened(self.best))
-        self.seen = [self._look(i, folder / "looks", looker) for i in range(len(self.pieces))]
+        seen = [self._look(i, folder / "looks", looker) for i in range(len(self.pieces))]
         if number == 1:
-            self.first_seen = self.seen
-        counts = counted(self.seen)
+            self.first_seen = seen
+        counts = counted(seen)
         for state in STATES:
             errors.print(f"{state}: " + (", ".join(f"{count} {name}" for name, count in
                                                    counts[state].items()) or "nothing"))
         if (agreed := sum(counts[KEPT].values())) < FEWEST_KEPT:
             few = (f"the detectors agree on {agreed} object{'s' * (agreed != 1)} only, too few to "
                    "learn from")
-            if self.rounds:
+            if self.rounds:  # what was learned from stays seen
                 errors.print(f"round {number} is not made: {few}; {self.best} stays")
                 return False
+            self.seen = seen
             raise Refused(
                 f"{self.data}: {few} ({FEWEST_KEPT}); record more, give --mount-height if it is "
                 "not right, or train for the sensor first (train --sensor)")
+        self.seen = seen
         if self.before is None:
             self.before = self._watch(self.out / JUDGED, self.weights)
         taught = self._learn(folder, begun)
@@ -308,6 +312,10 @@ class Adapting:
                              "fewer --scans") from None
         if ended is not None and ended.progress.stopped:
             raise KeyboardInterrupt
+        if not taught.is_file():
+            raise InputError(f"a budget of {self.hours:g} h was spent before the first step, as "
+                             "this machine was slower than planned; --resume goes on with what is "
+                             "prepared")
         return taught
 
     def _training(self, folder: Path, hours: float | None = None) -> Asked:

@@ -16,6 +16,7 @@ from lidar_perception.labeling.interpolation import Motion
 from lidar_perception.sensor_setup.scans import require_metres, require_space
 from lidar_perception.tracking.ego import Odometry, recorded_source, usable
 from lidar_perception.types import InputError
+from lidar_perception.wire.messages import recorded_intensity_problem
 
 PIECE = 60        # frames of a piece, where not all are looked at
 HELD = 5          # one of so many frames is held out, at the end of each piece
@@ -65,15 +66,17 @@ def checked(frames: Sequence[Frame], source: Path) -> list[str]:
         raise InputError(f"{source}: its clouds have no points; record while the sensor turns")
     require_metres(xyz, str(source))
     require_space(np.degrees(elevations(xyz)), str(source))
-    if any(cloud.intensity is not None and cloud.intensity.any() for cloud in clouds):
-        return []
+    lit = [cloud for cloud in clouds if cloud.intensity is not None and cloud.intensity.any()]
+    if lit:
+        return [*filter(None, [recorded_intensity_problem(source, lit[0])])]
     return [f"{source} has no intensity, which the networks were trained with, so that they may "
             "find little: turn it on in the driver"]
 
 
 def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
     """All frames by drive; where there are more than `most`, pieces of PIECE, or of `most` if that
-    is less, spread over all. Refused where none has FEWEST."""
+    is less, or shorter drives, spread over all, as many as hold `most` frames together. Refused
+    where none has FEWEST."""
     drives = drives_of(frames)
     if max(len(run) for runs in drives.values() for run in runs) < FEWEST:
         raise Refused(f"no {FEWEST} frames follow each other within {GAP:g} s, so that nothing "
@@ -81,15 +84,27 @@ def pieces_of(frames: Sequence[Frame], most: int) -> list[Piece]:
     whole, size = len(frames) <= most, max(FEWEST, min(PIECE, most))
     pieces: list[Piece] = []
     for name, runs in drives.items():
-        parts = [run[i:i + size] for run in runs for i in range(0, len(run), size)]
+        parts = [run[i:i + size] for run in runs
+                 for i in range(0, max(len(run) - size, 0) + 1, size)]
         cut = runs if whole else parts
         pieces += [Piece(f"{name or 'drive'} {k}" if len(cut) > 1 else name or "drive", tuple(part))
                    for k, part in enumerate(cut, 1)]
     if whole:
         return pieces
-    long = [piece for piece in pieces if len(piece.numbers) >= size // 2] or pieces
-    count = min(max(1, most // size), len(long))
-    return [long[i] for i in np.unique(np.linspace(0, len(long) - 1, count).astype(int))]
+    longest = max(len(piece.numbers) for piece in pieces)
+    return _spread([piece for piece in pieces if len(piece.numbers) >= max(FEWEST, longest // 2)],
+                   most)
+
+
+def _spread(pieces: Sequence[Piece], most: int) -> list[Piece]:
+    """Some of the pieces, the middle ones of equal shares of all: as many as hold `most` frames
+    together, at least one."""
+    for count in range(len(pieces), 0, -1):
+        middles = (np.arange(count) + 0.5) * len(pieces) / count
+        chosen = [pieces[i] for i in middles.astype(int)]
+        if sum(len(piece.numbers) for piece in chosen) <= most:
+            break
+    return chosen
 
 
 def seconds_of(frames: Sequence[Frame], piece: Piece) -> np.ndarray:

@@ -58,9 +58,8 @@ def adapt(data: Path, weights: Path, out: Path, budget: float, resume: bool, for
     from lidar_perception.adapting.report import write_report
     run = Adapting(data, weights, out, budget, params, device, jobs)
     with locked(out):
-        if force and (out / RECORD).exists():
-            shutil.rmtree(out)
-            out.mkdir()
+        if force:
+            empty(out)
         if not (out / RECORD).exists():
             (out / REPORT).unlink(missing_ok=True)
         try:
@@ -93,6 +92,13 @@ def begin(out: Path, weights: Path, resume: bool, force: bool) -> None:
         refuse_others(out, MADE)
         if weights.resolve().is_relative_to(out.resolve()):
             raise InputError(f"{weights} would be replaced with {out}; give another --out")
+
+
+def empty(out: Path) -> None:
+    """Remove all that is in out, but not out itself, which is locked; the record last, so that what
+    a stop leaves is still a run that --force replaces."""
+    for path in sorted(out.iterdir(), key=lambda path: path.name == RECORD):
+        shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
 
 
 def package_weights(weights: Path) -> Path:

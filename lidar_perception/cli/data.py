@@ -138,6 +138,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     if recording.mounted:
         return recording
     from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
+    from lidar_perception.wire.messages import recorded_intensity_problem
     clouds = first_clouds(recording)
     measured = mounted(recording, clouds)
     if measured is not recording:
@@ -146,7 +147,7 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
                      style="dim")
     if level and clouds:
         for problem in filter(None, (mount_problem(recording, clouds),
-                                     _intensity_problem(recording, clouds[0]))):
+                                     recorded_intensity_problem(recording.path, clouds[0]))):
             errors.print(problem, style="yellow")
     return measured
 
@@ -158,12 +159,6 @@ def as_mounted(recording: Any, params: Any) -> Any:
     if params.ground.sensor_pose.height != SENSOR_HEIGHT:
         return params
     return with_values(params, {"ground.sensor_pose.height": recording.frames[0].sensor_height})
-
-
-def _intensity_problem(recording: Any, cloud: Any) -> str | None:
-    from lidar_perception.wire.messages import intensity_problem
-    problem = intensity_problem(cloud)
-    return problem and f"{recording.path}: {problem}, and use convert --robot"
 
 
 def write_json(path: Path | None, content: dict) -> None:

@@ -89,6 +89,8 @@ class Measured:
         if self.beams is None:
             return np.nan
         up = self.beams.elevations
+        if self.mount is not None and self.mount.upside_down:
+            up = -up[::-1]
         middle = up[(up >= AROUND[0]) & (up <= AROUND[1])]
         apart = -np.diff(middle if len(middle) > 2 else up)
         return float(np.median(apart)) if len(apart) else np.nan
@@ -178,9 +180,24 @@ def model_of(beams: Beams | None) -> tuple[str, float]:
 
 
 def sensor_of(found: Measured) -> Sensor:
-    """What was measured as a sensor that can be simulated. What clouds do not say, such as the
-    divergence of the beams, is that of the model with the same beams, or the default. Without beams
-    there is a grid of the same view whose beams wander, with as many points in a turn."""
+    """What was measured as a sensor that can be simulated, as it hangs where it is upside down.
+    What clouds do not say, such as the divergence of the beams, is that of the model with the same
+    beams, or the default. Without beams there is a grid of the same view whose beams wander, with
+    as many points in a turn."""
+    sensor = _in_its_frame(found)
+    return sensor if found.mount is None or not found.mount.upside_down else _turned_over(sensor)
+
+
+def _turned_over(sensor: Sensor) -> Sensor:
+    """The sensor turned about its x axis by half a circle; its sectors are of all beams."""
+    return replace(
+        sensor, elevations=tuple(sensor.wander - up for up in reversed(sensor.elevations)),
+        lifts=tuple(-lift for lift in reversed(sensor.lifts)),
+        blocked=tuple((first, -end % 360, -start % 360 or 360.0)
+                      for first, start, end in sensor.blocked))
+
+
+def _in_its_frame(found: Measured) -> Sensor:
     known = sensor_named(found.model) if found.model else None
     fields: dict[str, Any] = {} if known is None else {name: getattr(known, name) for name in (
         "divergence", "reach", "pulse", "min_range", "max_range", "range_noise", "rate", "silent",

@@ -89,6 +89,12 @@ def intensity_problem(frame: LidarFrame) -> str | None:
             "what a full reflection is (1 or 255 for most drivers; setup measures it)")
 
 
+def recorded_intensity_problem(source: Any, frame: LidarFrame) -> str | None:
+    """intensity_problem of a frame of a recording, the source."""
+    problem = intensity_problem(frame)
+    return problem and f"{source}: {problem}, and use convert --robot"
+
+
 def spread(values: np.ndarray | int, indices: np.ndarray, msg: Any, dtype: str) -> np.ndarray:
     """Values (N,) at indices (N,) as a column of the whole cloud msg; 0 elsewhere."""
     column = np.zeros(msg.height * msg.width, dtype)

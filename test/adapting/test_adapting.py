@@ -19,7 +19,7 @@ from detection_samples import BOXES, lively, tiny, two_objects
 from samples import write
 
 from lidar_perception.adapting import adapt as adapt_module
-from lidar_perception.adapting.adapt import LAST, Adapting
+from lidar_perception.adapting.adapt import LAST, Adapting, counted
 from lidar_perception.adapting.drives import FEWEST
 from lidar_perception.adapting.judging import IGNORED, KEPT, REJECTED, STATES
 from lidar_perception.adapting.labels import ConcludedLabels
@@ -42,8 +42,10 @@ from lidar_perception.detectors.pointpillars.network import Outputs
 from lidar_perception.detectors.pointpillars.targets import stacked
 from lidar_perception.labeling.exchange import import_labels
 from lidar_perception.runs.files import refuse_others
+from lidar_perception.runs.resuming import locked
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.cache import write_arrays
+from lidar_perception.training.out import STATE
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.plan import TooShort
 from lidar_perception.training.pointpillars.task import Preparation, targets_of
@@ -134,6 +136,26 @@ def test_a_killed_run_ends_as_if_it_had_not_been(bag, weights, whole, tmp_path):
 def test_other_settings_are_no_resumed_run(bag, weights, whole):
     with pytest.raises(InputError, match="seed 0, not 1"):
         adapted(bag, weights, whole, replace(SMALL, seed=1))
+
+
+def test_a_recording_that_has_grown_since_is_no_resumed_run(bag, weights, whole, monkeypatch):
+    monkeypatch.setattr(adapt_module, "frames_of", lambda recording: recording.frames[:-1])
+    with pytest.raises(InputError, match=f"{whole} holds a run with frame_names"):
+        adapted(bag, weights, whole)
+
+
+def test_a_budget_that_is_spent_before_the_first_step_is_said(bag, weights, whole, tmp_path,
+                                                              monkeypatch):
+    out, asked = tmp_path / "out", Adapting._training
+    shutil.copytree(whole, out)
+    (out / "round1" / LAST).unlink()
+    (out / "round1" / STATE).unlink()
+    monkeypatch.setattr(Adapting, "_training", lambda run, folder, hours=None: asked(
+        run, folder, 1e-9 if folder.name == "round1" else None))
+    with pytest.raises(InputError, match=r"spent before the first step.*--resume"):
+        adapted(bag, weights, out)
+    monkeypatch.undo()
+    assert tensors(adapted(bag, weights, out).best) == tensors(whole / BEST)
 
 
 @pytest.mark.parametrize("record", ["{}", "[]", '{"asked": {"da', '{"asked": [], "frames": 9}',
@@ -283,6 +305,20 @@ def test_a_folder_of_somebody_else_stays_as_it_is(bag, weights, tmp_path):
     assert sorted(p.name for p in file.parent.iterdir()) == [RECORD, "thesis.txt"]
 
 
+def test_a_run_that_replaces_another_keeps_others_out_too(bag, weights, whole, tmp_path,
+                                                         monkeypatch):
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+
+    def run(self) -> None:
+        assert not any(out.iterdir())
+        with locked(out):
+            pass
+    monkeypatch.setattr(Adapting, "run", run)
+    assert "another process is writing" in refused(out, "--data", bag, "--weights", weights,
+                                                   "--force")
+
+
 def test_too_little_agreement_is_said_with_a_report(bag, weights, tmp_path):
     out = tmp_path / "out"
     line = refused(out, "--data", bag, "--weights", weights)
@@ -307,3 +343,4 @@ def test_a_later_round_with_too_little_agreement_leaves_what_was_learned(bag, we
     run = adapted(bag, weights, out, params)
     assert len(run.rounds) == 1 and not run.rounds[0].refused  # of a network that learned nothing
     assert (out / BEST).read_bytes() == (out / "round1" / LAST).read_bytes()
+    assert counted(run.seen)[KEPT] == run.rounds[0].counts[KEPT]  # it is what is told and written

@@ -30,6 +30,19 @@ def test_a_gap_of_the_stamps_ends_a_drive():
         pieces_of(frames(*range(0, 100, 5)), 100)
 
 
+@pytest.mark.parametrize("runs", [(3, *[20] * 5), (2, 2, *[25] * 10, 4), (75,), (5, 70, 9, 64)])
+def test_where_not_all_is_looked_at_pieces_are_long_enough_and_together_as_many(runs):
+    starts = np.cumsum([0, *runs[:-1]])
+    frames = [Frame("", int((30 * k + i / 10) * 1e9), lambda: None)
+              for k, run in enumerate(runs) for i in range(run)]
+    pieces = pieces_of(frames, 60)
+    numbers = [n for piece in pieces for n in piece.numbers]
+    assert len(set(numbers)) == len(numbers) and 40 <= len(numbers) <= 60
+    for piece in pieces:
+        assert len(piece.numbers) >= FEWEST and len(piece.held)  # followed, and judged
+        assert len(np.unique(np.searchsorted(starts, piece.numbers, "right"))) == 1  # of one drive
+
+
 def clouds(scale: tuple[float, float, float], count: int = 500) -> list[Frame]:
     """Frames of points all around within 20 m, their coordinates times scale."""
     xyz = np.random.default_rng(0).uniform(-20, 20, (count, 3)) * scale
@@ -46,10 +59,12 @@ def test_clouds_that_no_detector_can_read_are_refused(frames, named):
     assert "\n" not in str(error.value)
 
 
-def test_clouds_without_intensity_are_taken_and_it_is_said():
+def test_clouds_without_intensity_or_its_scale_are_taken_and_it_is_said():
     frames = clouds((1, 1, 0.1))
     assert checked(frames, BAG) == []
     dark = [Frame.of(f.name, LidarFrame(f.load().xyz, None)) for f in frames]
     assert "no intensity" in checked(dark, BAG)[0]
+    odd = [Frame.of(f.name, LidarFrame(f.load().xyz, f.load().intensity * 10)) for f in frames]
+    assert "input.intensity_max" in checked(odd, BAG)[0]
     one_empty = [Frame.of("0", LidarFrame(np.zeros((0, 3), np.float32), None)), *frames[1:]]
     assert checked(one_empty, BAG) == []

@@ -195,6 +195,29 @@ def test_a_frame_with_y_ahead_or_z_down_is_said():
     assert said(down, "upside down") and down.mount.height == pytest.approx(0.6, abs=0.02)
 
 
+@pytest.mark.parametrize("beams", [True, False])
+def test_a_sensor_that_is_upside_down_is_described_as_it_hangs(beams):
+    def part(points):  # it looks down more than up, and to the left
+        if not beams:
+            points["ring"] = 0
+            nearer = np.random.default_rng(0).uniform(0.7, 1.0, len(points))
+            points["x"], points["y"] = points["x"] * nearer, points["y"] * nearer
+        up = np.arctan2(points["z"], np.hypot(points["x"], points["y"]))
+        to = np.arctan2(points["y"], points["x"])
+        return points[(up < np.radians(4)) & (to > np.radians(-30))]
+
+    own, other = (of(all_changed(lambda p, axes=axes: turned(np.diag(axes))(part(p))))
+                  for axes in ([1, 1, 1], [1, -1, -1]))
+    level, hung = sensor_of(own), sensor_of(other)
+    np.testing.assert_allclose(hung.elevations, level.elevations, atol=np.radians(0.1))
+    np.testing.assert_allclose(hung.blocked, level.blocked, atol=1.01)
+    assert hung.wander == pytest.approx(level.wander, rel=0.05) and bool(hung.wander) != beams
+    if beams:  # closer to each other where people are than above
+        up = np.array([14.0, 11, 8, 5, 3, 1, -6, -8, -10, -12, -14])
+        assert replace(own, beams=own.beams._replace(elevations=up)).elevation_step == replace(
+            other, beams=other.beams._replace(elevations=-up[::-1])).elevation_step == 2
+
+
 DRIVES = {"at a robot's speed": (501, "campus", 0.92, 14), "at a car's": (502, "street", 11.15, 8),
           "not at all": (504, "campus", 0.0, 6)}
 
