@@ -36,10 +36,11 @@ class DetectorNode(ManagedNode):
         config = self.detector.config
         self.counts.update(network=f"{self.name_of(config)}, {' '.join(config.classes)}",
                            device=str(self.detector.device))
-        if self.detector.doubt:
+        if self.detector.doubt:  # beside the state, which says what the node waits for
             self.counts["scores"] = "not calibrated"
-        for said in filter(None, (self.detector.fallback, self.detector.doubt)):
-            self.report(WARN, said)
+            self.get_logger().warning(self.detector.doubt)
+        if self.detector.fallback:
+            self.report(WARN, self.detector.fallback)
         self.input("points", CLOUD, self.on_points)
 
     def weights(self) -> Path:
