@@ -24,6 +24,7 @@ from lidar_perception.adapting.drives import (
     poses_of,
     require_motion,
     seconds_of,
+    turned_problem,
 )
 from lidar_perception.adapting.hearing import Counts, Heard, heard_of, recognised, unheard
 from lidar_perception.adapting.judging import KEPT, STATES, Verdict, judged
@@ -146,6 +147,8 @@ class Adapting:
         self._choose()
         self.poses = [self._poses(i) for i in range(len(self.pieces))]
         require_motion(self.poses, self.data)
+        if problem := turned_problem(self.poses, self.data):
+            errors.print(problem)
         self.recognised = self._recognised()
         for number in range(1, self.params.rounds + 1):
             if not self._round(number, begun):

@@ -23,6 +23,7 @@ HELD = 5          # one of so many frames is held out, at the end of each piece
 FEWEST = 10       # frames
 CHECKED = 5       # clouds, for what they are
 WENT = 1.0        # metres that the sensor must go
+TURNED = 20.0     # degrees from x ahead of it to where it goes, from which on that is said
 
 
 class Refused(InputError):
@@ -132,3 +133,17 @@ def require_motion(poses: Sequence[np.ndarray], source: Path) -> None:
         raise Refused(f"{source}: the sensor stands still ({max(went):.1f} m in all), and from one "
                       "place people that stand cannot be told from posts; record a drive of some "
                       "metres at least")
+
+
+def turned_problem(poses: Sequence[np.ndarray], source: Path) -> str | None:
+    """What to say where the sensor goes elsewhere than along its x axis, where detectors look
+    ahead; None where it does not, or goes to and fro. poses: by piece, (F, 4, 4)."""
+    steps = [np.einsum("fji,fj->fi", each[:-1, :3, :3], np.diff(each[:, :3, 3], axis=0))[:, :2]
+             for each in poses]
+    ways = np.concatenate(steps)
+    went = ways.sum(axis=0)
+    angle = float(np.degrees(np.arctan2(went[1], went[0])))
+    if np.linalg.norm(went) < 0.5 * np.linalg.norm(ways, axis=1).sum() or abs(angle) < TURNED:
+        return None
+    return (f"{source}: the sensor drives towards {angle:.0f} deg of its x axis, where detectors "
+            "look ahead; setup and convert --robot make a bag with x ahead")

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from lidar_perception.adapting.drives import FEWEST, checked, pieces_of
+from lidar_perception.adapting.drives import FEWEST, TURNED, checked, pieces_of, turned_problem
 from lidar_perception.data.frame import Frame
 from lidar_perception.types import InputError, LidarFrame
 
@@ -68,3 +69,23 @@ def test_clouds_without_intensity_or_its_scale_are_taken_and_it_is_said():
     assert "input.intensity_max" in checked(odd, BAG)[0]
     one_empty = [Frame.of("0", LidarFrame(np.zeros((0, 3), np.float32), None)), *frames[1:]]
     assert checked(one_empty, BAG) == []
+
+
+@pytest.mark.parametrize("angle", [0, 15, -15, 90, -130, 180])
+@pytest.mark.parametrize("course", [0.0, 2.0])
+def test_a_sensor_that_looks_aside_is_named_whatever_the_course_and_the_curves(angle, course):
+    """The drive is a curve, first slow, then fast; the sensor is turned against it."""
+    turn = np.cumsum(np.full(40, 0.02)) + course
+    way = np.cumsum(np.linspace(0, 1, 40)[:, None] * np.column_stack(
+        [np.cos(turn), np.sin(turn)]), axis=0)
+    poses = np.tile(np.eye(4), (40, 1, 1))
+    poses[:, :2, 3] = way
+    poses[:, :3, :3] = Rotation.from_euler(
+        "z", (turn - np.radians(angle))[:, None]).as_matrix()
+    said = turned_problem([poses, poses[5:20]], BAG)
+    if abs(angle) < TURNED:
+        assert said is None
+    else:
+        assert abs((float(said.split("towards ")[1].split()[0]) - angle + 180) % 360 - 180) < 2
+    to_and_fro = np.concatenate([poses, poses[::-1]])
+    assert turned_problem([to_and_fro], BAG) is None
