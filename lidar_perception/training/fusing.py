@@ -94,6 +94,7 @@ def fuse(weights: Path | None, classifier: Path | None, out: Path, params: Fused
     params = as_trained(params, header)
     sensor = sensor_named(params.sensor, params.mount_height or trained_height(header))
     scenes = Scenes(None, params.people, params.scene)
+    scenes.sorts()  # InputError for what is none
     around = bool(detector.config.low[0] < 0)
     errors.print(f"{params.scans} {params.scene} scans of {params.sensor} at {sensor.height:g} m, "
                  f"{'all around' if around else 'ahead'}")
