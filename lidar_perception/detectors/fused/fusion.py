@@ -47,18 +47,18 @@ Models = Mapping[str, Any]
 @dataclass(frozen=True)
 class Fusion:
     """proposer, classifier: files of the weights of PointPillars and of the cluster network; models
-    were fitted to networks whose files have these sha256; fitted_to: what is known of that."""
+    were fitted to networks whose files have these digests; fitted_to: what is known of that."""
 
     proposer: Path
     classifier: Path
-    sha256: tuple[str, str]
+    digests: tuple[str, str]
     models: Models
     fitted_to: Mapping[str, Any]
 
     @property
     def doubt(self) -> str | None:
         """What to say where the curves were fitted to other weights, None where they were not."""
-        others = [str(path) for path, known in zip((self.proposer, self.classifier), self.sha256)
+        others = [str(path) for path, known in zip((self.proposer, self.classifier), self.digests)
                   if digest(path) != known]
         if not others:
             return None
