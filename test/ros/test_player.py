@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 from lidar_perception.campaign.samples import as_ros1
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
 from lidar_perception.nodes.runtime import LATCHED
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import bag_message, encode
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
 from msg_utils.stamps import to_ns
 
@@ -207,6 +207,34 @@ def test_the_recorder_writes_what_the_player_plays(processes, peer, text_bag, tm
         assert [m.data for _, _, m in bag.messages({"/text"})] == [str(i) for i in range(20)]
         assert [m.data for _, _, m in bag.messages({"/note"})] == ["latched"]
         assert bag.qos("/note")[0].durability.name == "TRANSIENT_LOCAL"
+
+
+def test_the_recorder_has_what_each_of_several_publishers_latched(processes, peer, tmp_path):
+    for i in range(6):  # as each node with a fixed sensor does on /tf_static
+        peer.talker("/note", TEXT, LATCHED).publish(encode(bag_message(TEXT, data=str(i))))
+    processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["/note"]})
+    peer.wait(lambda: peer.value_of("bag_recorder", "frames") == "6", "six messages")
+    assert processes.stop()["bag_recorder"] == 0
+    with Bag(tmp_path / "bag") as bag:
+        assert sorted(m.data for _, _, m in bag.messages({"/note"})) == [*"012345"]
+
+
+def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start, tmp_path):
+    from lidar_perception.nodes import bag_recorder
+    known = bag_recorder.message_class
+
+    def lacking(name):
+        if name == INFO:
+            raise ModuleNotFoundError
+        return known(name)
+    monkeypatch.setattr(bag_recorder, "message_class", lacking)
+    peer.talker("/info", INFO)
+    peer.talker("/text", TEXT)
+    node = start(bag_recorder.BagRecorder, bag=str(tmp_path / "bag"), topics=("/info", "/text"))
+    peer.wait(lambda: [node._discover(), not node.waiting][1], "both to be found")
+    node.close()
+    with Bag(tmp_path / "bag") as bag:
+        assert list(bag.topics) == ["/text"]
 
 
 def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tmp_path):
