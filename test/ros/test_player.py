@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 from lidar_perception.campaign.samples import as_ros1
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
 from lidar_perception.nodes.runtime import LATCHED
-from lidar_perception.wire.codec import bag_message, encode
+from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
 from msg_utils.stamps import to_ns
 
@@ -86,6 +86,40 @@ def test_a_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
     peer.call("/bag_player/pause", Trigger, Trigger.Request())
     note = peer.listen("/note", TEXT, LATCHED)
     peer.wait(lambda: note, "the latched message")
+
+
+def test_of_static_transforms_all_hold_and_of_other_latched_topics_the_last(
+        monkeypatch, start, tmp_path):
+    """Each node that publishes them sends its own, once."""
+    from lidar_perception.nodes import bag_player
+    monkeypatch.setattr(bag_player, "TF_MESSAGE", TEXT)  # which the wheels of ROS lack
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/tf_static", TEXT, LATCHED_QOS)
+        bag.add_topic("/info", INFO, LATCHED_QOS)
+        for i in range(20):
+            bag.write("/tf_static", START + i, bag_message(TEXT, data=str(i)))
+            bag.write("/info", START + i, bag_message(INFO, width=i))
+        bag.add_topic("/text", TEXT, SENSOR_QOS)
+        bag.write("/text", START + STEP, bag_message(TEXT))
+    player = start(bag_player.BagPlayer, bag=str(tmp_path / "bag"), start_offset=0.05)
+    player._publish_latched()
+    assert [decode(d, TEXT).data for d in player.sent["tf_static"]] == [*map(str, range(20))]
+    assert [decode(d, INFO).width for d in player.sent["info"]] == [19]
+    depths = {p.topic_name: p.qos_profile.depth for p in player._outputs}
+    assert depths == {"/tf_static": 100, "/info": 10, "/text": 10}  # also for who comes late
+
+
+def test_a_topic_of_several_publishers_is_offered_as_the_best_of_them_did():
+    from lidar_perception.nodes.bag_player import _qos
+
+    def profile(reliability, durability):
+        return SimpleNamespace(depth=1, reliability=SimpleNamespace(name=reliability),
+                               durability=SimpleNamespace(name=durability))
+    poor, good = profile("BEST_EFFORT", "VOLATILE"), profile("RELIABLE", "TRANSIENT_LOCAL")
+    for profiles, best in (([poor], False), ([good], True), ([poor, good], True)):
+        made = _qos(profiles, 1, lossless=False)
+        assert (made.reliability.name, made.durability.name) == (
+            ("RELIABLE", "TRANSIENT_LOCAL") if best else ("BEST_EFFORT", "VOLATILE"))
 
 
 def test_pause_step_resume_and_rate(processes, peer, text_bag):
