@@ -96,6 +96,15 @@ def test_a_pcd_file_gives_the_points_that_were_written(tmp_path, kind):
         assert "\n" not in str(error.value)
 
 
+def test_whole_numbers_in_a_text_keep_all_their_digits(tmp_path):
+    path = tmp_path / "one.pcd"
+    for name in ("u1", "i1", "u4", "i8", "u8"):
+        limits = np.iinfo(name)
+        cloud = np.array([(limits.min,), (limits.max,)], [("n", name)])
+        path.write_bytes(pcd(cloud, "ascii"))
+        assert np.array_equal(read_pcd(path), cloud)
+
+
 @pytest.mark.parametrize("data", [b"", b"a", b"abc" * 500, bytes(9000), bytes(range(256)) * 40])
 def test_lzf_unpacks_what_was_packed(data):
     assert unpacked_lzf(packed_lzf(data), len(data)) == data
@@ -108,7 +117,11 @@ ONE = "FIELDS x\nSIZE 4\nTYPE F\n"
 
 @pytest.mark.parametrize("text", [
     "", "FIELDS x\nDATA binary\n", "no cloud", ONE + "POINTS 999999999999\nDATA binary\n",
-    ONE.replace("F\n", "Q\n") + "POINTS 1\nDATA ascii\n1", ONE + "POINTS 1\nDATA zip\n1"])
+    ONE.replace("F\n", "Q\n") + "POINTS 1\nDATA ascii\n1", ONE + "POINTS 1\nDATA zip\n1",
+    ONE.replace("4", "0") + "POINTS 1\nDATA ascii\n1", *(
+        f"FIELDS n\nSIZE {size}\nTYPE {kind}\nPOINTS 1\nDATA ascii\n{number}"
+        for size, kind, number in ((1, "U", 256), (2, "U", -1), (1, "I", 128), (8, "U", 2**64),
+                                   (8, "I", 2**63)))])
 def test_what_is_no_pcd_file_is_named(tmp_path, text):
     path = tmp_path / "one.pcd"
     path.write_text(text)
