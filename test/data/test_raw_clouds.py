@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lidar_perception.data.bag import BagWriter
+from lidar_perception.data.cloud_files import read_points
 from lidar_perception.data.pcd import read_pcd, unpacked_lzf
 from lidar_perception.data.raw_clouds import open_clouds, spread
 from lidar_perception.types import InputError
@@ -138,6 +139,7 @@ def test_folders_of_files_and_kitti_and_nuscenes_records(tmp_path):
     assert open_clouds(tmp_path / "1.pcd").count == 1
     rng = np.random.default_rng(0)
     four = rng.normal(0, 10, (500, 4)).astype(np.float32)  # 8000 bytes: 400 records of five, too
+    four[:, 3] = abs(four[:, 3])
     (tmp_path / "a.bin").write_bytes(four.tobytes())
     five = np.column_stack([four, rng.integers(0, 32, 500)]).astype(np.float32)
     (tmp_path / "b.bin").write_bytes(five.tobytes())
@@ -147,6 +149,15 @@ def test_folders_of_files_and_kitti_and_nuscenes_records(tmp_path):
     assert np.array_equal(a["z"], four[:, 2]) and np.array_equal(b["ring"], five[:, 4])
     with pytest.raises(InputError, match="there is no"):
         open_clouds(tmp_path / "none")
+
+
+@pytest.mark.parametrize("more", [("time",), ("ring", "time"), ("r", "g", "b")])
+def test_records_of_other_columns_are_no_cloud_that_is_made_up_of_them(tmp_path, more):
+    rng = np.random.default_rng(0)
+    cloud = np.column_stack([rng.normal(0, 10, (400, 3)), rng.random((400, 1 + len(more)))])
+    (tmp_path / "one.bin").write_bytes(cloud.astype(np.float32).tobytes())
+    with pytest.raises(InputError, match=r"one\.bin is not of the columns .* save it as \.pcd"):
+        read_points(tmp_path / "one.bin")
 
 
 def in_a_bag(n):
