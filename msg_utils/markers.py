@@ -95,8 +95,7 @@ def from_marker_array(msg: Any) -> MarkedObjects:
     """The objects of a MarkerArray, from this module or any other node that sends CUBEs."""
     cubes = [m for m in msg.markers if m.action == ADD and m.type == CUBE]
     extras = [_content(m.text) for m in cubes]
-    scores = [float(e["score"]) if isinstance(e.get("score"), int | float) else 1.0
-              for e in extras]
+    scores = [_score(content) for content in extras]
     boxes = np.array([_box(m) for m in cubes], np.float64).reshape(-1, 7)
     notes = [(m.ns, _content(m.text)) for m in msg.markers if m.action == DELETE and m.text]
     header = array_header(msg)
@@ -137,6 +136,15 @@ def pose_yaw(pose: Any) -> float:
 def _box(m: Any) -> list[float]:
     p, s = m.pose.position, m.scale
     return [p.x, p.y, p.z, s.x, s.y, s.z, pose_yaw(m.pose)]
+
+
+def _score(content: dict[str, Any]) -> float:
+    """The score in it; 1 without one, and for what is no number that float64 holds."""
+    score = content.get("score")
+    try:
+        return float(score) if isinstance(score, int | float) else 1.0
+    except OverflowError:
+        return 1.0
 
 
 def _content(text: str) -> dict[str, Any]:

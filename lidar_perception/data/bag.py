@@ -169,6 +169,8 @@ class Bag:
         try:
             for file in _mcap_files(self.reader):
                 check_index(file)
+            # They are read one after the other as metadata.yaml names them, in whatever order.
+            _parts(self.reader).sort(key=lambda part: part.metadata.start_time)
             self.connections = list(self.reader.connections)
             self.topics = {c.topic: c.msgtype for c in self.connections}
             self.counts = dict.fromkeys(self.topics, 0)
@@ -249,10 +251,15 @@ class KeptOpen:
         return bag
 
 
-def _mcap_files(reader: Reader | Ros1Reader) -> list[Path]:
+def _parts(reader: Reader | Ros1Reader) -> list[Any]:
+    """rosbags' readers of the files of a bag of ROS 2."""
     storage = getattr(reader, "storage", None)
-    return [each.path for each in getattr(storage, "storages", [storage])
-            if each is not None and each.path.suffix == ".mcap"]
+    parts: list[Any] = getattr(storage, "storages", [storage] if storage else [])
+    return parts
+
+
+def _mcap_files(reader: Reader | Ros1Reader) -> list[Path]:
+    return [part.path for part in _parts(reader) if part.path.suffix == ".mcap"]
 
 
 def offered_qos(connection: Connection) -> list:

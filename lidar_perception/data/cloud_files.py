@@ -25,6 +25,7 @@ SUFFIXES = (".pcd", ".bin")
 KITTI = "x y z intensity"
 MAX_RING = 256
 SAMPLE = 2000  # points on which the columns of a .bin file are told
+NEGATIVE = 0.1  # of them; where more have a negative intensity the columns are others
 UNITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}  # digits of a Unix time of today: ns of its unit
 
 
@@ -99,14 +100,20 @@ def _load(file: Path, stamp_ns: int) -> LidarFrame:
 
 
 def _of_records(file: Path) -> np.ndarray:
-    """A .bin file of float32: KITTI's four columns, or nuScenes' five, whose last is the ring."""
+    """A .bin file of float32: KITTI's four columns, or nuScenes' five, whose last is the ring.
+    InputError where it has others: nothing in it says how many."""
     if file.stat().st_size % 20 == 0:
         cloud = read_records(file, SWEEP)
         ring = cloud[:SAMPLE, 4]
         with np.errstate(invalid="ignore"):
             if ((ring >= 0) & (ring < MAX_RING) & (ring == np.floor(ring))).all():
                 return _structured(cloud, SWEEP)
-    return _structured(read_records(file, KITTI), KITTI)
+    cloud = read_records(file, KITTI)
+    intensity = cloud[:SAMPLE, 3]
+    if np.count_nonzero(intensity < 0) > NEGATIVE * len(intensity):
+        raise InputError(f"{file} is not of the columns {KITTI}, nor {SWEEP}, as float32: much of "
+                         "the intensity would be negative; save it as .pcd, which names columns")
+    return _structured(cloud, KITTI)
 
 
 def _structured(cloud: np.ndarray, columns: str) -> np.ndarray:

@@ -25,7 +25,7 @@ def read_pcd(path: Path) -> np.ndarray:
         raise InputError(f"cannot read {path}: {error.strerror}; download it again") from None
     try:
         return _points(content)
-    except (ValueError, KeyError, IndexError, struct.error) as error:
+    except (ValueError, TypeError, OverflowError, LookupError, struct.error) as error:
         raise InputError(f"{path} is no PCD file that can be read ({error}); save it again as "
                          "binary PCD") from None
 
@@ -80,8 +80,10 @@ def _of_text(data: bytes, layout: np.dtype, number: int) -> np.ndarray:
     for name in layout.names or ():
         n = int(np.prod(layout[name].shape, dtype=int))
         kind = layout[name].base
-        # Whole numbers through int, so that 64-bit times keep their last digits.
-        read = rows[:, at:at + n].astype(np.float64 if kind.kind == "f" else np.int64)
+        # Whole numbers as such, so that 64-bit times keep their last digits.
+        read = rows[:, at:at + n].astype(kind.kind + "8")
+        if kind.kind != "f" and not np.array_equal(read, read.astype(kind)):
+            raise ValueError(f"a number of its field '{name}' does not fit into {kind}")
         points[name] = read.reshape((number, *layout[name].shape))
         at += n
     return points

@@ -65,6 +65,9 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
             try:
                 scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
                 pose, columns = frame.pose(), frame.point_truth() if clouds else None
+                if frame.stamp_ns < 0:
+                    raise InputError(f"{frame.name}: a stamp before 1970, which no bag holds; "
+                                     "set the clock of the sensor")
             except InputError as error:
                 if skipped is None:
                     raise

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from collections import deque
 from time import monotonic
 from typing import Any
 
@@ -16,8 +17,10 @@ from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.graph import cloud_topics
 from lidar_perception.nodes.pacing import Pace
 from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
+from lidar_perception.nodes.transforms import STATIC_QOS
 from lidar_perception.params import PlayerParams
 from lidar_perception.types import InputError
+from lidar_perception.wire.transforms import TF_MESSAGE
 from msg_utils.messages import ros_message
 from msg_utils.stamps import SECOND, time_message
 
@@ -108,14 +111,19 @@ class BagPlayer(LidarNode):
     def _publisher(self, topic: str) -> Any:
         kind = self.bag.topics[topic]
         try:
-            return self.output(self.names[topic], kind,
-                               _qos(self.bag.qos(topic), lossless=bool(self.params.follow)))
+            return self.output(self.names[topic], kind, _qos(
+                self.bag.qos(topic), self._held(topic), lossless=bool(self.params.follow)))
         except (ModuleNotFoundError, AttributeError):
             self.get_logger().warning(f"{topic} is not played: {kind} is not installed here")
             return None
 
     def _latched(self, topic: str) -> bool:
         return any(q.durability.name == "TRANSIENT_LOCAL" for q in self.bag.qos(topic))
+
+    def _held(self, topic: str) -> int:
+        """How many messages of a latched topic hold at a time: the last; but of transforms all that
+        who listens to TF takes, as each node sends its own and none takes back another's."""
+        return STATIC_QOS.depth if self.bag.topics[topic] == TF_MESSAGE else 1
 
     def spin(self, executor: Executor) -> None:
         """Play; services and parameters are served between messages."""
@@ -190,14 +198,15 @@ class BagPlayer(LidarNode):
                                slower=f"{(played + self.pace.held) / played:.2f}")
 
     def _publish_latched(self) -> None:
-        """The last message of each latched topic before the start, so that none is missed."""
-        before = {}
+        """What holds of each latched topic at the start, so that none is missed."""
+        before: dict[str, deque[bytes]] = {}
         latched = {t for t in self.publishers_by_topic if self._latched(t)}
         if self.start_ns > self.bag.start_ns and latched:
             for topic, _, data in self.bag.raw(latched, None, self.start_ns):
-                before[topic] = data
-        for topic, data in before.items():
-            self.publishers_by_topic[topic].publish(data)
+                before.setdefault(topic, deque(maxlen=self._held(topic))).append(data)
+        for topic, messages in before.items():
+            for data in messages:
+                self.publishers_by_topic[topic].publish(data)
 
     def _wait_until(self, stamp: int, topic: str) -> bool:
         """Serve until it is time for stamp; False when the node shall end."""
@@ -264,14 +273,15 @@ def _done(response: Any, message: str, success: bool = True) -> Any:
     return response
 
 
-def _qos(profiles: list, lossless: bool) -> QoSProfile:
-    """The recorded profile; what it leaves open is reliable and volatile. lossless: reliable."""
+def _qos(profiles: list, held: int, lossless: bool) -> QoSProfile:
+    """The profile that offers what any publisher did when the topic was recorded; what they leave
+    open is reliable and volatile. held: messages that a late subscriber gets of a latched topic, at
+    least ten. lossless: reliable."""
     if not profiles:
         return RELIABLE
-    recorded = profiles[0]
-    best_effort = recorded.reliability.name == "BEST_EFFORT" and not lossless
+    best_effort = all(q.reliability.name == "BEST_EFFORT" for q in profiles) and not lossless
+    latched = any(q.durability.name == "TRANSIENT_LOCAL" for q in profiles)
     return QoSProfile(
-        depth=max(recorded.depth, 10),
+        depth=max(held * latched, 10, *(q.depth for q in profiles)),
         reliability=ReliabilityPolicy.BEST_EFFORT if best_effort else ReliabilityPolicy.RELIABLE,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL
-        if recorded.durability.name == "TRANSIENT_LOCAL" else DurabilityPolicy.VOLATILE)
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE)

@@ -7,10 +7,10 @@ import threading
 from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, BagWriter
-from lidar_perception.nodes.runtime import LATCHED, OK, RELIABLE, SENSOR_DATA, WARN, LidarNode
+from lidar_perception.nodes.runtime import OK, WARN, LidarNode
 from lidar_perception.params import RecorderParams
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import typestore
@@ -52,16 +52,20 @@ class BagRecorder(LidarNode):
             if not offered:
                 continue
             self.waiting.remove(topic)
-            if types[topic][0] not in typestore().fielddefs:
-                self.get_logger().warning(f"{topic} is not recorded: {types[topic][0]} is unknown")
+            if (kind := self._known(types[topic][0])) is None:
+                self.get_logger().warning(f"{topic} is not recorded: {types[topic][0]} is not "
+                                          "installed here, or unknown")
                 continue
-            latched = all(q.durability == LATCHED.durability for q in offered)
-            reliable = all(q.reliability == RELIABLE.reliability for q in offered)
+            latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in offered)
+            reliable = all(q.reliability == ReliabilityPolicy.RELIABLE for q in offered)
             self.queue.put(("topic", topic, types[topic][0],
                             LATCHED_QOS if latched else SENSOR_QOS))
-            self._subscribe(topic, message_class(types[topic][0]),
-                            LATCHED if latched else QoSProfile(depth=DEPTH, reliability=(
-                                RELIABLE if reliable else SENSOR_DATA).reliability))
+            self._subscribe(topic, kind, QoSProfile(  # of several each may have latched its own
+                depth=DEPTH,
+                reliability=(ReliabilityPolicy.RELIABLE if reliable
+                             else ReliabilityPolicy.BEST_EFFORT),
+                durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched
+                            else DurabilityPolicy.VOLATILE)))
         gone = self.counts["lost"] + self.counts["dropped"]
         if gone > self.said:
             self.said = gone
@@ -72,6 +76,16 @@ class BagRecorder(LidarNode):
             self.report(WARN, f"waiting for {', '.join(self.waiting)}", expected=True)
         else:
             self.report(OK, "recording")
+
+    @staticmethod
+    def _known(type_name: str) -> type | None:
+        """The class of a type that can be received and written; None where there is none."""
+        if type_name not in typestore().fielddefs:
+            return None
+        try:
+            return message_class(type_name)
+        except (ModuleNotFoundError, AttributeError):
+            return None
 
     def _subscribe(self, topic: str, kind: type, qos: QoSProfile) -> None:
         def received(data: bytes) -> None:

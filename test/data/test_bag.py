@@ -20,6 +20,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.testing.bags import copy_bag
 from lidar_perception.types import GroundTruth, InputError
+from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, IMAGE, POINTS, TRUTH
 from msg_utils.point_cloud2 import to_array
 
@@ -192,6 +193,25 @@ def test_raw_takes_topics_and_a_window_of_time(written):
         assert list(bag.raw(set())) == []
         low, high = STAMP + 1, STAMP + 2 * 10**8
         assert list(bag.raw(None, low, high)) == [r for r in rows if low <= r[1] < high]
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_the_files_of_a_split_bag_are_read_in_order_of_time(tmp_path, storage):
+    parts = []
+    for name, stamps in (("late", (30, 40)), ("early", (10, 20))):
+        with BagWriter(tmp_path / f"{name}_ours") as bag:
+            bag.add_topic("/text", "std_msgs/msg/String")
+            for stamp in stamps:
+                bag.write("/text", stamp, bag_message("std_msgs/msg/String", data=str(stamp)))
+        parts.append(copy_bag(tmp_path / f"{name}_ours", tmp_path / name, storage))
+    metadata = yaml.safe_load((parts[0] / "metadata.yaml").read_text())
+    info = metadata["rosbag2_bagfile_information"]
+    for file in [f for f in parts[1].iterdir() if f.suffix != ".yaml"]:
+        info["relative_file_paths"].append(file.rename(parts[0] / file.name).name)
+    info["topics_with_message_count"][0]["message_count"] = info["message_count"] = 4
+    info.update(starting_time={"nanoseconds_since_epoch": 10}, duration={"nanoseconds": 30})
+    (parts[0] / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    assert [stamp for _, stamp, _ in message_bytes(parts[0])] == [10, 20, 30, 40]
 
 
 def test_labels_may_come_after_their_cloud(written, tmp_path):

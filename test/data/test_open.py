@@ -359,6 +359,12 @@ def test_a_scan_that_cannot_be_read_is_left_out_of_a_bag_and_named(tmp_path):
     assert [scene_of(f) for f in open_recording(tmp_path / "bag")] == [0, 2]
 
 
+def test_a_scan_with_a_stamp_that_no_bag_can_hold_is_left_out_and_named(tmp_path):
+    scans, skipped = [Frame.of(str(t), cloud_frame(scene(), t)) for t in (-5, 7)], []
+    assert write_bag(tmp_path / "bag", scans, skipped=skipped) == 1
+    assert "-5" in skipped[0] and open_recording(tmp_path / "bag").frames[0].stamp_ns == 7
+
+
 # columns
 
 def test_unusable_returns_go_from_all_columns_alike(tmp_path):

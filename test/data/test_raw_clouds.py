@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lidar_perception.data.bag import BagWriter
+from lidar_perception.data.cloud_files import read_points
 from lidar_perception.data.pcd import read_pcd, unpacked_lzf
 from lidar_perception.data.raw_clouds import open_clouds, spread
 from lidar_perception.types import InputError
@@ -96,6 +97,15 @@ def test_a_pcd_file_gives_the_points_that_were_written(tmp_path, kind):
         assert "\n" not in str(error.value)
 
 
+def test_whole_numbers_in_a_text_keep_all_their_digits(tmp_path):
+    path = tmp_path / "one.pcd"
+    for name in ("u1", "i1", "u4", "i8", "u8"):
+        limits = np.iinfo(name)
+        cloud = np.array([(limits.min,), (limits.max,)], [("n", name)])
+        path.write_bytes(pcd(cloud, "ascii"))
+        assert np.array_equal(read_pcd(path), cloud)
+
+
 @pytest.mark.parametrize("data", [b"", b"a", b"abc" * 500, bytes(9000), bytes(range(256)) * 40])
 def test_lzf_unpacks_what_was_packed(data):
     assert unpacked_lzf(packed_lzf(data), len(data)) == data
@@ -108,7 +118,11 @@ ONE = "FIELDS x\nSIZE 4\nTYPE F\n"
 
 @pytest.mark.parametrize("text", [
     "", "FIELDS x\nDATA binary\n", "no cloud", ONE + "POINTS 999999999999\nDATA binary\n",
-    ONE.replace("F\n", "Q\n") + "POINTS 1\nDATA ascii\n1", ONE + "POINTS 1\nDATA zip\n1"])
+    ONE.replace("F\n", "Q\n") + "POINTS 1\nDATA ascii\n1", ONE + "POINTS 1\nDATA zip\n1",
+    ONE.replace("4", "0") + "POINTS 1\nDATA ascii\n1", *(
+        f"FIELDS n\nSIZE {size}\nTYPE {kind}\nPOINTS 1\nDATA ascii\n{number}"
+        for size, kind, number in ((1, "U", 256), (2, "U", -1), (1, "I", 128), (8, "U", 2**64),
+                                   (8, "I", 2**63)))])
 def test_what_is_no_pcd_file_is_named(tmp_path, text):
     path = tmp_path / "one.pcd"
     path.write_text(text)
@@ -125,6 +139,7 @@ def test_folders_of_files_and_kitti_and_nuscenes_records(tmp_path):
     assert open_clouds(tmp_path / "1.pcd").count == 1
     rng = np.random.default_rng(0)
     four = rng.normal(0, 10, (500, 4)).astype(np.float32)  # 8000 bytes: 400 records of five, too
+    four[:, 3] = abs(four[:, 3])
     (tmp_path / "a.bin").write_bytes(four.tobytes())
     five = np.column_stack([four, rng.integers(0, 32, 500)]).astype(np.float32)
     (tmp_path / "b.bin").write_bytes(five.tobytes())
@@ -134,6 +149,15 @@ def test_folders_of_files_and_kitti_and_nuscenes_records(tmp_path):
     assert np.array_equal(a["z"], four[:, 2]) and np.array_equal(b["ring"], five[:, 4])
     with pytest.raises(InputError, match="there is no"):
         open_clouds(tmp_path / "none")
+
+
+@pytest.mark.parametrize("more", [("time",), ("ring", "time"), ("r", "g", "b")])
+def test_records_of_other_columns_are_no_cloud_that_is_made_up_of_them(tmp_path, more):
+    rng = np.random.default_rng(0)
+    cloud = np.column_stack([rng.normal(0, 10, (400, 3)), rng.random((400, 1 + len(more)))])
+    (tmp_path / "one.bin").write_bytes(cloud.astype(np.float32).tobytes())
+    with pytest.raises(InputError, match=r"one\.bin is not of the columns .* save it as \.pcd"):
+        read_points(tmp_path / "one.bin")
 
 
 def in_a_bag(n):

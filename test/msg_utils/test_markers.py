@@ -134,8 +134,9 @@ def test_a_message_without_markers_is_empty(make):
     ('{"score": 1}', 1.0, {"score": 1}),
     ('{"score": "high"}', 1.0, {"score": "high"}),
     ('{"score": null}', 1.0, {"score": None}),
+    ('{"score": 1%s}' % ("0" * 400), 1.0, {"score": 10**400}),
     *((endless, 1.0, {"text": endless}) for endless in ('{"a":' * 9000, "1" * 5000)),
-], ids=range(11))
+], ids=range(12))
 def test_cubes_of_other_nodes_are_read(make, text, score, extra):
     cube = make("visualization_msgs/msg/Marker", header=header(make, 5, "map"), ns="car", id=4,
                 type=CUBE, action=ADD, text=text,

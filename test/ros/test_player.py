@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 from lidar_perception.campaign.samples import as_ros1
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
 from lidar_perception.nodes.runtime import LATCHED
-from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
 from msg_utils.stamps import to_ns
 
@@ -86,6 +86,40 @@ def test_a_latched_topic_reaches_a_late_subscriber(processes, peer, text_bag):
     peer.call("/bag_player/pause", Trigger, Trigger.Request())
     note = peer.listen("/note", TEXT, LATCHED)
     peer.wait(lambda: note, "the latched message")
+
+
+def test_of_static_transforms_all_hold_and_of_other_latched_topics_the_last(
+        monkeypatch, start, tmp_path):
+    """Each node that publishes them sends its own, once."""
+    from lidar_perception.nodes import bag_player
+    monkeypatch.setattr(bag_player, "TF_MESSAGE", TEXT)  # which the wheels of ROS lack
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/tf_static", TEXT, LATCHED_QOS)
+        bag.add_topic("/info", INFO, LATCHED_QOS)
+        for i in range(20):
+            bag.write("/tf_static", START + i, bag_message(TEXT, data=str(i)))
+            bag.write("/info", START + i, bag_message(INFO, width=i))
+        bag.add_topic("/text", TEXT, SENSOR_QOS)
+        bag.write("/text", START + STEP, bag_message(TEXT))
+    player = start(bag_player.BagPlayer, bag=str(tmp_path / "bag"), start_offset=0.05)
+    player._publish_latched()
+    assert [decode(d, TEXT).data for d in player.sent["tf_static"]] == [*map(str, range(20))]
+    assert [decode(d, INFO).width for d in player.sent["info"]] == [19]
+    depths = {p.topic_name: p.qos_profile.depth for p in player._outputs}
+    assert depths == {"/tf_static": 100, "/info": 10, "/text": 10}  # also for who comes late
+
+
+def test_a_topic_of_several_publishers_is_offered_as_the_best_of_them_did():
+    from lidar_perception.nodes.bag_player import _qos
+
+    def profile(reliability, durability):
+        return SimpleNamespace(depth=1, reliability=SimpleNamespace(name=reliability),
+                               durability=SimpleNamespace(name=durability))
+    poor, good = profile("BEST_EFFORT", "VOLATILE"), profile("RELIABLE", "TRANSIENT_LOCAL")
+    for profiles, best in (([poor], False), ([good], True), ([poor, good], True)):
+        made = _qos(profiles, 1, lossless=False)
+        assert (made.reliability.name, made.durability.name) == (
+            ("RELIABLE", "TRANSIENT_LOCAL") if best else ("BEST_EFFORT", "VOLATILE"))
 
 
 def test_pause_step_resume_and_rate(processes, peer, text_bag):
@@ -207,6 +241,34 @@ def test_the_recorder_writes_what_the_player_plays(processes, peer, text_bag, tm
         assert [m.data for _, _, m in bag.messages({"/text"})] == [str(i) for i in range(20)]
         assert [m.data for _, _, m in bag.messages({"/note"})] == ["latched"]
         assert bag.qos("/note")[0].durability.name == "TRANSIENT_LOCAL"
+
+
+def test_the_recorder_has_what_each_of_several_publishers_latched(processes, peer, tmp_path):
+    for i in range(6):  # as each node with a fixed sensor does on /tf_static
+        peer.talker("/note", TEXT, LATCHED).publish(encode(bag_message(TEXT, data=str(i))))
+    processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["/note"]})
+    peer.wait(lambda: peer.value_of("bag_recorder", "frames") == "6", "six messages")
+    assert processes.stop()["bag_recorder"] == 0
+    with Bag(tmp_path / "bag") as bag:
+        assert sorted(m.data for _, _, m in bag.messages({"/note"})) == [*"012345"]
+
+
+def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start, tmp_path):
+    from lidar_perception.nodes import bag_recorder
+    known = bag_recorder.message_class
+
+    def lacking(name):
+        if name == INFO:
+            raise ModuleNotFoundError
+        return known(name)
+    monkeypatch.setattr(bag_recorder, "message_class", lacking)
+    peer.talker("/info", INFO)
+    peer.talker("/text", TEXT)
+    node = start(bag_recorder.BagRecorder, bag=str(tmp_path / "bag"), topics=("/info", "/text"))
+    peer.wait(lambda: [node._discover(), not node.waiting][1], "both to be found")
+    node.close()
+    with Bag(tmp_path / "bag") as bag:
+        assert list(bag.topics) == ["/text"]
 
 
 def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tmp_path):
