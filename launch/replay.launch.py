@@ -50,16 +50,18 @@ def replay(context):
     sim_time = {"use_sim_time": value["use_sim_time"] == "true"}
     log_level = ["--log-level", value["log_level"]]
     remap, scoring = evaluation(value["scores"], single)
+    final = relative(result_topics(single)["final"])
+    real_time = value["real_time"] == "true"
     # launch knows no type of an empty list
-    follow = {} if value["real_time"] == "true" else {
-        "follow": [relative(result_topics(single)["final"])]}
+    follow = {} if real_time else {"follow": [final]}
+    waits = [*wait_for(single), f"{final}:={1 if real_time else 2}"]  # evaluator, player
     player = Node(
         package="lidar_perception", executable="bag_player", name="bag_player", output="screen",
         parameters=[value["config"], {"bag": value["bag"], "rate": float(value["rate"]),
                                       "loop": value["loop"] == "true",
                                       "topics": played,
                                       **follow,
-                                      "wait_for": wait_for(single)}],
+                                      "wait_for": waits}],
         # Relative, so that they go into a namespace if this file is included in one.
         remappings=[(t, relative(POINTS if t == clouds else t)) for t in played
                     if t not in GLOBAL],
