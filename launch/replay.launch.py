@@ -9,6 +9,7 @@ from launch.actions import (
     DeclareLaunchArgument,
     EmitEvent,
     IncludeLaunchDescription,
+    LogInfo,
     OpaqueFunction,
     RegisterEventHandler,
     TimerAction,
@@ -36,6 +37,8 @@ HERE = Path(__file__).resolve().parent
 CONFIG = HERE.parent / "config" / "replay.param.yaml"
 GLOBAL = {TF_STATIC, "/tf", "/clock", "/diagnostics"}
 SECONDS_FOR_THE_LAST_FRAME = 1.0
+# What the player and the evaluator rely on. launch hands on to an included file whatever was given.
+GRAPH = {"detectors": "candidates", "namespace": "", "name_prefix": ""}
 
 
 def replay(context):
@@ -72,15 +75,18 @@ def replay(context):
         ros_arguments=log_level)
     end = TimerAction(period=SECONDS_FOR_THE_LAST_FRAME,
                       actions=[EmitEvent(event=Shutdown(reason="the bag is played"))])
-    return [player, evaluator,
+    given = context.launch_configurations
+    return [*(LogInfo(msg=f"{name}:={given[name]} is no argument of replay.launch.py")
+              for name, fixed in GRAPH.items() if given.get(name, fixed) != fixed),
+            player, evaluator,
             RegisterEventHandler(OnProcessExit(target_action=player, on_exit=[end]))]
 
 
 def generate_launch_description():
     pipeline = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(HERE / "perception.launch.py")),
-        launch_arguments={"points": relative(POINTS), **{k: LaunchConfiguration(k) for k in (
-            "config", "single", "rviz", "use_sim_time", "log_level")}}.items())
+        launch_arguments={"points": relative(POINTS), **GRAPH, **{k: LaunchConfiguration(k)
+            for k in ("config", "single", "rviz", "use_sim_time", "log_level")}}.items())
     return LaunchDescription([
         DeclareLaunchArgument("bag", description="Folder of the bag."),
         DeclareLaunchArgument("points", default_value="", description="The bag's topic of clouds; "
