@@ -9,6 +9,7 @@ from launch.actions import (
     DeclareLaunchArgument,
     EmitEvent,
     IncludeLaunchDescription,
+    LogInfo,
     OpaqueFunction,
     RegisterEventHandler,
     TimerAction,
@@ -36,6 +37,8 @@ HERE = Path(__file__).resolve().parent
 CONFIG = HERE.parent / "config" / "replay.param.yaml"
 GLOBAL = {TF_STATIC, "/tf", "/clock", "/diagnostics"}
 SECONDS_FOR_THE_LAST_FRAME = 1.0
+# What the player and the evaluator rely on. launch hands on to an included file whatever was given.
+GRAPH = {"detectors": "candidates", "namespace": "", "name_prefix": ""}
 
 
 def replay(context):
@@ -50,16 +53,18 @@ def replay(context):
     sim_time = {"use_sim_time": value["use_sim_time"] == "true"}
     log_level = ["--log-level", value["log_level"]]
     remap, scoring = evaluation(value["scores"], single)
+    final = relative(result_topics(single)["final"])
+    real_time = value["real_time"] == "true"
     # launch knows no type of an empty list
-    follow = {} if value["real_time"] == "true" else {
-        "follow": [relative(result_topics(single)["final"])]}
+    follow = {} if real_time else {"follow": [final]}
+    waits = [*wait_for(single), f"{final}:={1 if real_time else 2}"]  # evaluator, player
     player = Node(
         package="lidar_perception", executable="bag_player", name="bag_player", output="screen",
         parameters=[value["config"], {"bag": value["bag"], "rate": float(value["rate"]),
                                       "loop": value["loop"] == "true",
                                       "topics": played,
                                       **follow,
-                                      "wait_for": wait_for(single)}],
+                                      "wait_for": waits}],
         # Relative, so that they go into a namespace if this file is included in one.
         remappings=[(t, relative(POINTS if t == clouds else t)) for t in played
                     if t not in GLOBAL],
@@ -70,15 +75,18 @@ def replay(context):
         ros_arguments=log_level)
     end = TimerAction(period=SECONDS_FOR_THE_LAST_FRAME,
                       actions=[EmitEvent(event=Shutdown(reason="the bag is played"))])
-    return [player, evaluator,
+    given = context.launch_configurations
+    return [*(LogInfo(msg=f"{name}:={given[name]} is no argument of replay.launch.py")
+              for name, fixed in GRAPH.items() if given.get(name, fixed) != fixed),
+            player, evaluator,
             RegisterEventHandler(OnProcessExit(target_action=player, on_exit=[end]))]
 
 
 def generate_launch_description():
     pipeline = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(HERE / "perception.launch.py")),
-        launch_arguments={"points": relative(POINTS), **{k: LaunchConfiguration(k) for k in (
-            "config", "single", "rviz", "use_sim_time", "log_level")}}.items())
+        launch_arguments={"points": relative(POINTS), **GRAPH, **{k: LaunchConfiguration(k)
+            for k in ("config", "single", "rviz", "use_sim_time", "log_level")}}.items())
     return LaunchDescription([
         DeclareLaunchArgument("bag", description="Folder of the bag."),
         DeclareLaunchArgument("points", default_value="", description="The bag's topic of clouds; "

@@ -7,6 +7,7 @@ from collections import deque
 from time import monotonic
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.exceptions import NameValidationException
 from rclpy.executors import Executor
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -26,6 +27,7 @@ from msg_utils.stamps import SECOND, time_message
 
 SERVED = 0.05       # seconds between looks for services and parameters, while messages are late
 SHORTEST_LOOP = 0.1  # seconds
+UNKNOWN = "_NODE_NAME_UNKNOWN_"  # how rclpy calls the node of a publisher while discovery goes on
 
 
 class BagPlayer(LidarNode):
@@ -47,6 +49,7 @@ class BagPlayer(LidarNode):
             raise InputError(f"{self.params.bag}: nothing to play; no topic is left of "
                              f"{', '.join(self.bag.topics) or 'an empty bag'}")
         self.wanted = self._wanted()
+        self.told: dict[str, dict[str, str]] = {}  # node -> values of its diagnostics
         self.start_ns = self.bag.start_ns + int(self.params.start_offset * SECOND)
         if self.start_ns > self.bag.end_ns:
             raise InputError(f"start_offset {self.params.start_offset:g} s is after the end of "
@@ -142,6 +145,16 @@ class BagPlayer(LidarNode):
         self._wait_until_delivered()
 
     def _wait_for_subscribers(self) -> None:
+        diagnostics = self.create_subscription(DiagnosticArray, "/diagnostics", self._on_status,
+                                               RELIABLE)
+        self._wait_until_heard()
+        self.destroy_subscription(diagnostics)
+
+    def _on_status(self, msg: DiagnosticArray) -> None:
+        for status in msg.status:
+            self.told[f"/{status.name}"] = {v.key: v.value for v in status.values}
+
+    def _wait_until_heard(self) -> None:
         give_up = monotonic() + self.params.wait_timeout
         while not self.stop.done():
             missing = [t for t, count in self.wanted.items() if self._subscribers(t) < count]
@@ -157,11 +170,23 @@ class BagPlayer(LidarNode):
             self.serve(timeout_sec=0.02)
 
     def _subscribers(self, topic: str) -> int:
-        """Of a topic that is played, those that are matched; else those that are known of."""
+        """Of a topic that is played, or of a node of ours that says so in its diagnostics, those
+        that are matched; else those that are known of."""
         resolved = self.resolve_topic_name(topic)
         played = [p for p in self.publishers_by_topic.values() if p.topic_name == resolved]
-        return (played[0].get_subscription_count() if played
-                else self.count_subscribers(topic))
+        if played:
+            return played[0].get_subscription_count()
+        said = [int(self.told.get(node, {}).get(f"subscribers of {resolved}", 0))
+                for node in self._ours(resolved)]
+        return min([self.count_subscribers(resolved), *said])
+
+    def _ours(self, topic: str) -> list[str]:
+        """The nodes of this package that publish a topic, by the times that each of them tells;
+        also one whose name is not known yet."""
+        names = [f"{p.node_namespace.rstrip('/')}/{p.node_name}"
+                 for p in self.get_publishers_info_by_topic(topic)]
+        return [n for n in names
+                if n.endswith(UNKNOWN) or self.count_publishers(f"{n}/debug/processing_time_ms")]
 
     def _wait_until_delivered(self) -> None:
         from rclpy.duration import Duration

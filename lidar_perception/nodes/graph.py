@@ -148,10 +148,10 @@ def outputs_in_use(graph: Graph) -> dict[str, set[str]]:
 def wait_for(single: bool = False, points: int = 1, truth: int = 2,
              detector: str = "candidates") -> list[str]:
     """bag_player's wait_for: subscribers of the clouds, of the labels (the seed input and an
-    evaluator), and one of each topic between the nodes."""
+    evaluator), and one of each topic between the nodes and of each result."""
     between = sorted(set().union(*outputs_in_use(graph_of([detector], single)).values()))
     topics = [f"{POINTS}:={points}", f"{TRUTH}:={truth}", *between,
-              result_topics(single, detector)[FINAL]]
+              *result_topics(single, detector).values()]
     return [*map(relative, topics)]
 
 

@@ -17,7 +17,11 @@ from lidar_perception.types import InputError
 ROOT = Path(__file__).resolve().parents[2]
 SHARED = "lidar_perception.nodes.launching"
 STAND_INS = {"launch": ["LaunchDescription"],
-             "launch.actions": ["DeclareLaunchArgument", "LogInfo", "OpaqueFunction"],
+             "launch.actions": ["DeclareLaunchArgument", "EmitEvent", "IncludeLaunchDescription",
+                                "LogInfo", "OpaqueFunction", "RegisterEventHandler",
+                                "TimerAction"],
+             "launch.event_handlers": ["OnProcessExit"], "launch.events": ["Shutdown"],
+             "launch.launch_description_sources": ["PythonLaunchDescriptionSource"],
              "launch.substitutions": ["LaunchConfiguration"], "launch_ros": [],
              "launch_ros.actions": ["Node"]}
 
@@ -30,9 +34,8 @@ class Recorded(SimpleNamespace):
 
 
 @pytest.fixture
-def launched(monkeypatch):
-    """name of a launch file -> its arguments with their defaults, and a function that gives its
-    nodes by name for arguments that are given."""
+def description(monkeypatch):
+    """name of a launch file -> its actions."""
     for name, kinds in STAND_INS.items():
         module = ModuleType(name)
         for kind in kinds:
@@ -46,7 +49,16 @@ def launched(monkeypatch):
             name, ROOT / "launch" / f"{name}.launch.py")
         file = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(file)
-        described = file.generate_launch_description().args[0]
+        return file.generate_launch_description().args[0]
+    return load
+
+
+@pytest.fixture
+def launched(description):
+    """name of a launch file -> its arguments with their defaults, and a function that gives its
+    nodes by name for arguments that are given."""
+    def load(name):
+        described = description(name)
         arguments = {a.args[0]: a.default_value for a in described if hasattr(a, "default_value")}
         start = next(a.function for a in described if hasattr(a, "function"))
 
@@ -202,6 +214,25 @@ def test_weights_device_and_range_of_a_detector_are_arguments(name, launched):
         started = nodes(weights=weights, device="cpu", range="around", detectors=name
                         if file == name else "pointnet,pointpillars,fused")
         assert started[f"{name}_detector"].parameters[1] == expected
+
+
+def test_a_replay_plays_to_the_nodes_that_its_player_and_evaluator_know(description, drive_bag):
+    """Also where the file that includes it, or the command line, has arguments of these names."""
+    actions = description("replay")
+    pipeline = dict(next(a.launch_arguments for a in actions if hasattr(a, "launch_arguments")))
+    assert pipeline["detectors"] == "candidates"
+    assert pipeline["namespace"] == pipeline["name_prefix"] == ""
+    arguments = {a.args[0]: getattr(a, "default_value", "") for a in actions if a.args[1:] == ()
+                 and hasattr(a, "description")} | {"bag": str(drive_bag)}
+    started = next(a.function for a in actions if hasattr(a, "function"))(SimpleNamespace(
+        perform_substitution=lambda s: arguments[s.args[0]],
+        launch_configurations={**arguments, "namespace": "left", "detectors": "candidates"}))
+    assert [a.msg for a in started if hasattr(a, "msg")] == [
+        "namespace:=left is no argument of replay.launch.py"]
+    player = next(n for n in started if getattr(n, "executable", "") == "bag_player")
+    found = "candidate_refinement/output/detections"
+    assert player.parameters[1]["follow"] == [found]
+    assert f"{found}:=2" in player.parameters[1]["wait_for"]  # the evaluator and the player
 
 
 @pytest.mark.parametrize("given, words", [

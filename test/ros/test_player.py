@@ -11,13 +11,14 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.clock import ClockType
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
 from lidar_perception.campaign.samples import as_ros1
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
-from lidar_perception.nodes.runtime import LATCHED
+from lidar_perception.nodes.runtime import LATCHED, WAITING
 from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
 from msg_utils.stamps import to_ns
@@ -192,6 +193,28 @@ def test_it_waits_for_its_subscribers(processes, peer, text_bag):
     assert first == []
     second = peer.listen("/text", TEXT)
     peer.wait(lambda: len(first) == 20 and len(second) == 20, "all messages at both")
+
+
+def test_it_waits_until_a_node_of_ours_has_met_who_listens_to_it(processes, peer, text_bag):
+    """The player knows of a listener before the node that is listened to does: what that one
+    publishes meanwhile would be lost."""
+    me = peer.node.get_name()
+    said = peer.talker("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+    peer.talker(f"/{me}/debug/processing_time_ms", "std_msgs/msg/Float64")
+    peer.talker("/between", TEXT)
+    peer.listen("/between", TEXT)
+    heard = peer.listen("/text", TEXT)
+
+    def tell(count, until, what):
+        peer.send(said, DiagnosticArray(status=[DiagnosticStatus(name=me, values=[
+            KeyValue(key="subscribers of /between", value=count)])]), until, what)
+
+    start(processes, text_bag, wait_for=["/text", "/between"], rate=10.0)
+    peer.wait(lambda: peer.value_of("bag_player", "subscribers of /text") == "1", "the player")
+    peer.diagnostics.clear()
+    tell("0", lambda: "bag_player" in peer.diagnostics, "the player's next diagnostic")
+    assert peer.message_of("bag_player") == WAITING and heard == []
+    tell("1", lambda: len(heard) == 20, "all messages")
 
 
 BAD = {
