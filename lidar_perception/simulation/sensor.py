@@ -48,7 +48,8 @@ class Sensor:
     biases: tuple[float, ...] = ()  # what each beam adds to the intensity; empty: nothing
     fade: tuple[float, float] = (0.0, 0.0)  # from this range on intensity falls so much a metre
     blocked: tuple[tuple[float, float, float], ...] = ()  # by the vehicle: (first ring, from, to),
-    #                                that ring and all lower ones, counter-clockwise, in degrees
+    #                                that ring and all lower ones, counter-clockwise, in degrees; all
+    #                                around from 0 to 360
     wander: float = 0.0            # beams look elsewhere in every turn, up to so much lower
 
     def __post_init__(self) -> None:
@@ -127,7 +128,8 @@ class Sensor:
         azimuth, ring = np.arange(self.columns) * (360 / self.columns), np.arange(self.rings)
         free = np.ones((self.columns, self.rings), bool)
         for first, start, end in self.blocked:
-            within = (azimuth - start) % 360 < (end - start) % 360
+            wide = (end - start) % 360 if abs(end - start) < 360 else 360
+            within = (azimuth - start) % 360 < wide
             free &= ~(within[:, None] & (ring >= first))
         return free
 

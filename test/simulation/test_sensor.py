@@ -246,6 +246,13 @@ def test_the_vehicle_blocks_its_sectors():
     assert isinstance(sensor, Sensor) and len(found.xyz) == sensor.open_rays().sum()
 
 
+@pytest.mark.parametrize("start, end, degrees", [
+    (0, 360, 360), (-180, 180, 360), (-10, 370, 360), (350, 10, 20), (-10, 10, 20), (10, 10, 0)])
+def test_a_sector_is_as_wide_as_told_and_may_be_the_whole_turn(start, end, degrees):
+    shut = ~replace(SMALL, blocked=((4, start, end),)).open_rays()
+    assert (shut[:, 4:].sum(axis=0) == 2 * degrees).all() and not shut[:, :4].any()
+
+
 def test_a_generic_sensor_can_be_named():
     assert sensor_named("generic:32,-25,15,0.2,10") == generic(32, -25.0, 15.0, 0.2, 10.0)
 
