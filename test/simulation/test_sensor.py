@@ -66,6 +66,7 @@ def test_kittis_sensor_is_kittis():
 
 @pytest.mark.parametrize("change, named", [
     ({"elevations": ()}, "elevations"), ({"elevations": (0.1, 0.2)}, "elevations"),
+    ({"elevations": tuple(np.linspace(1, -1, 70_000)), "azimuth_step": 1.5}, "65536 beams"),
     ({"elevations": (2.0,)}, "elevations"), ({"elevations": (np.nan,)}, "elevations"),
     ({"lifts": (0.1,)}, "lifts"), ({"biases": (0.1,)}, "biases"), ({"offsets": (0.1,)}, "offsets"),
     ({"azimuth_step": 0.0}, "azimuth_step"), ({"azimuth_step": np.nan}, "azimuth_step"),
@@ -114,7 +115,12 @@ def test_a_file_in_degrees_is_the_sensor_in_radians(tmp_path):
     ("elevations: [a]\nazimuth_step: 1\nrate: 10", "elevations"),
     ("elevations: [1, 2]\nazimuth_step: 1\nrate: 10", "descend"),
     ("elevations: [1]\nazimuth_step: 0\nrate: 10", "azimuth_step"),
-    ("elevations: [1]\nazimuth_step: 1\nrate: .inf", "rate")])
+    ("elevations: [1]\nazimuth_step: 1\nrate: .inf", "rate"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: 1" + "0" * 400, "rate"),
+    ("elevations: " + "[" * 5000 + "]" * 5000 + "\nazimuth_step: 1\nrate: 10", "elevations"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nfade: []", "fade"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [[.inf, 0, 10]]", "blocked"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [[0.5, 0, 10]]", "blocked")])
 def test_a_file_of_no_possible_sensor_is_named_with_what_is_wrong(tmp_path, text, named):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
@@ -260,6 +266,7 @@ def test_a_generic_sensor_can_be_named():
 @pytest.mark.parametrize("name", ["generic:", "generic:32", "generic:64,-24,2,1e-9,10",
                                   "generic:64,-24,2,1e-320,10", "generic:1e12,-24,2,0.2,10",
                                   "generic:inf,-24,2,0.2,10", "generic:1000000,-24,2,1,10",
+                                  "generic:70000,-24,2,90,10", "generic:32.5,-24,2,1,10",
                                   "generic:a,b,c,d,e",
                                   "generic:32,-25,15,0.2,10,3", "generic:32,15,-25,0.2,10",
                                   "generic:0,-25,15,0.2,10", "generic:nan,-25,15,0.2,10"])
