@@ -1,5 +1,6 @@
 """Laws of sensors and of what they report."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -212,6 +213,15 @@ def test_far_and_dark_is_lost():
     assert len(measured(SMALL, 50.0, cosine=0.05).xyz) < len(measured(SMALL, 50.0).xyz)
     lost = 1 - len(measured(replace(SMALL, dropout=0.2), 5.0).xyz) / SMALL.columns / SMALL.rings
     assert abs(lost - 0.2) < 0.03
+
+
+def test_an_endless_reach_loses_what_meets_nothing_and_nothing_else():
+    sensor = replace(SMALL, reach=np.inf, dropout=0.0)
+    distance = np.where(np.arange(sensor.columns) % 2, np.inf, 100.0)[:, None]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = measured(sensor, distance, np.where(np.isinf(distance), 0.0, 1e-6))
+    assert len(found.xyz) == sensor.columns * sensor.rings / 2
 
 
 def test_intensity_is_the_brightness_unless_the_beam_or_range_says_otherwise():
