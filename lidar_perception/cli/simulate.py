@@ -16,7 +16,7 @@ from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.simulation.dataset import FOLDERS, LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import longest_drive
-from lidar_perception.simulation.scene import SCENES, Scenes
+from lidar_perception.simulation.scene import MOST_PEOPLE, SCENES, Scenes
 from lidar_perception.simulation.sensor import GENERIC, NAMES, sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.types import InputError
@@ -40,8 +40,8 @@ from lidar_perception.types import InputError
 @click.option("--kind", "--street", "kind", metavar="KIND", help="Scenes of this kind only: "
               + "; ".join(f"{name} {', '.join(one.kinds)}" for name, one in SCENES.items())
               + ". Default: all.")
-@click.option("--people", type=click.FloatRange(0), default=1.0, show_default=True,
-              help="Pedestrians and cyclists, as a multiple of the usual; on streets of KITTI's.")
+@click.option("--people", type=click.FloatRange(0, MOST_PEOPLE), default=1.0,
+              show_default=True, help="Pedestrians and cyclists, as a multiple of the usual; on streets of KITTI's.")
 @click.option("--streets-of", type=click.IntRange(1), metavar="N",
               help="Scans of each street. Default: 1 for kitti, a drive of 20 s for the others.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes that write the folders of a data "

@@ -207,7 +207,8 @@ def test_resume_names_every_difference(tmp_path, monkeypatch):
 @pytest.mark.parametrize("options, said", [
     (["--sensor", "hdl65"], "unknown sensor 'hdl65': must be one of hdl-32e"),
     (["--format", "pcap"], "pcap"), (["--frames", "0"], "0 is not in the range"),
-    (["--seed", "-1"], "-1 is not in the range"), (["--streets-of", "201"], "1 .. 200"),
+    (["--seed", "-1"], "-1 is not in the range"), (["--people", "nan"], "people = nan"),
+    (["--people", "101"], "101.0 is not in the range"), (["--streets-of", "201"], "1 .. 200"),
     (["--resume", "--force"], "one of them"), (["--format", "mcap", "--resume"], "with 'convert'")])
 def test_bad_arguments_are_named(tmp_path, options, said):
     arguments = ["--out", str(tmp_path / "set"), "--format", "kitti", *options]
