@@ -43,7 +43,8 @@ from lidar_perception.types import InputError
               + "; ".join(f"{name} {', '.join(one.kinds)}" for name, one in SCENES.items())
               + ". Default: all.")
 @click.option("--people", type=click.FloatRange(0, MOST_PEOPLE), default=1.0,
-              show_default=True, help="Pedestrians and cyclists, as a multiple of the usual; on streets of KITTI's.")
+              show_default=True, help="Pedestrians and cyclists, as a multiple of the usual; on "
+              "streets of KITTI's.")
 @click.option("--streets-of", type=click.IntRange(1), metavar="N",
               help="Scans of each street. Default: 1 for kitti, a drive of 20 s for the others.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes that write the folders of a data "

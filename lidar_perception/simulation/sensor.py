@@ -50,8 +50,8 @@ class Sensor:
     biases: tuple[float, ...] = ()  # what each beam adds to the intensity; empty: nothing
     fade: tuple[float, float] = (0.0, 0.0)  # from this range on intensity falls so much a metre
     blocked: tuple[tuple[float, float, float], ...] = ()  # by the vehicle: (first ring, from, to),
-    #                                that ring and all lower ones, counter-clockwise, in degrees; all
-    #                                around from 0 to 360
+    #                                that ring and all lower ones, counter-clockwise, in degrees;
+    #                                from 0 to 360 all around
     wander: float = 0.0            # beams look elsewhere in every turn, up to so much lower
 
     def __post_init__(self) -> None:
