@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from contextlib import closing
 from pathlib import Path
 
@@ -13,11 +14,12 @@ from lidar_perception.data.frame import BOXES
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.runs.folder import is_finished, unfinished
 from lidar_perception.runs.machine import cores
+from lidar_perception.runs.resuming import digest
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.simulation.dataset import FOLDERS, LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import longest_drive
-from lidar_perception.simulation.scene import SCENES, Scenes
-from lidar_perception.simulation.sensor import GENERIC, NAMES, sensor_named
+from lidar_perception.simulation.scene import MOST_PEOPLE, SCENES, Scenes
+from lidar_perception.simulation.sensor import GENERIC, NAMES, Sensor, sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.types import InputError
 
@@ -40,8 +42,9 @@ from lidar_perception.types import InputError
 @click.option("--kind", "--street", "kind", metavar="KIND", help="Scenes of this kind only: "
               + "; ".join(f"{name} {', '.join(one.kinds)}" for name, one in SCENES.items())
               + ". Default: all.")
-@click.option("--people", type=click.FloatRange(0), default=1.0, show_default=True,
-              help="Pedestrians and cyclists, as a multiple of the usual; on streets of KITTI's.")
+@click.option("--people", type=click.FloatRange(0, MOST_PEOPLE), default=1.0,
+              show_default=True, help="Pedestrians and cyclists, as a multiple of the usual; on "
+              "streets of KITTI's.")
 @click.option("--streets-of", type=click.IntRange(1), metavar="N",
               help="Scans of each street. Default: 1 for kitti, a drive of 20 s for the others.")
 @click.option("--jobs", type=click.IntRange(1), help="Processes that write the folders of a data "
@@ -75,7 +78,9 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
     if compare is not None:
         if scene != "street":
             raise click.UsageError("--compare compares streets, as all real data here does")
-        _compare(compare, frames, seed, scenes, json, png)
+        if resume or force or jobs or streets_of:
+            raise click.UsageError("--resume, --force, --jobs and --streets-of go with --out")
+        _compare(compare, frames, seed, sensor_named(sensor_name, mount_height), scenes, json, png)
         return
     if json or png:
         raise click.UsageError("--json and --png go with --compare")
@@ -91,7 +96,7 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
                                    "which can, and turn it into a bag with 'convert'")
         _bag(out, plan, force)
     else:
-        _data_set(out, plan, sensor_name, jobs or cores(), resume, force)
+        _data_set(out, plan, sensor_name, mount_height, jobs or cores(), resume, force)
 
 
 def _bag(out: Path, plan: Plan, force: bool) -> None:
@@ -104,18 +109,19 @@ def _bag(out: Path, plan: Plan, force: bool) -> None:
     console.print(f"{out}: {count} scans")
 
 
-def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
-              force: bool) -> None:
+def _data_set(out: Path, plan: Plan, sensor_name: str, mount_height: float, jobs: int,
+              resume: bool, force: bool) -> None:
     scenes = plan.scenes
     asked = {"format": plan.layout, "sensor": sensor_name, "height": plan.sensor.height,
-             "seed": plan.seed, "frames": plan.frames, "scene": scenes.scene,
-             "street": scenes.kind, "people": scenes.people, "streets_of": plan.streets_of,
-             "version": __version__}
-    asked["command"] = (f"lidar-perception simulate --format {plan.layout} --sensor {sensor_name} "
-                        f"--mount-height {plan.sensor.height:g} --seed {plan.seed} "
-                        f"--frames {plan.frames} --scene {scenes.scene} "
-                        f"--people {scenes.people:g} --streets-of {plan.streets_of}"
-                        + (f" --street {scenes.kind}" if scenes.kind else ""))
+             "sensor_digest": digest([repr(plan.sensor)]), "seed": plan.seed,
+             "frames": plan.frames, "scene": scenes.scene, "street": scenes.kind,
+             "people": scenes.people, "streets_of": plan.streets_of, "version": __version__}
+    options = {"format": plan.layout, "sensor": sensor_name, "mount-height": mount_height or None,
+               "seed": plan.seed, "frames": plan.frames, "scene": scenes.scene,
+               "people": scenes.people, "streets-of": plan.streets_of, "street": scenes.kind}
+    asked["command"] = shlex.join(["lidar-perception", "simulate", *(
+        word for name, value in options.items() if value is not None
+        for word in (f"--{name}", str(value)))])
     complete, begun = resume and is_finished(out), False
     try:
         with unfinished(out, asked, FOLDERS, resume=resume, force=force) as missing:
@@ -133,8 +139,8 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, jobs: int, resume: bool,
                                                    "before" if resume else ""))
 
 
-def _compare(real: Path, frames: int, seed: int, scenes: Scenes, json_file: Path | None,
-             png: Path | None) -> None:
+def _compare(real: Path, frames: int, seed: int, sensor: Sensor, scenes: Scenes,
+             json_file: Path | None, png: Path | None) -> None:
     from lidar_perception.candidates.configurations import PAPER
     from lidar_perception.candidates.warm_up import warm_up
     from lidar_perception.simulation.realism.compare import evenly, measured_scans, side_by_side
@@ -145,7 +151,7 @@ def _compare(real: Path, frames: int, seed: int, scenes: Scenes, json_file: Path
     chosen = evenly(recording)
     warm_up()
     measured = measured_scans(track(chosen, "measuring real scans", len(chosen)), PAPER)
-    made = simulated_scans(seed, frames, streets_of=1, scenes=scenes)
+    made = simulated_scans(seed, frames, sensor, streets_of=1, scenes=scenes)
     simulated = measured_scans(track(made, "measuring simulated scans", frames), PAPER)
     content = {"data": str(real), "seed": seed, **side_by_side(measured, simulated)}
     print_realism(content, console)

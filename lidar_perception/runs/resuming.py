@@ -57,5 +57,5 @@ def differences(before: dict[str, Any], asked: dict[str, Any]) -> list[str]:
 
 
 def digest(names: Iterable[str]) -> str:
-    """Short for the names of many frames: that of others, or in another order, is another."""
+    """Short for many names, such as of frames: that of others, or in another order, is another."""
     return hashlib.sha256("\n".join(names).encode()).hexdigest()[:12]

@@ -86,7 +86,8 @@ def truth(moment: Moment, hits: Hits, owner: np.ndarray) -> GroundTruth:
     size = len(hits.reached)
     points = np.bincount(owner, minlength=size)[moment.track_ids]
     visible = np.bincount(hits.owner.ravel(), minlength=size)[moment.track_ids]
-    share = visible / np.maximum(hits.reached[moment.track_ids], 1)
+    # The rim of a beam may meet an object that the middle of none would.
+    share = np.minimum(visible / np.maximum(hits.reached[moment.track_ids], 1), 1.0)
     occluded = (share < 0.8).astype(int) + (share < 0.4)
     keep = (points > 0) & (np.hypot(*moment.boxes[:, :2].T) <= LABEL_RANGE)
     extras = [{"track_id": int(track), "truncated": 0.0, "occluded": int(level),

@@ -29,9 +29,9 @@ from lidar_perception.simulation.windows import windows
 
 class Hits(NamedTuple):
     """What each ray meets first, without noise: (columns, rings) arrays. range float64 m, inf
-    where nothing; brightness float64 0..1; cosine float64: of the incidence, 0 where nothing; owner
-    int32, 0 where no object; semantic uint16, 0
-    where nothing, 1 (outlier) for a return from between two things, see edges.py; solid int32, an
+    where nothing, 0 where it starts in a tuft of grass; brightness float64 0..1; cosine float64:
+    of the incidence, 0 where nothing; owner int32, 0 where no object; semantic uint16, 0 where
+    nothing, 1 (outlier) for a return from between two things, see edges.py; solid int32, an
     index into the solids, -1 where none. reached[k] rays would meet object k if it were alone."""
 
     range: np.ndarray

@@ -49,7 +49,7 @@ def returns_of(hits: Hits, sensor: Sensor, motion: Motion, rng: np.random.Genera
     noisy = hits.range + rng.normal(0.0, sensor.range_noise, shape)
     if sensor.offsets:
         noisy += np.asarray(sensor.offsets)
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # no range over an endless reach: NaN
         power = (np.log(hits.brightness / 0.1) + GRAZING * np.log(hits.cosine)
                  - 2 * np.log(hits.range / sensor.reach))
     scatter = rng.normal(0.0, SCATTER, (-(-shape[0] // RUN), shape[1]))

@@ -25,6 +25,7 @@ from lidar_perception.simulation.traffic import populate
 from lidar_perception.simulation.way import SECONDS, Way
 from lidar_perception.types import CLASSES, InputError
 
+MOST_PEOPLE = 100  # times as many as usual; a street then takes 3 s, and has no room for more
 EGO = (3.0, 1.1)  # half length and width that the ego vehicle keeps clear, m
 
 
@@ -37,14 +38,18 @@ class Scenes(NamedTuple):
     scene: str = "street"
 
     def sorts(self) -> list[Sort]:
-        """In the order of their turns. InputError for an unknown scene or kind."""
+        """In the order of their turns. InputError for an unknown scene or kind, and people that
+        cannot be."""
+        if not 0 <= self.people <= MOST_PEOPLE:
+            raise InputError(f"people = {self.people} must be 0 .. {MOST_PEOPLE}, such as 1")
         names = self.scene.split(",")
         if unknown := [name for name in names if name not in SCENES]:
             raise InputError(f"unknown scene {unknown[0]!r}: must be one of {', '.join(SCENES)}, "
                              "or several with commas between")
-        kinds = dict.fromkeys(kind for name in names for kind in SCENES[name].kinds)
-        if self.kind is not None and any(self.kind not in SCENES[name].kinds for name in names):
-            raise InputError(f"kind = {self.kind!r} must be one of {', '.join(kinds)}")
+        for name in names:
+            if self.kind is not None and self.kind not in SCENES[name].kinds:
+                raise InputError(f"kind = {self.kind!r} must be one of "
+                                 f"{', '.join(SCENES[name].kinds)} where scene is {name}")
         return [SCENES[name] for name in names]
 
     @property
@@ -178,12 +183,10 @@ def make_scene(seed: int = 0, kind: str | None = None, people: float = 1.0,
     streets 1 comes near KITTI's labels, 0 is none. scene: see Scenes.
 
     What is placed later is dropped where it would ever touch what is there already. InputError
-    for a negative seed or people and an unknown scene or kind.
+    for a negative seed, people beyond 0 .. MOST_PEOPLE and an unknown scene or kind.
     """
     if seed < 0:
         raise InputError(f"seed = {seed} must not be negative")
-    if not 0 <= people < np.inf:
-        raise InputError(f"people = {people} must be 0 or more, such as 1")
     sorts = Scenes(kind, people, scene).sorts()
     chosen = sorts[seed % len(sorts)]
     rng = np.random.default_rng(seed)

@@ -3,6 +3,7 @@ file."""
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass, fields, replace
 from functools import cache
 from pathlib import Path
@@ -19,6 +20,7 @@ MAX_BYTES = 1 << 20  # of a file that describes a sensor
 GOLDEN = 0.6180339887498949
 MAX_RATE = 1000.0  # turns a second
 MAX_NOISE = 1.0    # metres
+MAX_BEAMS = 1 << 16  # as many rings as uint16 has
 MAX_RAYS = 5_000_000  # in a turn; the densest sensors have 0.5 million. Each takes some 100 bytes
 
 
@@ -27,7 +29,7 @@ class Sensor:
     """A LiDAR that turns about its z axis; angles in radians, lengths in metres.
 
     InputError for what cannot be: no beams, a height that is not positive, max_range <= min_range,
-    more than MAX_RAYS rays in a turn.
+    more than MAX_BEAMS beams, or MAX_RAYS rays in a turn.
     """
 
     elevations: tuple[float, ...]  # one per beam, descending; ring 0 is the highest
@@ -48,13 +50,15 @@ class Sensor:
     biases: tuple[float, ...] = ()  # what each beam adds to the intensity; empty: nothing
     fade: tuple[float, float] = (0.0, 0.0)  # from this range on intensity falls so much a metre
     blocked: tuple[tuple[float, float, float], ...] = ()  # by the vehicle: (first ring, from, to),
-    #                                that ring and all lower ones, counter-clockwise, in degrees
+    #                                that ring and all lower ones, counter-clockwise, in degrees;
+    #                                from 0 to 360 all around
     wander: float = 0.0            # beams look elsewhere in every turn, up to so much lower
 
     def __post_init__(self) -> None:
         up = np.asarray(self.elevations, np.float64)
         for wrong, what in (
                 (not len(up), "elevations must name one beam at least"),
+                (len(up) > MAX_BEAMS, f"elevations must name {MAX_BEAMS} beams at most"),
                 (not (np.abs(up) < np.pi / 2).all() or not (np.diff(up) < 0).all(),
                  "elevations must descend, within 90 degrees of level"),
                 *((len(each) not in (0, len(up)) or not np.isfinite(each).all(),
@@ -127,7 +131,8 @@ class Sensor:
         azimuth, ring = np.arange(self.columns) * (360 / self.columns), np.arange(self.rings)
         free = np.ones((self.columns, self.rings), bool)
         for first, start, end in self.blocked:
-            within = (azimuth - start) % 360 < (end - start) % 360
+            wide = (end - start) % 360 if abs(end - start) < 360 else 360
+            within = (azimuth - start) % 360 < wide
             free &= ~(within[:, None] & (ring >= first))
         return free
 
@@ -171,8 +176,8 @@ def generic(beams: int, lowest: float, highest: float, azimuth_step: float, rate
             **fields: Any) -> Sensor:
     """A sensor of evenly spaced beams; angles in degrees, rate in turns per second, and any other
     field of Sensor by name. InputError for impossible values."""
-    if beams > MAX_RAYS:  # before there is a list of them
-        raise InputError(f"impossible sensor: {beams} beams must be {MAX_RAYS} at most")
+    if beams > MAX_BEAMS:  # before there is a list of them
+        raise InputError(f"impossible sensor: {beams} beams must be {MAX_BEAMS} at most")
     if beams > 1 and not lowest < highest:
         raise InputError(f"impossible sensor: lowest {lowest} must be below highest {highest}")
     return Sensor(tuple(np.radians(np.linspace(highest, lowest, max(beams, 0))).tolist()),
@@ -212,21 +217,25 @@ IN_DEGREES = ("elevations", "azimuth_step", "divergence", "wander")
 def _read(key: str, value: Any) -> Any:
     """A value of the file in the unit of the field; InputError where it is of the wrong kind."""
     shape = SHAPES.get(key, ())
-    if value == [] and shape:
+    if value == [] and shape[:1] == (0,):
         return ()
     try:
         numbers = np.array(None if isinstance(value, (bool, str)) else value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         numbers = np.full((0,) * 9, np.nan)
     if numbers.ndim != len(shape) or any(n not in (0, m) for n, m in zip(shape, numbers.shape)) or (
-            np.isnan(numbers).any()):
+            np.isnan(numbers).any()) or (len(shape) == 2 and not _whole(numbers[:, 0])):
         what = "a number" if not shape else "a list of " + (
             f"{shape[0] or ''} numbers".strip() if len(shape) == 1 else "[ring, from, to]")
-        raise InputError(f"{key} = {str(value)[:60]} must be {what}")
+        raise InputError(f"{key} = {reprlib.repr(value)[:60]} must be {what}")
     rows = (np.radians(numbers) if key in IN_DEGREES else numbers).tolist()
     if not shape:
         return rows
     return tuple((int(row[0]), *row[1:]) for row in rows) if len(shape) == 2 else tuple(rows)
+
+
+def _whole(numbers: np.ndarray) -> bool:
+    return bool(np.isfinite(numbers).all() and (numbers == np.floor(numbers)).all())
 
 
 def _key(name: str) -> str:
@@ -270,6 +279,8 @@ def _named(name: str) -> Sensor:
     if name.startswith("generic:"):
         try:
             beams, *numbers = map(float, name.removeprefix("generic:").split(","))
+            if beams % 1:  # NaN is no whole number, either
+                raise ValueError
             return generic(int(beams), *numbers)
         except (TypeError, ValueError, OverflowError) as error:
             if isinstance(error, InputError):

@@ -205,7 +205,7 @@ def _meet_raised(ground, start, way, low, max_range):
 @njit(cache=True, nogil=True, error_model="numpy")
 def _meet_tufts(ground, start, way, t, cosine):
     """Range of the first tuft or bump met before the ground at t, else t: looked for where a ray is
-    low enough, from the sensor on, in TUFT_STEPS steps."""
+    low enough, from the sensor on, in TUFT_STEPS steps; 0 where it starts in one."""
     step = min(max(ground.rough, ground.litter) / cosine, TUFTS_HIDE) / TUFT_STEPS
     end, begin = start[1] + t * way[1], start[1] + (t - TUFT_STEPS * step) * way[1]
     left, right = ground.curb_left - ground.parking, ground.curb_right + ground.parking
@@ -214,11 +214,13 @@ def _meet_tufts(ground, start, way, t, cosine):
         first = 0  # the road itself is nowhere as high
     for k in range(first, -1, -1):
         back = k * step
+        if back >= t:
+            continue  # behind the sensor
         top = tufts(ground, start[0] + (t - back) * way[0], start[1] + (t - back) * way[1],
                     back * cosine)
         above = top / cosine  # the ray is as high so far before t
         if above > back:
-            return t - min(above, back + step)
+            return max(t - min(above, back + step), 0.0)
     return t
 
 

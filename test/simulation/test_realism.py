@@ -350,6 +350,18 @@ def test_the_command_compares(tmp_path, monkeypatch):
     assert content["real"]["scans"] == content["simulated"]["scans"] == 1
 
 
+def test_the_sensor_that_is_asked_for_is_compared(tmp_path):
+    root, found = object_folder(tmp_path / "kitti", walker_label(), 1), tmp_path / "realism.json"
+    asked = ["simulate", "--compare", str(root), "--frames", "1"]
+    result = CliRunner().invoke(cli, [*asked, "--json", str(found), "--sensor",
+                                      "generic:4,-12,0,2,10"], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    bins = json.loads(found.read_text())["curves"]["points"]["bins"]
+    assert 100 < sum(b["simulated"]["median"] for b in bins) <= 4 * 180
+    for unused in (["--resume"], ["--force"], ["--jobs", "2"], ["--streets-of", "2"]):
+        assert "go with --out" in CliRunner().invoke(cli, [*asked, *unused]).output
+
+
 def test_real_scans_are_as_real_as_themselves(data):
     scans = [r for r in open_recording(data / "kitti_object") if is_whole(r.load())][:2]
     first, second = (measured_scans(scans, PAPER) for _ in range(2))

@@ -177,7 +177,10 @@ def test_the_command_writes_every_layout_of_a_robot(layout, tmp_path):
 
 @pytest.mark.parametrize("scenes, said", [
     (Scenes(scene="moon"), "unknown scene 'moon': must be one of street, campus, indoor"),
-    (Scenes("zone", 1.0, "campus"), "kind = 'zone' must be one of forecourt, square, path")])
+    (Scenes("zone", 1.0, "campus"), "kind = 'zone' must be one of forecourt, square, path"),
+    (Scenes("city", 1.0, "street,campus"), "kind = 'city' must be one of forecourt, square, path"),
+    (Scenes(people=np.nan), "people = nan must be 0 .. 100"),
+    (Scenes(people=1e25), "people = 1e.25 must be 0 .. 100")])
 def test_what_is_no_scene_is_named(scenes, said):
     with pytest.raises(InputError, match=said):
         next(simulated_scans(0, 1, TINY, 1, scenes))

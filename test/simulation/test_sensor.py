@@ -1,5 +1,6 @@
 """Laws of sensors and of what they report."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -66,6 +67,7 @@ def test_kittis_sensor_is_kittis():
 
 @pytest.mark.parametrize("change, named", [
     ({"elevations": ()}, "elevations"), ({"elevations": (0.1, 0.2)}, "elevations"),
+    ({"elevations": tuple(np.linspace(1, -1, 70_000)), "azimuth_step": 1.5}, "65536 beams"),
     ({"elevations": (2.0,)}, "elevations"), ({"elevations": (np.nan,)}, "elevations"),
     ({"lifts": (0.1,)}, "lifts"), ({"biases": (0.1,)}, "biases"), ({"offsets": (0.1,)}, "offsets"),
     ({"azimuth_step": 0.0}, "azimuth_step"), ({"azimuth_step": np.nan}, "azimuth_step"),
@@ -114,7 +116,12 @@ def test_a_file_in_degrees_is_the_sensor_in_radians(tmp_path):
     ("elevations: [a]\nazimuth_step: 1\nrate: 10", "elevations"),
     ("elevations: [1, 2]\nazimuth_step: 1\nrate: 10", "descend"),
     ("elevations: [1]\nazimuth_step: 0\nrate: 10", "azimuth_step"),
-    ("elevations: [1]\nazimuth_step: 1\nrate: .inf", "rate")])
+    ("elevations: [1]\nazimuth_step: 1\nrate: .inf", "rate"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: 1" + "0" * 400, "rate"),
+    ("elevations: " + "[" * 5000 + "]" * 5000 + "\nazimuth_step: 1\nrate: 10", "elevations"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nfade: []", "fade"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [[.inf, 0, 10]]", "blocked"),
+    ("elevations: [1]\nazimuth_step: 1\nrate: 10\nblocked: [[0.5, 0, 10]]", "blocked")])
 def test_a_file_of_no_possible_sensor_is_named_with_what_is_wrong(tmp_path, text, named):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
@@ -208,6 +215,15 @@ def test_far_and_dark_is_lost():
     assert abs(lost - 0.2) < 0.03
 
 
+def test_an_endless_reach_loses_what_meets_nothing_and_nothing_else():
+    sensor = replace(SMALL, reach=np.inf, dropout=0.0)
+    distance = np.where(np.arange(sensor.columns) % 2, np.inf, 100.0)[:, None]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = measured(sensor, distance, np.where(np.isinf(distance), 0.0, 1e-6))
+    assert len(found.xyz) == sensor.columns * sensor.rings / 2
+
+
 def test_intensity_is_the_brightness_unless_the_beam_or_range_says_otherwise():
     plain = measured(SMALL, 10.0, 0.4)
     assert abs(plain.intensity.mean() - 0.4) < 0.005
@@ -246,6 +262,13 @@ def test_the_vehicle_blocks_its_sectors():
     assert isinstance(sensor, Sensor) and len(found.xyz) == sensor.open_rays().sum()
 
 
+@pytest.mark.parametrize("start, end, degrees", [
+    (0, 360, 360), (-180, 180, 360), (-10, 370, 360), (350, 10, 20), (-10, 10, 20), (10, 10, 0)])
+def test_a_sector_is_as_wide_as_told_and_may_be_the_whole_turn(start, end, degrees):
+    shut = ~replace(SMALL, blocked=((4, start, end),)).open_rays()
+    assert (shut[:, 4:].sum(axis=0) == 2 * degrees).all() and not shut[:, :4].any()
+
+
 def test_a_generic_sensor_can_be_named():
     assert sensor_named("generic:32,-25,15,0.2,10") == generic(32, -25.0, 15.0, 0.2, 10.0)
 
@@ -253,6 +276,7 @@ def test_a_generic_sensor_can_be_named():
 @pytest.mark.parametrize("name", ["generic:", "generic:32", "generic:64,-24,2,1e-9,10",
                                   "generic:64,-24,2,1e-320,10", "generic:1e12,-24,2,0.2,10",
                                   "generic:inf,-24,2,0.2,10", "generic:1000000,-24,2,1,10",
+                                  "generic:70000,-24,2,90,10", "generic:32.5,-24,2,1,10",
                                   "generic:a,b,c,d,e",
                                   "generic:32,-25,15,0.2,10,3", "generic:32,15,-25,0.2,10",
                                   "generic:0,-25,15,0.2,10", "generic:nan,-25,15,0.2,10"])

@@ -6,6 +6,7 @@ import errno
 import itertools
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -31,6 +32,12 @@ SENSORS["tiny"] = generic(16, -14.0, 3.0, 2.0, 10.0)
 from lidar_perception.cli.main import main
 main()
 """
+
+
+def invoke(options):
+    result = CliRunner().invoke(simulate, options, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result
 
 
 def test_a_data_set_says_how_it_was_made(made):
@@ -190,6 +197,31 @@ def test_what_is_there_is_not_touched_without_a_word(made, tmp_path):
     assert content(out) == content(made / "semantickitti")
 
 
+def test_the_recorded_command_makes_the_same_again(tmp_path):
+    sensor = tmp_path / "my sensor.yaml"
+    sensor.write_text("elevations: [2, -8]\nazimuth_step: 5\nrate: 10\nheight: 12.3456789\n")
+    made, again = tmp_path / "made", tmp_path / "again"
+    invoke(["--out", str(made), "--format", "kitti", "--sensor", str(sensor), "--frames", "1",
+            "--jobs", "1", "--people", "1.23456789"])
+    command = json.loads((made / "dataset.json").read_text())["command"]
+    program, name, *options = shlex.split(command)
+    assert (program, name) == ("lidar-perception", "simulate")
+    invoke([*options, "--out", str(again), "--jobs", "1"])
+    assert content(again) == content(made)
+
+
+def test_a_set_is_not_resumed_with_another_sensor_of_the_same_name(tmp_path):
+    sensor, out = tmp_path / "mine.yaml", tmp_path / "set"
+    sensor.write_text("elevations: [2, -8]\nazimuth_step: 5\nrate: 10\n")
+    options = ["--out", str(out), "--format", "kitti", "--sensor", str(sensor), "--frames", "1",
+               "--jobs", "1"]
+    invoke(options)
+    assert "nothing to do" in invoke([*options, "--resume"]).output
+    sensor.write_text("elevations: [2, -9]\nazimuth_step: 5\nrate: 10\n")
+    with pytest.raises(InputError, match="was begun with sensor_digest"):
+        invoke([*options, "--resume"])
+
+
 def test_resume_names_every_difference(tmp_path, monkeypatch):
     out = tmp_path / "set"
     with monkeypatch.context() as patch, pytest.raises(ZeroDivisionError):
@@ -207,7 +239,8 @@ def test_resume_names_every_difference(tmp_path, monkeypatch):
 @pytest.mark.parametrize("options, said", [
     (["--sensor", "hdl65"], "unknown sensor 'hdl65': must be one of hdl-32e"),
     (["--format", "pcap"], "pcap"), (["--frames", "0"], "0 is not in the range"),
-    (["--seed", "-1"], "-1 is not in the range"), (["--streets-of", "201"], "1 .. 200"),
+    (["--seed", "-1"], "-1 is not in the range"), (["--people", "nan"], "people = nan"),
+    (["--people", "101"], "101.0 is not in the range"), (["--streets-of", "201"], "1 .. 200"),
     (["--resume", "--force"], "one of them"), (["--format", "mcap", "--resume"], "with 'convert'")])
 def test_bad_arguments_are_named(tmp_path, options, said):
     arguments = ["--out", str(tmp_path / "set"), "--format", "kitti", *options]

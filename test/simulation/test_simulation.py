@@ -61,6 +61,7 @@ def test_frames_are_as_promised():
         assert np.hypot(*found.boxes[:, :2].T).max() <= 80.0
         assert all(e["num_points"] > 0 and e["occluded"] in (0, 1, 2) and e["truncated"] == 0.0
                    for e in found.extras)
+        assert all(0.0 <= e["visible"] <= 1.0 for e in found.extras)
         tracks = [e["track_id"] for e in found.extras]
         assert len(set(tracks)) == len(tracks) and min(tracks) > 0
 

@@ -120,3 +120,12 @@ def test_tufts_are_met_where_a_slow_march_meets_them():
                   - first_below_tufts(ground, start, tuple(way)) for way in ways.tolist()])
     # Steps are longer than tufts are thick: some are missed, and few met too early.
     assert np.quantile(off, 0.5) < 0.1 and np.quantile(off, 0.9) < 0.5
+
+
+@pytest.mark.parametrize("height, least", [(0.3, 0.0), (0.02, -1e-9)])
+def test_nothing_is_met_behind_a_low_sensor(height, least):
+    """Beside a meadow whose tufts are higher than it, and among the bumps of the road."""
+    meadow = Ground(curb_left=1.0, curb_right=-1.0, walk=0.0, rough=0.8)
+    low = replace(SENSOR, height=height, lifts=())
+    hits = cast(crowd(0, 0), meadow, np.array([0.0, 0.0, height]), low)
+    assert np.isfinite(hits.range).any() and hits.range.min() > least
