@@ -145,10 +145,11 @@ class BagPlayer(LidarNode):
         self._wait_until_delivered()
 
     def _wait_for_subscribers(self) -> None:
-        diagnostics = self.create_subscription(DiagnosticArray, "/diagnostics", self._on_status,
-                                               RELIABLE)
+        diagnostics = self.wanted and self.create_subscription(
+            DiagnosticArray, "/diagnostics", self._on_status, RELIABLE)
         self._wait_until_heard()
-        self.destroy_subscription(diagnostics)
+        if diagnostics:
+            self.destroy_subscription(diagnostics)
 
     def _on_status(self, msg: DiagnosticArray) -> None:
         for status in msg.status:
