@@ -127,6 +127,7 @@ class Reception:
         self.needed_since: float | None = None  # monotonic
         self.begun: float | None = None  # monotonic: since when the first one waits
         self.subscription: Any = None
+        self.met: list[Any] = []  # the publishers of now, or the last ones where there are none
         self.arrivals = Arrivals()
 
     def open(self) -> None:
@@ -163,8 +164,9 @@ class Reception:
         """Subscribe again if the publishers offer something else than before."""
         if self.subscription is None:
             return
-        wanted = self.params().reliability
-        offered = {info.qos_profile.reliability for info in self.publishers()}
+        wanted, publishers = self.params().reliability, self.publishers()
+        self.met = publishers or self.met
+        offered = {info.qos_profile.reliability for info in publishers}
         if wanted == "auto" and offered:
             chosen = RELIABLE if offered == {RELIABLE} else BEST_EFFORT
         else:
@@ -268,7 +270,7 @@ class Reception:
         enough = max(sent, SHARE_OF)  # one of the first two clouds is no half of them
         if lost > params.max_lost * enough:
             found.append(("lost", WARN, f"{lost} of the last {sent} {self.what}s on {self.topic} "
-                          f"were lost on the way; {self._remedy(publishers)}"))
+                          f"were lost on the way; {self._remedy(publishers or self.met)}"))
         if dropped > params.max_dropped * enough:
             found.append(("dropped", WARN, f"{dropped} of the last {sent} {self.what}s on "
                           f"{self.topic} were dropped, as newer ones came before their turn: the "

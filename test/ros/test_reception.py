@@ -294,6 +294,19 @@ def test_a_publisher_is_heard_or_it_is_said_with_the_remedy(start, monkeypatch, 
         assert bool(said) == (remedy != "" and BEST_EFFORT in offered)
 
 
+def test_who_has_lost_clouds_is_named_when_it_is_gone_as_before(start, monkeypatch):
+    reception, = start(GroundSegmentation, **{"input.max_lost": 0})._receptions()
+    driver = SimpleNamespace(node_namespace="/", node_name="driver", qos_profile=SimpleNamespace(
+        reliability=BEST_EFFORT))
+    for there in ([driver], []):
+        monkeypatch.setattr(reception, "publishers", lambda there=there: there)
+        reception.adapt()
+        reception.arrivals.add([{"publication_sequence_number": number, "source_timestamp": number}
+                                for number in (1, 3)], 0)
+        said, = (text for kind, _, text in reception.problems() if kind == "lost")
+        assert "let /driver publish reliable" in said
+
+
 class Late:
     """A Reception of clouds at 10 Hz, each of whose poses comes lag(stamp) seconds after it; in a
     time that is made up. answered: (stamp, whether it had its pose)."""
