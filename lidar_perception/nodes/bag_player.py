@@ -27,7 +27,7 @@ from msg_utils.stamps import SECOND, time_message
 
 SERVED = 0.05       # seconds between looks for services and parameters, while messages are late
 SHORTEST_LOOP = 0.1  # seconds
-UNKNOWN = "_NODE_NAME_UNKNOWN_"  # how rclpy calls the node of a publisher while discovery goes on
+UNCOUNTED = "_ms", "_3d"  # ends of topics of whose subscribers nodes do not tell
 
 
 class BagPlayer(LidarNode):
@@ -177,17 +177,11 @@ class BagPlayer(LidarNode):
         played = [p for p in self.publishers_by_topic.values() if p.topic_name == resolved]
         if played:
             return played[0].get_subscription_count()
-        said = [int(self.told.get(node, {}).get(f"subscribers of {resolved}", 0))
-                for node in self._ours(resolved)]
-        return min([self.count_subscribers(resolved), *said])
-
-    def _ours(self, topic: str) -> list[str]:
-        """The nodes of this package that publish a topic, by the times that each of them tells;
-        also one whose name is not known yet."""
-        names = [f"{p.node_namespace.rstrip('/')}/{p.node_name}"
-                 for p in self.get_publishers_info_by_topic(topic)]
-        return [n for n in names
-                if n.endswith(UNKNOWN) or self.count_publishers(f"{n}/debug/processing_time_ms")]
+        known, node = self.count_subscribers(resolved), resolved.rsplit("/", 2)[0]
+        if resolved.endswith(UNCOUNTED) or not self.count_publishers(
+                f"{node}/debug/processing_time_ms"):
+            return known  # no output of a node of ours
+        return min(known, int(self.told.get(node, {}).get(f"subscribers of {resolved}", 0)))
 
     def _wait_until_delivered(self) -> None:
         from rclpy.duration import Duration

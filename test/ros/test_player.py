@@ -199,17 +199,18 @@ def test_it_waits_until_a_node_of_ours_has_met_who_listens_to_it(processes, peer
     """The player knows of a listener before the node that is listened to does: what that one
     publishes meanwhile would be lost."""
     me = peer.node.get_name()
+    between = f"/{me}/output/between"
     said = peer.talker("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
     peer.talker(f"/{me}/debug/processing_time_ms", "std_msgs/msg/Float64")
-    peer.talker("/between", TEXT)
-    peer.listen("/between", TEXT)
+    peer.talker(between, TEXT)
+    peer.listen(between, TEXT)
     heard = peer.listen("/text", TEXT)
 
     def tell(count, until, what):
         peer.send(said, DiagnosticArray(status=[DiagnosticStatus(name=me, values=[
-            KeyValue(key="subscribers of /between", value=count)])]), until, what)
+            KeyValue(key=f"subscribers of {between}", value=count)])]), until, what)
 
-    start(processes, text_bag, wait_for=["/text", "/between"], rate=10.0)
+    start(processes, text_bag, wait_for=["/text", between], rate=10.0)
     peer.wait(lambda: peer.value_of("bag_player", "subscribers of /text") == "1", "the player")
     peer.diagnostics.clear()
     tell("0", lambda: "bag_player" in peer.diagnostics, "the player's next diagnostic")
