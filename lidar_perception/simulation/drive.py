@@ -66,7 +66,8 @@ def scans(seed: int = 0, frames: int = 40, sensor: Sensor = HDL64E,
 
 def scan_at(seed: int, i: int, sensor: Sensor, scenes: Scenes = ANY) -> SimulatedScan:
     """Scan i of the drive through the scene of a seed, whatever was asked for before."""
-    scene, sensor = _scene(seed, scenes), sensor.at_turn(i)
+    # Beams that wander do so from scene to scene too: of each there may be one scan only.
+    scene, sensor = _scene(seed, scenes), sensor.at_turn(seed + i)
     moment = scene.at(i / sensor.rate, sensor.height)
     hits = cast(moment.solids, scene.ground, moment.position, sensor, moment.motion,
                 (seed << 20) + i, moment.heading)

@@ -189,3 +189,12 @@ def test_what_is_no_scene_is_named(scenes, said):
 def test_only_streets_are_compared(tmp_path):
     result = CliRunner().invoke(simulate, ["--compare", str(tmp_path), "--scene", "indoor"])
     assert result.exit_code == 2 and "--compare compares streets" in result.output
+
+
+def test_beams_that_wander_do_so_where_there_is_one_scan_of_each_scene():
+    sensor, seen = replace(EXACT, wander=np.radians(2.0)), []
+    for seed in range(3):
+        scan = scan_at(seed, 0, sensor, Scenes(scene="campus"))
+        lowest = scan.frame.xyz[scan.ring == sensor.rings - 1]
+        seen.append(np.degrees(np.median(np.arctan2(lowest[:, 2], np.hypot(*lowest[:, :2].T)))))
+    assert np.diff(np.sort(seen)).min() > 0.3 and np.ptp(seen) < 2.0
