@@ -146,8 +146,7 @@ def _asked(pipe: Connection, item: Any) -> Connection:
 
 
 def _serve(start: Callable, pipe: Connection) -> None:
-    # Its end is always asked for, so it gives back what it holds of the system.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit())
+    signal.signal(signal.SIGTERM, _leave)
     results: SimpleQueue[Any] = SimpleQueue()
     Thread(target=_send, args=(results, pipe), daemon=True).start()
     work = start()
@@ -160,6 +159,13 @@ def _serve(start: Callable, pipe: Connection) -> None:
             results.put(ForkingPickler.dumps((work(item), None)))
         except InputError as error:
             results.put(ForkingPickler.dumps((None, str(error))))
+
+
+def _leave(*_: Any) -> None:
+    """The end of a process is asked for, perhaps twice: it gives back what it holds of the
+    system."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    sys.exit()
 
 
 def _send(results: SimpleQueue[Any], pipe: Connection) -> None:
