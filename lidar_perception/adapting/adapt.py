@@ -143,7 +143,6 @@ class Adapting:
     def run(self) -> None:
         """All rounds; then best is what was taken last, and what there was is in seen and
         rounds."""
-        begun = time.monotonic()
         self._choose()
         self.poses = [self._poses(i) for i in range(len(self.pieces))]
         require_motion(self.poses, self.data)
@@ -151,7 +150,7 @@ class Adapting:
             errors.print(problem)
         self.recognised = self._recognised()
         for number in range(1, self.params.rounds + 1):
-            if not self._round(number, begun):
+            if not self._round(number):
                 break
         write_bytes(self.out / BEST, self.best.read_bytes())
         self._record()
@@ -244,7 +243,7 @@ class Adapting:
             errors.print(line)
         return counts
 
-    def _round(self, number: int, begun: float) -> bool:
+    def _round(self, number: int) -> bool:
         """One round; whether its weights were taken."""
         folder = self.out / ROUND.format(number)
         errors.print(f"round {number} of {self.params.rounds}", style="bold")
@@ -269,7 +268,7 @@ class Adapting:
         self.seen = seen
         if self.before is None:
             self.before = self._watch(self.out / JUDGED, self.weights)
-        taught = self._learn(folder, begun)
+        taught = self._learn(folder)
         after = self._watch(folder / JUDGED, taught)
         refused = next((why for known in (self.before, *(each.after for each in self.rounds))
                         if (why := worse(known, after, self.params))), "")
@@ -294,7 +293,7 @@ class Adapting:
         verdicts = [judged(each, way[:, :2, 3], heard) for each in tracks]
         return Seen(piece, looks, tracks, verdicts, labels_of(tracks, verdicts, way, seconds))
 
-    def _learn(self, folder: Path, begun: float) -> Path:
+    def _learn(self, folder: Path) -> Path:
         """The weights after a training on what is kept, the average over its steps."""
         taught, labels = folder / LAST, folder / "labels.npz"
         if taught.is_file():

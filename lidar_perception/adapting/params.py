@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from lidar_perception.param_fields import Params, param
+from lidar_perception.param_fields import param
+from lidar_perception.training.params import AsTrained
 
 # In the folder of a run: what was asked for, and how it went; and for people, under this title.
 RECORD, REPORT, TITLE = "adapt.json", "report.html", "A detector, adapted"
@@ -14,7 +15,7 @@ MADE = (RECORD, REPORT, BEST, HEARD, JUDGED, POSES, SCANS, ROUND.format("*"), LA
 
 
 @dataclass(frozen=True)
-class AdaptParams(Params):
+class AdaptParams(AsTrained):
     """How often, how fast, and with what."""
 
     rounds: int = param(2, "Rounds of looking and learning; each begins with the weights of the "
@@ -30,11 +31,6 @@ class AdaptParams(Params):
     scans: int = param(0, "Simulated scans that are mixed in, which also give objects to be pasted "
                        "into real ones. 0: as many as there are frames.", low=0, high=10**6)
     val_scans: int = param(24, "Simulated scans by which a round is judged.", low=1, high=10**5)
-    scene: str = param("", "Where the simulated scans are taken: street, campus or indoor, or "
-                       "several in turn, such as street,campus. Empty: where those were that the "
-                       "weights were trained on.")
-    sensor: str = param("", "Sensor of the simulated scans: a sensor.yaml, or the name of a "
-                        "preset. Empty: the one that the weights were trained for.")
     mount_height: float = param(0.0, "Height of the sensor above the ground. 0: as the "
                                 "recording says, or else as its first clouds show.", unit="m",
                                 low=0.0, high=10.0)

@@ -212,18 +212,24 @@ class PointNetTraining(SceneTraining):
 
 
 @dataclass(frozen=True)
-class FusedTraining(Params):
+class AsTrained(Params):
+    """Which simulated scans, unless what weights were trained on, see trained_for.as_trained."""
+
+    scene: str = param("", "Where the simulated scans are taken: street, campus or indoor, or "
+                       "several in turn, such as street,campus. Empty: where those were that the "
+                       "weights were trained on.")
+    sensor: str = param("", "Sensor of the simulated scans: a sensor.yaml, or the name of a "
+                        "preset. Empty: the one that the weights were trained for.")
+
+
+@dataclass(frozen=True)
+class FusedTraining(AsTrained):
     """All settings of train fused."""
 
     scans: int = param(240, "Simulated scans that curves are fitted to, each of scenes of its own.",
                        low=2, high=100_000)
     people: float = param(2.5, "Pedestrians and cyclists in them, as a multiple of the usual "
                                "number.", low=0.0, high=100.0)
-    scene: str = param("", "Where the scans are taken: street, campus or indoor, or several in "
-                       "turn, such as street,campus. Empty: where those were that the weights were "
-                       "trained on.")
-    sensor: str = param("", "Sensor of the scans: a sensor.yaml, or the name of a preset. Empty: "
-                        "the one that the weights were trained for.")
     mount_height: float = param(0.0, "Height of the sensor above the ground. 0: that of the scans "
                                 "that the weights were trained on.", unit="m", low=0.0, high=10.0)
     range: str = seen_range()

@@ -7,14 +7,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.training.params import AsTrained
 from lidar_perception.types import InputError
 
 HDL, STREET = "hdl64e", "street"  # of weights that do not say
 
-Params = TypeVar("Params", bound=Any)
+Asked = TypeVar("Asked", bound=AsTrained)
 
 
-def as_trained(params: Params, header: Header) -> Params:
+def as_trained(params: Asked, header: Header) -> Asked:
     """The params, their sensor and scene those of a header where they are empty. InputError where
     the file of that sensor is not there."""
     sensor, given = _sensor(header), header.training.get("params")
