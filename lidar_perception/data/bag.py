@@ -18,6 +18,7 @@ from rosbags.rosbag2 import Reader
 from lidar_perception.data.mcap_index import NO_INDEX, check_index, profile_of
 from lidar_perception.data.record_file import RecordFile
 from lidar_perception.data.ros1_bag import Ros1Reader, is_ros1
+from lidar_perception.data.unchunked import Unchunked
 from lidar_perception.runs.files import check_free, refuse_others, regular, short
 from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError
@@ -167,8 +168,9 @@ class Bag:
         except Exception as error:  # rosbags lets through what damaged sizes lead to
             raise InputError(_foreign(source) or _unreadable(source, error)) from None
         try:
-            for file in _mcap_files(self.reader):
-                check_index(file)
+            for part in _mcap_parts(self.reader):
+                if check_index(part.path) == 0:
+                    part.messages = Unchunked(part).messages
             # They are read one after the other as metadata.yaml names them, in whatever order.
             _parts(self.reader).sort(key=lambda part: part.metadata.start_time)
             self.connections = list(self.reader.connections)
@@ -194,6 +196,12 @@ class Bag:
     def end_ns(self) -> int:
         return self.reader.end_time
 
+    @property
+    def content(self) -> str:
+        """Its topics, each with its type, for people."""
+        return ", ".join(f"{topic} ({kind})"
+                         for topic, kind in sorted(self.topics.items())) or "nothing"
+
     def qos(self, topic: str) -> list:
         """The profiles the topic was recorded with, as rosbags has them; maybe none."""
         return next(offered_qos(c) for c in self.connections if c.topic == topic)
@@ -201,8 +209,7 @@ class Bag:
     def require(self, topic: str) -> None:
         """InputError that lists what there is, if the bag has no such topic."""
         if topic not in self.topics:
-            have = ", ".join(f"{k} ({v})" for k, v in sorted(self.topics.items())) or "nothing"
-            raise InputError(f"{self.path} has no topic {topic}; it has {have}")
+            raise InputError(f"{self.path} has no topic {topic}; it has {self.content}")
 
     def raw(self, topics: Iterable[str] | None = None, start_ns: int | None = None,
             stop_ns: int | None = None) -> Iterator[tuple[str, int, bytes]]:
@@ -258,8 +265,8 @@ def _parts(reader: Reader | Ros1Reader) -> list[Any]:
     return parts
 
 
-def _mcap_files(reader: Reader | Ros1Reader) -> list[Path]:
-    return [part.path for part in _parts(reader) if part.path.suffix == ".mcap"]
+def _mcap_parts(reader: Reader | Ros1Reader) -> list[Any]:
+    return [part for part in _parts(reader) if part.path.suffix == ".mcap"]
 
 
 def offered_qos(connection: Connection) -> list:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from functools import partial
 
@@ -11,6 +12,7 @@ import pytest
 import yaml
 from bag_samples import LATCHED, cloud_frame, message_bytes, same_cloud, scans
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 from samples import STAMP, png_header, scene, write
 
@@ -193,6 +195,36 @@ def test_raw_takes_topics_and_a_window_of_time(written):
         assert list(bag.raw(set())) == []
         low, high = STAMP + 1, STAMP + 2 * 10**8
         assert list(bag.raw(None, low, high)) == [r for r in rows if low <= r[1] < high]
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_messages_without_chunks_are_read_in_order_of_time_and_none_for_another(
+        written, tmp_path, monkeypatch, turned):
+    """As `ros2 bag record` leaves them with its preset fastwrite."""
+    path, rows = tmp_path / "fast.mcap", message_bytes(written)
+    last = max(time for _, time, _ in rows)
+    with open(written / "drive.mcap", "rb") as stream, open(path, "wb") as out:
+        writer, channels = Writer(out, use_chunking=False, enable_crcs=False), {}
+        writer.start("ros2")
+        found = list(make_reader(stream).iter_messages())
+        for schema, channel, message in sorted(found, key=lambda row: row[2].log_time,
+                                               reverse=turned):
+            if channel.id not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.id] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number, channel.metadata)
+            writer.add_message(channels[channel.id], message.log_time, message.data,
+                               message.publish_time)
+        writer.finish()
+    assert message_bytes(path) == rows
+    read, pread = [], os.pread
+    monkeypatch.setattr(os, "pread", lambda file, size, at: read.append(size) or pread(
+        file, size, at))
+    with Bag(path) as bag:
+        list(bag.raw())
+        read.clear()
+        _, _, data = next(bag.raw({POINTS}, last, last + 1))
+    assert read == [len(data)]
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])

@@ -265,7 +265,8 @@ def test_a_bag_without_clouds_says_what_it_has(tmp_path):
         bag.write("/text", 1, bag_message("std_msgs/msg/String", data="hello"))
     with pytest.raises(InputError) as error:
         open_recording(tmp_path / "bag")
-    for word in (str(tmp_path / "bag"), "no topic /points", "/text (std_msgs/msg/String)"):
+    for word in (str(tmp_path / "bag"), "no sensor_msgs/PointCloud2", "/text (std_msgs/msg/String)",
+                 "driver"):
         assert word in str(error.value)
 
 
