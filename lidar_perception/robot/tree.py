@@ -16,6 +16,9 @@ KEPT_NS = 10 * SECOND    # of each transform, as tf2 does
 MAX_KEPT = 10_000        # of each transform, however often it comes
 MAX_FRAMES = 10_000      # whoever makes a new name for every message does not fill the memory
 JUMP_NS = SECOND         # a stamp so far before the last one is a bag that starts again
+APART = 60.0             # seconds between a stamp and a transform: no lag, but another clock
+CLOCKS = ("are they stamped by different clocks? Let the driver stamp clouds with the computer's "
+          "time, synchronise the sensor (PTP), or set use_sim_time everywhere")
 
 
 class Missing(InputError):
@@ -66,11 +69,13 @@ class _Link:
         """What is needed from one time to another, ns. Missing where it is not there."""
         times, ago = self.times, (end - self.times[-1]) / SECOND
         if ago > 0 and (max_gap is None or ago > max_gap or len(times) == 1):
-            raise Missing(f"the newest transform of {name} is {ago:.3f} s older than needed; "
-                          "is its publisher late, or has it stopped?", late=ago < 1.0)
+            why = CLOCKS if ago > APART else "is its publisher late, or has it stopped?"
+            raise Missing(f"the newest transform of {name} is {ago:.3f} s older than needed; {why}",
+                          late=ago < 1.0)
         early = (times[0] - begin) / SECOND
         if early > 0 and (max_gap is None or early > max_gap or len(times) == 1):
-            raise Missing(f"the oldest transform of {name} is {early:.3f} s newer than needed")
+            raise Missing(f"the oldest transform of {name} is {early:.3f} s newer than needed"
+                          + (f"; {CLOCKS}" if early > APART else ""))
         first, last = bisect_right(times, begin) - 1, bisect_left(times, end)
         if early > 0:
             first, last = 0, max(last, 1)
