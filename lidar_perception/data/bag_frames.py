@@ -57,9 +57,9 @@ def cloud_topic(bag: Bag, points: str = "") -> str:
         raise InputError(f"{bag.path} has clouds on {', '.join(clouds)}; name the topic of one, as "
                          f"in {bag.path}:{clouds[0]}")
     if not points and CLOUD not in bag.topics.values():
-        raise InputError(f"{bag.path} has no {CLOUD.replace('/msg', '')}; it has {bag.content}. Raw "
-                         "packets and Livox' CustomMsg become clouds in the driver of the sensor: "
-                         "play the bag to it and record what it publishes")
+        raise InputError(f"{bag.path} has no {CLOUD.replace('/msg', '')}; it has {bag.content}. "
+                         "Raw packets and Livox' CustomMsg become clouds in the driver of the "
+                         "sensor: play the bag to it and record what it publishes")
     chosen = points or (clouds[0] if clouds and POINTS not in clouds else POINTS)
     bag.require(chosen)
     if bag.topics[chosen] != CLOUD:
