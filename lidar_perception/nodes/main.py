@@ -97,7 +97,8 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
 
     RCLError = rclpy_implementation.RCLError
     UnknownROSArgsError = rclpy_implementation.UnknownROSArgsError
-    node, code = None, 0
+    node, code = None, 1
+    kept: BaseException | None = None  # and with it what a refused node has made
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = node_class()
@@ -107,12 +108,13 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         node.spin(executor)
+        code = 0
     except UnknownROSArgsError as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(f"unknown after --ros-args: {error}")
-        code = 2
+        kept, code = error, 2
     except (InputError, ValueError, ParameterException, NameValidationException, RCLError) as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(" ".join(str(error).split()))
-        code = 2
+        kept, code = error, 2
     finally:
         stop.closing()
         if node is not None:
@@ -124,6 +126,7 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
         stop.closed(code)
         if node is not None:
             node.destroy_node()
+        del kept  # DDS is taken down here, where a hang is cut short
         rclpy.try_shutdown()
     return code
 

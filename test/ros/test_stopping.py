@@ -1,5 +1,6 @@
 """A node's process ends at a signal with code 0, whatever holds the interpreter's lock."""
 
+import importlib.util
 import signal
 import subprocess
 import sys
@@ -24,6 +25,17 @@ TEARDOWN_HANGS = "awake.wait(); stop.closing(); stop.closed(3); hang()"
 WRITES_LONG = ("from time import sleep\nawake.wait(); stop.closing(); sleep(7)\n"
                "print('written', flush=True); stop.closed(0)")
 ENDS_BY_ITSELF = "stop.closing(); stop.closed(2); hang()"
+REFUSED = """
+from lidar_perception.nodes.main import _spin
+from lidar_perception.types import InputError
+class Made:
+    __del__ = lambda self: hang()
+class Refused:
+    def __init__(self):
+        self.made = Made()  # as of a node whose parameters are bad
+        raise InputError("refused")
+sys.exit(_spin(Refused, ["node"], 0.0, stop))
+"""
 
 
 # What hangs, the signal that comes then, the exit code and what is written. Of the signals none is
@@ -32,6 +44,8 @@ CASES = {"work": (WORK_HANGS, signal.SIGINT, 0, ""),
          "teardown": (TEARDOWN_HANGS, signal.SIGTERM, 3, ""),
          "writing": (WRITES_LONG, signal.SIGTERM, 0, "written\n"),
          "by itself": (ENDS_BY_ITSELF, None, 2, "")}
+if importlib.util.find_spec("rclpy"):
+    CASES["what a refused node has made"] = REFUSED, None, 2, ""
 
 
 @pytest.fixture(scope="module")
