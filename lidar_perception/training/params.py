@@ -207,6 +207,9 @@ class PointNetTraining(SceneTraining):
                          "others are rows of the paper's ablation.", choices=(
                              "improved", "pointnet", "pointnet2", "base", "dynamic-threshold",
                              "log-point-count", "skip", "msg-mrg", "msg-skip", "mrg-skip"))
+    proposer: str = param("", "Weights of PointPillars, or `package`, those that come with it: "
+                          "what it proposes where nothing is, is learned as background, too, as "
+                          "`fused` asks about its boxes. Empty: none.")
     augment: ClusterAugmentParams = ClusterAugmentParams()
     data: DataParams = DataParams()
 

@@ -11,6 +11,7 @@ from pointnet_samples import SMALL, blobs
 from samples import CALIBRATION
 
 from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.config import pointnet_config
 from lidar_perception.detectors.pointnet.network import make_pointnet
@@ -28,6 +29,7 @@ from lidar_perception.scoring.points.clusters import (
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.data import ReadScenes
 from lidar_perception.training.params import ClusterAugmentParams
+from lidar_perception.training.pointnet import cut_scenes
 from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes, cut
 from lidar_perception.training.pointnet.task import (
     FEWEST,
@@ -37,7 +39,7 @@ from lidar_perception.training.pointnet.task import (
     make_loss,
     validated,
 )
-from lidar_perception.types import CLASSES, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError, LidarFrame
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = pointnet_config(**SMALL)
@@ -198,6 +200,36 @@ def test_a_scene_is_cut_by_our_own_clustering_and_around_its_objects(rng, tmp_pa
     other = CutScenes(One(), pointnet_config("base"), 5, tmp_path)
     other.scene(0)
     assert len(list(tmp_path.iterdir())) == 2  # made in another way
+
+
+def test_of_what_a_proposer_finds_where_nothing_is_the_network_learns_that_it_is_none(
+        rng, tmp_path, monkeypatch):
+    """And nothing of what touches a label, wherever it is proposed."""
+    flat = np.column_stack([rng.uniform(-20, 30, (12_000, 2)), rng.normal(-1.73, 0.01, 12_000),
+                            rng.random(12_000)])
+    empty = BOXES[0] + [8, 8, 0, 0, 0, 0, 0]
+    points = np.concatenate([flat, in_boxes(rng, np.array([BOXES[0], empty]), 500).points])
+    scene = TrainingScene(points.astype(np.float32), BOXES[:1], ids("Car"), np.array([True]))
+    near = BOXES[0] + [1, 0.5, 0, 0, 0, 0, 0.2]
+    found = Detections.of(np.array([near, empty]), ids("Car", "Pedestrian"), np.array([0.9, 0.5]))
+    monkeypatch.setattr(cut_scenes, "_proposer", lambda path: lambda frame: Found(found))
+    plain, made = (cut(scene, CONFIG, 5, path) for path in (None, tmp_path))
+    none = len(CONFIG.classes)
+    boxes = made.boxes[made.loose & (made.labels == none)]
+    assert [np.isclose(boxes, box, atol=1e-5).all(axis=1).sum() for box in (empty, near)] == [1, 0]
+    assert np.array_equal(made.labels[~made.loose], plain.labels[~plain.loose])
+    assert (made.labels[made.loose] < none).sum() == 1
+
+
+def test_half_of_the_background_that_a_judge_learns_is_decoys(rng):
+    scene = sample_scene(rng)
+    background = np.flatnonzero(scene.labels == 3)
+    for decoys in (0, 4, 30):
+        loose = np.isin(np.arange(len(scene.labels)), background[:decoys])
+        judge = ClusterPreparation(CONFIG, ClusterAugmentParams(background=20), True)
+        chosen = judge._chosen(replace(scene, loose=loose), rng)
+        assert (scene.labels[chosen] == 3).sum() == 20
+        assert loose[chosen].sum() == min(decoys, 10)
 
 
 def sample_scene(rng, count=40):

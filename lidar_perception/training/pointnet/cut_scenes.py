@@ -6,6 +6,7 @@ So a network sees the errors that it will see later: objects in pieces, objects 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +14,22 @@ import numpy as np
 
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.fused.params import FusedParams
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of, middles, points_of
 from lidar_perception.detectors.pointnet.config import PointNetConfig
+from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, load_detector
+from lidar_perception.detectors.pointpillars.params import DetectorParams, PointPillarsParams
 from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.points.clusters import UNKNOWN, labelled
 from lidar_perception.training.augment import TrainingScene, raised
-from lidar_perception.training.cache import kept, path_in
+from lidar_perception.training.cache import kept, path_in, state_of
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, LidarFrame
 
 AROUND = 0.3  # m: points so near to an object are looked at, too
-DECOYS = 24   # in a scene
+DECOYS = 24    # in a scene, at most
+PROPOSED = 14  # proposals of each class among them, where there is a proposer,
+MADE_UP = 8    # and others beside those
 
 
 @dataclass(frozen=True)
@@ -41,12 +47,14 @@ class CutScene:
 @dataclass(frozen=True)
 class CutScenes:
     """scene(i): the clusters of a scene of `scenes`, as a network of the config is to see them, of
-    min_points or more. cache: folder for them, or None."""
+    min_points or more. cache: folder for them, or None. proposer: a file of PointPillars' weights
+    whose proposals are among the decoys, or None."""
 
     scenes: Any
     config: PointNetConfig
     min_points: int = 5
     cache: Path | None = None
+    proposer: Path | None = None
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -57,8 +65,9 @@ class CutScenes:
 
     def path(self, i: int) -> Path | None:
         """The file that keeps the clusters of scene i."""
+        proposer = [] if self.proposer is None else [state_of(self.proposer)]
         return path_in(self.cache, self.scenes.key(i), self.config.ground, self.config.clustering,
-                       self.config.classes, self.min_points)
+                       self.config.classes, self.min_points, *proposer)
 
     def keep(self, i: int) -> None:
         """Put it into the cache."""
@@ -66,14 +75,16 @@ class CutScenes:
 
     def scene(self, i: int) -> CutScene:
         """InputError naming the file that cannot be used."""
-        return kept(self.path(i),
-                    lambda: cut(self.scenes.scene(i), self.config, self.min_points), _read, _arrays)
+        return kept(self.path(i), lambda: cut(self.scenes.scene(i), self.config, self.min_points,
+                                              self.proposer), _read, _arrays)
 
 
-def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutScene:
+def cut(scene: TrainingScene, config: PointNetConfig, min_points: int,
+        proposer: Path | None = None) -> CutScene:
     """The clusters of a scene, as from SENSOR_HEIGHT; after them the points around each object that
     is wanted, and decoys: background cut out in the same way, as the network judges what is in a
-    detector's boxes, too. A cluster of an object that is not wanted is UNKNOWN."""
+    detector's boxes, too; some of them where a proposer is wrong. A cluster of an object that is
+    not wanted is UNKNOWN."""
     scene = raised(scene, scene.height - SENSOR_HEIGHT)
     frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
     ground = segment_ground(frame, config.ground)
@@ -87,8 +98,12 @@ def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutSce
     background = len(config.classes)
     wanted = [i for i in np.flatnonzero(scene.wanted)
               if CLASSES[scene.class_ids[i]] in config.classes]
-    around = np.concatenate([scene.boxes[wanted].reshape(-1, 7), decoys(
-        clusters.take(np.flatnonzero(labels == background)), scene.boxes, config)])
+    made_up = elsewhere(decoys(clusters.take(np.flatnonzero(labels == background)), config),
+                        scene.boxes)
+    proposed = np.zeros((0, 7))
+    if proposer is not None:
+        made_up, proposed = made_up[:MADE_UP], elsewhere(proposals(frame, proposer), scene.boxes)
+    around = np.concatenate([scene.boxes[wanted].reshape(-1, 7), proposed, made_up])
     of_around = np.append([config.classes.index(CLASSES[scene.class_ids[i]]) for i in wanted],
                           np.full(len(around) - len(wanted), background)).astype(np.int64)
     obstacles = frame.take(np.flatnonzero(~ground))
@@ -103,19 +118,37 @@ def cut(scene: TrainingScene, config: PointNetConfig, min_points: int) -> CutSce
                     np.concatenate([boxes, around[kept]]), np.arange(len(both)) >= len(clusters))
 
 
-def decoys(background: Clusters, boxes: np.ndarray, config: PointNetConfig) -> np.ndarray:
+def decoys(background: Clusters, config: PointNetConfig) -> np.ndarray:
     """(D, 7) boxes as large as objects, at most DECOYS, each at the mean of a background cluster
-    and on the ground there; none touches one of the boxes (M, 7) that are labelled. The same
-    clusters give the same."""
+    and on the ground there. The same clusters give the same."""
     rng = np.random.default_rng(len(background.points))
     chosen = rng.permutation(len(background))[:DECOYS]
     own = background.take(chosen)
     places = middles(own.points, own.first)
     sizes = np.array(config.sizes)[rng.integers(len(config.sizes), size=len(own))]
     sizes = sizes * rng.uniform(0.9, 1.15, sizes.shape)
-    found = np.column_stack([places + rng.normal(0, 0.2, places.shape),
-                             own.floor + sizes[:, 2] / 2, sizes,
-                             rng.uniform(-np.pi, np.pi, len(own))])
+    return np.column_stack([places + rng.normal(0, 0.2, places.shape),
+                            own.floor + sizes[:, 2] / 2, sizes,
+                            rng.uniform(-np.pi, np.pi, len(own))])
+
+
+def proposals(frame: LidarFrame, proposer: Path) -> np.ndarray:
+    """(P, 7) boxes that PointPillars with these weights proposes at SENSOR_HEIGHT, as low as its
+    score is: the best of each class, at most PROPOSED."""
+    found = _proposer(proposer)(frame).detections
+    return np.concatenate([found.boxes[found.class_ids == i][:PROPOSED]
+                           for i in range(len(CLASSES))])
+
+
+@lru_cache(maxsize=1)
+def _proposer(path: Path) -> PointPillarsDetector:
+    """One for each process, with the least score of fused."""
+    params = DetectorParams(pointpillars=PointPillarsParams(warm_up=False))
+    return load_detector(path, "cpu", params).raw().with_min_score(FusedParams().proposals)
+
+
+def elsewhere(found: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+    """Those of boxes (D, 7) that touch none of the labelled ones (M, 7)."""
     room = boxes + [0, 0, 0, 2 * AROUND, 2 * AROUND, 0, 0]
     return found[~(bev_iou(found, room) > 0).any(axis=1)]
 

@@ -15,6 +15,9 @@ from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file
+from lidar_perception.detectors.pointpillars.params import PointPillarsParams
+from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
+from lidar_perception.detectors.weights_file import existing
 from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.data import Batches, Item, ReadScenes, Stream
 from lidar_perception.training.measuring import first_read, seconds_of_step, timed, usable
@@ -28,8 +31,16 @@ from lidar_perception.training.pointnet.task import (
     validated,
 )
 from lidar_perception.training.run import Task
+from lidar_perception.training.start import PACKAGE
 
 MANY = 8  # frames that are validated to know the time of one, as the calibration takes its own
+
+
+def proposer_of(params: PointNetTraining) -> Path | None:
+    """The file that params.proposer names. InputError if it is not there."""
+    if params.proposer in ("", str(PACKAGE)):
+        return pointpillars_file(PointPillarsParams()) if params.proposer else None
+    return existing(params.proposer, "proposer")
 
 
 @dataclass(frozen=True)
@@ -62,8 +73,10 @@ class PointNetStart:
         prepare = ClusterPreparation(self.config, params.augment)
         rng = partial(np.random.default_rng, 0)
 
+        proposer = proposer_of(params)
+
         def cut_out(scene: TrainingScene) -> CutScene:
-            return cut(scene, self.config, params.data.min_points)
+            return cut(scene, self.config, params.data.min_points, proposer)
 
         chosen = usable(scenes, lambda scene: prepare(cut_out(scene), rng()))  # compiles, too
         cutting, parts = timed(lambda: [cut_out(scene) for scene in chosen])
@@ -82,8 +95,8 @@ class PointNetStart:
     def cut(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any],
             cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
         """The clusters of all scenes."""
-        cuts = [CutScenes(source, self.config, params.data.min_points, cache / "clusters")
-                for source in (*sources, *held_out)]
+        cuts = [CutScenes(source, self.config, params.data.min_points, cache / "clusters",
+                          proposer_of(params)) for source in (*sources, *held_out)]
         return cuts, [range(len(source)) for source in cuts]
 
     def gather(self, params: PointNetTraining, cut: tuple[list[Any], list], out: Path) -> None:
@@ -93,8 +106,9 @@ class PointNetStart:
                cut: tuple[list[Any], list], out: Path) -> tuple[Stream, ReadScenes]:
         """Of the clusters."""
         learned, judged = cut[0][:len(sources)], cut[0][len(sources):]
-        return (Stream(tuple(learned), ClusterPreparation(self.config, params.augment),
-                       params.seed), ReadScenes(tuple(judged), clusters_to_validate))
+        prepare = ClusterPreparation(self.config, params.augment, bool(params.proposer))
+        return (Stream(tuple(learned), prepare, params.seed),
+                ReadScenes(tuple(judged), clusters_to_validate))
 
     def task(self, params: PointNetTraining, batches: Batches, held_out: ReadScenes, out: Path,
              device: torch.device, about: dict[str, Any], commit: str, init: Path | None) -> Task:

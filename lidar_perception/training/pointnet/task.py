@@ -60,6 +60,7 @@ class ClusterPreparation:
 
     config: PointNetConfig
     augment: ClusterAugmentParams
+    judge: bool = False  # half of the background is decoys, as far as there are any
 
     def __call__(self, scene: CutScene, rng: np.random.Generator) -> ClusterSample:
         """InputError if it has no cluster to learn from."""
@@ -86,8 +87,11 @@ class ClusterPreparation:
         for label in range(len(self.config.classes) + 1):
             most = (self.augment.background if label == len(self.config.classes)
                     else self.augment.objects)
-            known = np.flatnonzero(scene.labels == label)
-            chosen.append(rng.permutation(known)[:most])
+            known = rng.permutation(np.flatnonzero(scene.labels == label))
+            if self.judge and label == len(self.config.classes):
+                decoys = known[scene.loose[known]][:most // 2]
+                known = np.concatenate([decoys, known[~scene.loose[known]]])
+            chosen.append(known[:most])
         return np.sort(np.concatenate(chosen))
 
 
