@@ -94,7 +94,8 @@ def card(header: checkpoint.Header, title: str, scored: dict[str, dict[str, Any]
 @click.argument("folders", nargs=-1, required=True, type=click.Path(exists=True, path_type=Path))
 @click.option("--mean-with", "before", type=click.Path(exists=True, path_type=Path),
               help="Store the mean of both, weight by weight (Wortsman et al., CVPR 2022).")
-def main(weights: Path, folders: tuple[Path, ...], before: Path | None) -> None:
+@click.option("--judge", is_flag=True, help="A PointNet for `fused`, not to be used alone.")
+def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: bool) -> None:
     """Score, store and describe one checkpoint."""
     load = load_pointnet if network_of(weights) == POINTNET else load_network
     header, network = load(weights)
@@ -108,7 +109,7 @@ def main(weights: Path, folders: tuple[Path, ...], before: Path | None) -> None:
         header = replace(header, training={**header.training, "mean_with": [
             {"steps": earlier.training["steps"], "commit": earlier.commit}]})
     if header.network == POINTNET:
-        out = POINTNET_WEIGHTS
+        out = POINTNET_WEIGHTS.with_name("judge.safetensors") if judge else POINTNET_WEIGHTS
     else:
         out = WEIGHTS / f"pointpillars_{header.config.version}_{header.config.size}.safetensors"
     out.parent.mkdir(exist_ok=True)

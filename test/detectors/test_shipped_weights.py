@@ -10,6 +10,7 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.checkpoint import network_of
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.weights_file import WEIGHTS as POINTNET
+from lidar_perception.detectors.pointnet.weights_file import judge_file
 from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.simulation.drive import scan_at
@@ -19,7 +20,7 @@ from lidar_perception.types import CLASSES
 # Others run these lines.
 pytestmark = [pytest.mark.no_cover,
               pytest.mark.usefixtures("one_thread", "streets")]
-FILES = [*sorted(WEIGHTS.glob("*.safetensors")), POINTNET]
+FILES = [*sorted(WEIGHTS.glob("*.safetensors")), POINTNET, judge_file()]
 MOST = {"pointpillars": 30e6, "pointnet": 6e6}  # bytes of all files
 
 

@@ -19,8 +19,7 @@ import numpy as np
 from lidar_perception.classes import DETECTED
 from lidar_perception.detectors.fused.params import FusedParams
 from lidar_perception.detectors.pointnet.config import PointNetConfig
-from lidar_perception.detectors.pointnet.params import PointNetParams
-from lidar_perception.detectors.pointnet.weights_file import weights_file as classifier_file
+from lidar_perception.detectors.pointnet.weights_file import judge_file
 from lidar_perception.detectors.pointpillars.config import NetworkConfig
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as proposer_file
@@ -115,7 +114,7 @@ def read_fusion(path: Path) -> Fusion:
             raise
         raise InputError(f"{path} is no file of `lidar-perception train fused` ({short(error)})"
                          ) from None
-    own = proposer_file(PointPillarsParams()), classifier_file(PointNetParams())
+    own = proposer_file(PointPillarsParams()), judge_file()
     proposer, classifier = (path.parent / file if file else default
                             for file, default in zip(files, own))
     for part in (proposer, classifier):
@@ -130,7 +129,7 @@ def write_fusion(path: Path, weights: tuple[Path | None, Path | None], models: M
     """Write what read_fusion reads. weights: the files of both networks, None for those that come
     with the package; they stay where they are. InputError where it cannot be written."""
     parts = {}
-    own = proposer_file(PointPillarsParams()), classifier_file(PointNetParams())
+    own = proposer_file(PointPillarsParams()), judge_file()
     for name, file, default in zip(NETWORKS, weights, own):
         parts[name] = {"file": relpath(file, path.parent) if file else "",
                        "sha256": digest(file or default)}

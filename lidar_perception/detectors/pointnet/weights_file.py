@@ -16,7 +16,16 @@ def weights_file(params: PointNetParams) -> Path:
     not there."""
     if params.weights:
         return existing(params.weights, "pointnet.weights")
-    if not WEIGHTS.is_file():
+    return _shipped(WEIGHTS)
+
+
+def judge_file() -> Path:
+    """Those that were trained to judge the boxes of other detectors. InputError likewise."""
+    return _shipped(WEIGHTS.with_name("judge.safetensors"))
+
+
+def _shipped(path: Path) -> Path:
+    if not path.is_file():
         raise InputError("no PointNet weights come with the package; name a checkpoint with "
                          "pointnet.weights")
-    return WEIGHTS
+    return path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -22,8 +23,9 @@ from lidar_perception.detectors.hybrid.params import ConfirmingParams, Rescoring
 from lidar_perception.detectors.hybrid.proposals import ConfirmedProposals
 from lidar_perception.detectors.open import FUSED, LOAD, open_detector
 from lidar_perception.detectors.params import MIN_SCORE
-from lidar_perception.detectors.pointnet.detector import PointNetDetector
+from lidar_perception.detectors.pointnet.detector import PointNetDetector, load_pointnet_detector
 from lidar_perception.detectors.pointnet.params import PointNetParams
+from lidar_perception.detectors.pointnet.weights_file import judge_file
 from lidar_perception.detectors.pointnet.weights_file import weights_file as pointnet_file
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
@@ -93,7 +95,7 @@ def contenders(weights: Sequence[Path] = (), device: str = "auto",
                             "those of PointPillars and PointNet"))
     except InputError as error:
         missing.append(Missing(FUSED, str(error)))
-    hybrids, lacking = _hybrids(opened, _mounted(BEST, sensor_height))
+    hybrids, lacking = _hybrids(opened, device, sensor_height)
     return [*_candidates(sensor_height), *found, *hybrids], [*missing, *lacking]
 
 
@@ -142,18 +144,20 @@ def _candidates(sensor_height: float) -> list[Contender]:
             _seeded("STM-CPA best, auto", CandidateDetector, best, _own_seed(best))]
 
 
-def _hybrids(opened: Sequence[Opened], best: PipelineParams
+def _hybrids(opened: Sequence[Opened], device: str, sensor_height: float
              ) -> tuple[list[Contender], list[Missing]]:
-    """STM-CPA and PointPillars, each with the first PointNet."""
-    classifiers = [(each.detector, str(each.source)) for each in opened
-                   if isinstance(each.detector, PointNetDetector)]
+    """STM-CPA and PointPillars, each with the judge of `fused`, or else the first PointNet."""
     proposers = {each.name: each for each in reversed(opened) if each.network == POINTPILLARS}
     proposer = proposers.get(PROPOSER, next(reversed(proposers.values()), None))
     names = "STM-CPA + PointNet", "STM-CPA + PointNet, auto", "PointPillars + PointNet"
+    classifiers = [(each.detector, str(each.source)) for each in opened
+                   if isinstance(each.detector, PointNetDetector)]
+    with suppress(InputError):
+        judge = load_pointnet_detector(judge_file(), device).mounted_at(sensor_height)
+        classifiers.insert(0, (judge, str(judge_file())))
     if not classifiers:
         return [], [Missing(name, "no PointNet has weights") for name in names]
-
-    classifier, source = classifiers[0]
+    (classifier, source), best = classifiers[0], _mounted(BEST, sensor_height)
 
     def rescored(seed, camera, pipeline):
         return RescoredCandidates(classifier, seed, camera, RescoringParams(), pipeline)
