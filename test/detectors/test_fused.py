@@ -24,7 +24,7 @@ from lidar_perception.detectors.fused.fusion import KNOTS, package_models
 from lidar_perception.detectors.fused.model import probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.pointnet import rescoring
-from lidar_perception.geometry import points_in_box, points_in_boxes
+from lidar_perception.geometry import bev_iou, points_in_box, points_in_boxes
 from lidar_perception.ground.surface import FEWEST, surface_under
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
@@ -132,13 +132,16 @@ def test_more_evidence_is_never_less_likely_and_silence_is_neither(seed):
     np.testing.assert_allclose(clipped_logit([0, 0.5, 1]), [least, 0, -least], atol=1e-9)
 
 
-def test_people_at_one_place_are_one_and_cars_are_told_apart_by_their_overlap():
+def test_people_at_one_place_are_one_and_cars_do_not_share_any():
     boxes = np.array([[10, 0, 0, 0.6, 0.6, 1.8, 0], [10.5, 0.2, 0, 0.6, 0.6, 1.8, 0],
                       [10, 5, 0, 4, 1.7, 1.5, 0], [10, 6.8, 0, 4, 1.7, 1.5, 0],
-                      [10.3, 5.1, 0, 4, 1.7, 1.5, 0], [10.2, 0, 0, 1.7, 0.6, 1.8, 0]])
-    ids = np.array([PEDESTRIAN] * 2 + [CAR] * 3 + [CLASSES.index("Cyclist")])
-    found = Detections.of(boxes, ids, [0.5, 0.8, 0.9, 0.7, 0.95, 0.4])
-    assert one_of_each(found, FusedParams()).tolist() == [4, 1, 3, 5]
+                      [10.3, 5.1, 0, 4, 1.7, 1.5, 0], [10.2, 0, 0, 1.7, 0.6, 1.8, 0],
+                      [14, 5.1, 0, 4, 1.7, 1.5, 0], [10.5, 0.85, 0, 0.6, 0.8, 1.8, 0]])
+    ids = np.array([PEDESTRIAN] * 2 + [CAR] * 3 + [CLASSES.index("Cyclist"), CAR, PEDESTRIAN])
+    found = Detections.of(boxes, ids, [0.5, 0.8, 0.9, 0.7, 0.95, 0.4, 0.3, 0.2])
+    (car, person), (other, beside) = boxes[[4, 1]], boxes[[6, 7]]  # overlap by 4 % either
+    assert min(bev_iou(car[None], other[None]), bev_iou(person[None], beside[None])) > 0.03
+    assert one_of_each(found, FusedParams()).tolist() == [4, 1, 3, 5, 7]
     assert len(one_of_each(found[:0], FusedParams())) == 0
 
 

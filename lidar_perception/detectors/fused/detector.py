@@ -33,7 +33,7 @@ from lidar_perception.detectors.view import (
     visible,
     with_intensity_scaled,
 )
-from lidar_perception.geometry import centre_distances
+from lidar_perception.geometry import bev_iou, centre_distances
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.surface import surface_under
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, LidarFrame
@@ -172,12 +172,15 @@ class FusedDetector(NetworkDetector):
 
 def one_of_each(found: Detections, params: FusedParams) -> np.ndarray:
     """(M,) int64 indices, best score first, of the detections that are not a better one of their
-    class once more: by their overlap, and but for cars by the distance of their centres."""
+    class once more: by their overlap, of which cars may have hardly any, while people walk side by
+    side; but for cars by the distance of their centres, too."""
     order = suppressed(found.boxes, found.scores, found.class_ids, params.nms.iou,
                        params.nms.across_classes)
     boxes, class_ids = found.boxes[order], found.class_ids[order]
     again = (centre_distances(boxes, boxes) < params.same_place) & (class_ids[:, None] == class_ids)
-    again[class_ids == CAR] = False
+    cars = np.flatnonzero(class_ids == CAR)
+    again[cars] = False
+    again[np.ix_(cars, cars)] = bev_iou(boxes[cars], boxes[cars]) > params.same_car
     return order[first_of_each(again)][:params.nms.max_boxes]
 
 

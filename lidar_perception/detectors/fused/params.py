@@ -31,6 +31,8 @@ class FusedParams(NetworkParams):
                              low=0.001, high=1.0)
     same_place: float = param(0.6, "People, and cyclists, whose centres are nearer than this are "
                                    "one.", unit="m", low=0.0, high=10.0)
+    same_car: float = param(0.02, "Cars that overlap by more than this, seen from above, are one.",
+                            low=0.0, high=1.0)
     on_ground: float = param(0.5, "How far boxes are moved to the ground that is seen around "
                              "them; 0: not at all, 1: onto it.", low=0.0, high=1.0)
     on_points: float = param(0.75, "How far cars are moved so that their points begin at the "
