@@ -116,8 +116,9 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
     """
     from lidar_perception.detectors.pointnet.config import ABLATIONS, pointnet_config
     from lidar_perception.training.ablation import compared
-    from lidar_perception.training.pointnet.start import PointNetStart
+    from lidar_perception.training.pointnet.start import PointNetStart, proposer_of
     from lidar_perception.training.ranks import rank
+    proposer_of(params)  # InputError before anything is made
     if not ablation:
         run(PointNetStart(pointnet_config(params.network)), asked, params)
         return

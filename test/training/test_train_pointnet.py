@@ -14,6 +14,7 @@ from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS
 from lidar_perception.detectors.pointnet.network import load_pointnet
+from lidar_perception.detectors.pointnet.weights_file import judge_file
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.params import PointNetTraining
@@ -65,6 +66,17 @@ def test_a_network_is_trained_on_clusters_and_finds_its_way_into_the_detector(ca
 def _weights(out):
     network = load_pointnet(out / "last.safetensors")[1]
     return {name: value.tolist() for name, value in network.state_dict().items()}
+
+
+def test_a_judge_is_trained_on_what_a_pointpillars_proposes(cache, tmp_path):
+    result = train(cache, tmp_path / "run", **{"--proposer": "package"})
+    assert result.exit_code == 0, result.output
+    training = read_header(tmp_path / "run/last.safetensors").training
+    assert training["params"]["proposer"] == "package"
+    for file, words in (tmp_path / "none", "no checkpoint"), (judge_file(), "no PointPillars"):
+        result = train(cache, tmp_path / "bad", **{"--proposer": file})
+        assert isinstance(result.exception, InputError) and words in str(result.exception)
+        assert not (tmp_path / "bad").exists()
 
 
 def test_rows_that_are_compared_have_the_same_steps_and_scenes_and_share_the_budget(

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from lidar_perception.detectors.checkpoint import POINTPILLARS, network_of
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.detectors.pointnet.network import make_pointnet
 from lidar_perception.detectors.pointnet.params import PointNetParams
@@ -32,15 +33,19 @@ from lidar_perception.training.pointnet.task import (
 )
 from lidar_perception.training.run import Task
 from lidar_perception.training.start import PACKAGE
+from lidar_perception.types import InputError
 
 MANY = 8  # frames that are validated to know the time of one, as the calibration takes its own
 
 
 def proposer_of(params: PointNetTraining) -> Path | None:
-    """The file that params.proposer names. InputError if it is not there."""
+    """The file that params.proposer names. InputError if it is not there, or no PointPillars."""
     if params.proposer in ("", str(PACKAGE)):
         return pointpillars_file(PointPillarsParams()) if params.proposer else None
-    return existing(params.proposer, "proposer")
+    path = existing(params.proposer, "proposer")
+    if network_of(path) != POINTPILLARS:
+        raise InputError(f"{path} is no PointPillars, whose weights `proposer` names")
+    return path
 
 
 @dataclass(frozen=True)
