@@ -28,6 +28,7 @@ from lidar_perception.detectors.checkpoint import (
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.detectors.pointnet.network import load_pointnet
+from lidar_perception.detectors.pointnet.weights_file import JUDGE
 from lidar_perception.detectors.pointnet.weights_file import WEIGHTS as POINTNET_WEIGHTS
 from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
@@ -109,7 +110,7 @@ def main(weights: Path, folders: tuple[Path, ...], before: Path | None, judge: b
         header = replace(header, training={**header.training, "mean_with": [
             {"steps": earlier.training["steps"], "commit": earlier.commit}]})
     if header.network == POINTNET:
-        out = POINTNET_WEIGHTS.with_name("judge.safetensors") if judge else POINTNET_WEIGHTS
+        out = POINTNET_WEIGHTS.with_name(JUDGE) if judge else POINTNET_WEIGHTS
     else:
         out = WEIGHTS / f"pointpillars_{header.config.version}_{header.config.size}.safetensors"
     out.parent.mkdir(exist_ok=True)

@@ -114,9 +114,8 @@ def read_fusion(path: Path) -> Fusion:
             raise
         raise InputError(f"{path} is no file of `lidar-perception train fused` ({short(error)})"
                          ) from None
-    own = proposer_file(PointPillarsParams()), judge_file()
     proposer, classifier = (path.parent / file if file else default
-                            for file, default in zip(files, own))
+                            for file, default in zip(files, _shipped()))
     for part in (proposer, classifier):
         if not part.is_file():
             raise InputError(f"{path} is made of {part}, which is not there; bring it back, or fit "
@@ -129,11 +128,15 @@ def write_fusion(path: Path, weights: tuple[Path | None, Path | None], models: M
     """Write what read_fusion reads. weights: the files of both networks, None for those that come
     with the package; they stay where they are. InputError where it cannot be written."""
     parts = {}
-    own = proposer_file(PointPillarsParams()), judge_file()
-    for name, file, default in zip(NETWORKS, weights, own):
+    for name, file, default in zip(NETWORKS, weights, _shipped()):
         parts[name] = {"file": relpath(file, path.parent) if file else "",
                        "sha256": digest(file or default)}
     write_text(path, json.dumps({**parts, "fitted_to": fitted_to, "classes": models}, indent=1))
+
+
+def _shipped() -> tuple[Path, Path]:
+    """Both networks' weights that come with the package. InputError if they are not there."""
+    return proposer_file(PointPillarsParams()), judge_file()
 
 
 def _check(models: Any) -> None:

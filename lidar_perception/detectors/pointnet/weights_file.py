@@ -9,6 +9,7 @@ from lidar_perception.detectors.weights_file import existing
 from lidar_perception.types import InputError
 
 WEIGHTS = Path(__file__).parent / "weights" / "pointnet.safetensors"
+JUDGE = "judge.safetensors"  # beside it
 
 
 def weights_file(params: PointNetParams) -> Path:
@@ -21,7 +22,7 @@ def weights_file(params: PointNetParams) -> Path:
 
 def judge_file() -> Path:
     """Those that were trained to judge the boxes of other detectors. InputError likewise."""
-    return _shipped(WEIGHTS.with_name("judge.safetensors"))
+    return _shipped(WEIGHTS.with_name(JUDGE))
 
 
 def _shipped(path: Path) -> Path:

@@ -76,9 +76,7 @@ class PointNetStart:
                  device: torch.device) -> tuple[float, float, float, float]:
         """With clusters of these scenes."""
         prepare = ClusterPreparation(self.config, params.augment)
-        rng = partial(np.random.default_rng, 0)
-
-        proposer = proposer_of(params)
+        rng, proposer = partial(np.random.default_rng, 0), proposer_of(params)
 
         def cut_out(scene: TrainingScene) -> CutScene:
             return cut(scene, self.config, params.data.min_points, proposer)
@@ -100,8 +98,9 @@ class PointNetStart:
     def cut(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any],
             cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
         """The clusters of all scenes."""
-        cuts = [CutScenes(source, self.config, params.data.min_points, cache / "clusters",
-                          proposer_of(params)) for source in (*sources, *held_out)]
+        proposer = proposer_of(params)
+        cuts = [CutScenes(source, self.config, params.data.min_points, cache / "clusters", proposer)
+                for source in (*sources, *held_out)]
         return cuts, [range(len(source)) for source in cuts]
 
     def gather(self, params: PointNetTraining, cut: tuple[list[Any], list], out: Path) -> None:
