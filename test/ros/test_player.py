@@ -187,7 +187,7 @@ def test_looping_starts_again_and_the_clock_follows_the_bag(processes, peer, tex
 
 
 def test_it_waits_for_its_subscribers(processes, peer, text_bag):
-    start(processes, text_bag, wait_for=["/text:=2"], rate=5.0)
+    start(processes, text_bag, wait_for=["/text:=2"], rate=1.0)  # ten are kept for whom is late
     first = peer.listen("/text", TEXT)
     peer.wait(lambda: peer.value_of("bag_player", "subscribers of /text") == "1", "one subscriber")
     assert first == []
@@ -210,7 +210,7 @@ def test_it_waits_until_a_node_of_ours_has_met_who_listens_to_it(processes, peer
         peer.send(said, DiagnosticArray(status=[DiagnosticStatus(name=me, values=[
             KeyValue(key=f"subscribers of {between}", value=count)])]), until, what)
 
-    start(processes, text_bag, wait_for=["/text", between], rate=10.0)
+    start(processes, text_bag, wait_for=["/text", between], rate=1.0)
     peer.wait(lambda: peer.value_of("bag_player", "subscribers of /text") == "1", "the player")
     peer.diagnostics.clear()
     tell("0", lambda: "bag_player" in peer.diagnostics, "the player's next diagnostic")
