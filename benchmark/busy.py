@@ -1,5 +1,6 @@
-"""PointPillars v4 compact while other programs want the cores too: torch's threads asleep while
-they wait for work, as our nodes and commands have it (runs/threads.py), beside torch's own way."""
+"""PointPillars v4 compact while other programs want the cores too: torch's threads soon asleep
+while they wait for work, as our nodes and commands have it (runs/threads.py), beside torch's own
+way."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ import numpy as np
 
 from benchmark.rows import measured, row
 from lidar_perception.detectors.open import open_detector
+from lidar_perception.runs.memory import keep_freed
 from lidar_perception.runs.terminal import track
 from lidar_perception.runs.threads import WAIT_ASLEEP
 from lidar_perception.types import LidarFrame
@@ -67,6 +69,7 @@ _ready: dict = {}  # in a worker
 
 def _prepare(scans: list[LidarFrame]) -> None:
     import torch
+    keep_freed()
     torch.set_num_threads(len(os.sched_getaffinity(0)))  # as the nodes do
     _ready.update(detector=open_detector("pointpillars"), scans=scans)
 

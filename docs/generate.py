@@ -168,7 +168,7 @@ PAGES: dict[str, dict[str, Any]] = {
                  "`ground`, and for PointPillars `cluster_id`, are used where they are there; what "
                  "is missing is computed, and so are the clusters of people.")],
         outputs=[*BOXES_OUT,
-                 ("~/debug/preprocess_ms, ground_ms, proposals_ms, clusters_ms, evidence_ms, "
+                 ("~/debug/preprocess_ms, ground_ms, proposals_ms, evidence_ms, "
                   "fusion_ms", STRING_TIMES, "Time of each step.")]),
     "tracker": dict(
         params=params.TrackerNodeParams(),

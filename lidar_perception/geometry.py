@@ -55,7 +55,7 @@ def points_in_boxes(xyz: np.ndarray, boxes: np.ndarray,
     k from first[k] to first[k + 1], ascending, and first (K + 1,) int64. A point can be in
     several. Time grows with K times N, so K is of detections, not of points."""
     boxes = np.ascontiguousarray(boxes, np.float32).reshape(-1, 7)
-    order = np.argsort(xyz[:, 0], kind="stable")
+    order = np.argsort(xyz[:, 0])
     ordered = np.ascontiguousarray(xyz[order, :3], np.float32)
     reach = np.hypot(boxes[:, 3] / 2.0 + margin, boxes[:, 4] / 2.0 + margin) + 1e-3
     begin = np.searchsorted(ordered[:, 0], boxes[:, 0] - reach, "left")
@@ -135,22 +135,17 @@ def _rows(boxes: np.ndarray) -> np.ndarray:
 def _ious(boxes, others):
     bev = np.zeros((len(boxes), len(others)))
     space = np.zeros((len(boxes), len(others)))
+    reach, other_reach = reaches(boxes), reaches(others)
     work = np.empty((4, MAX_CORNERS))
     for i in range(len(boxes)):
         a = boxes[i]
         area_a = a[3] * a[4]
-        if not (a[3] > 0 and a[4] > 0 and np.isfinite(a).all()):
-            continue
-        radius_a = math.hypot(a[3], a[4]) / 2
         for j in range(len(others)):
             b = others[j]
-            reach = radius_a + math.hypot(b[3], b[4]) / 2
-            dx, dy = a[0] - b[0], a[1] - b[1]
-            if not (dx * dx + dy * dy < reach * reach and b[3] > 0 and b[4] > 0
-                    and np.isfinite(b).all()):
+            shared = shared_area(a, b, reach[i] + other_reach[j], work)
+            if shared <= 0:
                 continue
             area_b = b[3] * b[4]
-            shared = min(_shared_area(a, b, work), area_a, area_b)
             bev[i, j] = shared / (area_a + area_b - shared)
             height = min(a[2] + a[5] / 2, b[2] + b[5] / 2) - max(a[2] - a[5] / 2, b[2] - b[5] / 2)
             height = min(height, a[5], b[5])
@@ -161,11 +156,25 @@ def _ious(boxes, others):
 
 
 @njit(cache=True, nogil=True)
-def _shared_area(a, b, work):
-    """Area that two rectangles share; work (4, MAX_CORNERS) float64 is overwritten."""
+def reaches(boxes):
+    """(K,) how far the corners of boxes (K, 7) are from their centres, from above; NaN where a
+    length or width is not above 0 or a number not finite."""
+    found = np.full(len(boxes), np.nan)
+    for i in range(len(boxes)):
+        if boxes[i, 3] > 0 and boxes[i, 4] > 0 and np.isfinite(boxes[i]).all():
+            found[i] = math.hypot(boxes[i, 3], boxes[i, 4]) / 2
+    return found
+
+
+@njit(cache=True, nogil=True)
+def shared_area(a, b, reach, work):
+    """Area that two boxes (7,) share from above; 0 where their centres are not within reach, the
+    sum of their reaches, or this is NaN. work (4, MAX_CORNERS) float64 is overwritten."""
+    dx, dy = a[0] - b[0], a[1] - b[1]
+    if not dx * dx + dy * dy < reach * reach:
+        return 0.0
     x, y, cut_x, cut_y = work[0], work[1], work[2], work[3]
     cos, sin = math.cos(b[6]), math.sin(b[6])
-    dx, dy = a[0] - b[0], a[1] - b[1]
     centre_x, centre_y = cos * dx + sin * dy, cos * dy - sin * dx
     cos, sin = math.cos(a[6] - b[6]), math.sin(a[6] - b[6])
     for k in range(4):
@@ -180,7 +189,7 @@ def _shared_area(a, b, work):
     area = 0.0
     for k in range(1, count - 1):
         area += (x[k] - x[0]) * (y[k + 1] - y[0]) - (x[k + 1] - x[0]) * (y[k] - y[0])
-    return max(area / 2, 0.0)
+    return min(max(area / 2, 0.0), a[3] * a[4], b[3] * b[4])
 
 
 @njit(cache=True, nogil=True)

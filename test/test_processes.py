@@ -1,4 +1,5 @@
-"""Processes that work for another one end with it, and give back what they hold."""
+"""Processes that work for another one end with it, and give back what they hold; freed memory stays
+with those that work on clouds."""
 
 from __future__ import annotations
 
@@ -8,6 +9,8 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+
+import pytest
 
 HELD = []
 ROOT = Path(__file__).resolve().parents[1]
@@ -31,3 +34,22 @@ def test_processes_that_are_ended_give_back_what_they_hold():
     run = subprocess.run([sys.executable, "-c", script], text=True, capture_output=True,
                          env={**os.environ, "PYTHONPATH": path}, check=False)
     assert (run.returncode, run.stderr) == (0, "")
+
+
+@pytest.mark.skipif(os.confstr("CS_GNU_LIBC_VERSION") is None, reason="not glibc")
+@pytest.mark.parametrize("own", [{}, {"MALLOC_TRIM_THRESHOLD_": "131072"}],
+                         ids=["ours", "the user's"])
+def test_memory_is_used_again_where_the_user_does_not_say_otherwise(own):
+    """Counted in pages that the system gives out."""
+    script = ("import resource\n"
+              "import numpy as np\n"
+              "from lidar_perception.runs.memory import keep_freed\n"
+              "keep_freed()\n"
+              "for _ in range(2):\n"
+              "    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+              "    for _ in range(5):\n"
+              "        np.ones(8_000_000)\n"
+              "print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)\n")
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("MALLOC", "GLIBC"))}
+    pages = int(subprocess.check_output([sys.executable, "-c", script], env=environment | own))
+    assert (pages > 100) == bool(own)

@@ -79,9 +79,11 @@ def cli() -> None:
 
 
 def main() -> None:
+    from lidar_perception.runs.memory import keep_freed
     from lidar_perception.runs.threads import wait_asleep
     from lidar_perception.types import InputError
     wait_asleep()
+    keep_freed()
     try:
         cli(prog_name="lidar-perception")
     except InputError as error:

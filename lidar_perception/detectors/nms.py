@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from lidar_perception.detectors.params import NmsParams
-from lidar_perception.geometry import bev_iou
+from lidar_perception.geometry import MAX_CORNERS, reaches, shared_area
 from lidar_perception.types import CLASSES, Detections
 
 
@@ -33,11 +33,22 @@ def suppressed(boxes: np.ndarray, scores: np.ndarray, labels: np.ndarray, iou: f
     order = np.argsort(-scores, kind="stable")
     group = np.zeros(len(order), np.int64) if across_classes else np.asarray(labels)[order]
     ordered = np.asarray(boxes, np.float64).reshape(-1, 7)[order]
-    stays = np.ones(len(order), np.bool_)
-    for label in np.unique(group):
-        members = np.flatnonzero(group == label)
-        stays[members] = first_of_each(bev_iou(ordered[members], ordered[members]) > iou)
-    return order[stays]
+    return order[_stay(ordered, group, iou)]
+
+
+@njit(cache=True, nogil=True)
+def _stay(boxes, group, iou):
+    stays = np.ones(len(boxes), np.bool_)
+    reach, work = reaches(boxes), np.empty((4, MAX_CORNERS))
+    area = boxes[:, 3] * boxes[:, 4]
+    for i in range(len(boxes)):
+        if not stays[i]:
+            continue
+        for j in range(i + 1, len(boxes)):
+            if stays[j] and group[i] == group[j]:
+                shared = shared_area(boxes[i], boxes[j], reach[i] + reach[j], work)
+                stays[j] = shared <= 0 or shared / (area[i] + area[j] - shared) <= iou
+    return stays
 
 
 @njit(cache=True, nogil=True)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from lidar_perception.nodes import NODES, require_rclpy
 from lidar_perception.nodes.shared_memory import fed_by_a_driver, use_large_shared_memory
+from lidar_perception.runs.memory import keep_freed
 from lidar_perception.runs.threads import one_thread_each
 
 if TYPE_CHECKING:
@@ -70,6 +71,7 @@ def run(name: str, arguments: list[str]) -> int:
     # on waits for Stop.
     signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
     one_thread_each()  # or nodes that share few cores stand in each other's way
+    keep_freed()
     use_large_shared_memory(fed_by_a_driver(arguments))
     from lidar_perception.nodes.stopping import Stop
     stop = Stop(STOP_SIGNALS)

@@ -22,7 +22,7 @@ from lidar_perception.detectors.pointnet.clusters import (
 )
 from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS, pointnet_config
 from lidar_perception.detectors.pointnet.network import Outputs, fused, make_pointnet, nearest
-from lidar_perception.detectors.pointnet.predict import found, predict
+from lidar_perception.detectors.pointnet.predict import found, outputs_of, predict
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame
 
@@ -179,13 +179,15 @@ def test_groups_are_what_plain_loops_make_of_them(rng):
 @pytest.mark.parametrize("name", NETWORKS)
 def test_points_that_fill_up_a_cluster_change_nothing(rng, name):
     net = network(name)
-    clusters = blobs(rng, [10, 12, 2])
+    clusters = blobs(rng, [10, 12, 2, 24, 6, 7, 40])
     inputs = network_input(clusters, net.config.points)
     other = inputs.points.copy()
-    for i in range(3):
+    for i in range(len(clusters)):
         real = np.flatnonzero(inputs.valid[i])
         other[i, len(real):] = inputs.points[i, rng.choice(real, net.config.points - len(real))]
     for mine, theirs in zip(called(net, clusters), called(net, clusters, points=other)):
+        assert torch.allclose(mine, theirs, atol=1e-5)
+    for mine, theirs in zip(outputs_of(net, inputs, chunk=2), called(net, clusters)):  # left out
         assert torch.allclose(mine, theirs, atol=1e-5)
     again = predict(net, clusters.take(np.array([2, 0])))
     assert np.allclose(again.boxes, predict(net, clusters).boxes[[2, 0]], atol=1e-4)

@@ -13,7 +13,7 @@ from lidar_perception.param_fields import param
 from lidar_perception.robot.params import CropParams
 from lidar_perception.wire.params import InputParams
 
-STEPS = ("preprocess", "ground", "proposals", "clusters", "evidence", "fusion")
+STEPS = ("preprocess", "ground", "proposals", "evidence", "fusion")
 
 
 @dataclass(frozen=True)

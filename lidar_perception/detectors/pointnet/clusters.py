@@ -18,6 +18,7 @@ from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
 
 NEAR = (3.0, 6.0, 12.0)  # m: so far around a cluster the ground is looked for
 FEWEST = 3               # points of it
+CELLS = 64               # of NEAR[0] m along x and y, then they begin anew: far places share them
 
 
 @dataclass(frozen=True)
@@ -112,38 +113,42 @@ def points_of(boxes: np.ndarray, frame: LidarFrame, seen: LidarFrame, margin: fl
 def ground_under(xyz: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """(K,) float64: the mean z of the ground's points (G, 3) around each position xy (K, 2), within
     the first of NEAR that has FEWEST of them; -SENSOR_HEIGHT where none has. Metres."""
-    if len(xy) == 0:
-        return np.zeros(0)
-    low = xy.min(axis=0) - NEAR[-1]
-    size = xy.max(axis=0) + NEAR[-1] - low
-    shape = np.ceil(size / NEAR[0]).astype(np.int64) + 1
-    column = np.floor((xyz[:, :2] - low) / NEAR[0])
-    inside = ((column >= 0) & (column < shape)).all(axis=1)
-    cell = (column[inside] @ np.array([shape[1], 1.0])).astype(np.int64)
-    order = np.argsort(cell, kind="stable")
-    return _ground_under(xyz[inside][order].astype(np.float64), cell[order], shape, low, xy)
+    return _ground_under(xyz, np.ascontiguousarray(xy, np.float64))
 
 
 @njit(cache=True, nogil=True)
-def _ground_under(xyz, cell, shape, low, xy):
+def _ground_under(xyz, xy):
+    cell, start = np.empty(len(xyz), np.int64), np.zeros(CELLS * CELLS + 1, np.int64)
+    for i in range(len(xyz)):
+        cell[i] = _cell(xyz[i, 0], 0) * CELLS + _cell(xyz[i, 1], 0)
+        start[cell[i] + 1] += 1
+    start = np.cumsum(start)
+    free, order = start.copy(), np.empty(len(xyz), np.int64)
+    for i in range(len(xyz)):
+        order[free[cell[i]]] = i
+        free[cell[i]] += 1
     heights = np.full(len(xy), -SENSOR_HEIGHT)
     for k in range(len(xy)):
         x, y = xy[k]
-        row, column = int((x - low[0]) / NEAR[0]), int((y - low[1]) / NEAR[0])
         for reach in NEAR:
             cells = int(np.ceil(reach / NEAR[0]))
             count, total = 0, 0.0
-            for i in range(max(row - cells, 0), min(row + cells + 1, shape[0])):
-                first = i * shape[1] + max(column - cells, 0)
-                last = i * shape[1] + min(column + cells, shape[1] - 1)
-                for j in range(np.searchsorted(cell, first), np.searchsorted(cell, last + 1)):
-                    if (xyz[j, 0] - x) ** 2 + (xyz[j, 1] - y) ** 2 <= reach * reach:
-                        count += 1
-                        total += xyz[j, 2]
+            for row in range(-cells, cells + 1):
+                for column in range(-cells, cells + 1):
+                    own = _cell(x, row) * CELLS + _cell(y, column)
+                    for j in order[start[own]:start[own + 1]]:
+                        if (xyz[j, 0] - x) ** 2 + (xyz[j, 1] - y) ** 2 <= reach * reach:
+                            count += 1
+                            total += xyz[j, 2]
             if count >= FEWEST:
                 heights[k] = total / count
                 break
     return heights
+
+
+@njit(cache=True, nogil=True)
+def _cell(along, off):
+    return int((np.floor(along / NEAR[0]) + off) % CELLS)
 
 
 def middles(points: np.ndarray, first: np.ndarray) -> np.ndarray:

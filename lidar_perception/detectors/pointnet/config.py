@@ -98,6 +98,11 @@ class PointNetConfig:
         return scales[-1:] if self.grouped or self.mrg else ()
 
     @property
+    def least_points(self) -> int:
+        """Points that a cluster is filled up to, so that there are enough of them to group."""
+        return max(self.coarse, self.coarse_neighbours, *self.neighbours)
+
+    @property
     def clustering(self) -> ClusteringParams:
         """How clusters are made for this network. Without dynamic_threshold one distance serves
         all points, without log_point_count a point alone makes others follow."""

@@ -158,7 +158,7 @@ class PointNet(nn.Module):
         features = self.points(points)                                     # (B, N, C)
         found, shallow = [], [features.amax(dim=1)]
         # Where points lie densely grouped features say more, else those of single points (Eq. 17).
-        dense = valid.float().mean(dim=1, keepdim=True)                    # (B, 1)
+        dense = valid.sum(dim=1, keepdim=True) / config.points             # (B, 1)
         if self.local is not None and self.fine is not None:
             local = self.local(points, features, valid, config.centroids)  # (B, M, C)
             found.append(self.fine(local).amax(dim=1))                     # (B, C)

@@ -68,10 +68,19 @@ def predict(network: PointNet, clusters: Clusters, seed: int = 0, chunk: int = C
 
 @torch.inference_mode()
 def outputs_of(network: PointNet, inputs: ClusterInput, chunk: int = CHUNK) -> Outputs:
-    """The network's outputs for one cluster or more."""
-    device, parts = network.temperature.device, []
-    for begin in range(0, len(inputs.points), chunk):
-        part = slice(begin, begin + chunk)
-        parts.append(network(*(torch.from_numpy(x[part]).to(device) for x in
-                               (inputs.points, inputs.valid, inputs.context))))
-    return Outputs(*(torch.cat(column) for column in zip(*parts)))
+    """The network's outputs for one cluster or more. Most clusters have few points: those that have
+    about the same number are taken together, without the places that none of them fills."""
+    device, least = network.temperature.device, network.config.least_points
+    sizes = np.maximum(inputs.valid.sum(axis=1), least)
+    doubled = np.ceil(np.log2(sizes / least))
+    order = np.argsort(doubled, kind="stable")
+    alike = np.split(order, np.flatnonzero(np.diff(doubled[order])) + 1)
+    parts = []
+    for rows in alike:
+        width = sizes[rows].max()
+        for begin in range(0, len(rows), chunk):
+            part = rows[begin:begin + chunk]
+            parts.append(network(*(torch.from_numpy(x).to(device) for x in (
+                inputs.points[part, :width], inputs.valid[part, :width], inputs.context[part]))))
+    back = torch.from_numpy(np.argsort(order)).to(device)
+    return Outputs(*(torch.cat(column)[back] for column in zip(*parts)))
