@@ -2,90 +2,34 @@
 
 from __future__ import annotations
 
-import shutil
 from itertools import pairwise
 
 import numpy as np
 import nuscenes_folder
 import pytest
-from bag_samples import cloud_frame, message_bytes, same_cloud, scans
-from kitti_samples import raw_folder, tracking_folder
-from samples import CALIBRATION, STAMP, object_folder, scene, write
+from bag_samples import cloud_frame
+from recording_samples import (
+    MADE,
+    cloud_folder,
+    drive,
+    each_recording,
+    nuscenes_root,
+    semantic_folder,
+)
+from samples import STAMP, object_folder, scene, write
 
 from lidar_perception.cli.data import opened
-from lidar_perception.data.bag import Bag, BagWriter
+from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES, Frame
 from lidar_perception.data.kitti.folder import GAP_NS, PERIOD_NS
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.raw_clouds import open_clouds
-from lidar_perception.data.semantickitti import calibration_text, pose_line, write_scan
+from lidar_perception.data.semantickitti import write_scan
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.topics import CAMERA_INFO, POINTS
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import header_message
-
-
-def drive(i):
-    """Pose of scan i of a sequence."""
-    turn, pose = 0.1 * i, np.eye(4)
-    pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
-    pose[:3, 3] = [2.0 * i, 0.3 * i, -0.1 * i]
-    return pose
-
-
-def semantic_folder(root):
-    """Two sequences; every point has labels of its own."""
-    for sequence, count in (("00", 2), ("08", 1)):
-        folder = root / "sequences" / sequence
-        for i in range(count):
-            cloud = scene(i)
-            write_scan(folder, i, cloud, np.arange(len(cloud)) % 260, np.arange(len(cloud)) % 7)
-        write(folder / "poses.txt", "".join(pose_line(drive(i), CALIBRATION)
-                                            for i in range(count)))
-        write(folder / "calib.txt", calibration_text(CALIBRATION))
-    return root
-
-
-def nuscenes_root(root):
-    return nuscenes_folder.save(root, nuscenes_folder.made_tables(frames=3, objects=6))
-
-
-def reduced_folder(root):
-    tracking_folder(root)
-    (root / "training/velodyne").rename(root / "training/velodyne_reduced")
-    return root
-
-
-def bag_folder(root):
-    write_bag(root, scans())
-    return root
-
-
-def cloud_folder(root):
-    for i in (1, 2, 10):  # in this order, as people count
-        write(root / f"scan{i}.bin", scene(i).astype(np.float32).tobytes())
-    return root
-
-
-MADE = {  # name: (make, inner folders or files that say the same, what is said of it)
-    "object": (object_folder, ("", "training"), "KITTI object data, 2 frames", {BOXES, CAMERA}),
-    "tracking": (tracking_folder, ("", "training"), "KITTI tracking data, 5 frames",
-                 {BOXES, CAMERA}),
-    "reduced": (reduced_folder, ("", "training"), "KITTI tracking data, 5 frames",
-                {BOXES, CAMERA}),
-    "raw": (raw_folder, ("", "2011_09_26", "2011_09_26/2011_09_26_drive_0001_sync"),
-            "KITTI raw drives, 3 frames", {BOXES, CAMERA}),
-    "nuscenes": (nuscenes_root, ("", nuscenes_folder.VERSION), "nuScenes v1.0-mini, 6 frames",
-                 {BOXES, POSES}),
-    "semantickitti": (semantic_folder, ("", "sequences"), "SemanticKITTI, 3 frames",
-                      {POINT_LABELS, POSES}),
-    "bag": (bag_folder, ("", "bag.mcap"), "rosbag2 bag, clouds on /points, 3 frames",
-            {BOXES, CAMERA}),
-    "files": (cloud_folder, ("",), ".bin clouds, no times in their names, 3 frames", set()),
-}
-each_recording = pytest.mark.parametrize("kind", MADE)
 
 
 @each_recording
@@ -266,103 +210,6 @@ def test_splits_that_are_wrong_are_named(tmp_path, written):
             assert "\n" not in str(error.value) and "split.txt" in str(error.value)
         with pytest.raises(InputError, match="cannot read the split"):
             open_recording(root, split=tmp_path / "missing.txt")
-
-
-# bags
-
-def same_frames(a, b):
-    return (a.name, a.stamp_ns, a.index) == (b.name, b.stamp_ns, b.index) and np.array_equal(
-        a.load().xyz, b.load().xyz)
-
-
-def test_frames_of_a_bag_by_number_are_those_of_iterating(written, tmp_path):
-    clouds = [row for row in message_bytes(written) if row[0] == POINTS]
-    with BagWriter(tmp_path / "equal") as bag:  # three at the same time, two of the same stamp
-        bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
-        bag.add_topic("/other", "sensor_msgs/msg/PointCloud2")
-        for i, time in ((2, 5), (0, 7), (1, 7), (0, 7), (2, 9)):
-            bag.write("/other", time, clouds[1][2])
-            bag.write(POINTS, time, clouds[i][2])
-    for path, count in ((written, 3), (tmp_path / "equal", 5)):
-        recording = open_recording(path)
-        frames = list(recording)
-        assert len(frames) == len(recording) == count == len({f.name for f in frames})
-        for i, frame in enumerate(frames):
-            assert same_frames(frame, recording.frames[i])
-            assert same_frames(frame, recording.frames[i - count])
-            assert (frame.truth() is None) == (recording.frames[i].truth() is None)
-        assert [f.name for f in recording.frames[1:]] == [f.name for f in frames[1:]]
-        for i in (count, -count - 1):
-            with pytest.raises(IndexError):
-                recording.frames[i]
-    assert [scene_of(f) for f in frames] == [2, 0, 1, 0, 2]
-
-
-def scene_of(frame):
-    return next(i for i in range(3) if same_cloud(scene(i), frame.load().xyz))
-
-
-def test_a_frame_of_a_bag_by_number_is_read_when_it_is_asked_for(written, tmp_path):
-    shutil.copytree(written, tmp_path / "bag")
-    frame = open_recording(tmp_path / "bag").frames[1]
-    shutil.rmtree(tmp_path / "bag")
-    with pytest.raises(InputError, match="there is no bag"):
-        frame.load()
-
-
-def test_a_bag_has_what_is_in_it_and_not_what_could_be(tmp_path):
-    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
-    assert open_recording(tmp_path / "bag").has == set()
-
-
-@each_recording
-def test_a_bag_made_of_a_recording_says_the_same(tmp_path, kind):
-    recording = open_recording(MADE[kind][0](tmp_path / kind))
-    assert write_bag(tmp_path / "made", recording) == len(recording)
-    bag = open_recording(tmp_path / "made")
-    assert bag.has == recording.has
-    for frame, read in zip(recording, bag, strict=True):
-        expected, got = frame.load(), read.load()
-        assert np.array_equal(got.xyz, expected.xyz)
-        assert np.array_equal(got.intensity, expected.intensity)
-        assert got.stamp_ns == expected.stamp_ns
-        pose, again = frame.pose(), read.pose()
-        assert (pose is None) == (again is None)
-        if pose is not None:
-            np.testing.assert_allclose(again, pose, atol=1e-6)
-        labels, again = frame.point_truth(), read.point_truth()
-        assert (labels is None) == (again is None)
-        if labels is not None:
-            assert np.array_equal(again.classes, labels.classes)
-            assert np.array_equal(again.instances, labels.instances)
-        truth, again = frame.truth(), read.truth()
-        assert (truth is None) == (again is None)
-        if truth is not None:
-            np.testing.assert_allclose(again.boxes, truth.boxes, atol=1e-9)
-            assert again.labels == truth.labels and len(again.notes) == len(truth.notes)
-            for a, b in zip(again.extras, truth.extras, strict=True):
-                assert a.keys() == b.keys()
-                np.testing.assert_equal([a.get("track_id"), a.get("category")],
-                                        [b.get("track_id"), b.get("category")])
-    with Bag(tmp_path / "made") as opened:  # a calibration is written when it changes
-        assert opened.counts[CAMERA_INFO] == (CAMERA in recording.has) * (1 + (kind == "bag"))
-
-
-def test_a_scan_that_cannot_be_read_is_left_out_of_a_bag_and_named(tmp_path):
-    root = object_folder(tmp_path / "kitti", count=3)
-    write(root / "training/velodyne/000001.bin", b"cut")
-    with pytest.raises(InputError, match=r"000001\.bin"):
-        write_bag(tmp_path / "strict", open_recording(root))
-    skipped = []
-    assert write_bag(tmp_path / "bag", open_recording(root), skipped=skipped) == 2
-    assert len(skipped) == 1 and "000001.bin" in skipped[0]
-    assert [scene_of(f) for f in open_recording(tmp_path / "bag")] == [0, 2]
-
-
-def test_a_scan_with_a_stamp_that_no_bag_can_hold_is_left_out_and_named(tmp_path):
-    scans, skipped = [Frame.of(str(t), cloud_frame(scene(), t)) for t in (-5, 7)], []
-    assert write_bag(tmp_path / "bag", scans, skipped=skipped) == 1
-    assert "-5" in skipped[0] and open_recording(tmp_path / "bag").frames[0].stamp_ns == 7
 
 
 # columns

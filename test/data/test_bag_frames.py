@@ -1,0 +1,113 @@
+"""Frames of a bag, and of a bag that is made of any recording."""
+
+from __future__ import annotations
+
+import shutil
+
+import numpy as np
+import pytest
+from bag_samples import cloud_frame, message_bytes, same_cloud
+from recording_samples import MADE, each_recording
+from samples import STAMP, object_folder, scene, write
+
+from lidar_perception.data.bag import Bag, BagWriter
+from lidar_perception.data.frame import CAMERA, Frame
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.types import InputError
+from lidar_perception.wire.topics import CAMERA_INFO, POINTS
+
+
+def same_frames(a, b):
+    return (a.name, a.stamp_ns, a.index) == (b.name, b.stamp_ns, b.index) and np.array_equal(
+        a.load().xyz, b.load().xyz)
+
+
+def test_frames_of_a_bag_by_number_are_those_of_iterating(written, tmp_path):
+    clouds = [row for row in message_bytes(written) if row[0] == POINTS]
+    with BagWriter(tmp_path / "equal") as bag:  # three at the same time, two of the same stamp
+        bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+        bag.add_topic("/other", "sensor_msgs/msg/PointCloud2")
+        for i, time in ((2, 5), (0, 7), (1, 7), (0, 7), (2, 9)):
+            bag.write("/other", time, clouds[1][2])
+            bag.write(POINTS, time, clouds[i][2])
+    for path, count in ((written, 3), (tmp_path / "equal", 5)):
+        recording = open_recording(path)
+        frames = list(recording)
+        assert len(frames) == len(recording) == count == len({f.name for f in frames})
+        for i, frame in enumerate(frames):
+            assert same_frames(frame, recording.frames[i])
+            assert same_frames(frame, recording.frames[i - count])
+            assert (frame.truth() is None) == (recording.frames[i].truth() is None)
+        assert [f.name for f in recording.frames[1:]] == [f.name for f in frames[1:]]
+        for i in (count, -count - 1):
+            with pytest.raises(IndexError):
+                recording.frames[i]
+    assert [scene_of(f) for f in frames] == [2, 0, 1, 0, 2]
+
+
+def scene_of(frame):
+    return next(i for i in range(3) if same_cloud(scene(i), frame.load().xyz))
+
+
+def test_a_frame_of_a_bag_by_number_is_read_when_it_is_asked_for(written, tmp_path):
+    shutil.copytree(written, tmp_path / "bag")
+    frame = open_recording(tmp_path / "bag").frames[1]
+    shutil.rmtree(tmp_path / "bag")
+    with pytest.raises(InputError, match="there is no bag"):
+        frame.load()
+
+
+def test_a_bag_has_what_is_in_it_and_not_what_could_be(tmp_path):
+    write_bag(tmp_path / "bag", [Frame.of("0", cloud_frame(scene(), STAMP))])
+    assert open_recording(tmp_path / "bag").has == set()
+
+
+@each_recording
+def test_a_bag_made_of_a_recording_says_the_same(tmp_path, kind):
+    recording = open_recording(MADE[kind][0](tmp_path / kind))
+    assert write_bag(tmp_path / "made", recording) == len(recording)
+    bag = open_recording(tmp_path / "made")
+    assert bag.has == recording.has
+    for frame, read in zip(recording, bag, strict=True):
+        expected, got = frame.load(), read.load()
+        assert np.array_equal(got.xyz, expected.xyz)
+        assert np.array_equal(got.intensity, expected.intensity)
+        assert got.stamp_ns == expected.stamp_ns
+        pose, again = frame.pose(), read.pose()
+        assert (pose is None) == (again is None)
+        if pose is not None:
+            np.testing.assert_allclose(again, pose, atol=1e-6)
+        labels, again = frame.point_truth(), read.point_truth()
+        assert (labels is None) == (again is None)
+        if labels is not None:
+            assert np.array_equal(again.classes, labels.classes)
+            assert np.array_equal(again.instances, labels.instances)
+        truth, again = frame.truth(), read.truth()
+        assert (truth is None) == (again is None)
+        if truth is not None:
+            np.testing.assert_allclose(again.boxes, truth.boxes, atol=1e-9)
+            assert again.labels == truth.labels and len(again.notes) == len(truth.notes)
+            for a, b in zip(again.extras, truth.extras, strict=True):
+                assert a.keys() == b.keys()
+                np.testing.assert_equal([a.get("track_id"), a.get("category")],
+                                        [b.get("track_id"), b.get("category")])
+    with Bag(tmp_path / "made") as opened:  # a calibration is written when it changes
+        assert opened.counts[CAMERA_INFO] == (CAMERA in recording.has) * (1 + (kind == "bag"))
+
+
+def test_a_scan_that_cannot_be_read_is_left_out_of_a_bag_and_named(tmp_path):
+    root = object_folder(tmp_path / "kitti", count=3)
+    write(root / "training/velodyne/000001.bin", b"cut")
+    with pytest.raises(InputError, match=r"000001\.bin"):
+        write_bag(tmp_path / "strict", open_recording(root))
+    skipped = []
+    assert write_bag(tmp_path / "bag", open_recording(root), skipped=skipped) == 2
+    assert len(skipped) == 1 and "000001.bin" in skipped[0]
+    assert [scene_of(f) for f in open_recording(tmp_path / "bag")] == [0, 2]
+
+
+def test_a_scan_with_a_stamp_that_no_bag_can_hold_is_left_out_and_named(tmp_path):
+    scans, skipped = [Frame.of(str(t), cloud_frame(scene(), t)) for t in (-5, 7)], []
+    assert write_bag(tmp_path / "bag", scans, skipped=skipped) == 1
+    assert "-5" in skipped[0] and open_recording(tmp_path / "bag").frames[0].stamp_ns == 7

@@ -1,0 +1,75 @@
+"""A recording of every kind that is known, as folders and files of a few small scans."""
+
+from __future__ import annotations
+
+import numpy as np
+import nuscenes_folder
+import pytest
+from bag_samples import scans
+from kitti_samples import raw_folder, tracking_folder
+from samples import CALIBRATION, object_folder, scene, write
+
+from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES
+from lidar_perception.data.semantickitti import calibration_text, pose_line, write_scan
+from lidar_perception.data.to_bag import write_bag
+
+
+def drive(i):
+    """Pose of scan i of a sequence."""
+    turn, pose = 0.1 * i, np.eye(4)
+    pose[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    pose[:3, 3] = [2.0 * i, 0.3 * i, -0.1 * i]
+    return pose
+
+
+def semantic_folder(root):
+    """Two sequences; every point has labels of its own."""
+    for sequence, count in (("00", 2), ("08", 1)):
+        folder = root / "sequences" / sequence
+        for i in range(count):
+            cloud = scene(i)
+            write_scan(folder, i, cloud, np.arange(len(cloud)) % 260, np.arange(len(cloud)) % 7)
+        write(folder / "poses.txt", "".join(pose_line(drive(i), CALIBRATION)
+                                            for i in range(count)))
+        write(folder / "calib.txt", calibration_text(CALIBRATION))
+    return root
+
+
+def nuscenes_root(root):
+    return nuscenes_folder.save(root, nuscenes_folder.made_tables(frames=3, objects=6))
+
+
+def reduced_folder(root):
+    tracking_folder(root)
+    (root / "training/velodyne").rename(root / "training/velodyne_reduced")
+    return root
+
+
+def bag_folder(root):
+    write_bag(root, scans())
+    return root
+
+
+def cloud_folder(root):
+    for i in (1, 2, 10):  # in this order, as people count
+        write(root / f"scan{i}.bin", scene(i).astype(np.float32).tobytes())
+    return root
+
+
+MADE = {  # name: (make, inner folders or files that say the same, what is said of it)
+    "object": (object_folder, ("", "training"), "KITTI object data, 2 frames", {BOXES, CAMERA}),
+    "tracking": (tracking_folder, ("", "training"), "KITTI tracking data, 5 frames",
+                 {BOXES, CAMERA}),
+    "reduced": (reduced_folder, ("", "training"), "KITTI tracking data, 5 frames",
+                {BOXES, CAMERA}),
+    "raw": (raw_folder, ("", "2011_09_26", "2011_09_26/2011_09_26_drive_0001_sync"),
+            "KITTI raw drives, 3 frames", {BOXES, CAMERA}),
+    "nuscenes": (nuscenes_root, ("", nuscenes_folder.VERSION), "nuScenes v1.0-mini, 6 frames",
+                 {BOXES, POSES}),
+    "semantickitti": (semantic_folder, ("", "sequences"), "SemanticKITTI, 3 frames",
+                      {POINT_LABELS, POSES}),
+    "bag": (bag_folder, ("", "bag.mcap"), "rosbag2 bag, clouds on /points, 3 frames",
+            {BOXES, CAMERA}),
+    "files": (cloud_folder, ("",), ".bin clouds, no times in their names, 3 frames", set()),
+}
+each_recording = pytest.mark.parametrize("kind", MADE)
