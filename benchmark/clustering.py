@@ -28,7 +28,7 @@ def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: fl
     others noise and the partition of the core points must be the same."""
     here = [p for p in peers.DBSCANS if not p.missing()]
     rows = {p.name: row(p.name, note=p.missing()) for p in peers.DBSCANS}
-    ms = {}
+    ms: dict[str, float] = {}
     for group, run in (([p for p in here if p != peers.WHEEL], dbscan_times),
                        ([p for p in here if p == peers.WHEEL], partial(in_child, dbscan_times))):
         if group:
@@ -37,7 +37,7 @@ def measure_dbscan(title: str, clouds: list[np.ndarray], repeat: int, target: fl
             ms |= times
             rows |= {p.name: against(p.name, times, None, same[p.name], differ[p.name])
                      for p in group}
-    faster = min((p.name for p in peers.SKLEARN), key=ms.get)
+    faster = min((p.name for p in peers.SKLEARN), key=lambda name: ms[name])
     rows[faster] = with_target(rows[faster], target)
     return measured(title, len(clouds), np.median([len(c) for c in clouds]), list(rows.values()))
 
@@ -53,7 +53,9 @@ def dbscan_times(chosen: list[int], clouds: list[np.ndarray], repeat: int,
         return {**{p.name: partial(peers.by_bands, p.run, xyz) for p in group},
                 "ours": partial(distance_aware_dbscan, xyz)}
 
-    clock, same, differ = Clock(repeat, calls(thin(clouds[0]))), Counter(), Counter()
+    clock = Clock(repeat, calls(thin(clouds[0])))
+    same: Counter[str] = Counter()
+    differ: Counter[str] = Counter()
     for xyz in track(clouds, title, len(clouds)):
         found = clock.time(calls(xyz))
         ours, core = found["ours"], core_points(xyz)

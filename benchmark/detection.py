@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -32,7 +33,7 @@ def measure_detection(scans: list[LidarFrame], repeat: int,
     anchors through."""
     device = chosen_device()
     name = torch.cuda.get_device_name(device) if device.type == "cuda" else cpu_name()
-    content = {"device": name, "threads": torch.get_num_threads(), "sizes": {}}
+    content: dict[str, Any] = {"device": name, "threads": torch.get_num_threads(), "sizes": {}}
     for size in sizes:
         chosen = evenly_chosen(scans, FEW) if (size, device.type) == ("full", "cpu") else scans
         detectors = {version: _random_detector(version, size, device, chosen[0])
@@ -49,9 +50,9 @@ def _medians(detectors: dict[str, PointPillarsDetector], scans: list[LidarFrame]
     for i, scan in enumerate(track(scans, title, len(scans))):
         for j in range(repeat):
             for version, detector in detectors.items():
-                found = detector(scan)
-                ms[version][i, j] = [found.ms[step] for step in STEPS]
-    found = {}
+                said = detector(scan).ms
+                ms[version][i, j] = [said[step] for step in STEPS]
+    found: dict[str, dict] = {}
     for version, runs in ms.items():
         steps = np.median(np.median(runs, axis=1), axis=0)
         total = float(np.median(np.median(runs.sum(axis=2), axis=1)))
@@ -69,6 +70,10 @@ class Heard:
         self.network = network
         self.logits: torch.Tensor | None = None
 
+    def to(self, device: torch.device) -> None:
+        """As Network."""
+        self.network.to(device)
+
     def __call__(self, pillars, maps):
         prediction = self.network(pillars, maps)
         self.logits = prediction[0]
@@ -84,6 +89,7 @@ def _random_detector(version: str, size: str, device: torch.device,
     detector = PointPillarsDetector(heard, Header(config), device)
     detector.warm_up()
     detector(scan)
+    assert heard.logits is not None
     best = torch.sigmoid(heard.logits.amax(dim=1))
     least = float(best.topk(min(CANDIDATES, len(best))).values[-1])
     detector = detector.with_min_score(least)

@@ -16,19 +16,19 @@ from lidar_perception.wire.topics import POINTS
 
 
 def measure_graph(recording: Recording, single: bool) -> dict:
-    """Latency, losses and memory of the nodes at 10 Hz, without recording."""
+    """Latency, losses and memory of the nodes at 10 Hz, which the recorder hears, too."""
     from lidar_perception.nodes.replay import replay
     with tempfile.TemporaryDirectory() as folder:
         drive, out = Path(folder) / "drive", Path(folder)
         write_bag(drive, track(recording, "writing a bag", len(recording)))
         with Bag(drive) as bag:
             clouds = bag.counts[POINTS]
-        content = replay(drive, clouds, out, PAPER, single=single, record=False)
+        content = replay(drive, clouds, out, PAPER, single=single)
     return {k: content[k] for k in ("clouds", "results", "latency_ms", "memory_mb", "ms")}
 
 
 def print_graph(content: dict) -> None:
-    table = Table(title="Nodes over DDS at 10 Hz, no recording")
+    table = Table(title="Nodes over DDS at 10 Hz")
     for name in ("graph", "clouds", "lost", "median ms", "95 % under ms", "memory MB"):
         table.add_column(name, justify="left" if name == "graph" else "right")
     for name, run in content.items():

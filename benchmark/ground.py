@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -15,15 +16,10 @@ from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.params import ClothParams, GroundParams, ThresholdParams
 from lidar_perception.ground.patchwork import segment_by_patchwork, silent_stdout
 from lidar_perception.ground.segment import METHODS
-from lidar_perception.ground.threshold import (
-    SENSOR_HEIGHT,
-    height_above,
-    ransac_plane,
-    segment_by_threshold,
-)
+from lidar_perception.ground.threshold import height_above, ransac_plane, segment_by_threshold
 from lidar_perception.runs.terminal import track
 from lidar_perception.scoring.points.segmentation import PROTOCOLS, GroundReport, ground_by_protocol
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
 
 PARAMS = GroundParams()
 FRAMES_OF_2000 = 3  # scikit-learn's 2000 trials take seconds
@@ -32,7 +28,8 @@ FRAMES_OF_2000 = 3  # scikit-learn's 2000 trials take seconds
 def measure_threshold(title: str, clouds: list[np.ndarray], repeat: int) -> dict:
     """Ours beside scikit-learn's RANSAC on points (N, 3) lower than paper A's z < -1.3: with its
     own early stop and without; and how far the planes of the same low points differ."""
-    rows, planes = [], {}
+    rows: list[dict] = []
+    planes: dict[str, dict] = {}
     for group, chosen, times in (
             (peers.RANSACS, clouds, repeat),
             ((peers.RANSAC_2000,), evenly_chosen(clouds, FRAMES_OF_2000), 1)):
@@ -70,7 +67,8 @@ def _plane_differences(clouds: list[np.ndarray], found: list[tuple]) -> dict:
     ours = [ransac_plane(points, PARAMS.threshold) for points in low]
     theirs = [plane for _, plane, _ in found]
     settled = [_settled(points.astype(np.float64), plane) for points, plane in zip(low, theirs)]
-    result = {"trials": float(np.median([trials for _, _, trials in found])), "difference": {}}
+    trials = float(np.median([trials for _, _, trials in found]))
+    result: dict[str, Any] = {"trials": trials, "difference": {}}
     for name, planes in (("raw", theirs), ("refined", settled)):
         pairs = [(a, b) for a, b in zip(ours, planes) if a is not None]
         more = [_inliers(p, a) - _inliers(p, b)
@@ -129,7 +127,7 @@ def measure_patchwork(frames: list[LidarFrame], repeat: int) -> dict:
 
 
 def _with_intensity(frame: LidarFrame) -> np.ndarray:
-    return np.column_stack([frame.xyz, frame.intensity]).astype(np.float32)
+    return frame.points()
 
 
 def _mask(indices, count: int) -> np.ndarray:

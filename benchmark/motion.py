@@ -10,6 +10,7 @@ from __future__ import annotations
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 from rich.table import Table
@@ -42,6 +43,11 @@ def odometry(motion: Motion) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             np.column_stack([np.zeros((len(times), 2)), np.sin(half), np.cos(half)]))
 
 
+def where(way: tuple[np.ndarray, np.ndarray, np.ndarray], at: np.ndarray) -> np.ndarray:
+    """(N, 4, 4): the poses of an odometry at (N,) seconds."""
+    return interpolated(*way, np.rint(at * 1e9).astype(np.int64))
+
+
 def turns(seed: int) -> Iterator[tuple]:
     """Of a street: speed, yaw rate, the clouds as met, as reported and as corrected, each with the
     same points, the number of each point's thing (0: none), which things are boxes that stand, and
@@ -52,9 +58,7 @@ def turns(seed: int) -> Iterator[tuple]:
         hits = cast(moment.solids, scene.ground, moment.position, HDL64E, motion, seed)
         met, reported = (returns_of(hits, HDL64E, motion, np.random.default_rng(seed), compensated)
                          for compensated in (True, False))
-        way = odometry(motion)
-        corrected = deskewed(reported.xyz, met.time.astype(float), lambda at, way=way: interpolated(
-            *way, np.rint(at * 1e9).astype(np.int64)))
+        corrected = deskewed(reported.xyz, met.time.astype(float), partial(where, odometry(motion)))
         since = rays(HDL64E, motion).since.astype(np.float32)
         order = np.argsort(since)
         solid = hits.solid[order[np.searchsorted(since[order], met.time)], met.ring]

@@ -116,7 +116,7 @@ def _merged(points: np.ndarray, labels: np.ndarray, gamma: float) -> np.ndarray:
         close = np.flatnonzero(distance < gamma * (diameter[k + 1:] + diameter[k]) / 2)
         first.append(np.full(len(close), k))
         second.append(close + k + 1)
-    first, second = np.concatenate(first), np.concatenate(second)
-    graph = coo_matrix((np.ones(len(first), bool), (first, second)), (count, count))
+    pairs = np.concatenate(first), np.concatenate(second)
+    graph = coo_matrix((np.ones(len(pairs[0]), bool), pairs), (count, count))
     component = connected_components(graph, directed=False)[1]
     return _numbered(np.where(labels > 0, component[labels - 1], -1))

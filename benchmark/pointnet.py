@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 import torch
 from rich.table import Table
 
 from benchmark.plain_pointnet2 import PlainPointNet2
-from benchmark.timing import interleaved
+from benchmark.timing import Calls, interleaved
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.pointnet.clusters import Clusters, clusters_of, network_input
@@ -41,10 +42,9 @@ def measure_pointnet(scans: Sequence[LidarFrame], repeat: int) -> dict:
         ground = segment_ground(scan, config.ground)
         every = clusters_of(scan, cluster_obstacles(scan.xyz, ground, config.clustering), 5, ground)
         some = every.take(np.arange(min(COUNT, len(every))))
-        calls = {name: (lambda n=network, c=some: predict(n, c))
-                 for name, network in networks.items()}
-        calls["plain PointNet++ (SSG)"] = lambda c=some: _plain(plain, c, config.points)
-        calls["detector"] = lambda s=scan: detector(s)
+        calls: Calls = {name: partial(predict, network, some) for name, network in networks.items()}
+        calls["plain PointNet++ (SSG)"] = partial(_plain, plain, some, config.points)
+        calls["detector"] = partial(detector, scan)
         interleaved(calls, 1)
         ms, said = interleaved(calls, repeat)
         rows.append(ms)

@@ -57,7 +57,7 @@ def print_measured(content: dict) -> None:
     for name in ("beside", "its ms", "our ms", "measured", "target", "met", "same"):
         table.add_column(name, justify="left" if name == "beside" else "right")
     for r in content["rows"]:
-        met = {True: "yes", False: Text("no", "red"), None: ""}[r["met"]]
+        met = "" if r["met"] is None else "yes" if r["met"] else Text("no", "red")
         table.add_row(r["name"], _ms(r["peer_ms"]), _ms(r["ours_ms"]),
                       r["note"] or value_text(r["value"], r["unit"]),
                       target_text(r["target"], r["unit"]), met,

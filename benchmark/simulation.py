@@ -40,7 +40,8 @@ def measure_simulation(streets: int, repeat: int) -> dict:
 
 
 def _busy(count: int) -> list[tuple[int, Scene]]:
-    found, seed = [], 0
+    found: list[tuple[int, Scene]] = []
+    seed = 0
     while len(found) < count:
         scene = make_scene(seed)
         near = [a for a in scene.actors if np.hypot(a.x, a.y) < HDL64E.max_range]

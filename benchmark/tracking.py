@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -57,7 +57,7 @@ def measure_recording(recording: Recording) -> dict:
     return measure_tracking(drives, recording.frames[0].calibration()) if drives else {}
 
 
-def measure_tracking(drives: dict[str, Sequence[Seen]], calibration: Calibration | None,
+def measure_tracking(drives: Mapping[str, Sequence[Seen]], calibration: Calibration | None,
                      params: TrackingParams = TrackingParams()) -> dict:
     """By "ours" and "plain AB3DMOT": the scores of TrackingReport, by centres, and ms, the median
     time of a frame."""
@@ -80,7 +80,7 @@ def tracker(params: TrackingParams) -> Step:
     return step
 
 
-def _measured(drives: dict[str, Sequence[Seen]], calibration: Calibration | None,
+def _measured(drives: Mapping[str, Sequence[Seen]], calibration: Calibration | None,
               make: Callable[[], Step]) -> dict:
     report, ms = TrackingReport(), []
     for name, frames in drives.items():
