@@ -20,6 +20,7 @@ from time import monotonic
 from typing import Any
 
 from lidar_perception.campaign.case import FAILED, Case, Outcome
+from lidar_perception.runs.memory import keep_freed
 from lidar_perception.types import InputError
 
 START_SECONDS = 900.0     # for what a part makes before its first case, on a busy machine
@@ -130,6 +131,7 @@ class Worker:
 
 def _serve(part: str, limits: Limits, folder: Path, quiet: bool, connection: Connection) -> None:
     os.setsid()
+    keep_freed()  # as nodes do
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_BYTES, ADDRESS_BYTES))
     if quiet:
         log = os.open(folder / f"{part}.log", os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o644)
