@@ -1,12 +1,14 @@
-"""Where a network runs: the CPU or CUDA."""
+"""Where a network runs, the CPU or CUDA, and in which number format."""
 
 from __future__ import annotations
 
 import torch
 
+from lidar_perception.runs.machine import has_bf16
 from lidar_perception.types import InputError
 
 CPU = torch.device("cpu")
+FORMATS = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 def chosen_device(name: str = "auto") -> torch.device:
@@ -26,3 +28,15 @@ def chosen_device(name: str = "auto") -> torch.device:
                          f"{torch.cuda.device_count() if available else 'no'} CUDA device here; "
                          "choose auto or cpu")
     return device
+
+
+def number_format(amp: str, device: torch.device) -> torch.dtype | None:
+    """The format of a network's layers, None for float32. auto: 16 bits where the device has
+    instructions for it; on the CPU fp16 is none."""
+    if device.type == "cpu":
+        return FORMATS["bf16"] if amp == "bf16" or (amp == "auto" and has_bf16()) else None
+    if amp == "off":
+        return None
+    if amp == "auto":
+        amp = "bf16" if torch.cuda.is_bf16_supported() else "fp16"
+    return FORMATS[amp]

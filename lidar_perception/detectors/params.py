@@ -63,6 +63,14 @@ def seen_range() -> Any:
                  fixed=True)
 
 
+def layers_format() -> Any:
+    """The parameter of detectors with PointPillars that says in which numbers its layers work."""
+    return param("off", "Number format of PointPillars' layers. off: float32. auto: bf16 where the "
+                 "device has instructions for it, and the layers take half the time; scores then "
+                 "differ by some thousandths. bf16: wherever it runs.",
+                 choices=("off", "auto", "bf16"), fixed=True)
+
+
 @dataclass(frozen=True)
 class NetworkParams(Params):
     """Where a detector's network runs, and what counts as a detection."""

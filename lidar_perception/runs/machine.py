@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+from functools import cache
 from pathlib import Path
 
 
@@ -21,6 +22,7 @@ def cores() -> int:
     return len(os.sched_getaffinity(0))
 
 
+@cache
 def has_bf16() -> bool:
     """Whether the processor has instructions for bf16, with which networks take half the time."""
     try:

@@ -10,10 +10,10 @@ from typing import Any, TypeVar
 import torch
 from torch import nn
 
+from lidar_perception.detectors.devices import number_format
 from lidar_perception.runs.machine import cores
 from lidar_perception.training.data import Item, ReadScenes
 from lidar_perception.training.params import LoopParams
-from lidar_perception.training.run import number_format
 from lidar_perception.types import InputError
 
 MOST = 4  # scenes with which it is measured

@@ -12,14 +12,13 @@ import torch
 from torch import Tensor, nn
 
 from lidar_perception.detectors.checkpoint import Net
-from lidar_perception.runs.machine import has_bf16
+from lidar_perception.detectors.devices import number_format
 from lidar_perception.training.params import LoopParams
 from lidar_perception.training.ranks import any_of, world
 from lidar_perception.training.schedule import Average, one_cycle
 from lidar_perception.types import InputError
 
 Judged = tuple[dict[str, float], dict[str, tuple[float, float]]]  # see Task.validate
-FORMATS = {"bf16": torch.bfloat16, "fp16": torch.float16}
 
 
 @dataclass(frozen=True)
@@ -173,14 +172,3 @@ class Run:
             self.scaler.step(self.optimizer)
         self.scaler.update()
         return length
-
-
-def number_format(amp: str, device: torch.device) -> torch.dtype | None:
-    """The format of the forward pass, None for float32; amp as in LoopParams."""
-    if device.type == "cpu":
-        return FORMATS["bf16"] if amp == "bf16" or (amp == "auto" and has_bf16()) else None
-    if amp == "off":
-        return None
-    if amp == "auto":
-        amp = "bf16" if torch.cuda.is_bf16_supported() else "fp16"
-    return FORMATS[amp]

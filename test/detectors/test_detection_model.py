@@ -21,6 +21,7 @@ from lidar_perception.detectors.pointpillars.config import (
     NetworkConfig,
     network_config,
 )
+from lidar_perception.detectors.pointpillars.detector import TorchNetwork
 from lidar_perception.detectors.pointpillars.losses import detection_loss
 from lidar_perception.detectors.pointpillars.network import fused, make_network
 from lidar_perception.detectors.pointpillars.pillars import first_of_each, make_pillars
@@ -145,6 +146,18 @@ def test_points_keep_their_precision_where_the_rest_runs_in_16_bits():
     with torch.autocast("cpu", torch.bfloat16):
         assert torch.equal(network.pillar_net(pillars), whole)
         assert network.features(pillars).dtype == torch.bfloat16
+
+
+def test_a_network_in_16_bits_says_about_the_same_in_float32():
+    config = tiny()
+    pillars = make_pillars([some_points(config)], config)
+    said = {}
+    with torch.inference_mode():
+        for amp in ("off", "bf16"):
+            logits, boxes_at = TorchNetwork(lively(config), amp=amp)(pillars, None)
+            said[amp] = torch.cat([logits, *boxes_at(torch.arange(len(logits)))], dim=1)
+    assert said["bf16"].dtype == torch.float32 and not torch.equal(said["bf16"], said["off"])
+    assert (said["bf16"] - said["off"]).abs().max() < 0.05 * said["off"].abs().max()
 
 
 def test_moving_the_points_by_a_pillar_moves_the_image_by_a_cell():

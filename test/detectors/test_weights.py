@@ -184,6 +184,8 @@ def test_export_writes_from_a_checkpoint_and_bad_files_are_refused(saved, tmp_pa
                 load_detector(path, "cpu", eager())(frame()), 1e-4)
     with pytest.raises(InputError, match="not on 'cuda'"):
         load_detector(out, "cuda")
+    with pytest.raises(InputError, match="set amp: off"):
+        load_detector(out, "cpu", with_values(eager(), {"pointpillars.amp": "bf16"}))
     (tmp_path / "bad.onnx").write_bytes(out.read_bytes()[:-50])
     for name, words in ("bad.onnx", "cannot read"), ("none.onnx", "no exported network"):
         with pytest.raises(InputError, match=words):

@@ -34,6 +34,7 @@ from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import weights_file as classifier_file
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as proposer_file
+from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.comparison.contenders import contenders
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.training.fusing import FEWEST, Samples, fitted, samples_of
@@ -160,6 +161,8 @@ def test_a_detector_weighs_by_its_own_curves(others):
     odds = [detector.with_min_score(0.0)(scan).detections for detector in (mine, theirs)]
     assert len(odds[0]) and not same(*odds)
     assert mine.seeing("around").models is models and loaded.seeing("around").doubt is None
+    half = with_values(loaded.params, {"fused.amp": "bf16", "fused.warm_up": False})
+    assert load_fused_detector(path, "cpu", half).proposer.network.amp == "bf16"
 
 
 def test_a_damaged_file_is_used_or_refused_with_one_line(tmp_path):

@@ -196,8 +196,9 @@ def load_fused_detector(path: str | Path = "", device: str = "auto",
     settings = params.fused
     fusion = fusion_of(path, settings)
     proposer = load_detector(fusion.proposer, device, DetectorParams(
-        pointpillars=PointPillarsParams(range=settings.range, threads=settings.threads,
-                                        warm_up=False, cpu_fallback=settings.cpu_fallback)))
+        pointpillars=PointPillarsParams(range=settings.range, amp=settings.amp, warm_up=False,
+                                        threads=settings.threads,
+                                        cpu_fallback=settings.cpu_fallback)))
     classifier = load_pointnet_detector(fusion.classifier, device, PointNetDetectorParams(
         pointnet=PointNetParams(warm_up=False, cpu_fallback=settings.cpu_fallback)))
     detector = FusedDetector(proposer, classifier, params, fusion.models)

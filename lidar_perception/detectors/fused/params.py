@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.clustering.params import ClusteringParams
-from lidar_perception.detectors.params import NetworkParams, seen_range
+from lidar_perception.detectors.params import NetworkParams, layers_format, seen_range
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
@@ -27,6 +27,7 @@ class FusedParams(NetworkParams):
     classifier: str = param("", "Checkpoint of the cluster network; empty: the one that comes with "
                             "the package.", fixed=True)
     range: str = seen_range()
+    amp: str = layers_format()
     proposals: float = param(0.02, "Least score of PointPillars for a box to be looked at.",
                              low=0.001, high=1.0)
     same_place: float = param(0.6, "People, and cyclists, whose centres are nearer than this are "

@@ -17,7 +17,7 @@ from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.calibration import calibrated
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found
-from lidar_perception.detectors.devices import CPU, chosen_device
+from lidar_perception.detectors.devices import CPU, chosen_device, number_format
 from lidar_perception.detectors.nms import best_of_each, suppressed
 from lidar_perception.detectors.pointpillars.anchors import make_anchors
 from lidar_perception.detectors.pointpillars.box_coder import decode
@@ -56,17 +56,21 @@ class Network(Protocol):
 
 
 class TorchNetwork:
-    """A network on a device, its norms folded into its layers."""
+    """A network on a device, its norms folded into its layers, which work in the format of
+    number_format(amp)."""
 
-    def __init__(self, network: PointPillars, device: torch.device = CPU):
-        self.network = fused(network).to(device)
+    def __init__(self, network: PointPillars, device: torch.device = CPU, amp: str = "off"):
+        self.network, self.amp = fused(network).to(device), amp
 
     def to(self, device: torch.device) -> None:
         """Move to another device."""
         self.network.to(device)
 
     def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
-        features = self.network.features(pillars, maps)
+        device = pillars.points.device
+        numbers = number_format(self.amp, device)
+        with torch.autocast(device.type, numbers, enabled=numbers is not None):
+            features = self.network.features(pillars, maps).float()
         head = self.network.head
         return head.logits(features)[0], lambda anchors: head.boxes_at(features, anchors)
 
@@ -261,10 +265,13 @@ def load_detector(path: str | Path = "", device: str = "auto",
         if device not in ("auto", "cpu"):
             raise InputError(f"{path} runs in ONNX Runtime on the CPU, not on {device!r}; use the "
                              "checkpoint it was exported from")
+        if params.pointpillars.amp == "bf16":
+            raise InputError(f"{path} works in the numbers it was exported with; set amp: off, or "
+                             "use the checkpoint it was exported from")
     else:
         where = chosen_device(device)
         header, loaded = load_network(path)
-        network = TorchNetwork(loaded, CPU)
+        network = TorchNetwork(loaded, CPU, params.pointpillars.amp)
     for name in "version", "size":
         wanted, found = getattr(params.pointpillars, name), getattr(header.config, name)
         if wanted not in ("auto", found):
