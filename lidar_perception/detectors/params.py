@@ -65,9 +65,9 @@ def seen_range() -> Any:
 
 def layers_format() -> Any:
     """The parameter of detectors with PointPillars that says in which numbers its layers work."""
-    return param("off", "Number format of PointPillars' layers. off: float32. auto: bf16 where the "
-                 "device has instructions for it, and the layers take half the time; scores then "
-                 "differ by some thousandths. bf16: wherever it runs.",
+    return param("off", "Number format of PointPillars' layers. off: float32. auto: 16 bits (bf16, "
+                 "on older GPUs fp16) where the device has instructions for it, so that they take "
+                 "half the time; scores differ a little. bf16: wherever it runs.",
                  choices=("off", "auto", "bf16"), fixed=True)
 
 
