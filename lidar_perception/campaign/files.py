@@ -111,6 +111,7 @@ def _put(path: Path, data: bytes) -> None:
 
 def _replace(path: Path, instead: str, data: bytes) -> None:
     _remove(path)
+    path.parent.mkdir(parents=True, exist_ok=True)  # of what is made only where it is damaged
     if instead == "a folder":
         path.mkdir()
     elif instead == "a pipe":

@@ -209,6 +209,12 @@ def test_the_short_campaign_finds_nothing(part, cases, tmp_path):
     assert tally.tried == cases and tally.verdicts[SURVIVED] >= cases // 10
 
 
+@pytest.mark.parametrize("instead", files.INSTEAD)
+def test_a_file_is_replaced_also_where_its_folder_is_made_with_it(instead, tmp_path):
+    files._replace(tmp_path / "onnx/weights.onnx", instead, b"")
+    assert os.path.lexists(tmp_path / "onnx/weights.onnx") == (instead != "nothing")
+
+
 def test_a_pipe_in_the_place_of_a_file_is_refused_and_not_waited_for(tmp_path):
     (tmp_path / "bag").mkdir()
     for path in ("bag/bag.mcap", "pipe.bin"):
