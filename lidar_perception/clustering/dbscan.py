@@ -13,6 +13,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from lidar_perception.clustering.dense import dbscan_by_cells
+from lidar_perception.clustering.grid import stable_order
 from lidar_perception.clustering.growing import dbscan_by_growing
 from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.clustering.thinned import SLACK, patience, thinned
@@ -56,17 +57,10 @@ def _by_band(xyz, limits):
     """order (N,): the points of each band of horizontal range, in their order, band by band; and
     start (B + 1,) of each band."""
     band = np.empty(len(xyz), np.int64)
-    start = np.zeros(len(limits) + 2, np.int64)
     for i in range(len(xyz)):
         away = np.sqrt(xyz[i, 0] * xyz[i, 0] + xyz[i, 1] * xyz[i, 1])  # float32: horizontal_range
         band[i] = np.searchsorted(limits, away, side="right")
-        start[band[i] + 1] += 1
-    start = np.cumsum(start)
-    place, order = start.copy(), np.empty(len(xyz), np.int64)
-    for i in range(len(xyz)):
-        order[place[band[i]]] = i
-        place[band[i]] += 1
-    return order, start
+    return stable_order(band, len(limits) + 1, np.arange(len(xyz)))
 
 
 def _joined(xyz: np.ndarray, bands: list[np.ndarray], labels: np.ndarray,

@@ -47,7 +47,7 @@ def grid(xyz, side, reach):
                 break
             slot = (slot + 1) & mask
         column[i] = c
-    order = _stable_order(column, columns, _order_by_height(z))
+    order = stable_order(column, columns, _order_by_height(z))[0]
 
     cell_start, cell_z = np.empty(n + 1, np.int64), np.empty(n, np.int64)
     column_start = np.empty(columns + 1, np.int64)
@@ -87,22 +87,23 @@ def _order_by_height(z):
     low, high = z.min(), z.max()
     if high - low > 8 * len(z) + 4096:  # far outliers: too many levels to count
         return np.argsort(z, kind="mergesort")
-    return _stable_order((z - low).astype(np.int32), high - low + 1, np.arange(len(z)))
+    return stable_order((z - low).astype(np.int32), high - low + 1, np.arange(len(z)))[0]
 
 
 @njit(cache=True, nogil=True)
-def _stable_order(keys, count, first):
-    """`first` reordered by keys 0..count-1; equal keys keep their order. Counting sort."""
+def stable_order(keys, count, first):
+    """order (N,): `first` reordered by keys (N,) 0..count-1, equal keys keep their order; and start
+    (count + 1,): those of key k are from start[k] to start[k + 1]. Counting sort."""
     start = np.zeros(count + 1, np.int64)
     for key in keys:
         start[key + 1] += 1
     for i in range(count):
         start[i + 1] += start[i]
-    order = np.empty(len(keys), np.int64)
+    place, order = start[:-1].copy(), np.empty(len(keys), np.int64)
     for i in first:
-        order[start[keys[i]]] = i
-        start[keys[i]] += 1
-    return order
+        order[place[keys[i]]] = i
+        place[keys[i]] += 1
+    return order, start
 
 
 @njit(cache=True, nogil=True)

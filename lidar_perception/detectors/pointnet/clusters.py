@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
+from lidar_perception.clustering.grid import stable_order
 from lidar_perception.geometry import points_in_boxes
 from lidar_perception.groups import groups_of
 from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
@@ -118,15 +119,10 @@ def ground_under(xyz: np.ndarray, xy: np.ndarray) -> np.ndarray:
 
 @njit(cache=True, nogil=True)
 def _ground_under(xyz, xy):
-    cell, start = np.empty(len(xyz), np.int64), np.zeros(CELLS * CELLS + 1, np.int64)
+    cell = np.empty(len(xyz), np.int64)
     for i in range(len(xyz)):
         cell[i] = _cell(xyz[i, 0], 0) * CELLS + _cell(xyz[i, 1], 0)
-        start[cell[i] + 1] += 1
-    start = np.cumsum(start)
-    free, order = start.copy(), np.empty(len(xyz), np.int64)
-    for i in range(len(xyz)):
-        order[free[cell[i]]] = i
-        free[cell[i]] += 1
+    order, start = stable_order(cell, CELLS * CELLS, np.arange(len(xyz)))
     heights = np.full(len(xy), -SENSOR_HEIGHT)
     for k in range(len(xy)):
         x, y = xy[k]
