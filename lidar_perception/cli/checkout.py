@@ -17,6 +17,7 @@ from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
 MAX_WORKERS = 4  # each holds torch and compiles what it runs
+NODE_WORKERS = 2  # of tests that mostly wait
 WITH_PROCESSES = ("test/ros", "test/launch", "test/testing")
 # What Numba compiles for all of this is cached beside the source, for each process after this one.
 COMPILE = ("""
@@ -40,8 +41,8 @@ PASS_ON = dict(ignore_unknown_options=True, help_option_names=[])
 def test(arguments: tuple[str, ...]) -> None:
     """Run the tests of this checkout; ARGUMENTS go to pytest.
 
-    Without ARGUMENTS ruff, mypy, and all tests: those of the core on all cores, and beside them,
-    one by one, those with processes that talk to each other. What Numba compiles is compiled before
+    Without ARGUMENTS ruff, mypy, and all tests: those of the core on all cores, and beside them
+    those with processes that talk to each other, two at a time. What Numba compiles is compiled before
     them, once, while ruff and mypy run. The lines that the tests run are measured, in all
     processes, but for long tests that run the lines of others, such as those of Hypothesis, as
     they would take twice as long; at least as many as setup.cfg says must be.
@@ -93,11 +94,9 @@ def _everything(folder: Path) -> list[str]:
         compiling.failed()
     Beside("-c", last).failed()
     # Nodes mostly wait, so their tests run beside the others.
-    running["tests of nodes"] = Beside(*pytest, *nodes, environment={
+    running["tests of nodes"] = Beside(*pytest, *_dealt(NODE_WORKERS), *nodes, environment={
         **environment, "COVERAGE_FILE": str(folder / "nodes")})
-    # By their number of tests, the files that take longest would come last.
-    dealt = ("-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder")
-    core = subprocess.run([sys.executable, *pytest, *dealt,
+    core = subprocess.run([sys.executable, *pytest, *_dealt(workers),
                            *(f"--ignore={name}" for name in nodes)], cwd=ROOT, env=environment)
     failed = ["tests"] * bool(core.returncode)
     failed += [name for name, command in running.items() if command.failed()]
@@ -106,6 +105,12 @@ def _everything(folder: Path) -> list[str]:
                     str(folder / "nodes")], cwd=ROOT, env=environment)
     covered = subprocess.run([*coverage, "report"], cwd=ROOT, env=environment)
     return [*failed, *["coverage"] * bool(covered.returncode)]
+
+
+def _dealt(workers: int) -> tuple[str, ...]:
+    """Options of pytest, for so many processes: whole files, in their order, as by their number of
+    tests those that take longest would come last."""
+    return "-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"
 
 
 @click.command(context_settings=PASS_ON)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ from lidar_perception.training.augment import TrainingScene
 from lidar_perception.training.data import ReadScenes
 from lidar_perception.training.params import ClusterAugmentParams
 from lidar_perception.training.pointnet import cut_scenes
-from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes, cut
+from lidar_perception.training.pointnet.cut_scenes import SPARSE, CutScene, CutScenes, cut
 from lidar_perception.training.pointnet.task import (
     FEWEST,
     ClusterPreparation,
@@ -166,30 +166,40 @@ def test_loose_clusters_are_cut_near_their_boxes_and_none_is_left_empty(rng):
     assert (changed(tiny, BOXES, np.ones(4, bool), hard, rng)[0].sizes == 3).all()
 
 
-def test_a_scene_is_cut_by_our_own_clustering_and_around_its_objects(rng, tmp_path):
+def a_scene(rng):
+    """A car, a pedestrian and a cyclist on flat ground; the cyclist is not wanted."""
     flat = np.column_stack([rng.uniform(-20, 30, (12_000, 2)), rng.normal(-1.73, 0.01, 12_000),
                             rng.random(12_000)])
-    objects = in_boxes(rng, BOXES[:3], 500).points
-    points = np.concatenate([flat, objects]).astype(np.float32)
-    scene = TrainingScene(points, BOXES[:3], ids("Car", "Pedestrian", "Cyclist"),
-                  np.array([True, True, False]))
+    points = np.concatenate([flat, in_boxes(rng, BOXES[:3], 500).points]).astype(np.float32)
+    return TrainingScene(points, BOXES[:3], ids("Car", "Pedestrian", "Cyclist"),
+                         np.array([True, True, False]))
+
+
+@dataclass(frozen=True)
+class Alike:
+    """So many times the same scene."""
+
+    one: TrainingScene
+    count: int = 1
+
+    def __len__(self):
+        return self.count
+
+    def key(self, i):
+        return "one"
+
+    def scene(self, i):
+        return self.one
+
+
+def test_a_scene_is_cut_by_our_own_clustering_and_around_its_objects(rng, tmp_path):
+    scene = a_scene(rng)
     made = cut(scene, CONFIG, 5)
     assert set(made.labels[~made.loose]) == {0, 1, UNKNOWN}  # of the cyclist too little is seen
     assert made.labels[made.loose].tolist() == [0, 1]
     assert np.array_equal(made.boxes[made.loose], BOXES[:2])
     assert not made.boxes[made.labels == UNKNOWN].any() and made.boxes[made.labels == 1].any()
-
-    class One:
-        def __len__(self):
-            return 1
-
-        def key(self, i):
-            return "one"
-
-        def scene(self, i):
-            return scene
-
-    source = CutScenes(One(), CONFIG, 5, tmp_path)
+    source = CutScenes(Alike(scene), CONFIG, 5, tmp_path)
     first, again = source.scene(0), source.scene(0)  # the second from the cache
     assert len(list(tmp_path.iterdir())) == 1
     for name in ("labels", "boxes", "loose"):
@@ -197,9 +207,30 @@ def test_a_scene_is_cut_by_our_own_clustering_and_around_its_objects(rng, tmp_pa
     assert np.array_equal(first.clusters.points, again.clusters.points)
     next(tmp_path.iterdir()).write_bytes(b"broken")
     assert np.array_equal(source.scene(0).labels, first.labels)
-    other = CutScenes(One(), pointnet_config("base"), 5, tmp_path)
+    other = CutScenes(Alike(scene), pointnet_config("base"), 5, tmp_path)
     other.scene(0)
     assert len(list(tmp_path.iterdir())) == 2  # made in another way
+
+
+def test_some_scenes_are_thinned_as_a_whole_and_always_the_same_ones(rng, tmp_path):
+    scene, count = a_scene(rng), 40
+    none, half, all_ = (CutScenes(Alike(scene, count), CONFIG, 5, tmp_path, sparse=sparse)
+                        for sparse in (0.0, 0.5, 1.0))
+    assert {none.share(i) for i in range(count)} == {1.0}
+    assert all(SPARSE[0] <= all_.share(i) <= SPARSE[1] for i in range(count))
+    shares = [half.share(i) for i in range(count)]
+    assert 10 < sum(share < 1 for share in shares) < 30
+    assert all(share in (1.0, all_.share(i)) for i, share in enumerate(shares))
+    whole, known = none.scene(0), set(map(bytes, scene.points))
+    sizes = []
+    for i in range(count):
+        thinned, again = all_.scene(i), all_.scene(i)  # the second from the cache
+        assert np.array_equal(thinned.clusters.points, again.clusters.points)
+        assert known >= set(map(bytes, thinned.clusters.points))
+        sizes.append(thinned.clusters.sizes[(thinned.labels == 0) & thinned.loose][0])
+    car = whole.clusters.sizes[(whole.labels == 0) & whole.loose][0]
+    expected = np.array([all_.share(i) for i in range(count)]) * car
+    assert (np.abs(sizes - expected) < 5 * np.sqrt(expected)).all()
 
 
 def test_of_what_a_proposer_finds_where_nothing_is_the_network_learns_that_it_is_none(

@@ -5,7 +5,7 @@ So a network sees the errors that it will see later: objects in pieces, objects 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,8 @@ from lidar_perception.training.augment import TrainingScene, raised
 from lidar_perception.training.cache import kept, path_in, state_of
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, LidarFrame
 
+SPARSE = 0.08, 0.7  # of the points stay where a scene is thinned,
+FEWEST = 3          # and a cluster counts there that has so many left
 AROUND = 0.3  # m: points so near to an object are looked at, too
 DECOYS = 24    # in a scene, at most
 PROPOSED = 14  # proposals of each class among them, where there is a proposer,
@@ -48,13 +50,15 @@ class CutScene:
 class CutScenes:
     """scene(i): the clusters of a scene of `scenes`, as a network of the config is to see them, of
     min_points or more. cache: folder for them, or None. proposer: a file of PointPillars' weights
-    whose proposals are among the decoys, or None."""
+    whose proposals are among the decoys, or None. sparse: so many of the scenes, 0..1, are thinned
+    as a whole before they are cut, as a sparser sensor would see them; always the same ones."""
 
     scenes: Any
     config: PointNetConfig
     min_points: int = 5
     cache: Path | None = None
     proposer: Path | None = None
+    sparse: float = 0.0
 
     def __len__(self) -> int:
         return len(self.scenes)
@@ -63,11 +67,19 @@ class CutScenes:
         """The frame that it is cut from, to validate on."""
         return self.scenes.frame(i)
 
+    def share(self, i: int) -> float:
+        """Of the points of scene i that stay."""
+        rng = np.random.default_rng(i)
+        if rng.random() >= self.sparse:
+            return 1.0
+        return float(np.exp(rng.uniform(*np.log(SPARSE))))
+
     def path(self, i: int) -> Path | None:
         """The file that keeps the clusters of scene i."""
         proposer = [] if self.proposer is None else [state_of(self.proposer)]
+        thinned = [share] if (share := self.share(i)) < 1 else []
         return path_in(self.cache, self.scenes.key(i), self.config.ground, self.config.clustering,
-                       self.config.classes, self.min_points, *proposer)
+                       self.config.classes, self.min_points, *proposer, *thinned)
 
     def keep(self, i: int) -> None:
         """Put it into the cache."""
@@ -75,8 +87,15 @@ class CutScenes:
 
     def scene(self, i: int) -> CutScene:
         """InputError naming the file that cannot be used."""
-        return kept(self.path(i), lambda: cut(self.scenes.scene(i), self.config, self.min_points,
-                                              self.proposer), _read, _arrays)
+        return kept(self.path(i), lambda: self._cut(i), _read, _arrays)
+
+    def _cut(self, i: int) -> CutScene:
+        scene, share = self.scenes.scene(i), self.share(i)
+        if share == 1:
+            return cut(scene, self.config, self.min_points, self.proposer)
+        left = np.random.default_rng([i, 1]).random(len(scene.points)) < share
+        return cut(replace(scene, points=scene.points[left]), self.config,
+                   min(self.min_points, FEWEST), self.proposer)
 
 
 def cut(scene: TrainingScene, config: PointNetConfig, min_points: int,

@@ -99,8 +99,10 @@ class PointNetStart:
             cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
         """The clusters of all scenes."""
         proposer = proposer_of(params)
-        cuts = [CutScenes(source, self.config, params.data.min_points, cache / "clusters", proposer)
-                for source in (*sources, *held_out)]
+        cuts = [CutScenes(source, self.config, params.data.min_points, cache / "clusters", proposer,
+                          sparse)
+                for those, sparse in ((sources, params.augment.sparse), (held_out, 0.0))
+                for source in those]
         return cuts, [range(len(source)) for source in cuts]
 
     def gather(self, params: PointNetTraining, cut: tuple[list[Any], list], out: Path) -> None:

@@ -34,12 +34,11 @@ from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.training.augment import noisy, varied
 from lidar_perception.training.data import Batches, ReadScenes, loaded
 from lidar_perception.training.params import ClusterAugmentParams, PointNetTraining
-from lidar_perception.training.pointnet.cut_scenes import CutScene, CutScenes
+from lidar_perception.training.pointnet.cut_scenes import FEWEST, CutScene, CutScenes
 from lidar_perception.training.record import begun_with, judged, keeper, name_skipped
 from lidar_perception.training.run import Judged, Task
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
-FEWEST = 3          # points that are left of a cluster, at least
 SCORED_POINTS = 10  # clusters with fewer do not count in the accuracy
 
 
