@@ -42,8 +42,8 @@ def test(arguments: tuple[str, ...]) -> None:
     """Run the tests of this checkout; ARGUMENTS go to pytest.
 
     Without ARGUMENTS ruff, mypy, and all tests: those of the core on all cores, and beside them
-    those with processes that talk to each other, two at a time. What Numba compiles is compiled before
-    them, once, while ruff and mypy run. The lines that the tests run are measured, in all
+    those with processes that talk to each other, two at a time. What Numba compiles is compiled
+    before them, once, while ruff and mypy run. The lines that the tests run are measured, in all
     processes, but for long tests that run the lines of others, such as those of Hypothesis, as
     they would take twice as long; at least as many as setup.cfg says must be.
 
