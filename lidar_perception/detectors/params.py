@@ -71,6 +71,12 @@ def layers_format() -> Any:
                  choices=("off", "auto", "bf16"), fixed=True)
 
 
+def share_on_points() -> Any:
+    """The parameter of detectors that put cars where their points are."""
+    return param(0.75, "How far cars are moved so that their points begin at the faces that are "
+                 "seen; 0: not at all.", low=0.0, high=1.0)
+
+
 @dataclass(frozen=True)
 class NetworkParams(Params):
     """Where a detector's network runs, and what counts as a detection."""

@@ -16,8 +16,15 @@ from pointnet_samples import random_detector as random_classifier
 
 from lidar_perception.classes import CAR
 from lidar_perception.detectors.base import Place
+from lidar_perception.detectors.boxes import (
+    FRONT,
+    MARGIN,
+    SIDE,
+    cars_on_points,
+    on_ground,
+    on_points,
+)
 from lidar_perception.detectors.devices import CPU
-from lidar_perception.detectors.fused.boxes import FRONT, MARGIN, SIDE, on_ground, on_points
 from lidar_perception.detectors.fused.detector import FusedDetector, one_of_each
 from lidar_perception.detectors.fused.evidence import LEAST, clipped_logit
 from lidar_perception.detectors.fused.fusion import KNOTS, package_models
@@ -100,6 +107,8 @@ def test_a_car_that_is_off_comes_to_its_points_and_one_that_is_right_stays(seed)
     np.testing.assert_allclose(half, (off + box) / 2, atol=0.02)
     np.testing.assert_array_equal(on_points(off[None], points, 0.0)[0], off)
     np.testing.assert_array_equal(on_points(off[None], points[:0], 1.0)[0], off)
+    cars = cars_on_points(np.stack([off, off]), np.array([CAR, PEDESTRIAN]), points, 1.0)
+    np.testing.assert_array_equal(cars, [on_points(off[None], points, 1.0)[0], off])
     # Never farther than the margin, however far the points are.
     assert np.hypot(*(on_points(off[None], points + [0.3, 0, 0], 1.0) - off)[0, :2]) <= 2 * MARGIN
 

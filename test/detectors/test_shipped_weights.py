@@ -7,11 +7,13 @@ import pytest
 
 from lidar_perception.classes import CAR
 from lidar_perception.data.open import open_recording
+from lidar_perception.detectors.boxes import MARGIN
 from lidar_perception.detectors.checkpoint import network_of
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointnet.weights_file import WEIGHTS as POINTNET
 from lidar_perception.detectors.pointnet.weights_file import judge_file
 from lidar_perception.detectors.pointpillars.weights_file import WEIGHTS
+from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.sensor import HDL64E
@@ -59,6 +61,21 @@ def test_each_finds_most_cars_that_are_plain_to_see(file, scans):
         found += len(boxes)
         hits += len(match_centres(mine[:, :3], boxes[:, :3], 1.0)[0])
     assert found >= 4 and hits >= 0.7 * found
+
+
+@pytest.mark.parametrize("name", ["pointnet", "fused"])
+def test_cars_alone_are_moved_to_where_their_points_begin(name, scans):
+    detector = open_detector(name, "cpu")
+    found = []
+    for share in (0.0, 1.0):
+        detector.params = with_values(detector.params, {f"{name}.on_points": share})
+        found.append(detector(scans[0].frame).detections)
+    before, after = found
+    cars = before.class_ids == CAR
+    ways = np.hypot(*(after.boxes - before.boxes)[:, :2].T)
+    assert 0.02 < ways[cars].max() <= MARGIN * 2**0.5 + 1e-5 and not ways[~cars].any()
+    np.testing.assert_array_equal(after.boxes[:, 3:], before.boxes[:, 3:])
+    np.testing.assert_array_equal(after.scores, before.scores)
 
 
 def test_no_car_is_seen_where_the_recording_car_is(data):

@@ -15,8 +15,8 @@ import torch
 from lidar_perception.classes import CAR
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.boxes import cars_on_points, on_ground
 from lidar_perception.detectors.contract import Found
-from lidar_perception.detectors.fused.boxes import on_ground, on_points
 from lidar_perception.detectors.fused.evidence import Evidence, clipped_logit, judged, silhouette_at
 from lidar_perception.detectors.fused.fusion import Models, fusion_of, package_models
 from lidar_perception.detectors.fused.model import at_most, probabilities, sources
@@ -157,8 +157,7 @@ class FusedDetector(NetworkDetector):
             return found, {
                 name: float(every.scores[every.class_ids == CLASSES.index(name)].max(initial=0.0))
                 for name in self.classes}
-        boxes, cars = found.boxes.astype(np.float64), found.class_ids == CAR
-        boxes[cars] = on_points(boxes[cars], look.xyz, settings.on_points)
+        boxes = cars_on_points(found.boxes, found.class_ids, look.xyz, settings.on_points)
         floors = surface_under(look.ground, boxes[:, :2])
         moved = replace(found, boxes=on_ground(boxes, floors, settings.on_ground).astype(
             np.float32))

@@ -6,7 +6,12 @@ from dataclasses import dataclass
 
 from lidar_perception.candidates.configurations import BEST
 from lidar_perception.clustering.params import ClusteringParams
-from lidar_perception.detectors.params import NetworkParams, layers_format, seen_range
+from lidar_perception.detectors.params import (
+    NetworkParams,
+    layers_format,
+    seen_range,
+    share_on_points,
+)
 from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EXPERT_GROUND
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
@@ -36,8 +41,7 @@ class FusedParams(NetworkParams):
                             low=0.0, high=1.0)
     on_ground: float = param(0.5, "How far boxes are moved to the ground that is seen around "
                              "them; 0: not at all, 1: onto it.", low=0.0, high=1.0)
-    on_points: float = param(0.75, "How far cars are moved so that their points begin at the "
-                             "faces that are seen; 0: not at all.", low=0.0, high=1.0)
+    on_points: float = share_on_points()
 
 
 @dataclass(frozen=True)

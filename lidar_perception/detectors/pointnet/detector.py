@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -10,6 +11,7 @@ import torch
 
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector
+from lidar_perception.detectors.boxes import cars_on_points
 from lidar_perception.detectors.calibration import calibrated
 from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found
@@ -69,7 +71,9 @@ class PointNetDetector(NetworkDetector):
         predicted = self.guarded(lambda: predict(self.network, clusters))
         t5 = self.now()
         detections, best, broken = self._detections(predicted)
-        detections = as_found(detections, pose)
+        boxes = cars_on_points(detections.boxes, detections.class_ids, clusters.points,
+                               self.settings.on_points)
+        detections = as_found(replace(detections, boxes=boxes.astype(np.float32)), pose)
         t6 = perf_counter()
         ms = {step: seconds * 1e3 for step, seconds in zip(
             STEPS, (t1 - t0 + t4 - t3, t2 - t1, t3 - t2, t5 - t4, t6 - t5))}

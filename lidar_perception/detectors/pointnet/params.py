@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lidar_perception.clustering.params import ClusteringParams
-from lidar_perception.detectors.params import NetworkParams
+from lidar_perception.detectors.params import NetworkParams, share_on_points
 from lidar_perception.detectors.pointnet.config import PointNetConfig
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
@@ -23,6 +23,7 @@ class PointNetParams(NetworkParams):
     max_clusters: int = param(4000, "Clusters that are looked at, the nearest first; a scan has "
                               "some hundred. The diagnostics say how many are left out.", low=1,
                               high=1_000_000)
+    on_points: float = share_on_points()
 
 
 INPUT = InputParams()

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from lidar_perception.classes import CAR
 from lidar_perception.geometry import points_in_boxes
 
 MARGIN = 0.4   # metres around a box in which its points are looked for
@@ -26,6 +27,15 @@ def on_ground(boxes: np.ndarray, floors: np.ndarray, share: float) -> np.ndarray
     moved = boxes.copy()
     way = share * (floors - (boxes[:, 2] - boxes[:, 5] / 2))
     moved[:, 2] += np.where(np.isfinite(way), way, 0.0)
+    return moved
+
+
+def cars_on_points(boxes: np.ndarray, class_ids: np.ndarray, xyz: np.ndarray,
+                   share: float) -> np.ndarray:
+    """Boxes (K, 7) float64, of which the cars, by class_ids (K,), are moved, see on_points."""
+    moved, cars = np.array(boxes, np.float64), class_ids == CAR
+    if share and cars.any():
+        moved[cars] = on_points(moved[cars], xyz, share)
     return moved
 
 
