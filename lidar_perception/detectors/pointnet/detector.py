@@ -71,8 +71,8 @@ class PointNetDetector(NetworkDetector):
         predicted = self.guarded(lambda: predict(self.network, clusters))
         t5 = self.now()
         detections, best, broken = self._detections(predicted)
-        boxes = cars_on_points(detections.boxes, detections.class_ids, clusters.points,
-                               self.settings.on_points)
+        boxes = cars_on_points(detections.boxes, detections.class_ids,
+                               seen.xyz.compress(~ground, axis=0), self.settings.on_points)
         detections = as_found(replace(detections, boxes=boxes.astype(np.float32)), pose)
         t6 = perf_counter()
         ms = {step: seconds * 1e3 for step, seconds in zip(
