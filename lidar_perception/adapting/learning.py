@@ -55,7 +55,7 @@ def training_params(header: Header, params: AdaptParams, frames: int, height: fl
     if header.network == POINTPILLARS:
         around = "around" if header.config.low[0] < 0 else "ahead"
         return with_values(PointPillarsTraining(), {**values, "range": around})
-    return with_values(PointNetTraining(), {**values, "augment.sparse": 0.0})
+    return with_values(PointNetTraining(), values)
 
 
 def simulated_frames(asked: Asked, params: Any, sensor: Sensor) -> list[Frame]:

@@ -183,7 +183,7 @@ class ClusterAugmentParams(ThingParams):
                          high=1000)
     background: int = param(40, "Background clusters taken from a scene, at most.", low=0,
                             high=10_000)
-    sparse: float = param(0.5, "Share of the scenes that keep only 8 to 70 % of their points, "
+    sparse: float = param(0.0, "Share of the scenes that keep only 8 to 70 % of their points, "
                                "before they are cut, as from a sparser sensor.",
                           low=0.0, high=1.0)
     box_shift: float = param(0.15, "Objects are also cut out by their boxes, shifted by this; "
