@@ -58,7 +58,9 @@ def test_density_is_that_of_the_sensors_steps_wherever_the_surfaces_are(up, asid
 def test_density_is_the_share_of_the_points_that_is_left(scan, share, seed):
     xyz = scan.frame.xyz
     kept = np.random.default_rng(seed).random(len(xyz)) < share
-    assert density(xyz[kept]) == pytest.approx(share * density(xyz), rel=0.08)
+    # Of a whole scan every fourth point is looked at, of whose neighbours 5 % are missed; and four
+    # standard deviations of the drawing, which is 0.4 % by the root of the share.
+    assert density(xyz[kept]) == pytest.approx(share * density(xyz), rel=0.06 + 0.016 * share**-0.5)
 
 
 def test_density_of_a_cropped_cloud_is_that_of_the_whole(scan):
