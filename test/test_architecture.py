@@ -130,6 +130,11 @@ def test_the_core_imports_no_ros_no_nodes_and_no_command_line(name):
     assert above == []
 
 
+@for_all([name for name in SOURCES if not name.startswith("lidar_perception/nodes/")])
+def test_rclpy_is_imported_by_nodes_alone(name):
+    assert [m for m in imports(name) if within(m, ["rclpy"])] == []
+
+
 @for_all(files_in("lidar_perception/cli"))
 def test_the_command_line_imports_no_ros_when_it_is_imported(name):
     ros = {m for m in imports(name, everywhere=False) if m.partition(".")[0] in ROS}

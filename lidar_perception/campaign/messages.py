@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rclpy.context import Context
-from rclpy.parameter import Parameter
 
 from lidar_perception.campaign.case import FAILED, REFUSED, SURVIVED, Case, Outcome, generator, pick
 from lidar_perception.campaign.good import CLOUD, good, mutated
@@ -21,7 +19,7 @@ from lidar_perception.nodes import NODES
 from lidar_perception.nodes.graph import private_domain
 from lidar_perception.nodes.reception import Reception
 from lidar_perception.nodes.runtime import ERROR, MARKERS, OK
-from lidar_perception.nodes.watch import new_context
+from lidar_perception.nodes.watch import Context, new_context, parameters_of
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode
 from lidar_perception.wire.transforms import ODOMETRY_MESSAGE
@@ -103,7 +101,7 @@ class Tried:
         module = importlib.import_module(f"lidar_perception.nodes.{name}")
         self.node = getattr(module, NODES[name][0])(
             context=context, enable_rosout=False, start_parameter_services=False,
-            parameter_overrides=[Parameter(k, value=v) for k, v in values.items()])
+            parameter_overrides=parameters_of(values))
         self.node.start()
         self.inputs = TRIED[name][1]
         self.calls = {s.topic_name.removeprefix(f"/{name}").lstrip("/"): s.callback
@@ -141,8 +139,7 @@ class Tried:
     def set(self, params: dict[str, Any]) -> None:
         """Change parameters of the node, as at run time."""
         if params != self.params:
-            for result in self.node.set_parameters(
-                    [Parameter(name, value=value) for name, value in params.items()]):
+            for result in self.node.set_parameters(parameters_of(params)):
                 if not result.successful:
                     raise InputError(result.reason)
             self.params = params

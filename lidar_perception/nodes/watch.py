@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import struct
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import contextmanager
 from time import monotonic, sleep
 from typing import Any, Self
@@ -14,6 +14,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import MarkerArray
@@ -31,6 +32,16 @@ def new_context(domain: int | None) -> Context:
     context = Context()
     rclpy.init(context=context, domain_id=domain, signal_handler_options=SignalHandlerOptions.NO)
     return context
+
+
+def parameters_of(values: Mapping[str, Any]) -> list[Parameter]:
+    """What sets parameters of these names to these values."""
+    return [Parameter(name, value=value) for name, value in values.items()]
+
+
+def values_of(answers: Iterable[Any]) -> list[Any]:
+    """The values in a node's answers to get_parameters."""
+    return [parameter_value_to_python(answer) for answer in answers]
 
 
 def leave(context: Context, *nodes: Node) -> None:

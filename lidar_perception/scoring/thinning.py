@@ -14,5 +14,9 @@ def thinned(frame: LidarFrame, share: float, name: str) -> LidarFrame:
     the same; with 1 the frame itself. A smaller share keeps some of the points of a larger one."""
     if share >= 1.0:
         return frame
-    rng = np.random.default_rng(zlib.crc32(name.encode()))
-    return frame.take(np.flatnonzero(rng.random(len(frame)) < share))
+    return frame.take(np.flatnonzero(drawn(len(frame), share, name)))
+
+
+def drawn(count: int, share: float, name: str) -> np.ndarray:
+    """(count,) bool: which of the points of something called name are that share of it."""
+    return np.random.default_rng(zlib.crc32(name.encode())).random(count) < share

@@ -8,12 +8,10 @@ from time import monotonic
 from typing import Any
 
 from rcl_interfaces.srv import GetParameters, SetParameters
-from rclpy.parameter import Parameter, parameter_value_to_python
-from rclpy.qos import QoSProfile
 
 from lidar_perception.nodes.graph import Graph, outputs_in_use
-from lidar_perception.nodes.runtime import RELIABLE
-from lidar_perception.nodes.watch import Outside
+from lidar_perception.nodes.runtime import RELIABLE, QoSProfile
+from lidar_perception.nodes.watch import Outside, parameters_of, values_of
 from lidar_perception.testing.processes import NodesUnderTest
 from lidar_perception.wire.codec import decode, encode, typestore
 from msg_utils.messages import message_class
@@ -165,8 +163,8 @@ class Peer(Outside):
 
     def change(self, node: str, values: Mapping[str, Any]) -> list[str]:
         """Set parameters of a node, each by itself; its reasons where it refuses."""
-        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()
-                                                    for name, value in values.items()])
+        request = SetParameters.Request(
+            parameters=[parameter.to_parameter_msg() for parameter in parameters_of(values)])
         results = self.call(f"{node}/set_parameters", SetParameters, request).results
         return [r.reason or "no reason is given" for r in results if not r.successful]
 
@@ -178,13 +176,12 @@ class Peer(Outside):
     def parameters(self, node: str, values: Mapping[str, Any]) -> Iterator[None]:
         """Other parameters for a while; those from before come back at the end."""
         request = GetParameters.Request(names=list(values))
-        before = self.call(f"{node}/get_parameters", GetParameters, request).values
+        before = values_of(self.call(f"{node}/get_parameters", GetParameters, request).values)
         assert not (refused := self.change(node, values)), refused
         try:
             yield
         finally:
-            assert not self.change(node, {
-                name: parameter_value_to_python(old) for name, old in zip(values, before)})
+            assert not self.change(node, dict(zip(values, before)))
 
 
 def _named(kind: str | type) -> tuple[str, type]:

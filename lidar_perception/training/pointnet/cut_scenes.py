@@ -22,6 +22,7 @@ from lidar_perception.detectors.pointpillars.params import DetectorParams, Point
 from lidar_perception.geometry import bev_iou
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.points.clusters import UNKNOWN, labelled
+from lidar_perception.scoring.thinning import drawn
 from lidar_perception.training.augment import TrainingScene, raised
 from lidar_perception.training.cache import kept, path_in, state_of
 from lidar_perception.types import CLASSES, SENSOR_HEIGHT, LidarFrame
@@ -90,12 +91,11 @@ class CutScenes:
         return kept(self.path(i), lambda: self._cut(i), _read, _arrays)
 
     def _cut(self, i: int) -> CutScene:
-        scene, share = self.scenes.scene(i), self.share(i)
-        if share == 1:
-            return cut(scene, self.config, self.min_points, self.proposer)
-        left = np.random.default_rng([i, 1]).random(len(scene.points)) < share
-        return cut(replace(scene, points=scene.points[left]), self.config,
-                   min(self.min_points, FEWEST), self.proposer)
+        scene, least, share = self.scenes.scene(i), self.min_points, self.share(i)
+        if share < 1:
+            left = drawn(len(scene.points), share, str(i))
+            scene, least = replace(scene, points=scene.points[left]), min(least, FEWEST)
+        return cut(scene, self.config, least, self.proposer)
 
 
 def cut(scene: TrainingScene, config: PointNetConfig, min_points: int,

@@ -98,11 +98,10 @@ class PointNetStart:
     def cut(self, params: PointNetTraining, sources: Sequence[Any], held_out: Sequence[Any],
             cache: Path) -> tuple[list[Any], list[Sequence[int]]]:
         """The clusters of all scenes."""
-        proposer = proposer_of(params)
-        cuts = [CutScenes(source, self.config, params.data.min_points, cache / "clusters", proposer,
-                          sparse)
-                for those, sparse in ((sources, params.augment.sparse), (held_out, 0.0))
-                for source in those]
+        made = partial(CutScenes, config=self.config, min_points=params.data.min_points,
+                       cache=cache / "clusters", proposer=proposer_of(params))
+        cuts = [*(made(source, sparse=params.augment.sparse) for source in sources),
+                *map(made, held_out)]
         return cuts, [range(len(source)) for source in cuts]
 
     def gather(self, params: PointNetTraining, cut: tuple[list[Any], list], out: Path) -> None:
