@@ -16,6 +16,7 @@ from lidar_perception.types import InputError
 from lidar_perception.wire.codec import typestore
 from msg_utils.messages import message_class
 
+LATCHED = DurabilityPolicy.TRANSIENT_LOCAL
 DEPTH = 100  # messages of a topic that may wait at DDS while the machine is busy
 MAX_WAITING = 256 * 2**20  # bytes that wait for the file; what comes then is dropped, and counted
 DISCOVERY_PERIOD = 0.2  # seconds between looks for the type of a topic that is not there yet
@@ -31,7 +32,9 @@ class BagRecorder(LidarNode):
             raise InputError("parameters 'bag' and 'topics' must name the bag and its topics")
         self.writer = BagWriter(self.params.bag)
         self.writer.__enter__()
-        self.waiting = list(self.params.topics)
+        self.waiting = list(dict.fromkeys(map(self.resolve_topic_name, self.params.topics)))
+        self.heard: dict[str, Any] = {}
+        self.unheard: set[str] = set()  # topics of which somebody offers less than was asked for
         self.queue: queue.Queue = queue.Queue()
         self.put, self.done = 0, 0  # bytes, each counted by one thread
         self.counts.update(lost=0, dropped=0)
@@ -56,16 +59,15 @@ class BagRecorder(LidarNode):
                 self.get_logger().warning(f"{topic} is not recorded: {types[topic][0]} is not "
                                           "installed here, or unknown")
                 continue
-            latched = all(q.durability == DurabilityPolicy.TRANSIENT_LOCAL for q in offered)
-            reliable = all(q.reliability == ReliabilityPolicy.RELIABLE for q in offered)
+            self._subscribe(topic, kind)
+            latched = self.heard[topic].qos_profile.durability == LATCHED
             self.queue.put(("topic", topic, types[topic][0],
                             LATCHED_QOS if latched else SENSOR_QOS))
-            self._subscribe(topic, kind, QoSProfile(  # of several each may have latched its own
-                depth=DEPTH,
-                reliability=(ReliabilityPolicy.RELIABLE if reliable
-                             else ReliabilityPolicy.BEST_EFFORT),
-                durability=(DurabilityPolicy.TRANSIENT_LOCAL if latched
-                            else DurabilityPolicy.VOLATILE)))
+        while self.unheard:
+            topic = self.unheard.pop()
+            before = self.heard[topic]
+            self.destroy_subscription(before)
+            self._subscribe(topic, before.msg_type)
         gone = self.counts["lost"] + self.counts["dropped"]
         if gone > self.said:
             self.said = gone
@@ -87,7 +89,17 @@ class BagRecorder(LidarNode):
         except (ModuleNotFoundError, AttributeError):
             return None
 
-    def _subscribe(self, topic: str, kind: type, qos: QoSProfile) -> None:
+    def _subscribe(self, topic: str, kind: type) -> None:
+        """As its publishers of now offer it; again when another offers less."""
+        offered = [info.qos_profile for info in self.get_publishers_info_by_topic(topic)]
+        qos = QoSProfile(  # of several publishers each may have latched its own
+            depth=DEPTH,
+            reliability=(ReliabilityPolicy.RELIABLE if all(
+                q.reliability == ReliabilityPolicy.RELIABLE for q in offered)
+                else ReliabilityPolicy.BEST_EFFORT),
+            durability=(LATCHED if all(q.durability == LATCHED for q in offered)
+                        else DurabilityPolicy.VOLATILE))
+
         def received(data: bytes) -> None:
             waiting = self.put - self.done
             if waiting and waiting + len(data) > MAX_WAITING:
@@ -97,9 +109,10 @@ class BagRecorder(LidarNode):
             self.put += len(data)
             self.queue.put(("message", topic, self.get_clock().now().nanoseconds, data))
 
-        self.create_subscription(kind, topic, received, qos, raw=True,
-                                 event_callbacks=SubscriptionEventCallbacks(
-                                     message_lost=self.count_lost))
+        self.heard[topic] = self.create_subscription(
+            kind, topic, received, qos, raw=True, event_callbacks=SubscriptionEventCallbacks(
+                message_lost=self.count_lost,
+                incompatible_qos=lambda _: self.unheard.add(topic)))
 
     def _write(self) -> None:
         try:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lidar_perception.nodes.runtime import CLOUD, LidarNode
+from lidar_perception.nodes.runtime import CLOUD, JUMP_NS, LidarNode
 from lidar_perception.robot.tree import Missing, TransformTree
 from lidar_perception.tracking.ego import NO_SOURCE, Odometry, best_source, has_odometry
 from lidar_perception.tracking.params import EgoParams
@@ -62,7 +62,8 @@ class EgoInput:
         """(4, 4) of the frame with this header; None where it is not known. xyz (N, 3) is its scan,
         where the node takes the clouds."""
         frame_id, stamp = header.frame_id, to_ns(header.stamp)
-        if self.icp is not None and self.clouds and xyz is not None and self._by_scans():
+        if (self.icp is not None and self.clouds and xyz is not None and len(xyz)
+                and self._by_scans()):
             self._register(header, xyz)
         pose = None
         try:
@@ -197,13 +198,17 @@ class EgoInput:
             self.node.input("points", CLOUD, self._on_cloud)
 
     def _on_cloud(self, msg: Any) -> None:
-        if self._by_scans():
-            self._register(msg.header, to_frame(msg)[0].xyz)
+        if not self._by_scans():
+            return
+        xyz = to_frame(msg)[0].xyz
+        if not len(xyz):
+            raise InputError("the cloud has no usable point, so the sensor's motion is not known")
+        self._register(msg.header, xyz)
 
     def _register(self, header: Any, xyz: np.ndarray) -> None:
         stamp_ns = to_ns(header.stamp)
-        if not len(xyz):
-            raise InputError("the cloud has no usable point, so the sensor's motion is not known")
+        if self.scan_ns - JUMP_NS <= stamp_ns <= self.scan_ns:
+            return  # once more, or late; the tracker leaves it out, too, and says so
         gap = (stamp_ns - self.scan_ns) / SECOND
         if not 0 < gap <= 2 * self.params().max_gap:  # a map of another place, or of another time
             self.icp, self.scans, self.begun = Odometry(), TransformTree(), self.begun + 1

@@ -96,23 +96,23 @@ class Paired:
     """Clouds that wait for the message with the same stamp from another topic.
 
     A cloud is given out with its partner; without one when a later partner or too many clouds
-    have come, as then its own is lost. When time goes back, what is from before is dropped.
+    have come, as then its own is lost. When time goes back, what is from before is dropped, and
+    dropped told how many clouds that are.
     """
 
-    def __init__(self, deliver: Callable[[Any, Any], None], capacity: int = 5):
-        self.deliver, self.capacity = deliver, capacity
+    def __init__(self, deliver: Callable[[Any, Any], None], capacity: int = 5,
+                 dropped: Callable[[int], None] = lambda _: None):
+        self.deliver, self.capacity, self.dropped = deliver, capacity, dropped
         self.clouds: OrderedDict[int, Any] = OrderedDict()
         self.partners: OrderedDict[int, Any] = OrderedDict()
 
     def add_cloud(self, stamp_ns: int, msg: Any) -> None:
-        for waiting in (self.clouds, self.partners):
-            _drop_if_later(waiting, stamp_ns)
+        self._drop_later(stamp_ns)
         self.clouds[stamp_ns] = msg
         self._flush()
 
     def add_partner(self, stamp_ns: int, msg: Any) -> None:
-        for waiting in (self.clouds, self.partners):
-            _drop_if_later(waiting, stamp_ns)
+        self._drop_later(stamp_ns)
         self.partners[stamp_ns] = msg
         while len(self.partners) > 20 * self.capacity:
             self.partners.popitem(last=False)
@@ -129,11 +129,17 @@ class Paired:
             del self.clouds[stamp]
             self.deliver(cloud, partner)
 
+    def clear(self) -> None:
+        """Drop all that waits."""
+        self._drop_later(-JUMP_NS - 1)
 
-def _drop_if_later(waiting: OrderedDict[int, Any], stamp_ns: int) -> None:
-    """Forget all if the last of them is from before a jump back to stamp_ns."""
-    if waiting and next(reversed(waiting)) > stamp_ns + JUMP_NS:
-        waiting.clear()
+    def _drop_later(self, stamp_ns: int) -> None:
+        """Drop all if the last of them is from before a jump back to stamp_ns."""
+        for waiting in (self.clouds, self.partners):
+            if waiting and next(reversed(waiting)) > stamp_ns + JUMP_NS:
+                if waiting is self.clouds:
+                    self.dropped(len(waiting))
+                waiting.clear()
 
 
 class SeedInput:
@@ -148,7 +154,7 @@ class SeedInput:
         self.click: Any = None
         self.clicked: Seed | None = None
         self.loaded: tuple[str, Seed] | None = None
-        self.paired = Paired(self._deliver_with_truth)
+        self.paired = Paired(self._deliver_with_truth, dropped=self._count)
         node.input("ground_truth", MARKERS, self._on_truth, RELIABLE)
         node.input(relative(CLICK), "geometry_msgs/msg/PointStamped", self._on_click, RELIABLE,
                    private=False)
@@ -161,8 +167,7 @@ class SeedInput:
 
     def close(self) -> None:
         """The node is not active any more: what waits is too old when it is again."""
-        self.paired.clouds.clear()
-        self.paired.partners.clear()
+        self.paired.clear()
 
     @property
     def params(self) -> SeedParams:
@@ -188,7 +193,13 @@ class SeedInput:
 
     def _on_truth(self, msg: Any) -> None:
         objects = from_marker_array(msg)
+        if not objects.stamp_ns:
+            raise InputError("labels without a header.stamp belong to no cloud; send a DELETEALL "
+                             "with the header of the frame where nothing is labelled")
         self.paired.add_partner(objects.stamp_ns, to_truth(objects))
+
+    def _count(self, dropped: int) -> None:
+        self.node.counts["dropped"] = self.node.counts.get("dropped", 0) + dropped
 
     def _deliver_with_truth(self, cloud: Any, truth: Any) -> None:
         if truth is None:

@@ -132,8 +132,7 @@ class Reception:
 
     def open(self) -> None:
         """Subscribe."""
-        self.subscription = self._subscribe()
-        self.arrivals.depth = self.subscription.qos_profile.depth
+        self._subscribe()
         self.adapt()
 
     def close(self) -> None:
@@ -145,16 +144,18 @@ class Reception:
         self.arrivals.interrupted(len(self.waiting))
         self.waiting.clear()
 
-    def _subscribe(self) -> Any:
+    def _subscribe(self) -> None:
+        """What comes while a cloud is worked on waits at the middleware: as many as may wait."""
         kinds = [QoSPolicyKind.HISTORY, QoSPolicyKind.DEPTH]
         look = SubscriptionEventCallbacks(matched=lambda _: self.look_again.trigger(),
                                           incompatible_qos=lambda _: self.look_again.trigger())
         received: Any = self._received  # rclpy's annotation forgets that it may ask for the info
-        return self.node.create_subscription(
-            self.kind, self.topic, received,
-            QoSProfile(depth=DEPTH, reliability=self.reliability), raw=True, event_callbacks=look,
+        profile = QoSProfile(depth=max(DEPTH, self.params().queue), reliability=self.reliability)
+        self.subscription = self.node.create_subscription(
+            self.kind, self.topic, received, profile, raw=True, event_callbacks=look,
             qos_overriding_options=QoSOverridingOptions(
                 [*kinds, QoSPolicyKind.RELIABILITY] if self.fixed else kinds))
+        self.arrivals.depth = self.subscription.qos_profile.depth
 
     def publishers(self) -> list[Any]:
         """What is known of those that publish the topic."""
@@ -176,7 +177,7 @@ class Reception:
             return
         self.reliability = chosen
         self.node.destroy_subscription(self.subscription)
-        self.subscription = self._subscribe()
+        self._subscribe()
         self.node.get_logger().info(f"{self.topic} is received {self._how()} now")
 
     def _how(self) -> str:

@@ -19,7 +19,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.serialization import deserialize_message
 from rclpy.task import Future
@@ -146,12 +146,16 @@ class LidarNode(Node):
         received: Any = guarded  # rclpy's annotation has no result
         kind, what = message_class(type_name), "cloud" if type_name == CLOUD else "array"
 
-        def refused(_: Any) -> None:
-            if len(qos) == 1:  # else another of them fits
-                topic = self.resolve_topic_name(name)
-                self.report(WARN, f"a publisher on {topic} offers less than is asked for, and is "
-                            "not heard: let it publish reliable, or set "
-                            f"qos_overrides.{topic}.subscription.reliability to best_effort")
+        def refused(event: Any) -> None:
+            if len(qos) > 1:
+                return  # another of them fits
+            topic = self.resolve_topic_name(name)
+            remedy = ("let it publish transient local (ros2 bag play: --qos-profile-overrides-path)"
+                      if event.last_policy_kind == QoSPolicyKind.DURABILITY else
+                      "let it publish reliable, or set "
+                      f"qos_overrides.{topic}.subscription.reliability to best_effort")
+            self.report(WARN, f"a publisher on {topic} offers less than is asked for, and is not "
+                        f"heard: {remedy}")
 
         events = SubscriptionEventCallbacks(message_lost=self.count_lost, incompatible_qos=refused)
 

@@ -165,8 +165,8 @@ class Transforms:
         self._met.add((frame, frame_id))
 
     def _sweep_of(self, cloud: Any) -> float:
-        """As of the last cloud that was moved; before there is one, of this one, which could not
-        wait for the end of its turn otherwise."""
+        """As of the last cloud that was to be moved; before there is one, of this one, which could
+        not wait for the end of its turn otherwise."""
         if self.sweep is None:
             try:
                 seconds = point_times(cloud, to_frame(cloud)[1]).seconds
@@ -242,8 +242,9 @@ class Transforms:
                 self.lacking["crop.body"] = (
                     f"crop.body ends {-crop.body[5]:.2f} m below the ground of '{self.base_frame}'"
                     ", in which it is read; give it in that frame, as a file of setup has it too")
-        pose = self._by_hand()
-        level = levelling(pose) if placing.level is None and pose is not None else placing.level
+        level, pose = placing.level, None if placing.base is not None else self._by_hand()
+        if level is None and pose is not None:
+            level = levelling(pose)
         return cropped(frame, crop, placing.base, level)
 
     def to_level(self, header: Any, frame_id: str) -> np.ndarray:
@@ -338,12 +339,16 @@ class Transforms:
         if crop is not None and crop.enabled:
             kept, frame = self.cropped(frame, crop, self.placing(msg.header))
             indices = indices.take(kept)
-        found = corrected(msg, frame, indices, lambda at: self.sensor_poses(
-            self.node.robot.input.deskew, frame.frame_id, at))
+
+        def poses(at: np.ndarray) -> np.ndarray:
+            # Also where they are not known yet: the next cloud then waits for the end of its turn.
+            self.sweep = float(at.max() - frame.stamp_ns) / SECOND
+            return self.sensor_poses(self.node.robot.input.deskew, frame.frame_id, at)
+
+        found = corrected(msg, frame, indices, poses)
         if found is None:
             return msg
         known, moved, times = found
-        self.sweep = float(times.seconds.max())
         return moved_cloud(msg, bag_message, indices.take(known), moved, times)
 
     # For the diagnostics

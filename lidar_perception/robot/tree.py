@@ -16,7 +16,7 @@ KEPT_NS = 10 * SECOND    # of each transform, as tf2 does
 MAX_KEPT = 10_000        # of each transform, however often it comes
 MAX_FRAMES = 10_000      # whoever makes a new name for every message does not fill the memory
 JUMP_NS = SECOND         # a stamp so far before the last one is a bag that starts again
-APART = 60.0             # seconds between a stamp and a transform: no lag, but another clock
+APART = 10.0             # seconds between a stamp and a transform: hardly a lag any more
 CLOCKS = ("are they stamped by different clocks? Let the driver stamp clouds with the computer's "
           "time, synchronise the sensor (PTP), or set use_sim_time everywhere")
 
@@ -69,7 +69,8 @@ class _Link:
         """What is needed from one time to another, ns. Missing where it is not there."""
         times, ago = self.times, (end - self.times[-1]) / SECOND
         if ago > 0 and (max_gap is None or ago > max_gap or len(times) == 1):
-            why = CLOCKS if ago > APART else "is its publisher late, or has it stopped?"
+            why = (f"has its publisher stopped? If not, {CLOCKS}" if ago > APART else
+                   "is its publisher late, or has it stopped?")
             raise Missing(f"the newest transform of {name} is {ago:.3f} s older than needed; {why}",
                           late=ago < 1.0)
         early = (times[0] - begin) / SECOND

@@ -90,7 +90,7 @@ def test_nothing_is_guessed_beyond_what_is_known():
     tree, _, (times, _, _) = chain()
     for stamp, words, late in [(times[-1] + 1, "'odom' -> 'base' is 0.000 s older", True),
                                (times[-1] + 5 * SECOND, "5.000 s older than needed", False),
-                               (times[-1] + 10**6 * SECOND, "different clocks", False),
+                               (times[-1] + 37 * SECOND, "stopped.*different clocks", False),
                                (START - SECOND, "1.000 s newer than needed$", False),
                                (1234 * SECOND, "different clocks", False)]:  # since power-up
         with pytest.raises(Missing, match=words) as error:

@@ -156,6 +156,18 @@ def test_in_a_detectors_process_a_cloud_waits_for_its_pose_and_not_for_ever(star
     assert len(node.sent["tracks"]) == 4
 
 
+def test_an_empty_cloud_is_answered_and_the_scans_go_on(start):
+    if not has_odometry():
+        pytest.skip("needs kiss-icp, the extra [odometry]")
+    node = start(Perception, **{"tracking.enabled": True, "ego.source": "kiss_icp"})
+    xyz, _ = walker(mounted(0.0, 0.0, 1.7, 0.0, 0.0, 0.0))
+    for i in range(6):
+        node._receptions()[0].deliver(encode(message(xyz[:0] if i == 3 else xyz,
+                                                     START + i * TENTH)), False)
+        assert node.counts["frames"] == len(node.sent["tracks"]) == i + 1
+    assert node.counts["ego"] == "kiss_icp" and node.outputs.final.tracks.ego.begun == 1
+
+
 def test_late_poses_hold_frames_up_for_max_wait_and_not_once_a_frame(start, monkeypatch):
     """A newer cloud takes the place of one that waits, so that none waits for long by itself."""
     node, now = start(TrackerNode), [100.0]
@@ -233,6 +245,9 @@ def test_poses_of_the_scans_are_carried_to_the_frame_of_the_detections(start):
     np.testing.assert_allclose(ego.pose(header(START, "base")),
                                ego.pose(header(START)) @ inverse(rear), atol=1e-6)
     assert ego.problem("base", START) is None
+    for late in (0, 1):  # once more, or between two drivers' queues: the map stays
+        ego._on_cloud(message(xyz, START + (2 - late) * TENTH))
+    assert ego.begun == 1
     ego._on_cloud(message(xyz, START + 10**11))  # another map, with another origin
     assert ego.begun == 2
 

@@ -209,8 +209,8 @@ def test_markers_that_go_away_are_deleted_and_time_that_jumps_back_is_noticed(
 def test_a_bag_that_starts_again_pairs_its_clouds_with_the_new_round():
     """Whichever comes first after the jump, nothing of the round before is given out."""
     for first in ("cloud", "partner"):
-        delivered = []
-        paired = Paired(lambda c, p, d=delivered: d.append((c, p)))
+        delivered, dropped = [], []
+        paired = Paired(lambda c, p, d=delivered: d.append((c, p)), dropped=dropped.append)
         for round_ in range(3):
             for i in range(30):
                 stamp = i * 10**9
@@ -218,6 +218,10 @@ def test_a_bag_that_starts_again_pairs_its_clouds_with_the_new_round():
                     (paired.add_cloud if kind == "cloud" else paired.add_partner)(
                         stamp, (round_, i))
         assert delivered == [((r, i), (r, i)) for r in range(3) for i in range(30)]
+        paired.add_cloud(30 * 10**9, "waits")
+        paired.add_cloud(0, "of the next round")
+        paired.clear()
+        assert dropped == [1, 1] and len(delivered) == 90
 
 
 def test_clouds_wait_for_the_partner_with_their_stamp():

@@ -18,7 +18,7 @@ from std_srvs.srv import Trigger
 
 from lidar_perception.campaign.samples import as_ros1
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
-from lidar_perception.nodes.runtime import LATCHED, WAITING
+from lidar_perception.nodes.runtime import LATCHED, RELIABLE, SENSOR_DATA, WAITING
 from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
 from msg_utils.stamps import to_ns
@@ -277,6 +277,22 @@ def test_the_recorder_has_what_each_of_several_publishers_latched(processes, pee
         assert sorted(m.data for _, _, m in bag.messages({"/note"})) == [*"012345"]
 
 
+def test_a_publisher_that_comes_later_and_offers_less_is_recorded_too(processes, peer, tmp_path):
+    """Also by a name of the node's namespace."""
+    first = peer.talker("/robot/text", TEXT, RELIABLE)
+    processes.start("bag_recorder", {}, {"bag": str(tmp_path / "bag"), "topics": ["text"]},
+                    namespace="robot")
+
+    def frames():
+        return int(peer.value_of("robot/bag_recorder", "frames") or 0)
+    peer.send(first, bag_message(TEXT, data="first"), frames, "the first")
+    before, later = frames(), peer.talker("/robot/text", TEXT, SENSOR_DATA)
+    peer.send(later, bag_message(TEXT, data="later"), lambda: frames() > before, "the later one")
+    assert processes.stop()["robot.bag_recorder"] == 0
+    with Bag(tmp_path / "bag") as bag:
+        assert {m.data for _, _, m in bag.messages({"/robot/text"})} == {"first", "later"}
+
+
 def test_a_type_that_is_not_installed_ends_no_recording(monkeypatch, peer, start, tmp_path):
     from lidar_perception.nodes import bag_recorder
     known = bag_recorder.message_class
@@ -306,7 +322,7 @@ def test_a_recorder_that_cannot_keep_up_drops_and_says_so(monkeypatch, start, tm
                         lambda self, kind, topic, received, *_, **__: kept.append(received))
     node = start(bag_recorder.BagRecorder, **{"bag": str(tmp_path / "bag"), "topics": ["/a"],
                                               "use_sim_time": True})
-    node._subscribe("/a", None, None)
+    node._subscribe("/a", None)
     try:
         for _ in range(10):
             kept[-1](bytes(40))

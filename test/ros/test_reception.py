@@ -16,6 +16,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from rclpy.executors import SingleThreadedExecutor
 from test_bad_input import CLOUD, MARKERS, cloud
 
 from lidar_perception.nodes import reception as reception_module
@@ -30,6 +31,8 @@ from lidar_perception.nodes.reception import (
     Arrivals,
     Reception,
 )
+from lidar_perception.nodes.runtime import LATCHED
+from lidar_perception.nodes.runtime import RELIABLE as RELIABLE_QOS
 from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES, SOCKET_BUFFER, socket_buffer
 from lidar_perception.nodes.track_outputs import lifetime_ns
 from lidar_perception.params import MarkerParams, ReceptionParams
@@ -38,6 +41,7 @@ from msg_utils.stamps import to_ns
 
 NODE, OK, WARN, ERROR, STALE = "ground_segmentation", 0, 1, 2, 3
 KITTI = 130_000  # points of a cloud: 2 MB
+TEXT = "std_msgs/msg/String"
 
 
 @contextmanager
@@ -292,6 +296,22 @@ def test_a_publisher_is_heard_or_it_is_said_with_the_remedy(start, monkeypatch, 
         assert bool(said) == (asked == RELIABLE and BEST_EFFORT in offered)
         assert all(text.startswith("/best_effort on /") and remedy in text for text in said)
         assert bool(said) == (remedy != "" and BEST_EFFORT in offered)
+
+
+def test_as_many_clouds_wait_at_the_middleware_as_may_wait(start):
+    for queue, depth in (1, 5), (20, 20):
+        reception, = start(GroundSegmentation, **{"input.queue": queue})._receptions()
+        assert reception.subscription.qos_profile.depth == reception.arrivals.depth == depth
+
+
+def test_a_topic_that_is_not_latched_where_it_must_be_is_said_with_the_remedy(peer, start):
+    node = start(GroundSegmentation)
+    node.input("/static", TEXT, lambda _: None, LATCHED, private=False)
+    peer.talker("/static", TEXT, RELIABLE_QOS)
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
+    peer.wait(lambda: [executor.spin_once(0.0), "transient local" in node.state[1]][1],
+              "the remedy")
 
 
 def test_who_has_lost_clouds_is_named_when_it_is_gone_as_before(start, monkeypatch):

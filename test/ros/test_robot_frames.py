@@ -366,6 +366,32 @@ def test_the_first_cloud_waits_for_odometry_that_lags_behind_the_end_of_its_turn
     assert node.counts["deskewed"] == 1 and "not_deskewed" not in node.counts
 
 
+@pytest.mark.parametrize("first, begin, sectors", [(0.3, 0.0, ()), (1.0, -1.0, (120.0, 240.0))])
+def test_later_clouds_wait_for_the_end_of_their_turn_whatever_the_first_one_was(start, first, begin,
+                                                                                sectors):
+    """A part of a turn, where the driver starts in the middle of one; or one that is stamped at its
+    end, near which points are cropped. The odometry comes every 0.02 s."""
+    node = start(GroundSegmentation, **{"input.deskew": "odometry", "crop.sectors": sectors})
+    deliver = node._receptions()[0].deliver
+    heard = iter(range(START, START + 20 * PERIOD, PERIOD // 5))
+
+    def hear():
+        stamp = next(heard)
+        node.transforms.on_odometry(odometry(np.eye(4), stamp, "lidar"))
+        return stamp
+    known = hear()
+    for i in range(1, 8):
+        share = np.linspace(0, 1, 400)[:round(400 * (first if i == 1 else 1.0))]
+        angle, seconds = np.pi - 2 * np.pi * share, 0.0999 * (begin + share)
+        xyz = np.column_stack([20 * np.cos(angle), 20 * np.sin(angle), np.full(len(angle), -1.7)])
+        stamp = START + i * PERIOD + PERIOD // 10
+        while known < stamp + 1e9 * seconds[-1] - PERIOD // 5:
+            known = hear()
+        while deliver(encode(message(xyz, stamp, time=seconds.astype("<f4"))), True):
+            known = hear()
+    assert node.counts["deskewed"] == 7 - (first < 1.0)  # the second cannot know
+
+
 def test_tracks_of_a_tilted_sensor_stay_in_the_clouds_frame(start, weights):
     """Where its detections are in the base, its tracks are in the cloud."""
     scan, tilt = frame(), tilted(-0.2, 0.3, 1.73)
