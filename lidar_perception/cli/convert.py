@@ -150,8 +150,9 @@ def _bag(source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, im
 
 def _on_topic(source: Path, recording: Any, topic: str) -> Any:
     """DriveLabels of the boxes on a topic of a bag."""
+    from lidar_perception.data.open import with_topic
     from lidar_perception.labeling.formats import bag
-    return bag.read(source, recording.frames[:], topic)
+    return bag.read(with_topic(source)[0], recording.frames[:], topic)
 
 
 def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: str, out: Path,

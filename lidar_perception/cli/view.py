@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -22,6 +22,8 @@ from lidar_perception.types import InputError
 
 if TYPE_CHECKING:
     from lidar_perception.labeling.served import Served
+
+WEIGHTS = (".safetensors", ".onnx", ".json")
 
 
 @click.command()
@@ -125,21 +127,39 @@ def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], poi
             sequence: str | None, where: str, device: str) -> Served:
     """What the page shows of a path."""
     from lidar_perception.data.bag_frames import recognises
+    from lidar_perception.data.open import with_topic
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.labeling import results as shown
     from lidar_perception.labeling.drive import one_drive
     from lidar_perception.labeling.served import Served
 
+    path, named = with_topic(path)
     a_bag = path.exists() and recognises(path)
-    recording = opened(path, points=points or shown.points_topic(path)) if a_bag else opened(path)
+    recording = (opened(path, points=points or named or shown.points_topic(path)) if a_bag
+                 else opened(path))
     drive = one_drive(recording, sequence)
     found = shown.Results()
     if a_bag:
         drive = shown.with_recorded_scans(drive)
-        found = shown.recorded(path, [f.stamp_ns for f in drive.frames])
+        found = shown.recorded(path, [f.stamp_ns for f in drive.frames],
+                               drive.frames[0].load().frame_id)
     height = drive.frames[0].sensor_height
-    more = {Path(name).stem: shown.by_detector(
+    made = {Path(name): shown.by_detector(
         open_detector(name, device, sensor_height=height, where=where)) for name in weights}
-    more |= {folder.name: shown.by_files(folder) for folder in results}
-    found = shown.Results({**found.sources, **more}, found.tracks)
+    made |= {folder.absolute(): shown.by_files(folder) for folder in results}
+    more = zip(short_names(list(made), found.sources), made.values())
+    found = shown.Results({**found.sources, **dict(more)}, found.tracks)
     return Served(drive, layers=found.layers_of(drive), tracks=lambda: found.tracks)
+
+
+def short_names(paths: list[Path], taken: Collection[str] = ()) -> list[str]:
+    """A name for each of several files or folders: the end of its path, as much of it as tells it
+    from the others and from the names that are taken; all of it where nothing else does."""
+    parts = [path.with_suffix("").parts if path.suffix in WEIGHTS else path.parts for path in paths]
+    names = []
+    for i, own in enumerate(parts):
+        ends = (own[-k:] for k in range(1, len(own) + 1))
+        others = [each for j, each in enumerate(parts) if j != i]
+        names.append(next(("/".join(end) for end in ends if "/".join(end) not in taken and all(
+            other[-len(end):] != end for other in others)), str(paths[i])))
+    return names

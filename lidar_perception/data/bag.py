@@ -19,7 +19,7 @@ from lidar_perception.data.mcap_index import NO_INDEX, check_index, profile_of
 from lidar_perception.data.record_file import RecordFile
 from lidar_perception.data.ros1_bag import Ros1Reader, is_ros1
 from lidar_perception.data.unchunked import Unchunked
-from lidar_perception.runs.files import check_free, refuse_others, regular, short
+from lidar_perception.runs.files import check_free, refuse_others, regular, require_name, short
 from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import decode, encode, typestore
@@ -55,6 +55,7 @@ class BagWriter:
 
     def __init__(self, path: str | Path, *, force: bool = False):
         self.path, self.force = Path(path), force
+        require_name(self.path)
         self.partial = self.path.with_name(self.path.name + ".incomplete")
         self.channels: dict[str, int] = {}
         self.topics: list[dict] = []

@@ -228,11 +228,11 @@ class BagFrames(Sequence):
 
 
 def _stamp(data: bytes, time: int) -> int:
-    """header.stamp of a serialised message; its time if it is too short to have one."""
+    """header.stamp of a serialised message; its time if it has none, or is too short for one."""
     if len(data) < 12:
         return time
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-    return seconds * SECOND + nanoseconds
+    return seconds * SECOND + nanoseconds or time
 
 
 def _frame_id(data: bytes) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.bag import Bag
+from lidar_perception.robot.poses import inverse, moved_boxes
 from lidar_perception.robot.tree import Missing, TransformTree
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import ODOMETRY, ODOMETRY_FRAME, TF, TF_STATIC
@@ -22,6 +24,7 @@ from lidar_perception.wire.transforms import (
     add_odometry,
     add_transforms,
 )
+from msg_utils.markers import MarkedObjects
 
 FILTERED = "/odometry/filtered"  # of robot_localization
 FIRST = 500    # messages of /tf that show which frames there are
@@ -117,6 +120,28 @@ class BagPoses:
         fixed = [above for frame, above in zip(self._above, self._above[1:])
                  if self._seen.fixed(frame)]
         return fixed[-1] if fixed else ""
+
+    def of(self, frame_id: str, stamp_ns: int) -> np.ndarray:
+        """(4, 4): the pose of another frame in that of the clouds at a time, which takes points to
+        the latter. Missing where nothing says it."""
+        if self.odometry and frame_id.lstrip("/") == self._first.header.frame_id.lstrip("/"):
+            return inverse(self.at(np.array([stamp_ns]))[0])
+        return self._tree.lookup(self.frame_id, frame_id, stamp_ns, MAX_GAP)
+
+    def brought(self, objects: MarkedObjects, topic: str) -> MarkedObjects:
+        """Objects of a topic with their boxes in the frame of the clouds at their stamp, as nodes
+        give them in another one where they are asked to. InputError where the bag connects the two
+        frames by nothing."""
+        if not len(objects) or not self.frame_id or objects.frame_id.lstrip("/") in (
+                "", self.frame_id):
+            return objects
+        try:
+            pose = self.of(objects.frame_id, objects.stamp_ns)
+        except Missing as error:
+            raise InputError(f"{self.path}: the boxes on {topic} are in '{objects.frame_id}', the "
+                             f"clouds in '{self.frame_id}': {error}; record TF, or the odometry, "
+                             "with them") from None
+        return replace(objects, boxes=moved_boxes(objects.boxes, pose))
 
     def carrier_pose(self, stamp_ns: int) -> np.ndarray:
         """(4, 4): that of the odometry. Missing where it is not known then."""

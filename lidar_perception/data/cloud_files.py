@@ -30,10 +30,14 @@ UNITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}  # digits of a Unix time of tod
 
 
 def cloud_files(path: Path) -> list[Path]:
-    """The file at path, or those in the folder, numbers in their names in order (2 before 10);
-    none where there is no cloud."""
-    files = [path] if path.is_file() else [file for file in path.glob("*") if file.is_file()]
-    return sorted((file for file in files if file.suffix in SUFFIXES), key=lambda file: [
+    """The file at path, or those in the folder in order: of the times that their names are, else
+    of the numbers in them (2 before 10); none where there is no cloud."""
+    files = [path] if path.is_file() else [
+        file for file in path.glob("*") if file.suffix in SUFFIXES and file.is_file()]
+    times = {file: _named_time(file) for file in files if file.suffix in SUFFIXES}
+    if None not in times.values():
+        return sorted(times, key=lambda file: (times[file], file.name))
+    return sorted(times, key=lambda file: [
         (int(part or -1), text) for text, part in re.findall(r"(\D*)(\d*)", file.name)])
 
 
@@ -61,14 +65,19 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
 
 def named_times(files: list[Path]) -> list[int]:
     """Nanoseconds that the names of the files are, in ascending order; none where one is not."""
-    stamps: list[int] = []
-    for file in files:
-        whole, _, fraction = file.name.removesuffix(file.suffix).partition(".")
-        if not whole.isdecimal() or len(whole) not in UNITS or (
-                fraction and (len(whole) != 10 or not fraction.isdecimal())):
-            return []
-        stamps.append(int(whole) * UNITS[len(whole)] + int(f"{fraction:0<9}"[:9] or 0))
-    return stamps if all(a < b for a, b in pairwise(stamps)) else []
+    stamps = [stamp for file in files if (stamp := _named_time(file)) is not None]
+    return stamps if len(stamps) == len(files) and all(
+        a < b for a, b in pairwise(stamps)) else []
+
+
+def _named_time(file: Path) -> int | None:
+    """Nanoseconds that the name of a file is; None where it is none: a frame of KITTI's raw data
+    has ten digits, too, the first of them 0."""
+    whole, _, fraction = file.name.removesuffix(file.suffix).partition(".")
+    if not whole.isdecimal() or whole[0] == "0" or len(whole) not in UNITS or (
+            fraction and (len(whole) != 10 or not fraction.isdecimal())):
+        return None
+    return int(whole) * UNITS[len(whole)] + int(f"{fraction:0<9}"[:9] or 0)
 
 
 def read_points(file: Path) -> np.ndarray:

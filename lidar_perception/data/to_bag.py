@@ -60,6 +60,7 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
         if clouds:
             bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
         shown: frozenset[tuple[str, int]] = frozenset()
+        labelled: set[int] = set()  # stamps, by which labels and clouds find each other
         count, written = 0, None
         for frame in frames:
             try:
@@ -68,6 +69,9 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
                 if frame.stamp_ns < 0:
                     raise InputError(f"{frame.name}: a stamp before 1970, which no bag holds; "
                                      "set the clock of the sensor")
+                if truth is not None and frame.stamp_ns in labelled:
+                    raise InputError(f"{frame.name}: another labelled scan has its stamp, so that "
+                                     "nothing would say whose the labels are")
             except InputError as error:
                 if skipped is None:
                     raise
@@ -80,6 +84,7 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
             if pose is not None:
                 _write_pose(bag, pose, frame.stamp_ns, header.frame_id)
             if truth is not None:
+                labelled.add(frame.stamp_ns)
                 markers = truth_markers(truth, header, bag_message, shown)
                 shown = marker_keys(markers)
                 bag.write(TRUTH, frame.stamp_ns, markers)

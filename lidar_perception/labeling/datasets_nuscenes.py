@@ -70,6 +70,8 @@ class NuscenesTables:
         scene = f"scene-{drive + 1:04}"
         sample = token(scene, len(self.rows["sample"]))
         file = f"samples/{CHANNEL}/{scene}__{CHANNEL}__{frame.stamp_ns // 1000}.pcd.bin"
+        if (self.folder / file).exists():  # of a driver that gives two scans one stamp
+            file = file.replace(".pcd.bin", f"-{len(self.rows['sample'])}.pcd.bin")
         self._sweep(self.folder / file, cloud)
         pose = frame.pose()
         pose = np.eye(4) if pose is None else pose

@@ -88,6 +88,10 @@ def recognised(path: Path) -> str:
                          f"{', '.join(FORMATS)}")
     if path.suffix in (".mcap", ".db3") or (path.is_dir() and is_bag(path)):
         return "bag"
+    for inner in path, path / "training":
+        for folder, format in ("label_02", "kitti_tracking"), ("label_2", "kitti_object"):
+            if (inner / folder).is_dir():
+                return format
     for file in files:
         found = _by_text(file) if file.suffix == ".txt" else _by_json(read_json(file))
         if found:
@@ -99,6 +103,8 @@ def recognised(path: Path) -> str:
 def _by_text(file: Path) -> str:
     """By the class's place in the first line."""
     words = read_text(file, MAX_BYTES).split(maxsplit=3)
+    if words and words[0].endswith(":"):
+        return ""  # a calibration
     with suppress(ValueError, IndexError):
         float(words[0]), float(words[1])
         return "kitti_tracking"

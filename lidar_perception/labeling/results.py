@@ -15,11 +15,13 @@ from lidar_perception.camera import Camera
 from lidar_perception.classes import CLASSES, DETECTED, PEDESTRIAN, TABLE
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.bag_frames import cloud_topic
+from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.results import read_results
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.geometry import bev_iou
 from lidar_perception.labeling.drive import Drive, Scan, scan_of, scanned
+from lidar_perception.runs.terminal import errors
 from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_to_one
 from lidar_perception.scoring.recorded import by_stamp
 from lidar_perception.types import Detections, GroundTruth, InputError
@@ -152,19 +154,25 @@ def points_topic(path: Path) -> str:
         return known[0] if known else cloud_topic(bag)
 
 
-def recorded(path: Path, stamps: list[int]) -> Results:
-    """What a bag holds beside its clouds, whose stamps are given: detections of every node, tracks.
-    A message belongs to the cloud of its stamp."""
+def recorded(path: Path, stamps: list[int], frame_id: str = "") -> Results:
+    """What a bag holds beside its clouds, whose stamps and frame are given: detections of every
+    node, tracks. A message belongs to the cloud of its stamp. A topic whose boxes nothing connects
+    with the clouds' frame is left out, and that is said."""
     with Bag(path) as bag:
         wanted = {topic for topic, kind in bag.topics.items() if kind == MARKERS and topic != TRUTH
                   and topic.endswith((FOUND, TRACKS))}
         found = by_stamp(bag, sorted(wanted))
-    numbers = {stamp: i for i, stamp in enumerate(stamps)}
+    numbers, poses = {stamp: i for i, stamp in enumerate(stamps)}, BagPoses(path, frame_id)
     sources: dict[str, Source] = {}
     tracks: list[dict[str, Any]] = []
     trackers = [topic for topic in found if topic.endswith(TRACKS)]
     for topic, marked in found.items():
-        frames = {numbers[stamp]: each for stamp, each in marked.items() if stamp in numbers}
+        try:
+            frames = {numbers[stamp]: poses.brought(each, topic)
+                      for stamp, each in marked.items() if stamp in numbers}
+        except InputError as error:
+            errors.print(f"left out: {error}", style="yellow")
+            continue
         if topic in trackers:
             tracks += tracks_of(frames, topic, trackers.index(topic))
         else:

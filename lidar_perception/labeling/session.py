@@ -86,9 +86,11 @@ class Session:
         if action.get("do") in ("propose", "cancel"):
             return self.prepare(by, True) if action["do"] == "propose" else self.cancel()
         with self._lock:
-            seq = self._record(self._computed(_asked(action)), by)
-            if action.get("do") == "seed" and self._waiting():
-                self._start("following", lambda: self._follow(by, seq))
+            seq, name = self._record(self._computed(_asked(action)), by), action.get("do")
+            # What was made while a click was followed is undone to the track of before.
+            again = name in ("undo", "redo") and not self._what
+            if (name == "seed" or again) and self._waiting():
+                self._start("following", lambda: self._follow(by, None if again else seq))
         return seq
 
     def cancel(self) -> int:
@@ -188,7 +190,7 @@ class Session:
             self._record({"do": "propose", **_made(tracks, removed), **how}, by)
             self.was_proposed = True
 
-    def _follow(self, by: str, seed: int) -> None:
+    def _follow(self, by: str, seed: int | None) -> None:
         with self._lock:
             waiting = self._waiting()
         if waiting:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.wire.topics import TRUTH
 from msg_utils.markers import MarkedObjects, from_marker_array
 
@@ -22,11 +23,13 @@ class Answered:
 
 def answered(path: Path, *topics: str) -> list[list[Answered]]:
     """For each of these topics of a bag, the labelled frames that have an answer on it, in order of
-    time; of equal stamps the last."""
+    time; of equal stamps the last. Answers are in the frame of the labels; InputError where nothing
+    connects theirs with it."""
     with Bag(path) as bag:
         found = by_stamp(bag, (*topics, TRUTH))
     truth = found[TRUTH]
-    return [[Answered(stamp, truth[stamp], found[topic][stamp])
+    poses = BagPoses(path, next((each.frame_id for each in truth.values()), ""))
+    return [[Answered(stamp, truth[stamp], poses.brought(found[topic][stamp], topic))
              for stamp in sorted(found[topic].keys() & truth.keys())] for topic in topics]
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.cloud_files import read_points
+from lidar_perception.data.open import open_recording
 from lidar_perception.data.pcd import read_pcd, unpacked_lzf
 from lidar_perception.data.raw_clouds import open_clouds, spread
 from lidar_perception.types import InputError
@@ -200,6 +201,19 @@ def test_files_that_are_named_by_times_have_these_as_stamps(tmp_path):
     assert clouds.load(1).header.stamp.nanosec == 2 * 10**8
     (tmp_path / "another.pcd").write_bytes(pcd(points(), "ascii"))
     assert open_clouds(tmp_path).stamps_ns is None
+
+
+@pytest.mark.parametrize("names, timed", [
+    (["1700000000.1", "1700000000.19998", "1700000000.4", "1700000001"], True),  # str(time)
+    (["0000000000", "0000000001", "0000000010"], False)])  # KITTI's numbers of frames
+def test_files_are_in_the_order_of_time_and_a_number_is_no_time(names, timed, tmp_path):
+    for name in reversed(names):
+        (tmp_path / f"{name}.pcd").write_bytes(pcd(points(), "ascii"))
+    recording = open_recording(tmp_path)
+    assert [frame.name for frame in recording] == names
+    stamps = [frame.stamp_ns for frame in recording]
+    assert stamps == sorted(stamps) and timed == ("no times" not in recording.layout)
+    assert timed == (stamps[-1] == 1_700_000_001 * 10**9)
 
 
 def test_scans_are_looked_at_in_pairs_spread_over_all():

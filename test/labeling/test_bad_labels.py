@@ -74,6 +74,15 @@ def test_the_examples_are_good(format, tmp_path):
     assert import_labels(path, format, drive("one")).boxes == 1
 
 
+def test_a_folder_of_kitti_is_told_by_its_folders(tmp_path):
+    """Not by the first text file there, which is of the calibration."""
+    write_dataset("kitti_tracking", drive("one"), tmp_path / "set")
+    for path in tmp_path / "set", tmp_path / "set/training":
+        assert recognised(path) == "kitti_tracking"
+    with pytest.raises(InputError, match="no labels that are recognised"):
+        recognised(tmp_path / "set/training/calib")
+
+
 @pytest.mark.parametrize(("format", "old", "new", "words"), WRONG)
 def test_what_is_wrong_is_named_with_its_file(format, old, new, words, tmp_path):
     path = put(tmp_path / "in", format, old, new)

@@ -10,24 +10,32 @@ import pytest
 from cli_samples import error_line, exit_of
 from format_samples import CALIBRATION, drive, labels_of, pose, same
 from nuscenes_folder import made_tables, save
+from robot_bags import ON_BASE, base_at, mount, moving, moving_tf, recorded, stamps
 from samples import DATA, needs_data
 
+from lidar_perception.classes import CAR
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
+from lidar_perception.labeling import results
 from lidar_perception.labeling.datasets import write_dataset
 from lidar_perception.labeling.exchange import export_labels
 from lidar_perception.labeling.formats import bag as bag_format
 from lidar_perception.labeling.labels import DriveLabels, of_truth
+from lidar_perception.robot.poses import inverse, moved_boxes
 from lidar_perception.simulation.sensor import generic
 from lidar_perception.simulation.to_bag import simulated_scans
-from lidar_perception.types import Detections, LidarFrame
+from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.types import Detections, GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import detection_markers
+from lidar_perception.wire.topics import ODOMETRY, POINTS
 from msg_utils.detections import to_detection_array
+from msg_utils.markers import to_marker_array
 from msg_utils.stamps import header_message
 
+MARKERS = "visualization_msgs/msg/MarkerArray"
 SMALL = generic(32, -25.0, 5.0, 0.4, 10.0)
 LAYOUTS = {"kitti": "kitti_object", "kitti-tracking": "kitti_tracking",
            "semantickitti": "semantickitti"}
@@ -200,6 +208,49 @@ def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
         assert one.track_ids.tolist() == [-1] * len(boxes)
         assert other.track_ids.tolist() == [100 + k for k in range(len(boxes))]
         assert other.class_names == ["tree"] * len(boxes)
+
+
+@pytest.mark.parametrize("parts", [[moving(ODOMETRY), mount()], [moving_tf(), mount()], []])
+def test_boxes_in_another_frame_are_brought_to_that_of_the_clouds(parts, tmp_path):
+    """As target_frame:=odom gives them. Where nothing connects the two, that is said."""
+    boxes = np.array([[10.0, 2, 0.5, 4, 2, 1.5, 0.3]])
+    rows = []
+    for stamp in stamps():
+        marked = to_marker_array(boxes, ["Car"], ids=[1], make=bag_message,
+                                 header=header_message(stamp, "odom", bag_message))
+        rows += [(topic, MARKERS, stamp, marked) for topic in ("/n/output/detections",
+                                                               "/n/output/tracks")]
+    frames = recorded(tmp_path / "bag", *map(list, parts), rows).frames[:]
+    if not parts:
+        with pytest.raises(InputError, match="in 'odom', the clouds in 'lidar'"):
+            bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
+        assert not results.recorded(tmp_path / "bag", stamps(), "lidar").sources
+        return
+    labels = bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
+    shown = results.recorded(tmp_path / "bag", stamps(), "lidar")
+    for i, (frame, each) in enumerate(zip(frames, labels.frames)):
+        near = moved_boxes(boxes, inverse(base_at(frame.stamp_ns) @ ON_BASE))
+        np.testing.assert_allclose(each.boxes, near, atol=1e-3)
+        np.testing.assert_allclose(shown.sources["n"].find(i, frame).boxes, near, atol=1e-3)
+        np.testing.assert_allclose(shown.tracks[0]["boxes"][i][1:8], near[0], atol=1e-3)
+
+
+def test_scans_of_one_stamp_are_all_there_and_labels_go_to_no_other_scan(tmp_path):
+    twice = frames_at([0.0, 0.1, 0.1])
+    write_dataset("nuscenes", twice, tmp_path / "nuscenes")
+    assert len({f.points for f in open_recording(tmp_path / "nuscenes")}) == 3
+    skipped = []
+    assert write_bag(tmp_path / "plain", twice) == 3
+    truth = GroundTruth.of(np.ones((1, 7)), [CAR])
+    assert write_bag(tmp_path / "bag", [replace(f, truth=lambda: truth) for f in twice],
+                     skipped=skipped) == 2
+    assert "another labelled scan has its stamp" in skipped[0]
+    unset = [replace(f, stamp_ns=0) for f in frames_at([0, 1])]
+    with BagWriter(tmp_path / "unset") as bag:  # a driver that sets no stamp
+        bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+        for i, frame in enumerate(unset, 5):
+            bag.write(POINTS, i * 10**9, cloud_message(frame.load().xyz, 0, "top"))
+    assert [f.stamp_ns for f in open_recording(tmp_path / "unset")] == [5 * 10**9, 6 * 10**9]
 
 
 def test_results_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch, capsys):

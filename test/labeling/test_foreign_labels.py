@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from format_samples import drive
+from format_samples import CALIBRATION, drive
 from scipy.spatial.transform import Rotation
 
+from lidar_perception.data.kitti.labels import DONT_CARE
 from lidar_perception.geometry import box_corners
 from lidar_perception.labeling.exchange import FORMATS, export_labels, import_labels, recognised
 from lidar_perception.labeling.labels import DriveLabels, FrameLabels
@@ -136,6 +138,14 @@ def test_openlabel_of_another_tool_is_placed_by_its_systems_and_kept(tmp_path):
     moved = import_labels(tmp_path / "moved.json", "openlabel", frames)
     np.testing.assert_allclose(moved.frames[0].boxes, each.boxes, atol=1e-9)
     assert [e["wheels"] for e in moved.frames[0].extra[:1]] == ["four"]
+    flat = [replace(each, notes=[("lane mark", {"bbox": [{"name": "seen"}]}), ("DontCare", {
+        **DONT_CARE, "bbox": [1.0, 2.0, 3.0, 4.0]})])]  # regions that only an image shows
+    frames = [replace(frames[0], calibration=lambda: CALIBRATION)]
+    for format in ("kitti_tracking", "kitti_object"):
+        export_labels(DriveLabels(flat), format, tmp_path / format, frames)
+        notes = import_labels(tmp_path / format, format, frames).frames[0].notes
+        assert [(name, extra["bbox"]) for name, extra in notes] == [
+            ("lane_mark", [0, 0, 0, 0]), ("DontCare", [1, 2, 3, 4])]
 
 
 TILTED = {

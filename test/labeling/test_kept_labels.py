@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import fcntl
+import json
 import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -18,8 +19,10 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labeling.drive import Drive, one_drive
 from lidar_perception.labeling.journal import Journal, header
-from lidar_perception.labeling.labelled import joined, to_labels
+from lidar_perception.labeling.labelled import from_labels, joined, to_labels
+from lidar_perception.labeling.labels import DriveLabels, FrameLabels
 from lidar_perception.labeling.session import ImportedAlready, session
+from lidar_perception.labeling.state import State, track_to_json
 from lidar_perception.types import InputError, LidarFrame
 
 COUNT = 6
@@ -131,6 +134,18 @@ def test_two_exports_at_once_are_both_whole_or_refused(tmp_path):
         names = sorted(path.name for path in (tmp_path / "labels").iterdir())
         assert [n for n in names if n[:6].isdigit()] == [f"{f.name}.json" for f in frames()]
         assert not [n for n in os.listdir(tmp_path) if n.endswith(".tmp")]
+
+
+def test_numbers_that_are_none_are_null_in_the_journal():
+    """As the velocity in nuScenes of what was labelled once."""
+    none, box = float("nan"), np.array([BOX])
+    labels = DriveLabels([FrameLabels.of("000000", 10**8, box, ["Car"], [1], [0.5],
+                                         [{"velocity": [none, 1.0]}], [("area", {"x": none})])])
+    tracks, kept = from_labels(labels, 1)
+    json.dumps([track_to_json(tracks[0]), kept], allow_nan=False)
+    back = to_labels(replace(State(), tracks={1: tracks[0]}, kept=kept), frames()[:1])
+    assert back.frames[0].extra[0] == {"velocity": [None, 1.0]}
+    assert back.frames[0].notes == [("area", {"x": None})]
 
 
 def test_the_command_imports_once_and_exports_no_journal_that_is_not_there(tmp_path):

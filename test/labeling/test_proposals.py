@@ -219,6 +219,27 @@ def test_a_seed_that_is_corrected_before_it_was_followed_is_followed_all_the_sam
     assert [f for f, b in found.boxes.items() if b.kind == KEY] == [0, 1]
 
 
+def test_a_correction_that_is_undone_while_a_click_was_followed_leaves_it_followed(
+        made, monkeypatch):
+    monkeypatch.setattr("lidar_perception.labeling.session.NEARBY", 1)
+    made.propose(here=True)
+    begun, start = [], made._start
+    monkeypatch.setattr(made, "_start", lambda *asked: begun.append(asked))  # slowly
+    _, track = click(made)
+    made.do({"do": "box", "track": track.id, "frame": 1, "box": [
+        track.boxes[1].values[0] + 0.1, *track.boxes[1].values[1:]]})
+    (_, work), = begun
+    work()
+    followed = made.state.tracks[track.id]
+    assert len(followed.boxes) >= FRAMES - 1 and not followed.nearby
+    monkeypatch.setattr(made, "_start", start)
+    for back in ("undo", "redo"):
+        made.do({"do": back})
+        made.wait()
+        found = made.state.tracks[track.id]
+        assert found.boxes.keys() == followed.boxes.keys() and not found.nearby
+
+
 def test_what_was_only_looked_at_by_the_server_is_nobodys_to_undo(made):
     """The first proposals come when they come: they take nothing from redo, nor a seed with them
     when they are undone."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 
 from lidar_perception.classes import CAR, CLASSES, PEDESTRIAN
 from lidar_perception.cli.main import cli
+from lidar_perception.cli.view import short_names
 from lidar_perception.data.bag import BagWriter
 from lidar_perception.data.open import open_recording
 from lidar_perception.labeling.drive import one_drive, scanned
@@ -123,6 +125,13 @@ def test_tracks_of_all_trackers_in_a_bag_keep_apart(tmp_path):
     found = recorded(tmp_path / "bag", [10]).tracks
     assert len({t["id"] for t in found}) == len(found) == 4
     assert {t["source"] for t in found} == {"a", "b"}
+
+
+def test_sources_have_names_that_tell_them_apart():
+    paths = [Path(name) for name in ("fused", "robot/fused.json", "a/v4/best.safetensors",
+                                     "b/v4/best.safetensors", "/out/data", "x/y.json", "x/y.onnx")]
+    assert short_names(paths, ["data"]) == ["fused", "robot/fused", "a/v4/best", "b/v4/best",
+                                            "out/data", "x/y.json", "x/y.onnx"]
 
 
 def test_result_files_that_are_not_there_are_named(tmp_path):

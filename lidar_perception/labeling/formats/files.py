@@ -145,15 +145,16 @@ def read_json(path: Path) -> Any:
 
 def write_json(path: Path, content: Any, indent: int | None = None) -> None:
     """Write a JSON file as every reader takes it: null instead of numbers that are not finite."""
-    write_text(path, json.dumps(_finite(content), indent=indent, allow_nan=False))
+    write_text(path, json.dumps(finite(content), indent=indent, allow_nan=False))
 
 
-def _finite(value: Any) -> Any:
+def finite(value: Any) -> Any:
+    """A JSON value with null instead of numbers that are not finite."""
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
-    return [_finite(item) for item in value] if isinstance(value, list | tuple) else value
+        return {str(key): finite(item) for key, item in value.items()}
+    return [finite(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def in_file(where: str, read: Callable[[], Any]) -> Any:

@@ -8,13 +8,14 @@ where the length points to the right. A box that was read and not changed keeps 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.kitti.labels import COLUMNS, camera_box, lidar_box
+from lidar_perception.data.kitti.labels import COLUMNS, DONT_CARE, camera_box, lidar_box
 from lidar_perception.data.kitti.write import image_boxes
 from lidar_perception.labeling.labels import (
     NO_TRACK,
@@ -68,7 +69,7 @@ def lines_of(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str, 
     the share of it outside of the image, and, where nobody said it, the level of occlusion by the
     other boxes. InputError without a calibration.
     """
-    notes = [{"class": name, **extra} for name, extra in labels.notes]
+    notes = [_note(name, extra) for name, extra in labels.notes]
     if len(labels):
         calibration = calibration_of(frame)
         to_lidar = np.linalg.inv(calibration.lidar_to_camera)
@@ -91,6 +92,16 @@ def lines_of(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str, 
         line["truncated"] = str(int(value) if _is_level(value, track)
                                 else max(-1, round(2 * value)))
     return lines + notes
+
+
+def _note(name: str, extra: dict[str, Any]) -> dict[str, Any]:
+    """The line of an object without a box: as KITTI's it was read, or as DontCare has it, without
+    a place in the image."""
+    kinds = {"bbox": (4,), "dimensions": (3,), "location": (3,)}
+    with suppress(KeyError, TypeError, ValueError):
+        if all(np.array(extra[c], np.float64).shape == kinds.get(c, ()) for c in COLUMNS):
+            return {"class": name, **extra}
+    return {"class": "_".join(name.split()) or "Misc", **DONT_CARE, "bbox": [0.0] * 4}
 
 
 def _as_read(box: np.ndarray, extra: dict[str, Any], to_lidar: np.ndarray) -> bool:

@@ -160,7 +160,7 @@ def _columns(task: str, labels: FrameLabels, k: int, pose: np.ndarray,
     if kind in LIKE:
         extra["class_name"] = kind
     if isinstance(said := extra.pop("velocity", None), list) and len(said) == 2:
-        velocity = said
+        velocity = _finite(said) or velocity
     columns = {"velocity": velocity, "attribute_name": attribute,
                f"{task}_name": WRITTEN.get(kind, kind),
                f"{task}_score": (float(labels.scores[k]) if np.isfinite(labels.scores[k])
