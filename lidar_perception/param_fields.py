@@ -9,11 +9,15 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+import reprlib
 from collections.abc import Iterator
 from dataclasses import field, fields
 from typing import Any
 
 MAX_INT = 2**31 - 1
+SHOWN = reprlib.Repr()  # of a value that is refused, as much as fits into a line
+SHOWN.maxstring = SHOWN.maxother = SHOWN.maxlong = 80
+SHOWN.maxlevel = 2
 
 # Old names, or old groups of them, and what they are called now.
 RENAMED = {
@@ -66,7 +70,8 @@ def _checked(f: dataclasses.Field[Any], value: Any) -> Any:
     default, limits = f.default, f.metadata
     if isinstance(default, tuple):
         if isinstance(value, str) or not hasattr(value, "__iter__"):
-            raise ValueError(f"{f.name} = {value!r} must be a list of {limits['item'].__name__}")
+            raise ValueError(f"{f.name} = {SHOWN.repr(value)} must be a list of "
+                             f"{limits['item'].__name__}")
         return tuple(_scalar(f, limits["item"], item) for item in value)
     value = _scalar(f, type(default), value)
     if limits["choices"] and value not in limits["choices"]:
@@ -78,7 +83,7 @@ def _scalar(f: dataclasses.Field[Any], kind: type[Any], value: Any) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value) if abs(value) < 2**63 else math.inf if value > 0 else -math.inf
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise ValueError(f"{f.name} = {value!r} must be of type {kind.__name__}")
+        raise ValueError(f"{f.name} = {SHOWN.repr(value)} must be of type {kind.__name__}")
     low, high = f.metadata["low"], f.metadata["high"]
     if kind is float and math.isnan(value):
         raise ValueError(f"{f.name} is not a number (NaN)")

@@ -50,6 +50,8 @@ def adapt(data: Path, weights: Path, out: Path, budget: float, resume: bool, for
       lidar-perception label --data drive.bag --import openlabel:adapted/labels
     """
     from lidar_perception.runs.resuming import locked
+    if resume and force:
+        raise click.UsageError("--resume resumes, --force starts over: give one of them")
     weights = package_weights(weights)
     begin(out, weights, resume, force)
     console.print(f"adapting {weights} to {data}", style="dim")

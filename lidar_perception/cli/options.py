@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterable, Iterator
-from itertools import islice
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from lidar_perception.runs.files import read_text, short
 from lidar_perception.types import InputError
 
 MAX_BYTES, MAX_NAMES = 10**6, 10_000  # of a parameter file; aliases in YAML make many of few bytes
+MAX_DEPTH = 20  # groups in each other
 
 
 class NumberList(click.ParamType):
@@ -93,15 +94,12 @@ def read_config(path: Path, params: Any) -> dict[str, Any]:
         raise InputError(f"cannot read the parameter file {path}: {short(error)}") from None
     if not isinstance(content, dict | None):
         raise InputError(f"{path} is no parameter file; see config/ for the form")
-    known, values = parameter_fields(params), {}
+    known, values, visited = parameter_fields(params), {}, count()
     for node, section in (content or {}).items():
         if not (isinstance(section, dict)
                 and isinstance(section.get("ros__parameters", ()), dict | None)):
             raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for the form")
-        names = islice(_dotted(section.get("ros__parameters") or {}), MAX_NAMES + 1)
-        for count, (name, value) in enumerate(names):
-            if count == MAX_NAMES:
-                raise InputError(f"{path}: '{node}' has more than {MAX_NAMES} parameters")
+        for name, value in _dotted(path, section.get("ros__parameters") or {}, visited):
             if not isinstance(name, str):
                 raise InputError(f"{path}: {name!r} is no name of a parameter; put it into quotes")
             if name in known:
@@ -119,12 +117,17 @@ def _wrong_level(name: str, known: Iterable[str]) -> str:
             "below a parameter that holds no others")
 
 
-def _dotted(section: dict, prefix: str = "") -> Iterator[tuple[Any, Any]]:
-    """(dotted name, value); the name as it is where it is no text."""
+def _dotted(path: Path, section: dict, visited: Iterator[int], prefix: str = "",
+            depth: int = 0) -> Iterator[tuple[Any, Any]]:
+    """(dotted name, value); the name as it is where it is no text. visited counts all that is
+    looked at, as groups may be empty, and may be in each other by their anchors."""
     for key, value in section.items():
+        if next(visited) >= MAX_NAMES or depth >= MAX_DEPTH:
+            raise InputError(f"{path} has more than {MAX_NAMES} parameters, or groups in more than "
+                             f"{MAX_DEPTH} others")
         if not isinstance(key, str):
             yield key, value
         elif isinstance(value, dict):
-            yield from _dotted(value, f"{prefix}{key}.")
+            yield from _dotted(path, value, visited, f"{prefix}{key}.", depth + 1)
         else:
             yield f"{prefix}{key}", value

@@ -74,8 +74,17 @@ def write_bytes(path: str | Path, content: bytes | memoryview) -> None:
 
 
 def _beside(path: Path) -> Path:
-    """A hidden name in the same folder that no other process and no other call takes."""
+    """A hidden name in the same folder that no other process and no other call takes. InputError
+    for a path that ends with no name."""
+    require_name(path)
     return path.with_name(f".{path.name}.{os.getpid()}-{next(_calls)}.tmp")
+
+
+def require_name(path: Path) -> None:
+    """InputError for a path, such as `.`, without a name of its own, beside which something is
+    written first."""
+    if not path.name:
+        raise InputError(f"{path} is no name for something new; give one, such as {path / 'out'}")
 
 
 def check_free(path: Path, force: bool) -> None:

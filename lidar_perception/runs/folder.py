@@ -74,19 +74,25 @@ def _begin(folder: Path, asked: dict, made: Iterable[str], resume: bool, force: 
         _compare(folder, asked)
         return
     refuse_others(folder, (*made, MARK, RECORD, PARTS))
-    write_text(folder / MARK, json.dumps(asked, indent=1))  # first: a stop leaves it marked
+    write_text(folder / MARK, "{}")  # a stop while files are removed leaves what only force takes
     for old in folder.iterdir():
         if old.is_dir() and not old.is_symlink():
             shutil.rmtree(old)
         elif old.name != MARK:
             old.unlink()
+    write_text(folder / MARK, json.dumps(asked, indent=1))
 
 
 def _compare(folder: Path, asked: dict) -> None:
     path = folder / (RECORD if is_finished(folder) else MARK)
     try:
         before = json.loads(path.read_text())
+        if not before:
+            raise InputError(f"{folder} was stopped while --force removed what was there; start "
+                             "again with --force")
         different = differences(before, {k: v for k, v in asked.items() if k != "command"})
+    except InputError:
+        raise
     except (OSError, ValueError, AttributeError) as error:
         raise InputError(f"cannot read {path}: {error}; --force starts again") from None
     if different:

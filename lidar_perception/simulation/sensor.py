@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import yaml
 
-from lidar_perception.runs.files import read_text
+from lidar_perception.runs.files import read_text, short
 from lidar_perception.types import SENSOR_HEIGHT, InputError
 
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where it was built
@@ -190,10 +190,11 @@ def sensor_from_file(path: str | Path) -> Sensor:
     elevations, azimuth_step and rate must be. sensors/*.yaml are examples, and `setup` writes one.
     InputError, which names the file, where it is no such description, or an impossible one."""
     remedy = "see config/sensors/ for examples, or measure one with 'lidar-perception setup'"
+    text = read_text(path, MAX_BYTES)
     try:
-        content = yaml.load(read_text(path, MAX_BYTES), _Loader)
-    except yaml.YAMLError as error:
-        raise InputError(f"{path} is no YAML: {' '.join(str(error).split())[:150]}") from None
+        content = yaml.load(text, _Loader)
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        raise InputError(f"{path} is no YAML: {short(error)}") from None
     if not isinstance(content, dict):
         raise InputError(f"{path} describes no sensor; {remedy}")
     values = {key: value for key, value in content.items() if key != "name"}

@@ -22,7 +22,7 @@ from lidar_perception.cli.main import COMMANDS, cli
 from lidar_perception.cli.options import read_config
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.to_bag import write_bag
-from lidar_perception.param_fields import parameter_fields
+from lidar_perception.param_fields import parameter_fields, with_values
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS, TRUTH
 
@@ -231,12 +231,23 @@ def test_a_config_says_the_same_as_flags_and_flags_win(bag, tmp_path):
     ("[" * 1_500, "cannot read the parameter file"), ("a: 2001-99-99", "cannot read the param"),
     ("\n    ".join(["a0: &a0 {x: 1}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}"
                                         for i in range(40)]), "more than 10000 parameters"),
-], ids=range(7))
+    ("\n    ".join(["a0: &a0 {}"] + [f"a{i + 1}: &a{i + 1} {{x: *a{i}, y: *a{i}}}"
+                                     for i in range(40)]), "more than 10000 parameters"),
+    ("&a {b: *a}", "more than 20 others")], ids=range(9))
 def test_a_parameter_file_says_nothing_that_is_passed_over(tmp_path, section, words):
     file = write(tmp_path / "p.yaml", f"/**:\n  ros__parameters:\n    {section}\n")
     with pytest.raises(InputError) as error:
         read_config(file, PipelineParams())
     assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_value_that_is_refused_is_shown_as_far_as_a_line_goes(tmp_path):
+    lists = ["a0: &a0 [1, 1]", *(f"a{i + 1}: &a{i + 1} [*a{i}, *a{i}]" for i in range(40))]
+    file = write(tmp_path / "p.yaml", "/**:\n  ros__parameters:\n    " + "\n    ".join(
+        [*lists, "clustering.dbscan.min_samples: *a40"]))
+    with pytest.raises(ValueError, match="must be of type int") as error:
+        with_values(PipelineParams(), read_config(file, PipelineParams()))
+    assert len(str(error.value)) < 500
 
 
 @pytest.mark.parametrize("file", sorted(Path(__file__).parents[2].glob("config/*.yaml")),
@@ -326,6 +337,9 @@ def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch,
     (["evaluate", "candidates", "--data", "b", "--seed-source", "luck"], "'luck'"),
     (["convert", "a", "--out", "b", "--limit", "0"], "0 is not in the range"),
     (["convert", "a"], "--out"),
+    (["adapt", "--data", "a", "--out", "b", "--weights", "pointnet", "--resume", "--force"],
+     "give one of them"),
+    (["simulate", "--frames", "1", "--out", "."], "no name for something new"),
     (["run", "bogus"], "'bogus'"),
 ])
 def test_a_command_that_cannot_be_used_is_exit_code_2(arguments, words, monkeypatch, capsys):

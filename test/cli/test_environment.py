@@ -42,3 +42,16 @@ def test_of_two_first_calls_one_makes_the_environment_and_the_other_waits(tmp_pa
         assert "another call is making" in other.stderr.readline()
         write(venv / "lidar-setup", wanted)
     assert other.communicate() == ("ran info\n", "") and other.returncode == 0
+
+
+@pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
+def test_a_sourced_ros_is_not_seen_while_the_environment_is_made(tmp_path):
+    """pip leaves out what it finds on PYTHONPATH."""
+    seen = tmp_path / "seen"
+    python = write(tmp_path / "python", f"#!/bin/sh\necho ${{PYTHONPATH-unset}} >>{seen}\n")
+    python.chmod(0o755)
+    done = subprocess.run([ROOT / "lidar", "info"], text=True, capture_output=True, env={
+        **os.environ, "PYTHONPATH": "/opt/ros/jazzy/lib", "LIDAR_VENV": str(tmp_path / "venv"),
+        "LIDAR_PYTHON": str(python)})
+    assert done.returncode == 1 and "pip failed" in done.stderr  # this python makes none
+    assert seen.read_text().split() == ["unset", "unset"]

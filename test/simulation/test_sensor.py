@@ -107,7 +107,8 @@ def test_a_file_in_degrees_is_the_sensor_in_radians(tmp_path):
 
 
 @pytest.mark.parametrize("text, named", [
-    ("[1, 2", "no YAML"), ("- 1", "describes no sensor"), ("azimuth_step: 1", "elevations"),
+    ("[1, 2", "no YAML"), ("rate: 2024-13-45", "no YAML"), ("rate: " + "1" * 5000, "no YAML"),
+    ("- 1", "describes no sensor"), ("azimuth_step: 1", "elevations"),
     ("elevations: [1]\nazimuth_step: 1\nrate: 10\nbeams: 3", "no 'beams'; known are"),
     ("elevations: 3\nazimuth_step: 1\nrate: 10", "elevations = 3 must be a list of numbers"),
     ("elevations: [1]\nazimuth_step: yes\nrate: 10", "azimuth_step = True must be a number"),

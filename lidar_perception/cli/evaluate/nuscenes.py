@@ -12,6 +12,7 @@ from lidar_perception.cli.data import (
     a_path,
     device_option,
     no_labels,
+    out_file,
     range_option,
     walk_options,
     weights_option,
@@ -28,8 +29,8 @@ from lidar_perception.types import InputError
 @weights_option
 @range_option
 @device_option
-@a_path("--write-results", "Write the detections of --weights as a result file, also for frames "
-                           "without labels.", "JSON")
+@out_file("--write-results", "Write the detections of --weights as a result file, also for frames "
+                             "without labels.")
 def nuscenes(walk: Walk, results: Path | None, weights: Path | None, where: str, device: str,
              write_results: Path | None) -> None:
     """Boxes by the protocol of nuScenes' detection task.
