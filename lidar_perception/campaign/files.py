@@ -33,6 +33,7 @@ COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
     "template": (3, [("evaluate", "candidates", *KITTI, "--seed-source", "file",
                       "--seed-file", "{}")]),
     "yaml": (3, [("evaluate", "candidates", *KITTI, "--config", "{}")]),
+    "sensor": (1, [("simulate", "--sensor", "{}", "--frames", "1", "--out", "made")]),
     "weights": (3, [("evaluate", "detection", *KITTI, "--limit", "1", "--weights", "{}")]),
     "fused": (1, [("evaluate", "detection", *KITTI, "--limit", "1", "--weights", "{}")]),
     "onnx": (1, [("evaluate", "detection", *KITTI, "--limit", "1", "--weights", "{}")]),

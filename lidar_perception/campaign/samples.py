@@ -81,6 +81,8 @@ def write_samples(root: Path) -> None:
     write_bytes(root / "fused/fused.json", (
         package / "detectors/fused/fusion.json").read_bytes())
     write_text(root / "yaml/best.yaml", _yaml(BEST_VALUES))
+    write_bytes(root / "sensor/mine.yaml", (
+        package / "simulation/sensors/vlp-16.yaml").read_bytes())
     for name in ("pointpillars_v0_compact", "pointnet"):
         write_bytes(root / f"weights/{name}.safetensors", (
             package / f"detectors/{name.partition('_')[0]}/weights/{name}.safetensors"
