@@ -30,7 +30,7 @@ from lidar_perception.training.params import FusedTraining
 from lidar_perception.training.scenes import SimulatedScenes
 from lidar_perception.training.sources import FIRST_FITTED_SCENE
 from lidar_perception.training.trained_for import as_trained, trained_height
-from lidar_perception.types import CLASSES
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT
 
 NEAR = 0.5   # metres from the centre of a person, or of a cyclist: is one, too
 FEWEST = 20  # proposals of a class that are right, and as many that are wrong, to fit curves to
@@ -116,8 +116,8 @@ def samples_of(frame: Frame, look: Look, scan: int) -> Samples:
     one object the one with the best score, as only one is kept."""
     truth, camera, found = frame.truth(), frame.camera(), look.proposed
     assert truth is not None  # as of all simulated scans
-    seen = np.ones(len(found), bool) if camera is None else camera.in_view(
-        found.boxes[:, :3].copy())
+    centres = found.boxes[:, :3] - np.array([0, 0, frame.sensor_height - SENSOR_HEIGHT], np.float32)
+    seen = np.ones(len(found), bool) if camera is None else camera.in_view(centres)
     kept, right = [], []
     for class_id in np.unique(found.class_ids):
         own = np.flatnonzero((found.class_ids == class_id) & seen)

@@ -169,6 +169,8 @@ def test_intensity_is_scaled_and_may_be_left_out():
     assert same(detector(half), found)
     without = detector(replace(scan, intensity=None))
     assert "no intensity" in without.problem
+    half = np.where(np.arange(len(scan)) % 2, np.float32(np.nan), scan.intensity)
+    assert "their intensity is no number" in detector(replace(scan, intensity=half)).problem
     detector.params = with_values(detector.params, {"pointpillars.intensity_scale": 0.0})
     for blind in scan, replace(scan, intensity=None):
         assert same(detector(blind), without) and detector(blind).problem is None

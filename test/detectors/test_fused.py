@@ -24,6 +24,7 @@ from lidar_perception.detectors.boxes import (
     on_ground,
     on_points,
 )
+from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.fused.detector import FusedDetector, one_of_each
 from lidar_perception.detectors.fused.evidence import LEAST, clipped_logit
@@ -195,6 +196,15 @@ def test_a_higher_sensor_and_given_columns_change_nothing(detector):
     # Of what the network does not see nothing is asked.
     ground = ~np.isin(scan.xyz.view("V12").ravel(), look.xyz.view("V12").ravel())
     assert same(detector(scan, ground=ground), found)
+
+
+@pytest.mark.parametrize("height, stays", [(0.4, True), (1.0, True), (1.73, False), (6.0, True)])
+def test_a_car_close_to_a_sensor_that_it_does_not_carry_is_looked_at(detector, monkeypatch, height,
+                                                                     stays):
+    """What carries the sensor depends on how high that is, and not on how high networks have it."""
+    car = Detections.of([[0, 1.4, -0.98, 4, 1.6, 1.5, 0]], CAR, 0.9)  # 0.6 m aside
+    monkeypatch.setattr(detector.proposer.__class__, "propose", lambda *_: Found(car))
+    assert len(detector.mounted_at(height).look(frame()).proposed) == stays
 
 
 def test_it_says_so_when_a_part_had_to_leave_its_device(detector):

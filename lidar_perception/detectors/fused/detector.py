@@ -33,6 +33,7 @@ from lidar_perception.detectors.view import (
     made_up_frame,
     visible,
     with_intensity_scaled,
+    without_carrier,
 )
 from lidar_perception.geometry import bev_iou, centre_distances
 from lidar_perception.ground.params import SensorPoseParams
@@ -113,10 +114,10 @@ class FusedDetector(NetworkDetector):
         with ThreadPoolExecutor(1) as beside:
             clustered = beside.submit(cluster_obstacles, seen.xyz, ground, self.params.people,
                                       frame.xyz)
-            proposed = self._proposer()(seen, ground=ground, cluster_ids=cluster_ids)
+            proposed = self._proposer().propose(seen, ground, cluster_ids)
             people = clustered.result()[~ground]
         times.append(perf_counter())
-        found = proposed.detections
+        found = without_carrier(proposed.detections, self.params.ground.sensor_pose.height)
         evidence = {"network": clipped_logit(found.scores), "silhouette": clipped_logit(
             silhouette_at(found.boxes, obstacles.xyz, floor, people))}
         open_ = scores.passed(replace(found, scores=at_most(self.models, found.class_ids,

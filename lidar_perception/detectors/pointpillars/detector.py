@@ -103,9 +103,16 @@ class PointPillarsDetector(NetworkDetector):
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:
         """Columns are computed only if the version needs them."""
+        found = self.propose(frame, ground, cluster_ids)
+        return replace(found, detections=as_found(found.detections,
+                                                  self.params.ground.sensor_pose))
+
+    def propose(self, frame: LidarFrame, ground: np.ndarray | None = None,
+                cluster_ids: np.ndarray | None = None) -> Found:
+        """What is detected, as from a level sensor at SENSOR_HEIGHT, with what carries the sensor
+        among it."""
         t0 = perf_counter()
-        pose = self.params.ground.sensor_pose
-        indices, seen = visible(frame, self.config, pose)
+        indices, seen = visible(frame, self.config, self.params.ground.sensor_pose)
         seen = with_intensity_scaled(seen, self.settings.intensity_scale)
         t1 = perf_counter()
         looks = self._looks(seen, *experts(
@@ -119,7 +126,6 @@ class PointPillarsDetector(NetworkDetector):
                          problem or self.fallback)
         with torch.inference_mode():
             t3, t4, detections, best, broken = self.guarded(lambda: self._predict(looks))
-            detections = as_found(detections, pose)
         t5 = perf_counter()
         ms = dict(zip(STEPS, (
             (t1 - t0 + t3 - t2) * 1e3, (t2 - t1) * 1e3, (t4 - t3) * 1e3, (t5 - t4) * 1e3)))
@@ -204,6 +210,10 @@ class PointPillarsDetector(NetworkDetector):
                  looks: dict[bool, NetworkInput]) -> str | None:
         if blind := self.out_of_sight(frame, seen):
             return blind
+        if seen.intensity is not None and (
+                lost := len(seen) - np.count_nonzero(np.isfinite(seen.intensity))):
+            return (f"{lost} of {len(seen)} points are not seen, as their intensity is no number "
+                    "(NaN); give 0 where it is not known")
         if not looks:
             return ("every point in the network's range is ground; is the sensor mounted at "
                     "another height or angle? set ground.sensor_pose")
@@ -230,8 +240,10 @@ class PointPillarsDetector(NetworkDetector):
         return other
 
     def bring_to(self, device: torch.device) -> None:
-        """Bring the network to a device; the anchors follow."""
+        """Bring the network and its anchors to a device."""
         self.network.to(device)
+        if self.anchors.device != device:
+            self.anchors = make_anchors(self.look, device)
 
     def warm_up(self) -> None:
         """Run every part once on made-up points, so that what is compiled is compiled."""

@@ -154,7 +154,7 @@ def decoys(background: Clusters, config: PointNetConfig) -> np.ndarray:
 def proposals(frame: LidarFrame, proposer: Path) -> np.ndarray:
     """(P, 7) boxes that PointPillars with these weights proposes at SENSOR_HEIGHT, as low as its
     score is: the best of each class, at most PROPOSED."""
-    found = _proposer(proposer)(frame).detections
+    found = _proposer(proposer).propose(frame).detections
     return np.concatenate([found.boxes[found.class_ids == i][:PROPOSED]
                            for i in range(len(CLASSES))])
 
