@@ -137,7 +137,9 @@ class FusedDetector(NetworkDetector):
             ground=replace(self.params.ground, sensor_pose=SensorPoseParams(height=SENSOR_HEIGHT)),
             clustering=self.params.clustering,
             pointpillars=PointPillarsParams(scores=ScoreParams.all_alike(settings.proposals),
-                                            nms=settings.nms, cpu_fallback=settings.cpu_fallback))
+                                            nms=replace(settings.nms,
+                                                        max_boxes=settings.max_proposals),
+                                            cpu_fallback=settings.cpu_fallback))
         return other
 
     def _classifier(self) -> PointNetDetector:

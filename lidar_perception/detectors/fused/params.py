@@ -8,6 +8,7 @@ from lidar_perception.candidates.configurations import BEST
 from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.detectors.params import (
     NetworkParams,
+    NmsParams,
     layers_format,
     seen_range,
     share_on_points,
@@ -35,6 +36,9 @@ class FusedParams(NetworkParams):
     amp: str = layers_format()
     proposals: float = param(0.02, "Least score of PointPillars for a box to be looked at.",
                              low=0.001, high=1.0)
+    max_proposals: int = param(200, "Boxes of PointPillars that are looked at, those with its "
+                                    "highest scores.", low=1, high=10_000)
+    nms: NmsParams = NmsParams(candidates=1000)
     same_place: float = param(0.6, "People, and cyclists, whose centres are nearer than this are "
                                    "one.", unit="m", low=0.0, high=10.0)
     same_car: float = param(0.02, "Cars that overlap by more than this, seen from above, are one.",
