@@ -127,6 +127,7 @@ def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], poi
             sequence: str | None, where: str, device: str) -> Served:
     """What the page shows of a path."""
     from lidar_perception.data.bag_frames import recognises
+    from lidar_perception.data.frame import frame_id_of
     from lidar_perception.data.open import with_topic
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.labeling import results as shown
@@ -142,7 +143,7 @@ def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], poi
     if a_bag:
         drive = shown.with_recorded_scans(drive)
         found = shown.recorded(path, [f.stamp_ns for f in drive.frames],
-                               drive.frames[0].load().frame_id)
+                               frame_id_of(drive.frames))
     height = drive.frames[0].sensor_height
     made = {Path(name): shown.by_detector(
         open_detector(name, device, sensor_height=height, where=where)) for name in weights}

@@ -6,6 +6,7 @@ Nothing is read before it is asked for, so a list of a whole data set costs its 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -70,6 +71,14 @@ class Frame:
         """A frame of what is in memory already."""
         return Frame(name, scan.stamp_ns, partial(_given, scan), partial(_given, truth),
                      calibration=partial(_given, calibration), **more)
+
+
+def frame_id_of(frames: Sequence[Frame]) -> str:
+    """The coordinate frame of their clouds, as the first one names it; "" where there is none, or
+    it cannot be read, which is said when it is asked for."""
+    with suppress(InputError):
+        return frames[0].load().frame_id if frames else ""
+    return ""
 
 
 def _given(value: Any) -> Any:

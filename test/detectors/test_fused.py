@@ -198,6 +198,13 @@ def test_a_higher_sensor_and_given_columns_change_nothing(detector):
     assert same(detector(scan, ground=ground), found)
 
 
+def test_as_many_boxes_are_looked_at_as_asked_for_the_likeliest_ones(detector):
+    every, other = detector.look(frame()).proposed, copy.copy(detector)
+    other.params = with_values(detector.params, {"fused.max_proposals": 9})
+    few = other.look(frame()).proposed  # but for what would carry the sensor
+    assert len(every) > 100 and 0 < len(few) <= 9 and same(few, every[:len(few)])
+
+
 @pytest.mark.parametrize("height, stays", [(0.4, True), (1.0, True), (1.73, False), (6.0, True)])
 def test_a_car_close_to_a_sensor_that_it_does_not_carry_is_looked_at(detector, monkeypatch, height,
                                                                      stays):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -243,7 +244,8 @@ def test_of_what_a_proposer_finds_where_nothing_is_the_network_learns_that_it_is
     scene = TrainingScene(points.astype(np.float32), BOXES[:1], ids("Car"), np.array([True]))
     near = BOXES[0] + [1, 0.5, 0, 0, 0, 0, 0.2]
     found = Detections.of(np.array([near, empty]), ids("Car", "Pedestrian"), np.array([0.9, 0.5]))
-    monkeypatch.setattr(cut_scenes, "_proposer", lambda path: lambda frame: Found(found))
+    monkeypatch.setattr(cut_scenes, "_proposer", lambda path: SimpleNamespace(
+        propose=lambda frame: Found(found)))
     plain, made = (cut(scene, CONFIG, 5, path) for path in (None, tmp_path))
     none = len(CONFIG.classes)
     boxes = made.boxes[made.loose & (made.labels == none)]
