@@ -30,6 +30,7 @@ PARTS: dict[str, tuple[float, Limits, str]] = {
 }
 NEEDS_ROS = {"messages", "live", "faults", "load", "leaks"}
 FOREVER = 2**62
+INTERRUPTED = "interrupted"  # by ctrl-C
 SAME = 5  # files that are kept of failures that give the same reason
 
 
@@ -102,7 +103,7 @@ def run_campaign(out: Path, minutes: float, seed: int, only: Sequence[str] = (),
             try:
                 _run_part(tally, out, seed, weight * max(0.0, end - monotonic()), most, watch)
             except KeyboardInterrupt:  # what is known so far is said all the same
-                tally.problem = "interrupted"
+                tally.problem = INTERRUPTED
                 break
     return tallies
 

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lidar_perception.campaign.case import FAILED, REFUSED, SKIPPED, SURVIVED
-from lidar_perception.campaign.run import PARTS, Tally, replay, run_campaign
+from lidar_perception.campaign.run import INTERRUPTED, PARTS, Tally, replay, run_campaign
 from lidar_perception.runs.files import write_text
 from lidar_perception.runs.terminal import console, progress
 
@@ -66,6 +66,8 @@ def campaign(minutes: float, seed: int, only: tuple[str, ...], cases: int | None
     write_text(out / "campaign.json", json.dumps(
         {"seed": seed, "minutes": minutes, **{t.part: t.content() for t in tallies}}, indent=1))
     _print(tallies)
+    if any(t.problem == INTERRUPTED for t in tallies):
+        raise SystemExit(130)
     raise SystemExit(1 if any(t.failed() for t in tallies) else 0)
 
 

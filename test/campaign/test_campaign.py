@@ -96,6 +96,12 @@ def test_the_command_ends_with_1_if_anything_failed(planted, tmp_path, monkeypat
     content = json.loads((tmp_path / "out/campaign.json").read_text())
     assert content["planted"]["tried"] == 4 and content["planted"][FAILED] == 1
 
+    def stopped(*_):
+        raise KeyboardInterrupt
+    monkeypatch.setattr(Tally, "add", stopped)
+    result = run("--only", "planted", "--cases", "3")
+    assert result.exit_code == 130 and "interrupted" in result.output
+
 
 def test_a_part_that_cannot_start_is_a_failure_with_a_reason(tmp_path, monkeypatch):
     monkeypatch.setitem(PARTS, "nowhere", (1, Limits(1.0, 1.0), ""))
