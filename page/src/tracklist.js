@@ -11,6 +11,7 @@ const STATE = { left: "proposed", accepted: "accepted", rejected: "rejected" };
 const ROW = 34; // pixels, as in app.css
 const list = document.getElementById("tracks");
 const tabs = document.getElementById("filters");
+let pressed = false, late = false;
 const classes = document.getElementById("only"), rest = document.getElementById("reject-rest");
 
 function listed() {
@@ -102,8 +103,9 @@ function showClasses() {
   }, element("i", { class: "dot", style: `background:${colourOfClass(name)}` }), name)));
 }
 
-/** Only the rows in sight are made. */
+/** Only the rows in sight are made; none while one is pressed, or the click would meet another. */
 function place() {
+  if (pressed) { late = true; return; }
   const tracks = store.shownTracks, first = Math.max(0, Math.floor(list.scrollTop / ROW) - 2);
   const seen = tracks.slice(first, first + Math.ceil(list.clientHeight / ROW) + 4);
   const rest = tracks.length - first - seen.length;
@@ -147,6 +149,15 @@ export function openTrackList() {
     }, title, element("span", { class: "count" })));
   }
   list.addEventListener("scroll", place);
+  list.addEventListener("pointerdown", (event) => {
+    pressed = event.target.closest("[data-track]") !== null;
+  });
+  for (const end of ["pointerup", "pointercancel"]) {
+    addEventListener(end, () => setTimeout(() => { // after the click
+      pressed = false;
+      if (late) { late = false; place(); }
+    }));
+  }
   list.addEventListener("mousedown", (event) => { // arrow keys then move the box that was chosen
     if (event.target !== list) event.preventDefault();
   });

@@ -195,6 +195,22 @@ def test_what_is_typed_or_held_is_of_the_track_and_the_frame_where_that_began(pa
     page.wait_for_function("() => page.store.frame === 0")
 
 
+def test_a_row_that_is_pressed_is_chosen_though_the_list_changes_meanwhile(page, labels, person):
+    """As it does when an action of somebody comes from the server."""
+    other, number = labels.chosen(page, person), labels.chosen(page, person)
+    labels.wait(page, other, lambda t: t is not None)
+    page.click("[data-filter=all]")
+    assert page.evaluate("page.store.selected") == number
+    for chosen in other, number:
+        row = page.locator(f"[data-track='{chosen}']").bounding_box()
+        page.mouse.move(row["x"] + 30, row["y"] + row["height"] / 2)
+        page.mouse.down()
+        page.evaluate("document.getElementById('tracks').dispatchEvent(new Event('scroll'))")
+        page.mouse.up()
+        page.wait_for_function("n => page.store.selected === n", arg=chosen)
+        page.wait_for_selector(f"[data-track='{chosen}'][aria-selected=true]")
+
+
 def test_a_hand_that_shakes_moves_no_box_and_space_presses_no_button(page, labels, person):
     number = labels.chosen(page, person)
     lines = len(labels.lines())
