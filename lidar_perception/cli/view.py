@@ -127,7 +127,6 @@ def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], poi
             sequence: str | None, where: str, device: str) -> Served:
     """What the page shows of a path."""
     from lidar_perception.data.bag_frames import recognises
-    from lidar_perception.data.frame import frame_id_of
     from lidar_perception.data.open import with_topic
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.labeling import results as shown
@@ -142,8 +141,7 @@ def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], poi
     found = shown.Results()
     if a_bag:
         drive = shown.with_recorded_scans(drive)
-        found = shown.recorded(path, [f.stamp_ns for f in drive.frames],
-                               frame_id_of(drive.frames))
+        found = shown.recorded(recording.frames.poses, [f.stamp_ns for f in drive.frames])
     height = drive.frames[0].sensor_height
     made = {Path(name): shown.by_detector(
         open_detector(name, device, sensor_height=height, where=where)) for name in weights}

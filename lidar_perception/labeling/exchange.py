@@ -20,6 +20,7 @@ from lidar_perception.labeling.formats import (
     sustech,
 )
 from lidar_perception.labeling.formats.files import MAX_BYTES, read_json
+from lidar_perception.labeling.formats.kitti_lines import label_folder
 from lidar_perception.labeling.labels import NO_TRACK, DriveLabels
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
@@ -88,10 +89,9 @@ def recognised(path: Path) -> str:
                          f"{', '.join(FORMATS)}")
     if path.suffix in (".mcap", ".db3") or (path.is_dir() and is_bag(path)):
         return "bag"
-    for inner in path, path / "training":
-        for folder, format in ("label_02", "kitti_tracking"), ("label_2", "kitti_object"):
-            if (inner / folder).is_dir():
-                return format
+    for folder, format in ("label_02", "kitti_tracking"), ("label_2", "kitti_object"):
+        if label_folder(path, folder) != path:
+            return format
     for file in files:
         found = _by_text(file) if file.suffix == ".txt" else _by_json(read_json(file))
         if found:

@@ -154,15 +154,15 @@ def points_topic(path: Path) -> str:
         return known[0] if known else cloud_topic(bag)
 
 
-def recorded(path: Path, stamps: list[int], frame_id: str = "") -> Results:
-    """What a bag holds beside its clouds, whose stamps and frame are given: detections of every
+def recorded(poses: BagPoses, stamps: list[int]) -> Results:
+    """What a bag holds beside its clouds, whose poses and stamps are given: detections of every
     node, tracks. A message belongs to the cloud of its stamp. A topic whose boxes nothing connects
     with the clouds' frame is left out, and that is said."""
-    with Bag(path) as bag:
+    with Bag(poses.path) as bag:
         wanted = {topic for topic, kind in bag.topics.items() if kind == MARKERS and topic != TRUTH
                   and topic.endswith((FOUND, TRACKS))}
         found = by_stamp(bag, sorted(wanted))
-    numbers, poses = {stamp: i for i, stamp in enumerate(stamps)}, BagPoses(path, frame_id)
+    numbers = {stamp: i for i, stamp in enumerate(stamps)}
     sources: dict[str, Source] = {}
     tracks: list[dict[str, Any]] = []
     trackers = [topic for topic in found if topic.endswith(TRACKS)]

@@ -87,14 +87,12 @@ def _compare(folder: Path, asked: dict) -> None:
     path = folder / (RECORD if is_finished(folder) else MARK)
     try:
         before = json.loads(path.read_text())
-        if not before:
-            raise InputError(f"{folder} was stopped while --force removed what was there; start "
-                             "again with --force")
         different = differences(before, {k: v for k, v in asked.items() if k != "command"})
-    except InputError:
-        raise
     except (OSError, ValueError, AttributeError) as error:
         raise InputError(f"cannot read {path}: {error}; --force starts again") from None
+    if not before:
+        raise InputError(f"{folder} was stopped while --force removed what was there; start again "
+                         "with --force")
     if different:
         raise InputError(f"{folder} was begun with {'; '.join(different)}; resume it with the same "
                          "arguments, or start again with --force")

@@ -220,14 +220,15 @@ def test_boxes_in_another_frame_are_brought_to_that_of_the_clouds(parts, tmp_pat
                                  header=header_message(stamp, "odom", bag_message))
         rows += [(topic, MARKERS, stamp, marked) for topic in ("/n/output/detections",
                                                                "/n/output/tracks")]
-    frames = recorded(tmp_path / "bag", *map(list, parts), rows).frames[:]
+    recording = recorded(tmp_path / "bag", *map(list, parts), rows)
+    frames, poses = recording.frames[:], recording.frames.poses
     if not parts:
         with pytest.raises(InputError, match="in 'odom', the clouds in 'lidar'"):
             bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
-        assert not results.recorded(tmp_path / "bag", stamps(), "lidar").sources
+        assert not results.recorded(poses, stamps()).sources
         return
     labels = bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
-    shown = results.recorded(tmp_path / "bag", stamps(), "lidar")
+    shown = results.recorded(poses, stamps())
     for i, (frame, each) in enumerate(zip(frames, labels.frames)):
         near = moved_boxes(boxes, inverse(base_at(frame.stamp_ns) @ ON_BASE))
         np.testing.assert_allclose(each.boxes, near, atol=1e-3)

@@ -19,10 +19,10 @@ from lidar_perception.geometry import points_in_box
 from lidar_perception.labeling import survey_cache
 from lidar_perception.labeling.alike import alike
 from lidar_perception.labeling.annotator import Annotator, Truth, is_right
-from lidar_perception.labeling.drive import Clouds, Drive, Scan, one_drive
+from lidar_perception.labeling.drive import Drive
 from lidar_perception.labeling.journal import NAME
 from lidar_perception.labeling.session import session
-from lidar_perception.labeling.snap import headed, to_cluster, to_ground, to_size
+from lidar_perception.labeling.snap import to_cluster, to_ground
 from lidar_perception.labeling.state import KEY, PROPOSED, Box, State
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.types import InputError
@@ -346,37 +346,6 @@ def test_proposals_that_are_cancelled_write_nothing(made):
     assert made.state == State() and made.proposer.looks is None
 
 
-def test_clouds_keep_to_their_bound_and_are_made_once():
-    made = []
-
-    def make(i):
-        made.append(i)
-        return Scan(np.zeros((1000, 3), np.float32), np.zeros(1000, np.uint8),
-                    np.zeros(1000, bool), np.zeros(1000, np.int32))
-    clouds = Clouds(make, limit=5 * make(0).size)
-    made.clear()
-    threads = [threading.Thread(target=clouds, args=(3,)) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert made == [3]
-    for i in range(1000):
-        clouds(i)
-        assert sum(s.size for s in clouds._kept.values()) == clouds._size <= 5 * make(0).size
-    assert len(clouds._making) <= 6
-
-
-def test_a_recording_of_several_drives_wants_one_named():
-    frames = [*simulated_scans(SEED, 2, streets_of=1)]
-    recording = Recording(Path("two"), "simulated", frames)
-    with pytest.raises(InputError, match="--sequence"):
-        one_drive(recording)
-    assert [f.sequence for f in one_drive(recording, "0001").frames] == ["0001"]
-    with pytest.raises(InputError, match="no drive 7"):
-        one_drive(recording, "7")
-
-
 def test_boxes_snap_to_what_is_there(drive):
     frame = drive.frames[0]
     truth, scan = frame.truth(), drive.clouds(0)
@@ -393,27 +362,3 @@ def test_boxes_snap_to_what_is_there(drive):
         to_cluster(scan, np.array([0, 0, 50.0, 1, 1, 1, 0]))
     with pytest.raises(InputError, match="no ground"):
         to_ground(scan, np.array([500.0, 0, 0, 1, 1, 1, 0]))
-
-
-def test_another_size_leaves_the_corner_that_is_seen():
-    from lidar_perception.geometry import box_corners
-    rng = np.random.default_rng(0)
-    for _ in range(50):
-        box = np.array([*rng.uniform(8, 20, 2) * rng.choice([-1, 1], 2), 0, *rng.uniform(1, 4, 3),
-                        rng.uniform(-3, 3)])
-        other = to_size(box, rng.uniform(1, 4, 3))
-        corners, after = (box_corners(b[None])[0][:, :2] for b in (box, other))
-        nearest = int(np.hypot(*corners.T).argmin())
-        seen = np.array([np.cos(box[6]), np.sin(box[6])]) @ -box[:2]
-        if abs(seen) > box[3] / 2 and abs(np.array([-np.sin(box[6]), np.cos(box[6])])
-                                         @ -box[:2]) > box[4] / 2:
-            assert np.allclose(corners[nearest], after[nearest])
-        assert other[2] - other[5] / 2 == pytest.approx(box[2] - box[5] / 2)
-        assert to_size(other, box[3:6]) == pytest.approx(box) or abs(seen) <= 4
-
-
-def test_a_box_has_four_ways_to_say_it():
-    box = np.array([1.0, 2, 3, 4, 2, 1, 0.3])
-    for turn in range(-4, 5):
-        again = headed(headed(box, 0.3 + turn * np.pi / 2), 0.35)
-        assert again == pytest.approx(box)

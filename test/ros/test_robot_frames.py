@@ -22,14 +22,13 @@ from lidar_perception.nodes.perception import Perception
 from lidar_perception.nodes.pointpillars_detector import PointPillarsNode
 from lidar_perception.nodes.transforms import NO_TF
 from lidar_perception.param_fields import flatten, with_values
-from lidar_perception.robot.deskew import skewed, steady
 from lidar_perception.robot.placing import tilted
 from lidar_perception.robot.poses import inverse, moved_points
 from lidar_perception.wire.codec import bag_message, decode, encode
-from lidar_perception.wire.messages import column, to_detections, to_frame
+from lidar_perception.wire.messages import to_detections
 from msg_utils.markers import from_marker_array
-from msg_utils.point_cloud2 import from_array, to_array
-from msg_utils.stamps import header_message, time_message
+from msg_utils.point_cloud2 import from_array
+from msg_utils.stamps import header_message
 
 START = 1_700_000_000 * 10**9
 PERIOD = 10**8
@@ -286,110 +285,6 @@ def test_a_cloud_waits_for_a_transform_that_is_late_or_that_never_came(start):
     deliver(encode(message(xyz, START + 2 * PERIOD)), False)  # it has waited for long enough
     assert boxes_of(node)[1] == "lidar" and "0.100 s older than needed" in problems(node)
     assert deliver(encode(message(xyz, START + 20 * PERIOD)), True) is None  # odom has stopped
-
-
-def drive(at_ns):
-    """The base's pose in odom: 15 m/s on a left turn."""
-    return steady([15.0, 0.0, 0.0], [0.0, 0.0, 0.5])(np.array([(at_ns - START) * 1e-9]))[0]
-
-
-@pytest.mark.parametrize("source", ["odometry", "tf"])
-def test_a_cloud_of_a_moving_sensor_is_moved_to_its_stamp(start, source):
-    """Later nodes get the moved points, all at the stamp; the robot's own body stays where it is;
-    without odometry the cloud is used as it is, and this is said."""
-    rng = np.random.default_rng(0)
-    sensor = mounted(1.2, 0.1, 1.8, 0.5, 0.0, 0.0)
-    still = np.vstack([rng.uniform(-30, 30, (3000, 3)) * [1, 1, 0.001] - [0, 0, 1.8],
-                       rng.uniform(-0.5, 0.5, (50, 3)) + [-1.0, 0, -0.6]]).astype(np.float32)
-    body = np.arange(3000, 3050)
-    seconds = rng.uniform(0.0, 0.1, len(still))
-
-    def poses(at):
-        return np.array([drive(START + round(s * 1e9)) @ sensor for s in at])
-    raw = skewed(still, seconds, poses)
-    raw[body] = still[body]
-    node = start(GroundSegmentation, **{
-        "input.deskew": source, "base_frame": "base",
-        "crop.body": [-1.5, -1.5, 0.2, 2.0, 1.5, 2.5]})
-    node.transforms.on_tf(transforms(("base", "lidar", sensor, 0)), static=True)
-    msg = message(raw, t=np.rint(seconds * 1e9).astype("<u4"))
-
-    give(node, msg)
-    as_it_is = decode(node.sent["points"][-1], "sensor_msgs/msg/PointCloud2")
-    np.testing.assert_array_equal(to_array(as_it_is)["x"], raw[:, 0])
-    assert node.counts["not_deskewed"] == 1
-    assert "clouds are used as they are" in problems(node)
-
-    for i in range(-5, 16):
-        stamp = START + i * PERIOD // 10
-        if source == "tf":
-            node.transforms.on_tf(transforms(("odom", "base", drive(stamp), stamp)), static=False)
-        else:
-            node.transforms.on_odometry(odometry(drive(stamp), stamp))
-    give(node, msg)
-    assert "deskew" not in problems(node) and node.counts["deskewed"] == 1
-    after = decode(node.sent["points"][-1], "sensor_msgs/msg/PointCloud2")
-    moved = np.column_stack([to_array(after)[n] for n in "xyz"])
-    others = np.setdiff1d(np.arange(len(still)), body)
-    wrong = np.linalg.norm(raw - still, axis=1)[others]
-    np.testing.assert_allclose(moved[others], still[others], atol=5e-3)
-    assert np.median(wrong) > 0.5
-    np.testing.assert_array_equal(moved[body], still[body])
-    assert not column(after, "in_view", body).any() and not to_array(after)["t"].any()
-    frame_, _ = to_frame(after)
-    again = start(GroundSegmentation, **{"input.deskew": source})
-    again.transforms = node.transforms
-    give(again, after)
-    np.testing.assert_array_equal(  # moved once
-        to_array(decode(again.sent["points"][-1], "sensor_msgs/msg/PointCloud2"))["x"],
-        moved[:, 0])
-    give(node, message(raw, START + PERIOD))
-    assert "no column of times" in problems(node) and len(node.sent["points"]) == 3
-    assert time_message(START, bag_message).sec == after.header.stamp.sec and len(frame_)
-
-
-def test_the_first_cloud_waits_for_odometry_that_lags_behind_the_end_of_its_turn(start):
-    rng = np.random.default_rng(0)
-    xyz = (rng.uniform(-30, 30, (2000, 3)) * [1, 1, 0.001] - [0, 0, 1.8]).astype(np.float32)
-    msg = message(xyz, t=np.linspace(0, 1e8, len(xyz)).astype("<u4"))
-    node = start(GroundSegmentation, **{"input.deskew": "odometry"})
-    deliver = node._receptions()[0].deliver
-    for i in range(-2, 9):
-        node.transforms.on_odometry(odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
-    needed = deliver(encode(msg), True)
-    assert "/ground_segmentation/input/odometry" in needed and "0.020 s older" in needed
-    assert "'lidar'" in needed and "child_frame_id" not in needed
-    assert node.counts["frames"] == 0
-    for i in (9, 10):
-        node.transforms.on_odometry(odometry(np.eye(4), START + i * PERIOD // 10, "lidar"))
-    assert deliver(encode(msg), True) is None
-    assert node.counts["deskewed"] == 1 and "not_deskewed" not in node.counts
-
-
-@pytest.mark.parametrize("first, begin, sectors", [(0.3, 0.0, ()), (1.0, -1.0, (120.0, 240.0))])
-def test_later_clouds_wait_for_the_end_of_their_turn_whatever_the_first_one_was(start, first, begin,
-                                                                                sectors):
-    """A part of a turn, where the driver starts in the middle of one; or one that is stamped at its
-    end, near which points are cropped. The odometry comes every 0.02 s."""
-    node = start(GroundSegmentation, **{"input.deskew": "odometry", "crop.sectors": sectors})
-    deliver = node._receptions()[0].deliver
-    heard = iter(range(START, START + 20 * PERIOD, PERIOD // 5))
-
-    def hear():
-        stamp = next(heard)
-        node.transforms.on_odometry(odometry(np.eye(4), stamp, "lidar"))
-        return stamp
-    known = hear()
-    for i in range(1, 8):
-        share = np.linspace(0, 1, 400)[:round(400 * (first if i == 1 else 1.0))]
-        angle, seconds = np.pi - 2 * np.pi * share, 0.0999 * (begin + share)
-        xyz = np.column_stack([20 * np.cos(angle), 20 * np.sin(angle), np.full(len(angle), -1.7)])
-        stamp = START + i * PERIOD + PERIOD // 10
-        while known < stamp + 1e9 * seconds[-1] - PERIOD // 5:
-            known = hear()
-        while deliver(encode(message(xyz, stamp, time=seconds.astype("<f4"))), True):
-            known = hear()
-    assert node.counts["deskewed"] == 7 - (first < 1.0)  # the second cannot know
 
 
 def test_tracks_of_a_tilted_sensor_stay_in_the_clouds_frame(start, weights):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,14 @@ def calibration_of(frame: Frame) -> Calibration:
                          "the camera's frame; take labelcloud, sustech or openlabel, which are in "
                          "the LiDAR's")
     return calibration
+
+
+def label_folder(path: Path, name: str) -> Path:
+    """The folder of that name, label_2 or label_02, in a folder of KITTI's layout; path itself
+    where there is none."""
+    for inner in (f"training/{name}", name):
+        path = path / inner if (path / inner).is_dir() else path
+    return path
 
 
 def frame_labels(frame: Frame, lines: Sequence[dict[str, Any]], where: object) -> FrameLabels:

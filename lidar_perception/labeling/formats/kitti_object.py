@@ -9,7 +9,7 @@ from pathlib import Path
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import format_label, parsed_lines
 from lidar_perception.labeling.formats.files import check_all_known, frame_files
-from lidar_perception.labeling.formats.kitti_lines import frame_labels, lines_of
+from lidar_perception.labeling.formats.kitti_lines import frame_labels, label_folder, lines_of
 from lidar_perception.labeling.labels import DriveLabels, FrameLabels
 from lidar_perception.runs.files import whole_folder, write_bytes
 
@@ -20,8 +20,7 @@ ZEROS = re.compile(r"(\.\d\d\d*?)0+(?=\s|$)")
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     """path: a folder with FRAME.txt, or one of the object layout. A frame without a file has no
     labels."""
-    for inner in ("training/label_2", "label_2"):
-        path = path / inner if (path / inner).is_dir() else path
+    path = label_folder(path, "label_2")
     files = frame_files(path, frames, ".txt")
     check_all_known(path, files, ".txt")
     return DriveLabels([frame_labels(

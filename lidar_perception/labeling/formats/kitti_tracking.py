@@ -11,7 +11,7 @@ from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import parsed_tracking_lines
 from lidar_perception.data.kitti.write import tracking_line
 from lidar_perception.labeling.formats.files import known_drive_files, sequences_of, write_drives
-from lidar_perception.labeling.formats.kitti_lines import frame_labels, lines_of
+from lidar_perception.labeling.formats.kitti_lines import frame_labels, label_folder, lines_of
 from lidar_perception.labeling.labels import NO_TRACK, DriveLabels, FrameLabels
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError
@@ -19,8 +19,7 @@ from lidar_perception.types import InputError
 
 def read(path: Path, frames: Sequence[Frame]) -> DriveLabels:
     """path: DRIVE.txt, a folder of them, or a folder of the tracking layout."""
-    for inner in ("training/label_02", "label_02"):
-        path = path / inner if (path / inner).is_dir() else path
+    path = label_folder(path, "label_02")
     files = known_drive_files(path, frames, ".txt")
     labels: list[FrameLabels] = []
     for drive, positions in sequences_of(frames).items():
