@@ -55,38 +55,58 @@ def points_in_boxes(xyz: np.ndarray, boxes: np.ndarray,
     k from first[k] to first[k + 1], ascending, and first (K + 1,) int64. A point can be in
     several. Time grows with K times N, so K is of detections, not of points."""
     boxes = np.ascontiguousarray(boxes, np.float32).reshape(-1, 7)
-    order = np.argsort(xyz[:, 0])
-    ordered = np.ascontiguousarray(xyz[order, :3], np.float32)
+    xyz = np.ascontiguousarray(xyz[:, :3], np.float32)
     reach = np.hypot(boxes[:, 3] / 2.0 + margin, boxes[:, 4] / 2.0 + margin) + 1e-3
-    begin = np.searchsorted(ordered[:, 0], boxes[:, 0] - reach, "left")
-    end = np.searchsorted(ordered[:, 0], boxes[:, 0] + reach, "right")
-    first = np.zeros(len(boxes) + 1, np.int64)
-    inside = _points_in_boxes(ordered, boxes, margin, begin, end, first)
-    indices = order[inside]
-    for k in range(len(boxes)):
-        indices[first[k]:first[k + 1]].sort()
-    return indices, first
+    begin, end = boxes[:, 0] - reach, boxes[:, 0] + reach
+    low = max(_lowest(begin), _lowest(xyz[:, 0]), -FAR)
+    high = min(-_lowest(-end), -_lowest(-xyz[:, 0]), FAR)
+    return _points_in_boxes(xyz, boxes, margin, begin, end, low, high)
+
+
+SLABS = 256  # across x, between low and high, in which the points of a box are looked for
+FAR = 1e9    # m: nothing is
+
+
+def _lowest(values: np.ndarray) -> float:
+    """The least that is a number, inf where there is none."""
+    return float(np.fmin.reduce(values, initial=np.inf))
 
 
 @njit(cache=True, nogil=True)
-def _points_in_boxes(xyz, boxes, margin, begin, end, first):
-    """Which of the points begin[k] .. end[k] are in box k, one box after the other; how many fills
-    first."""
-    inside = np.empty((end - begin).sum(), np.int64)
+def _points_in_boxes(xyz, boxes, margin, begin, end, low, high):
+    scale = (SLABS - 1) / max(high - low, 1e-3)
+    start = np.zeros(SLABS + 1, np.int64)
+    for i in range(len(xyz)):
+        if low <= xyz[i, 0] <= high:
+            start[int((xyz[i, 0] - low) * scale) + 1] += 1
+    start = np.cumsum(start)
+    place, order = start.copy(), np.empty(start[-1], np.int64)
+    for i in range(len(xyz)):
+        if low <= xyz[i, 0] <= high:
+            slab = int((xyz[i, 0] - low) * scale)
+            order[place[slab]] = i
+            place[slab] += 1
+    first, inside = np.zeros(len(boxes) + 1, np.int64), np.empty(len(order), np.int64)
     count = 0
     for k in range(len(boxes)):
         x, y, z, yaw = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 6]
         cos, sin = np.cos(yaw), np.sin(yaw)
         length, width = boxes[k, 3] / 2.0 + margin, boxes[k, 4] / 2.0 + margin
         height = boxes[k, 5] / 2.0 + margin
-        for i in range(begin[k], end[k]):
-            dx, dy = xyz[i, 0] - x, xyz[i, 1] - y
-            if (abs(cos * dx + sin * dy) <= length and abs(cos * dy - sin * dx) <= width
-                    and abs(xyz[i, 2] - z) <= height):
-                inside[count] = i
-                count += 1
+        left, right = max(begin[k], low), min(end[k], high)
+        if left <= right:
+            some = order[start[int((left - low) * scale)]:start[int((right - low) * scale) + 1]]
+            if count + len(some) > len(inside):
+                inside = np.concatenate((inside, np.empty(len(inside) + len(some), np.int64)))
+            for i in some:
+                dx, dy = xyz[i, 0] - x, xyz[i, 1] - y
+                if (abs(cos * dx + sin * dy) <= length and abs(cos * dy - sin * dx) <= width
+                        and abs(xyz[i, 2] - z) <= height):
+                    inside[count] = i
+                    count += 1
         first[k + 1] = count
-    return inside[:count]
+        inside[first[k]:count].sort()
+    return inside[:count].copy(), first
 
 
 def centre_distances(boxes: np.ndarray, others: np.ndarray) -> np.ndarray:

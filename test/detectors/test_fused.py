@@ -52,6 +52,7 @@ def random_boxes(rng, count: int) -> np.ndarray:
 def test_all_boxes_at_once_hold_what_each_holds(seed, count, boxes, margin):
     rng = np.random.default_rng(seed)
     xyz = rng.uniform([-22, -22, -2], [22, 22, 2], (count, 3)).astype(np.float32)
+    xyz[::50, rng.integers(3)] = rng.choice([np.nan, np.inf, -np.inf, 1e30])
     boxes = random_boxes(rng, boxes).astype(np.float32)
     indices, first = points_in_boxes(xyz, boxes, margin)
     assert first[0] == 0 and first[-1] == len(indices) and len(first) == len(boxes) + 1

@@ -60,15 +60,19 @@ def nearest(centres: Tensor, xyz: Tensor, valid: Tensor, count: int) -> tuple[Te
     """squared (B, M, k) rising, and indices (B, M, k), of the nearest of xyz (B, N, 3) to each
     centre (B, M, 3), inf where no valid one is left; k = count."""
     # Differences, not a matrix product: a point is at no distance from itself in any format.
-    squared = (centres[:, :, None] - xyz[:, None]).square().sum(dim=-1)    # (B, M, N)
+    # Axis by axis: a sum over an axis of three takes four times as long.
+    x, y, z = ((a[:, :, None] - b[:, None]).square() for a, b in zip(centres.unbind(-1),
+                                                                     xyz.unbind(-1)))
+    squared = x + y + z                                                    # (B, M, N)
     squared = squared.masked_fill(~valid[:, None], torch.inf)
     return squared.topk(count, dim=2, largest=False)
 
 
 def taken(values: Tensor, indices: Tensor) -> Tensor:
     """(B, M, k, C): rows of values (B, N, C) at indices (B, M, k)."""
-    index = indices.flatten(1)[..., None].expand(-1, -1, values.shape[-1])
-    return values.gather(1, index).view(*indices.shape, -1)
+    first = torch.arange(len(values), device=values.device)[:, None, None] * values.shape[1]
+    rows = values.flatten(0, 1).index_select(0, (indices + first).flatten())
+    return rows.view(*indices.shape, -1)
 
 
 class LocalNet(nn.Module):
