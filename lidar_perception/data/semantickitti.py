@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import partial
+from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -54,13 +55,14 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
         if not (sequence / "labels").is_dir():
             continue
         start = frames[-1].stamp_ns + GAP_NS if frames else START_NS
+        poses = cache(partial(_poses, sequence))
         for scan in files:
             number = number_of(scan)
             stamp = start + (number - number_of(files[0])) * PERIOD_NS
             frames.append(Frame(
                 f"{sequence.name}/{scan.stem}", stamp, partial(load_velodyne, scan, stamp),
                 point_truth=partial(_point_truth, scan, sequence / f"labels/{scan.stem}.label"),
-                pose=partial(_pose, sequence, number), sequence=sequence.name, index=number,
+                pose=partial(_pose, poses, number), sequence=sequence.name, index=number,
                 points=scan, native=sequence / "poses.txt"))
     if not frames:
         raise InputError(f"{path} has scans but no labels: expected "
@@ -88,18 +90,30 @@ def _point_truth(scan: Path, path: Path) -> PointTruth:
     return PointTruth((labels & 0xFFFF).astype(np.uint16), (labels >> 16).astype(np.uint16))
 
 
-def _pose(sequence: Path, i: int) -> np.ndarray | None:
-    """(4, 4) the LiDAR's frame of scan number i in that of scan 0, as pose_line wrote it; None
-    without poses.txt. InputError for files that are not as they should be."""
+def _poses(sequence: Path) -> tuple[np.ndarray, Path, list[str]] | None:
+    """(4, 4) the LiDAR's frame in the camera's, and poses.txt with its lines; None without it.
+    InputError for files that are not as they should be."""
     poses, calibration = sequence / "poses.txt", sequence / "calib.txt"
     if not poses.is_file():
         return None
-    lidar_to_camera = matrix(matrices(calibration), calibration, "Tr", (3, 4))
+    to_camera = homogeneous(matrix(matrices(calibration), calibration, "Tr", (3, 4)))
     try:
-        moved = np.array(regular(poses).read_text().splitlines()[i].split(), float).reshape(3, 4)
-    except (OSError, ValueError, IndexError) as error:
-        raise InputError(f"cannot read pose {i} of {poses} ({error}); download it again") from None
-    to_camera = homogeneous(lidar_to_camera)
+        return to_camera, poses, regular(poses).read_text().splitlines()
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {poses} ({error}); download it again") from None
+
+
+def _pose(poses: Callable[[], tuple[np.ndarray, Path, list[str]] | None],
+          i: int) -> np.ndarray | None:
+    """(4, 4) the LiDAR's frame of scan number i in that of scan 0, as pose_line wrote it; None
+    without poses.txt. InputError also for a line that is none, or not there."""
+    if (read := poses()) is None:
+        return None
+    to_camera, path, lines = read
+    try:
+        moved = np.array(lines[i].split(), float).reshape(3, 4)
+    except (ValueError, IndexError) as error:
+        raise InputError(f"cannot read pose {i} of {path} ({error}); download it again") from None
     return np.linalg.inv(to_camera) @ homogeneous(moved) @ to_camera
 
 
