@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
-from itertools import islice
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any
 
@@ -117,9 +117,9 @@ class BagPoses:
         does not move; "" where TF has none."""
         if self.carrier and self.carrier != self.frame_id:
             return self.carrier
-        fixed = [above for frame, above in zip(self._above, self._above[1:])
-                 if self._seen.fixed(frame)]
-        return fixed[-1] if fixed else ""
+        # Up to what moves: above that odom may be fixed in a map, and is not the robot's.
+        fixed = len([*takewhile(self._seen.fixed, self._above[:-1])])
+        return self._above[fixed] if fixed else ""
 
     def of(self, frame_id: str, stamp_ns: int) -> np.ndarray:
         """(4, 4): the pose of another frame in that of the clouds at a time, which takes points to

@@ -5,7 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 import yaml
-from robot_bags import ON_BASE, base_at, mount, moving, recorded
+from robot_bags import ON_BASE, START, base_at, mount, moving, moving_tf, recorded, tf, transform
 
 from lidar_perception.data.raw_clouds import _of_frame, open_clouds
 from lidar_perception.params import ReceptionParams
@@ -22,7 +22,8 @@ from lidar_perception.sensor_setup.told import Told, told_by
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
-from lidar_perception.wire.topics import ODOMETRY
+from lidar_perception.wire.topics import ODOMETRY, TF_STATIC
+from lidar_perception.wire.transforms import TF_MESSAGE
 
 COUNT, HEIGHT = 8, 1.7
 
@@ -130,6 +131,11 @@ def test_a_bag_tells_where_its_base_went_and_how_the_sensor_is_on_it(tmp_path):
     for i, pose in said.poses.items():
         np.testing.assert_allclose(pose, base_at(int(clouds.stamps_ns[i])), atol=1e-4)
     assert len(said.poses) == 3 and np.isnan(said.height)
+    # A map that is fixed in the world is above what moves, and not the robot.
+    world = TF_STATIC, TF_MESSAGE, START, tf(transform("world", "map", 0, np.eye(4)))
+    recorded(tmp_path / "tf", moving_tf(), mount(), [world])
+    clouds = open_clouds(tmp_path / "tf")
+    assert told_by(clouds.poses, range(3), clouds.stamps_ns).base == "base_link"
     recorded(tmp_path / "none")
     clouds = open_clouds(tmp_path / "none")
     assert told_by(clouds.poses, range(3), clouds.stamps_ns) == Told()
