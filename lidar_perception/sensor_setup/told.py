@@ -58,7 +58,8 @@ def told_by(poses: BagPoses | None, numbers: Sequence[int], stamps_ns: np.ndarra
     base = poses.base
     mount = poses.mounted(base)
     moved = {}
-    for number in numbers:
+    # Odometry that does not say what it is of does not say where the base went.
+    for number in numbers if poses.carrier or not poses.odometry else ():
         pose = _base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))
         if pose is not None:
             moved[number] = pose

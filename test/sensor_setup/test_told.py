@@ -136,6 +136,11 @@ def test_a_bag_tells_where_its_base_went_and_how_the_sensor_is_on_it(tmp_path):
     recorded(tmp_path / "tf", moving_tf(), mount(), [world])
     clouds = open_clouds(tmp_path / "tf")
     assert told_by(clouds.poses, range(3), clouds.stamps_ns).base == "base_link"
+    # Odometry that does not say what it is of is not taken for the base's.
+    recorded(tmp_path / "of", moving(ODOMETRY, ""), mount())
+    clouds = open_clouds(tmp_path / "of")
+    nameless = told_by(clouds.poses, range(3), clouds.stamps_ns)
+    assert nameless.base == "base_link" and nameless.poses == {}
     recorded(tmp_path / "none")
     clouds = open_clouds(tmp_path / "none")
     assert told_by(clouds.poses, range(3), clouds.stamps_ns) == Told()
