@@ -152,7 +152,9 @@ def _way(scans: Sequence[Scan], mount: Mount | None, heading: Ahead | None, told
     """Metres that the robot went, by its poses, else between the clouds that were compared, and
     from the first to the last: it may be slow. NaN where that is not clear."""
     if told.poses:
-        return float(np.ptp([pose[:2, 3] for pose in told.poses.values()], axis=0).max())
+        went = float(np.ptp([pose[:2, 3] for pose in told.poses.values()], axis=0).max())
+        if len(told.poses) == len(scans) or went >= HARDLY:  # poses of a part may be of a halt
+            return went
     if mount is None or heading is None:
         return np.nan
     ends = _levelled([scans[0], scans[-1]], mount)

@@ -91,6 +91,12 @@ def test_odometry_of_the_sensor_itself_says_where_it_drives_whatever_the_clouds_
     assert m.heading.degrees == pytest.approx(-30, abs=1) and not m.heading.base
 
 
+def test_odometry_of_a_part_of_the_clouds_does_not_make_the_robot_stand():
+    _, poses = drive()
+    m = found(Told("base_link", poses={COUNT - 1: poses[-1]}))
+    assert m.coverage.still is False and not any("stands still" in line for line in doubts(m))
+
+
 def test_many_pairs_of_one_place_are_led_alike_and_no_surer_than_one():
     alike = ahead_of({(i, i + 1): np.array([1.0, 0.25]) for i in range(40)}, {})
     assert alike.error >= 7 and not looks_elsewhere(alike)
