@@ -36,6 +36,7 @@ FEW_SCANS = 5       # fewer say little of what is the robot's and what is the pl
 SMALL_ROOM = 30.0   # metres: where nothing is farther, the room ends the range and not the sensor
 TURNED = 0.01       # degrees by which points of a beam scatter, from which on they have been moved
 HARDLY = 0.1        # metres: a robot that has gone less stands still
+DROVE = 2.0         # metres by its poses, from which on it has moved; one that stands drifts less
 AROUND = (-15.0, 5.0)  # degrees: where people are, in which the distance of beams is measured
 
 
@@ -113,7 +114,8 @@ def measured(scans: Sequence[Scan], numbers: Sequence[int], source: str, total: 
         noise, pieces = range_noise(scans, beams, step)
     mount = mount_of(scans)
     nearest = nearest_of(scans, beams)
-    still = stands_still(nearest.ranges)
+    # Where all is alike, as on a field, what is around a robot that drives stays as it is.
+    still = False if _posed(told) >= DROVE else stands_still(nearest.ranges)
     heading = _heading(scans, numbers, mount, still, told)
     # People who pass by, or doors, change what is around a robot that stands.
     still = True if len(scans) > 1 and _way(scans, mount, heading, told) < HARDLY else still
@@ -151,15 +153,20 @@ def _levelled(scans: Sequence[Scan], mount: Mount) -> list[np.ndarray]:
 def _way(scans: Sequence[Scan], mount: Mount | None, heading: Ahead | None, told: Told) -> float:
     """Metres that the robot went, by its poses, else between the clouds that were compared, and
     from the first to the last: it may be slow. NaN where that is not clear."""
-    if told.poses:
-        went = float(np.ptp([pose[:2, 3] for pose in told.poses.values()], axis=0).max())
-        if len(told.poses) == len(scans) or went >= HARDLY:  # poses of a part may be of a halt
-            return went
+    went = _posed(told)
+    if len(told.poses) == len(scans) or went >= HARDLY:  # poses of a part may be of a halt
+        return went
     if mount is None or heading is None:
         return np.nan
     ends = _levelled([scans[0], scans[-1]], mount)
     shift = shift_between(*map(spectrum, pictures_of(ends, moves=False)))
     return np.nan if shift is None else float(np.maximum(heading.went, np.hypot(*shift)))
+
+
+def _posed(told: Told) -> float:
+    """Metres that the robot went by its poses; NaN without any."""
+    return float(np.ptp([pose[:2, 3] for pose in told.poses.values()], axis=0).max()
+                 ) if told.poses else np.nan
 
 
 def model_of(beams: Beams | None) -> tuple[str, float]:

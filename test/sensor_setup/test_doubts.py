@@ -162,6 +162,17 @@ def test_people_who_pass_by_do_not_move_a_robot_that_stands():
     assert m.heading.went < 0.1 and m.coverage.still is False
 
 
+def test_where_all_is_alike_poses_say_that_the_robot_moved():
+    ground = [scan_at(scan.xyz[(scan.xyz[:, 2] < -0.5) | (np.hypot(*scan.xyz[:, :2].T) < 2)])
+              for scan in seen(body=1.5)]
+    for went, drives in ((0.0, False), (4.0, True)):
+        poses = {i: tilted(0, 0, 0) for i in range(8)}
+        poses[7][0, 3] = went
+        m = measured(ground, range(8), "field", 8, None, NOTHING._replace(poses=poses))
+        assert (m.coverage.still is False) == drives == m.coverage.fits
+        assert drives != said(m, "stands still") and not said(m, "cannot be told, as too few")
+
+
 def test_clouds_whose_origin_is_on_the_ground_are_told_and_their_floor_is_no_body():
     scans = [scan_at(s.xyz + [0, 0, 0.6]) for s in seen()]
     assert mount_of(scans) is None and on_the_ground(scans) and not on_the_ground(list(seen()))
