@@ -24,6 +24,7 @@ from lidar_perception.sensor_setup.doubts import (
 from lidar_perception.sensor_setup.measure import SMALL_ROOM, Measured, sensor_of
 from lidar_perception.sensor_setup.told import FOOTPRINT
 from lidar_perception.simulation.sensor import Sensor
+from lidar_perception.types import InputError
 
 WIDTH = 98
 # The paper's neighbourhoods (0.15, 0.30, 0.50 m up to 15, 30, 45 m) are this many times the
@@ -103,7 +104,7 @@ def _list(name: str, values: Sequence[float] | np.ndarray, digits: int) -> str:
 
 def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
     """Parameter of PipelineParams -> value and why: what the sensor and its mount ask for, and
-    nothing that is as by default. The values have passed the ranges of the parameters."""
+    nothing that is as by default. InputError where a value is out of its parameter's range."""
     out: dict[str, tuple[Any, str]] = {}
     if m.intensity is not None:
         out["input.intensity_max"] = (m.intensity.full, f"intensities go up to "
@@ -135,7 +136,11 @@ def chosen_params(m: Measured) -> dict[str, tuple[Any, str]]:
         out["ground.patchwork.max_range"] = (reach, "nothing is farther")
     if m.beams is not None and np.isfinite(m.step):
         out |= _of_resolution(m)
-    with_values(PipelineParams(), {name: value for name, (value, _) in out.items()})
+    try:
+        with_values(PipelineParams(), {name: value for name, (value, _) in out.items()})
+    except ValueError as error:
+        raise InputError(f"{m.source}: what was measured is beyond what nodes take: {error}; give "
+                         "clouds, in metres, of a sensor on a robot or a vehicle") from None
     return out
 
 

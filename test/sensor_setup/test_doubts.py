@@ -297,6 +297,10 @@ def test_millimetres_two_dimensions_few_points_and_mixed_layouts_are_refused():
     mixed = all_changed(None)
     with pytest.raises(InputError, match="several layouts"):
         of([mixed[0]._replace(columns=("x", "y", "z")), *mixed[1:]])
+    m = of(mixed)
+    high = replace(m, mount=m.mount._replace(height=60.0))
+    with pytest.raises(InputError, match=r"height = 60\.0 is outside 0\.0 \.\. 50\.0 m; give"):
+        params_yaml(high)
 
 
 def test_several_frames_gaps_and_stamps_that_jump_are_said():
