@@ -42,9 +42,7 @@ class _Link:
         if self.static:
             self.times, self.values = [stamp_ns], [value]
             return
-        place = len(self.times)
-        while place and self.times[place - 1] > stamp_ns:
-            place -= 1
+        place = bisect_right(self.times, stamp_ns)  # a recording may go back far
         if place and self.times[place - 1] == stamp_ns:
             self.values[place - 1] = value
             return

@@ -166,6 +166,29 @@ def test_a_bag_that_starts_again_leaves_what_is_fixed_and_forgets_what_moves():
     assert tree.lookup("odom", "base", START - 19 * SECOND - SECOND // 4)[0, 3] == 5
 
 
+class Counted(int):
+    """A stamp that counts how often it is compared."""
+
+    asked = 0
+
+    def __lt__(self, other):
+        Counted.asked += 1
+        return int(self) < int(other)
+
+    def __gt__(self, other):
+        Counted.asked += 1
+        return int(self) > int(other)
+
+
+def test_a_recording_that_goes_back_takes_no_longer():
+    tree = TransformTree(keeps_all=True)
+    for first in (0, 5):
+        for i in range(500):
+            tree.set("a", "b", Counted(10 * i + first), [2 * i + first / 5, 0, 0], [0, 0, 0, 1])
+    assert Counted.asked < 1000 * 20
+    assert [tree.lookup("a", "b", 5 * i)[0, 3] for i in range(1000)] == [*range(1000)]
+
+
 def test_memory_is_bounded(monkeypatch):
     """By time, by count and by the number of frames; what is still kept stays right."""
     monkeypatch.setattr(module, "MAX_KEPT", 100)
