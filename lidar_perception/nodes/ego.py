@@ -46,6 +46,7 @@ class EgoInput:
         self.apart = False  # TF does not connect it with the frame of the detections
         self.begun = 0  # how often KISS-ICP has begun, each time at an origin of its own
         self.icp_ms: deque[float] = deque(maxlen=TIMED)  # of CPU time, for the last ones
+        self.unknown = ""  # why the source said no pose of the last frame
         self.without_ns: int | None = None  # since when frames have had no pose, with auto
         self.late_since: float | None = None  # monotonic: since then no pose has come in time
         wanted = params().source
@@ -65,11 +66,11 @@ class EgoInput:
         if (self.icp is not None and self.clouds and xyz is not None and len(xyz)
                 and self._by_scans()):
             self._register(header, xyz)
-        pose = None
+        pose, self.unknown = None, ""
         try:
             pose = self._of(self._source(frame_id, stamp), frame_id, stamp, self.params().max_gap)
-        except Missing:
-            pass
+        except Missing as error:
+            self.unknown = str(error)
         if self.params().source == "auto":
             self._look_further(stamp, pose is not None)
         return pose
@@ -122,7 +123,7 @@ class EgoInput:
         if self.source == "kiss_icp" and self.apart:
             return (f"KISS-ICP moves with '{self.scan_frame}', the detections are in '{frame_id}', "
                     "and TF does not connect them: tracks are relative to the sensor")
-        return None
+        return f"the sensor's pose is not known: {self.unknown}" if self.unknown else None
 
     def _source(self, frame_id: str, stamp: int) -> str:
         """Of what there is, the best that ego.source allows; it is kept in self.source."""

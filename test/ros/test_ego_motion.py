@@ -204,6 +204,22 @@ def test_odometry_of_another_clock_and_one_that_has_stopped_are_named(start, mon
     assert "no odometry on /tracker/input/odometry for 5 s" in said(2.1)
 
 
+@pytest.mark.parametrize("source, lag", [("odometry", 3.0), ("tf", 0.7)])
+def test_a_source_that_is_always_too_late_is_named(start, source, lag):
+    """Longer than ego.max_gap, and less than what tells another clock."""
+    node = start(TrackerNode, **{"ego.source": source})
+    for i in range(15):
+        stamp = START + i * TENTH
+        past = stamp - round(lag * 10 * TENTH)
+        if source == "odometry":
+            node.transforms.on_odometry(odometry(base_at(i), past, "lidar"))
+        else:
+            node.transforms.on_tf(transforms(("odom", "lidar", base_at(i), past)), static=False)
+        node.on_markers(detection_markers(next(crowd()), header(stamp), bag_message))
+        assert f"{lag:.3f} s older than needed" in node.state[1]
+    assert node.counts["ego"] == source
+
+
 def test_of_two_odometries_on_a_topic_the_first_counts_while_it_comes_and_it_is_said(
         start, monkeypatch):
     node, now = start(TrackerNode), [100.0]
