@@ -184,6 +184,10 @@ def told_doubts(m: Measured) -> list[str]:
     if told.left_out:
         out.append(f"{told.left_out} transforms or poses of the odometry are none (not finite, or "
                    "no rotation) and were left out: look at what publishes them")
+    if told.unposed:
+        out.append(f"how the robot moved is told by the clouds alone: {told.unposed}; record the "
+                   "odometry, or the TF, all the time, with the base as child_frame_id and by the "
+                   "clock of the clouds")
     if q is not None and told.mount is not None:
         by_ground, error = np.degrees([q.roll, q.pitch]), np.degrees(q.error[1:])
         apart = turned(by_ground - told.roll_pitch)

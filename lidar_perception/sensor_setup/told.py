@@ -19,13 +19,15 @@ class Told(NamedTuple):
     """base: the robot's frame, "" for none; mount (4, 4): the sensor's pose in it, None where TF
     does not say it; footprint (4, 4): likewise in base_footprint; poses: of the base, or without
     one of the sensor, in a frame that stands, by the number of the cloud; left_out: transforms and
-    odometry that are no poses."""
+    odometry that are no poses; unposed: why most clouds have no pose though the recording has
+    some, "" where they have, or it has none."""
 
     base: str = ""
     mount: np.ndarray | None = None
     footprint: np.ndarray | None = None
     poses: Mapping[int, np.ndarray] = {}
     left_out: int = 0
+    unposed: str = ""
 
     @property
     def roll_pitch(self) -> tuple[float, float]:
@@ -53,17 +55,21 @@ NOTHING = Told()
 
 def told_by(poses: BagPoses | None, numbers: Sequence[int], stamps_ns: np.ndarray | None) -> Told:
     """What the odometry and TF of a bag say; poses None: nothing is told."""
-    if poses is None or stamps_ns is None or not (poses.base or poses.carrier):
+    if poses is None or stamps_ns is None or not (poses.base or poses.odometry):
         return NOTHING
     base = poses.base
-    mount = poses.mounted(base)
+    mount = poses.mounted(base) if base else None
     moved = {}
     # Odometry that does not say what it is of does not say where the base went.
     for number in numbers if poses.carrier or not poses.odometry else ():
         pose = _base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))
         if pose is not None:
             moved[number] = pose
-    return Told(base, mount, poses.mounted(FOOTPRINT), moved, poses.left_out)
+    unposed = "" if 2 * len(moved) >= len(numbers) or not poses.known else (
+        f"{len(numbers) - len(moved)} of {len(numbers)} clouds have no pose at their time"
+        if poses.carrier or not poses.odometry else
+        "its odometry does not say in child_frame_id what it is of")
+    return Told(base, mount, poses.mounted(FOOTPRINT), moved, poses.left_out, unposed)
 
 
 def _base_pose(poses: BagPoses, stamp_ns: int, mount: np.ndarray | None) -> np.ndarray | None:

@@ -1,5 +1,6 @@
 """What TF and odometry of a bag say is compared with what the clouds say."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -118,6 +119,8 @@ def test_what_tf_says_and_the_clouds_do_not_is_said_with_the_remedy():
     row = next(each for each in findings(right) if each.what == "mount by TF")
     assert row.sure == "sure" and "above 'base_footprint'" in row.how
     assert not any("URDF" in line for line in doubts(right))
+    unposed = replace(right, told=right.told._replace(unposed="3 of 4 clouds have no pose"))
+    assert any("by the clouds alone: 3 of 4 clouds" in line for line in doubts(unposed))
     for said, height, words in ((on_robot(0, roll + 3, pitch), None, "with roll"),
                                 (on_robot(0, roll, pitch - 3), None, "and pitch"),
                                 (on_robot(45, roll, pitch), None, "correct the yaw"),
@@ -147,6 +150,20 @@ def test_a_bag_tells_where_its_base_went_and_how_the_sensor_is_on_it(tmp_path):
     clouds = open_clouds(tmp_path / "of")
     nameless = told_by(clouds.poses, range(3), clouds.stamps_ns)
     assert nameless.base == "base_link" and nameless.poses == {}
+    assert "child_frame_id" in nameless.unposed
+    recorded(tmp_path / "bare", moving(ODOMETRY, ""))
+    clouds = open_clouds(tmp_path / "bare")
+    assert told_by(clouds.poses, range(3), clouds.stamps_ns) == Told(unposed=nameless.unposed)
+    # A clock of its own: nothing is known at the times of the clouds.
+    recorded(tmp_path / "clock", moving(ODOMETRY), mount())
+    clouds = open_clouds(tmp_path / "clock")
+    assert told_by(clouds.poses, range(3), clouds.stamps_ns).unposed == ""
+    apart = told_by(clouds.poses, range(3), clouds.stamps_ns - 10**12)
+    assert apart.poses == {} and apart.unposed.startswith("3 of 3 clouds have no pose")
+    recorded(tmp_path / "stands", mount())
+    clouds = open_clouds(tmp_path / "stands")
+    fixed = told_by(clouds.poses, range(3), clouds.stamps_ns)
+    assert fixed.base == "base_link" and fixed.unposed == ""
     recorded(tmp_path / "none")
     clouds = open_clouds(tmp_path / "none")
     assert told_by(clouds.poses, range(3), clouds.stamps_ns) == Told()
