@@ -130,6 +130,10 @@ def _robot(file: Path) -> tuple[Any, bool]:
     if params == PipelineParams() and node == CloudNodeParams():
         raise InputError(f"{file} says nothing of how the sensor is mounted; setup writes such a "
                          "file")
+    if node.base_frame and params.crop.body:
+        raise InputError(f"{file} has crop.body in '{node.base_frame}', its base_frame, as nodes "
+                         "read it; leave base_frame out and give the box in the sensor's frame, "
+                         "as setup writes it")
     pose = params.ground.sensor_pose
     return Robot(pose.height, pose.roll, pose.pitch, math.radians(node.input.ahead), params.crop,
                  params.input.intensity_max), node.input.deskew != "off"

@@ -129,6 +129,8 @@ def test_what_deskewing_lacks_is_said(parts, cloud, words, tmp_path, monkeypatch
     (MOUNT.replace("0.9", "-9"), [], "ground.sensor_pose.height"),
     ("[]", [], "is no parameter file"),
     ("/**: {ros__parameters: {autostart: true}}", [], "says nothing of how the sensor is mounted"),
+    ("/**: {ros__parameters: {base_frame: base, crop: {body: [-1.0, -1.0, 0.0, 1.0, 1.0, 1.0]}}}",
+     [], "crop.body in 'base'"),
     (MOUNT, ["--to", "openlabel"], "are for a recording with its clouds"),
 ])
 def test_what_cannot_be_used_is_said(content, more, words, tmp_path, monkeypatch, capsys):
