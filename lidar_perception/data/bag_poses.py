@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
-from itertools import islice, takewhile
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from lidar_perception.wire.transforms import (
 from msg_utils.markers import MarkedObjects
 
 FILTERED = "/odometry/filtered"  # of robot_localization
-FIRST = 500    # messages of /tf that show which frames there are
+FIRST = 500    # messages of /tf that show which frames there are, where something moves the sensor
 MAX_GAP = 0.5  # seconds between two poses, before the first and after the last
 
 
@@ -172,13 +172,16 @@ class BagPoses:
 
     @cached_property
     def _seen(self) -> TransformTree:
-        """What is fixed, and of what moves the first."""
+        """What is fixed, and of what moves the first, until something above the sensor moves."""
         tree = TransformTree(keeps_all=True)
         with Bag(self.path) as bag:
             for _, _, msg in bag.messages({TF_STATIC} & self.transforms):
                 self._add(tree, msg, True)
         with Bag(self.path) as bag:
-            for _, _, msg in islice(bag.messages({TF} & self.transforms), FIRST):
+            for i, (_, _, msg) in enumerate(bag.messages({TF} & self.transforms)):
+                if i >= FIRST and (self.odometry or not all(map(tree.fixed, _chain_in(
+                        tree, self.frame_id)))):
+                    break  # wheels may turn for long before the robot is localised
                 self._add(tree, msg, False)
         return tree
 
@@ -187,11 +190,7 @@ class BagPoses:
         return self._chain(self.frame_id)
 
     def _chain(self, frame: str) -> list[str]:
-        """A frame, its parent, and so on; it alone where they go round."""
-        try:
-            return self._seen.chain(frame)
-        except Missing:
-            return [frame]
+        return _chain_in(self._seen, frame)
 
     @cached_property
     def _tree(self) -> TransformTree:
@@ -209,3 +208,11 @@ class BagPoses:
             add_transforms(tree, msg, static)
         except InputError:
             self.left_out += 1
+
+
+def _chain_in(tree: TransformTree, frame: str) -> list[str]:
+    """A frame, its parent, and so on; it alone where they go round."""
+    try:
+        return tree.chain(frame)
+    except Missing:
+        return [frame]

@@ -32,10 +32,18 @@ from lidar_perception.wire.transforms import ODOMETRY_MESSAGE, TF_MESSAGE
 from msg_utils.stamps import SECOND, header_message
 
 
+def wheels():
+    """They turn for a while before the robot is localised."""
+    for i in range(600):
+        stamp = START - SECOND + i * SECOND // 1000
+        yield TF, TF_MESSAGE, stamp, tf(transform("base_link", "wheel", stamp, np.eye(4)))
+
+
 @pytest.mark.parametrize("parts", [
     (moving(ODOMETRY), mount()), (moving(FILTERED), mount()), (moving("/kiss/odometry"), mount()),
     (moving_tf(), mount()), (moving(ODOMETRY), moving("/wheels", "wheels"), moving_tf(), mount()),
-], ids=["odom", "filtered", "the only one", "TF", "all of them"])
+    (wheels(), moving_tf(), mount()),
+], ids=["odom", "filtered", "the only one", "TF", "all of them", "late TF"])
 def test_the_sensor_is_where_odometry_and_tf_say_at_the_time_of_its_cloud(tmp_path, parts):
     check(recorded(tmp_path / "bag", *map(list, parts)))
 
