@@ -138,6 +138,17 @@ def test_times_and_problems_are_told(classifier):
         RescoredCandidates(classifier, SEED)(cloud())
 
 
+def test_the_numbers_of_a_clouds_clusters_may_have_gaps(classifier, found):
+    segmented, _ = found
+    ground, ids = np.zeros((2, len(cloud())), np.int64)
+    ground[segmented.indices], ids[segmented.indices] = segmented.ground, segmented.cluster_ids
+    detector = RescoredCandidates(classifier, SEED, None, RescoringParams(threshold=0.0), PIPELINE)
+    wanted = detector(cloud()).detections
+    for other in (ids, np.where(ids > 0, ids + 1, 0), 1000 * ids):
+        assert same(detector(cloud(), ground=ground.astype(bool), cluster_ids=other).detections,
+                    wanted)
+
+
 def test_a_network_that_knows_no_pedestrian_cannot_score_candidates():
     with pytest.raises(InputError, match="not know the class Pedestrian, only Car"):
         RescoredCandidates(random_detector(classes=("Car",), sizes=((4, 2, 1.5),)), SEED)

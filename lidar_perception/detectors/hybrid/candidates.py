@@ -74,9 +74,10 @@ class RescoredCandidates:
         segmented, candidates = find_candidates(frame, self.seed, self.camera, self.pipeline,
                                                 ground=ground, cluster_ids=cluster_ids)
         t0 = perf_counter()
-        chosen = np.flatnonzero(np.isin(segmented.cluster_ids, candidates.clusters))
+        ids = segmented.cloud_ids  # of which candidates.clusters are some
+        chosen = np.flatnonzero(np.isin(ids, candidates.clusters))
         seen = seen_by(self.classifier, frame.take(segmented.indices), pose)
-        clusters = clusters_of(seen.take(chosen), segmented.cluster_ids[chosen]).on(
+        clusters = clusters_of(seen.take(chosen), ids[chosen]).on(
             seen.xyz.compress(segmented.ground, axis=0))
         judged, whole = rescored_by(self.classifier, candidates.final, clusters, 1.0, pose)
         # The curves of the fused detector, with a proposer that has no opinion.
