@@ -12,12 +12,16 @@ from pointnet_samples import SMALL, blobs
 from samples import CALIBRATION
 
 from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointnet.clusters import Clusters
 from lidar_perception.detectors.pointnet.config import pointnet_config
+from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.network import make_pointnet
+from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
 from lidar_perception.detectors.pointnet.predict import Predictions
 from lidar_perception.geometry import points_in_box, wrap_angle
+from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.points.clusters import (
     UNKNOWN,
     ClusterScores,
@@ -27,7 +31,7 @@ from lidar_perception.scoring.points.clusters import (
     uncared,
     unknown_where,
 )
-from lidar_perception.training.augment import TrainingScene
+from lidar_perception.training.augment import TrainingScene, raised
 from lidar_perception.training.data import ReadScenes
 from lidar_perception.training.params import ClusterAugmentParams
 from lidar_perception.training.pointnet import cut_scenes
@@ -40,7 +44,14 @@ from lidar_perception.training.pointnet.task import (
     make_loss,
     validated,
 )
-from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import (
+    CLASSES,
+    SENSOR_HEIGHT,
+    Detections,
+    GroundTruth,
+    InputError,
+    LidarFrame,
+)
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 CONFIG = pointnet_config(**SMALL)
@@ -211,6 +222,21 @@ def test_a_scene_is_cut_by_our_own_clustering_and_around_its_objects(rng, tmp_pa
     other = CutScenes(Alike(scene), pointnet_config("base"), 5, tmp_path)
     other.scene(0)
     assert len(list(tmp_path.iterdir())) == 2  # made in another way
+
+
+def test_the_clusters_are_those_that_a_detector_makes_at_the_height_of_the_scene(rng):
+    seen = a_scene(rng)
+    things = in_boxes(rng, BOXES[:3] * [1, -1, 1, 0.1, 0.3, 0.3, 0], 6).points  # too small, or not
+    points = np.concatenate([seen.points, things])
+    scene = raised(replace(seen, points=points, height=3.5), SENSOR_HEIGHT - 3.5)
+    detector = PointNetDetector(make_pointnet(CONFIG), Header(CONFIG), params=with_values(
+        PointNetDetectorParams(ground=CONFIG.ground, clustering=CONFIG.clustering),
+        {"ground.sensor_pose.height": scene.height, "pointnet.min_points": 5}))
+    read = []
+    detector.network.register_forward_pre_hook(lambda _, inputs: read.append(len(inputs[0])))
+    detector(LidarFrame(scene.points[:, :3].copy(), scene.points[:, 3].copy()))
+    made = cut(scene, CONFIG, 5)
+    assert sum(read) == (~made.loose).sum() > 3
 
 
 def test_some_scenes_are_thinned_as_a_whole_and_always_the_same_ones(rng, tmp_path):

@@ -104,10 +104,11 @@ def cut(scene: TrainingScene, config: PointNetConfig, min_points: int,
     is wanted, and decoys: background cut out in the same way, as the network judges what is in a
     detector's boxes, too; some of them where a proposer is wrong. A cluster of an object that is
     not wanted is UNKNOWN."""
+    sensed = scene.points[:, :3]  # whose density counts, as where the network is used
     scene = raised(scene, scene.height - SENSOR_HEIGHT)
     frame = LidarFrame(np.ascontiguousarray(scene.points[:, :3]), scene.points[:, 3].copy())
     ground = segment_ground(frame, config.ground)
-    clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering),
+    clusters = clusters_of(frame, cluster_obstacles(frame.xyz, ground, config.clustering, sensed),
                            min_points, ground)
     labels, owners = labelled(clusters, scene.boxes, scene.class_ids, config.classes)
     hidden = (owners >= 0) & ~np.append(scene.wanted, False)[owners]
