@@ -84,10 +84,11 @@ def turned_boxes(boxes: np.ndarray) -> np.ndarray:
 
 
 def with_intensity_scaled(frame: LidarFrame, factor: float) -> LidarFrame:
-    """The frame with its intensity times factor; itself where it has none."""
+    """The frame with its intensity times factor, of 0 without any: zeros would still be read, as
+    by Patchwork++, which takes what is dark and low for reflections. Itself where it has none."""
     if frame.intensity is None:
         return frame
-    return replace(frame, intensity=frame.intensity * np.float32(factor))
+    return replace(frame, intensity=frame.intensity * np.float32(factor) if factor else None)
 
 
 def made_up_frame(pose: SensorPoseParams) -> LidarFrame:

@@ -172,7 +172,7 @@ def test_intensity_is_scaled_and_may_be_left_out():
     half = np.where(np.arange(len(scan)) % 2, np.float32(np.nan), scan.intensity)
     assert "their intensity is no number" in detector(replace(scan, intensity=half)).problem
     detector.params = with_values(detector.params, {"pointpillars.intensity_scale": 0.0})
-    for blind in scan, replace(scan, intensity=None):
+    for blind in scan, replace(scan, intensity=None), replace(scan, intensity=half):
         assert same(detector(blind), without) and detector(blind).problem is None
 
 

@@ -199,6 +199,19 @@ def test_a_higher_sensor_and_given_columns_change_nothing(detector):
     assert same(detector(scan, ground=ground), found)
 
 
+def test_an_intensity_that_is_left_out_is_as_one_that_is_not_there(detector):
+    """For the ground, too, which else loses what is low and dark as reflections."""
+    scan, other = frame(), copy.copy(detector)
+    other.params = with_values(detector.params, {"fused.intensity_scale": 0.0})
+    pit = np.random.default_rng(0).uniform([4, -4, -2.81], [9, 4, -2.79], (3000, 3))
+    scan = LidarFrame(np.concatenate([scan.xyz, pit.astype(np.float32)]),
+                      np.concatenate([scan.intensity, np.full(3000, 0.5, np.float32)]))
+    without = replace(scan, intensity=None)
+    assert "no intensity" in detector(without).problem and other(without).problem is None
+    assert same(other(scan), other(without)) and other(scan).problem is None
+    assert len(other.look(scan).ground) == len(detector.look(scan).ground)
+
+
 def test_as_many_boxes_are_looked_at_as_asked_for_the_likeliest_ones(detector):
     every, other = detector.look(frame()).proposed, copy.copy(detector)
     other.params = with_values(detector.params, {"fused.max_proposals": 9})

@@ -227,7 +227,8 @@ def test_intensity_is_scaled_and_may_be_left_out(ids):
     without = detector(replace(scan, intensity=None), cluster_ids=ids)
     assert "no intensity" in without.problem
     detector.params = with_values(eager(), {"pointnet.intensity_scale": 0.0})
-    for blind in scan, replace(scan, intensity=None):
+    unknown = np.full_like(scan.intensity, np.nan)
+    for blind in scan, replace(scan, intensity=None), replace(scan, intensity=unknown):
         found = detector(blind, cluster_ids=ids)
         assert same(found, without) and found.problem is None
 

@@ -131,7 +131,8 @@ class FusedDetector(NetworkDetector):
                     dict(zip(STEPS, (np.diff(times) * 1e3).tolist())))
 
     def _proposer(self) -> PointPillarsDetector:
-        """The proposer, told what this detector is told; what it sees is level already."""
+        """The proposer, told what this detector is told; what it sees is level, and its intensity
+        scaled, already."""
         settings, other = self.settings, copy.copy(self.proposer)
         other.params = DetectorParams(
             ground=replace(self.params.ground, sensor_pose=SensorPoseParams(height=SENSOR_HEIGHT)),
@@ -139,6 +140,7 @@ class FusedDetector(NetworkDetector):
             pointpillars=PointPillarsParams(scores=ScoreParams.all_alike(settings.proposals),
                                             nms=replace(settings.nms,
                                                         max_boxes=settings.max_proposals),
+                                            intensity_scale=float(settings.intensity_scale > 0),
                                             cpu_fallback=settings.cpu_fallback))
         return other
 
