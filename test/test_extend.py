@@ -101,3 +101,14 @@ def test_a_ground_method_is_one_file_and_two_entries(copy, tmp_path):
     said = run(copy, "evaluate", "segmentation", "--data", object_folder(tmp_path / "kitti"),
                "--methods", "dbscan", "--ground-method", "lowest")
     assert "ground by lowest" in said
+
+
+def test_a_class_is_one_row_that_all_networks_of_the_package_go_on_with(copy, tmp_path):
+    file = copy / "lidar_perception" / "classes.py"
+    known, row = file.read_text(), '    ObjectClass("Truck", vehicle=True),\n'
+    assert row in known
+    file.unlink()  # it is a link to the original
+    numbers = "Numbers((8.0, 2.5, 3.2), 0.6, 0.45, (8.0, 2.5, 3.2), 5.0, 0.7, 0.5)"
+    file.write_text(known.replace(row, row.replace("vehicle", f"{numbers}, vehicle")))
+    said = run(copy, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"))
+    assert "2 frames" in said

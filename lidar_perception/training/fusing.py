@@ -159,12 +159,12 @@ def _looker(params: FusedDetectorParams,
 
 
 def fitted(samples: Samples, before: Models) -> tuple[Models, dict[str, Fitted]]:
-    """By class, the curves; those of before where there is too little to fit them to. And how both
-    do on scans that they were not fitted to."""
-    models, judged = {}, {}
+    """By class, the curves; those of before, if it has any, where there is too little to fit them
+    to. And how both do on scans that they were not fitted to."""
+    models, judged = dict(before), {}
     for name in DETECTED:
         own = samples.take(samples.class_ids == CLASSES.index(name))
-        models[name], after = before[name], None
+        after = None
         if enough(own):
             models[name] = curves(name, own)
             after = _on_other_scans(name, own)

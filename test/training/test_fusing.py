@@ -84,6 +84,8 @@ def test_curves_are_not_fitted_to_too_little():
         models, judged = fitted(own, package_models())
         assert (models["Car"] == package_models()["Car"]) == (right < FEWEST)
         assert (judged["Car"].after is None) == (right < FEWEST)
+        models, _ = fitted(own, {"Cyclist": models["Cyclist"]})  # a class is new
+        assert ("Car" in models) == (right >= FEWEST)
 
 
 @pytest.mark.parametrize("camera", [None, FORWARD_CAMERA], ids=["all around", "in an image"])

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from lidar_perception.classes import BY_SIZE
+from lidar_perception.classes import TABLE
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.params import ClusteringParams
 from lidar_perception.clustering.shapes import class_by_diagonal, ellipses, oriented_boxes
@@ -20,9 +20,11 @@ from lidar_perception.detectors.pointpillars.params import EXPERT_CLUSTERING, EX
 from lidar_perception.detectors.view import levelled_ground
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.groups import renumbered
-from lidar_perception.types import CLASSES, LidarFrame
+from lidar_perception.types import LidarFrame
 
-MAP_CLASSES = tuple(BY_SIZE)  # a channel each: vehicle, two-wheeler, pedestrian
+MAP_KINDS = ("vehicle", "cyclist", "pedestrian")  # a channel each, however many classes there are
+# Into MAP_KINDS, by class, and last of what is of no class, which has no channel.
+CHANNELS = np.array([*(MAP_KINDS.index(row.moves_as) for row in TABLE), -1])
 
 
 @dataclass(frozen=True)
@@ -84,14 +86,11 @@ def draw_clusters(xyz: np.ndarray, cluster_ids: np.ndarray, config: NetworkConfi
     """(3, H, W) uint8, 0 or 1, H along y: the cluster 2D pseudo-map (paper B, Section 3.1.2).
 
     Clusters 1..K of points (N, 3) with ids (N,) are classified by the diagonal of their smallest
-    rectangle, and drawn as filled ellipses into the channel of their class (MAP_CLASSES): the
+    rectangle, and drawn as filled ellipses into the channel of its kind (MAP_KINDS): the
     cells whose middle lies in the ellipse, and the one that holds its centre.
     """
-    class_ids = class_by_diagonal(oriented_boxes(xyz, cluster_ids, "min_area"))
-    channels = np.full(len(class_ids), -1)
-    for channel, name in enumerate(MAP_CLASSES):
-        channels[class_ids == CLASSES.index(name)] = channel
-    image = np.zeros((len(MAP_CLASSES), *config.grid), np.uint8)
+    channels = CHANNELS[class_by_diagonal(oriented_boxes(xyz, cluster_ids, "min_area"))]
+    image = np.zeros((len(MAP_KINDS), *config.grid), np.uint8)
     _fill_ellipses(image, ellipses(xyz, cluster_ids), channels, config.low[0], config.low[1],
                    config.cell)
     return image
