@@ -20,8 +20,8 @@ class DbscanParams(Params):
         unit="m", low=0.001, high=100.0)
     min_samples: int = param(10, "Points within eps, itself included, that make a core point.",
                              low=1, high=MAX_INT)
-    join_bands: bool = param(False, "Join clusters across a range limit where core points of both "
-                             "lie within the smaller eps; the paper cuts them there.")
+    join_bands: bool = param(False, "Join clusters across a range limit where points of both lie "
+                             "within the smaller eps; the paper cuts them there.")
 
     def check(self) -> None:
         if len(self.eps) != len(self.range_limits) + 1:
