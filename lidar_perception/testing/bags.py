@@ -79,8 +79,12 @@ def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = 
 
 def frames_of(given: Sequence[Any] | Iterable[Frame], labels: Any = None, **options: Any
               ) -> list[Frame]:
-    """Frames as they are, or recording() of clouds."""
+    """Frames as they are, or recording() of clouds. InputError where Frames are given what they
+    have of their own, or an option that there is not: it would be lost without a word."""
     given = list(given)
-    if given and isinstance(given[0], Frame):
-        return given
-    return recording(given, labels, **options)
+    if not given or not isinstance(given[0], Frame):
+        return recording(given, labels, **options)
+    if refused := [*(() if labels is None else ("labels",)), *options]:
+        raise InputError(f"Frames have labels, times and a frame_id of their own, so they take no "
+                         f"{' and no '.join(refused)}; give arrays instead")
+    return given

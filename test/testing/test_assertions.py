@@ -11,6 +11,7 @@ from samples import each_make, header, scene, walker_truth
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
 from lidar_perception.nodes.graph import private_domain
+from lidar_perception.testing.bags import recording
 from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.testing.detections import assert_detections, objects_of
 from lidar_perception.testing.launching import description, launch_file
@@ -121,6 +122,7 @@ def test_a_bag_gives_back_its_arrays(make_bag, storage):
     ([scene()], [[("Dragon", [0] * 7)]], {}, "'Dragon' is none of Car"),
     ([scene()], [[("Car", [0] * 3)]], {}, "whole boxes"),
     ([scene()], None, {"storage": "tape"}, "'tape' is none of mcap, sqlite3"),
+    (recording([scene()]), [None], {"hz": 5.0}, "they take no labels and no hz"),
 ])
 def test_a_bag_that_cannot_be_made_is_refused_by_name(make_bag, clouds, labels, options, words):
     with pytest.raises(InputError, match=words):
