@@ -111,4 +111,5 @@ def test_a_class_is_one_row_that_all_networks_of_the_package_go_on_with(copy, tm
     numbers = "Numbers((8.0, 2.5, 3.2), 0.6, 0.45, (8.0, 2.5, 3.2), 5.0, 0.7, 0.5)"
     file.write_text(known.replace(row, row.replace("vehicle", f"{numbers}, vehicle")))
     said = run(copy, "evaluate", "detection", "--data", object_folder(tmp_path / "kitti"))
-    assert "2 frames" in said
+    assert "2 frames" in said and "Truck" in said
+    assert re.search(r"\n +Car E +Car M +Car H +Cyc E", said)  # the paper's columns

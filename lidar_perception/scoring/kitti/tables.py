@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from lidar_perception.classes import BY_SIZE
+from lidar_perception.classes import CAR, CLASSES, CYCLIST, PEDESTRIAN
 from lidar_perception.scoring.average_precision import FEW
 from lidar_perception.scoring.intervals import SHARE
 from lidar_perception.scoring.kitti.protocol import DIFFICULTIES
@@ -21,7 +21,7 @@ from lidar_perception.scoring.tables import (
 
 # The EG-PointPillars paper, Table 5: AP in space at 0.7 (Car) and 0.5; easy, moderate, hard. It
 # does not say at how many recall points.
-COLUMNS = tuple(BY_SIZE)
+COLUMNS = tuple(CLASSES[i] for i in (CAR, CYCLIST, PEDESTRIAN))
 PAPER = {
     "PointPillars": ((84.00, 72.89, 68.24), (80.57, 61.96, 58.32), (52.66, 47.09, 43.21)),
     "V1": ((86.94, 76.06, 68.77), (79.53, 61.85, 58.18), (56.12, 50.96, 46.56)),
