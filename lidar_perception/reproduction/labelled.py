@@ -7,27 +7,47 @@ from dataclasses import dataclass
 import numpy as np
 
 from lidar_perception.camera import Camera
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.seeds import Seed, seed_from_truth
 from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import points_in_box
-from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, InputError, LidarFrame
+from lidar_perception.param_fields import with_values
+from lidar_perception.types import (
+    CLASSES,
+    PEDESTRIAN,
+    SENSOR_HEIGHT,
+    GroundTruth,
+    InputError,
+    LidarFrame,
+)
 
 VEHICLES = [i for i, row in enumerate(TABLE) if row.vehicle]
 
 
 @dataclass(frozen=True)
 class Labelled:
-    """A frame with at least one pedestrian: pedestrians (M, 7) are their true boxes."""
+    """A frame with at least one pedestrian: pedestrians (M, 7) are their true boxes; height: of
+    the sensor above the ground, metres."""
 
     frame: LidarFrame
     camera: Camera
     truth: GroundTruth
+    height: float = SENSOR_HEIGHT
 
     @property
     def pedestrians(self) -> np.ndarray:
         return self.truth.of_class(PEDESTRIAN)
+
+    def mounted(self, params: PipelineParams) -> PipelineParams:
+        """params for a sensor as high as this one."""
+        return with_values(params, {"ground.sensor_pose.height": self.height})
+
+    def segmented(self, params: PipelineParams, scan: LidarFrame | None = None) -> Segmented:
+        """The frame, or another scan of the same sensor, up to the boxes."""
+        return segment(self.frame if scan is None else scan, self.camera, self.mounted(params))
 
 
 def load_labelled(frame: Frame) -> Labelled:
@@ -44,7 +64,7 @@ def load_labelled(frame: Frame) -> Labelled:
     if not camera.in_view(scan.xyz).any():
         raise InputError(f"{frame.points or frame.name} has no point in the camera's view; "
                          "download it and its calibration again")
-    return Labelled(scan, camera, truth)
+    return Labelled(scan, camera, truth, frame.sensor_height)
 
 
 def nearest_seed(segmented: Segmented, labelled: Labelled) -> Seed:

@@ -10,7 +10,6 @@ import numpy as np
 from lidar_perception.candidates.boxes import height_matches, snap_to_ground
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.refine import STAGES, Candidates, refine
 from lidar_perception.candidates.seeds import Seed
 from lidar_perception.candidates.segmented import Segmented
@@ -47,7 +46,7 @@ def measure(frames: Sequence[Frame], number: int) -> dict[str, Any]:
     frame = frames[number]
     labelled = load_labelled(frame)
     truth = labelled.pedestrians
-    segmented = segment(labelled.frame, labelled.camera, PAPER)
+    segmented = labelled.segmented(PAPER)
     seed, no_seed, found, everything = None, None, Candidates.none(), Candidates.none()
     sweep = [found.final.boxes] * (NUMBERS.cpa_steps + 1)
     try:

@@ -10,7 +10,7 @@ import numpy as np
 
 from lidar_perception.candidates.boxes import height_matches
 from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.pipeline import refined, segment
+from lidar_perception.candidates.pipeline import refined
 from lidar_perception.candidates.seed_sources import automatic_seed
 from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.candidates.segmented import Segmented
@@ -112,7 +112,7 @@ def segments_of(labelled: Labelled) -> Callable[[PipelineParams], Segmented]:
     def segments(params: PipelineParams) -> Segmented:
         key = (params.view, params.ground, params.clustering, params.boxes)
         if key not in done:
-            done[key] = segment(labelled.frame, labelled.camera, params)
+            done[key] = labelled.segmented(params)
         return done[key]
 
     return segments

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -15,7 +16,9 @@ from lidar_perception.candidates.params import StmParams
 from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.refine import STAGES, refine
 from lidar_perception.clustering.params import DbscanParams
+from lidar_perception.data.frame import Frame
 from lidar_perception.data.open import open_recording
+from lidar_perception.param_fields import with_values
 from lidar_perception.reproduction import runner
 from lidar_perception.reproduction.experiment import Cell
 from lidar_perception.reproduction.labelled import load_labelled, nearest_seed
@@ -36,9 +39,9 @@ from lidar_perception.scoring.centres.matching import (
     match_centres,
     range_bins,
 )
-from lidar_perception.scoring.centres.report import CandidateReport, by_pipeline
+from lidar_perception.scoring.centres.report import CandidateReport, by_pipeline, of_frame
 from lidar_perception.scoring.run import fill
-from lidar_perception.types import InputError
+from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError
 
 COUNT = 7
 DIGEST = DATA.parent / "papers" / "DIGEST.md"
@@ -124,6 +127,31 @@ def test_the_stages_are_those_of_evaluate_candidates(kitti, measured):
             assert total(measured, "stages", stage, key).tolist() == getattr(score, key).tolist()
         np.testing.assert_allclose(total(measured, "stages", stage, "error"), score.error,
                                    atol=1e-4)
+
+
+def as_mounted_at(frame, height):
+    """The frame as a sensor so high would have it, metres."""
+    up = np.array([0, 0, SENSOR_HEIGHT - height], np.float32)
+    scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
+    lower = np.eye(4)
+    lower[2, 3] = -up[2]
+    return Frame.of(
+        frame.name, replace(scan, xyz=scan.xyz + up),
+        GroundTruth.of(truth.boxes + [*up[[0, 0, 2]], 0, 0, 0, 0], truth.class_ids, truth.extras),
+        replace(calibration, lidar_to_camera=calibration.lidar_to_camera @ lower),
+        sensor_height=height)
+
+
+def test_a_low_sensor_stands_on_the_ground_of_evaluate_candidates(kitti):
+    frames = [as_mounted_at(frame, 0.7) for frame in open_recording(kitti).frames[:2]]
+    params, report = with_values(PAPER, {"ground.sensor_pose.height": 0.7}), CandidateReport()
+    for frame in frames:
+        report.update(of_frame(frame, params))
+    records = [measure(frames, i) for i in range(len(frames))]
+    assert report.scores["stage1"].tp.sum() > 3
+    for stage, score in report.scores.items():
+        for key in ("tp", "fp", "fn"):
+            assert total(records, "stages", stage, key).tolist() == getattr(score, key).tolist()
 
 
 def test_no_cpa_is_stage_2_and_near_clusters_never_have_any(measured):

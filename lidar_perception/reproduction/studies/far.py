@@ -14,7 +14,6 @@ from scipy.special import expit, logit
 from lidar_perception.candidates.accumulation import accumulate, aligned, velocities
 from lidar_perception.candidates.boxes import snap_to_ground
 from lidar_perception.candidates.configurations import BEST
-from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import oriented_boxes
@@ -51,11 +50,12 @@ def measure(frames: Sequence[Frame], number: int) -> dict[str, Any]:
     scans = [f.load().xyz for f in before] + [labelled.frame.xyz]
     ages = np.array([frames[number].stamp_ns - f.stamp_ns for f in before] + [0]) / 1e9
     poses = np.array([*map(Odometry(), scans)])
-    obstacles = [xyz[~segment_ground(LidarFrame(xyz), BEST.ground)] for xyz in scans]
-    single = segment(labelled.frame, labelled.camera, BEST)
+    ground = labelled.mounted(BEST).ground
+    obstacles = [xyz[~segment_ground(LidarFrame(xyz), ground)] for xyz in scans]
+    single = labelled.segmented(BEST)
     seed = functools.partial(nearest_seed, single, labelled)
     found = {NAMES[0]: found_with(single, seed, BEST)}
-    earlier = [segment(f.load(), labelled.camera, BEST) for f in before]
+    earlier = [labelled.segmented(BEST, f.load()) for f in before]
     for name, params in PERSISTENT.items():
         own = functools.partial(seed_of, single, labelled, params)
         now = found_with(single, own, params)
