@@ -38,7 +38,7 @@ from lidar_perception.simulation.realism.scan_statistics import (
     square_degrees,
 )
 from lidar_perception.types import CLASSES as KITTI_CLASSES
-from lidar_perception.types import GroundTruth, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 
 SCANS = 6
 FEET = -1.7
@@ -106,6 +106,17 @@ def test_a_recording_is_as_real_as_itself():
     assert all(b["ratio"] == 1.0 and factor_off(b) == 1.0 for b in judged(content))
     assert all(content["curves"][name]["judged"] for name in CURVES
                if "histogram" not in name and name not in FACES)
+
+
+def test_the_ground_is_looked_for_below_the_sensor_of_the_recording():
+    up = np.array([0, 0, SENSOR_HEIGHT - 0.7], np.float32)
+    lower = []
+    for frame in map(recorded, range(SCANS)):
+        scan = frame.load()
+        lower.append(Frame.of(frame.name, replace(scan, xyz=scan.xyz + up), sensor_height=0.7))
+    measured = measured_scans(lower, PAPER)
+    for curve in ("clusters", "person clusters"):
+        np.testing.assert_array_equal(measured.rows[curve], street().rows[curve])
 
 
 def test_half_the_points_are_found_by_the_points_and_not_by_the_heights():

@@ -54,9 +54,11 @@ class Measured:
     skipped: list[str] = field(default_factory=list)
 
     def update(self, frame: Frame, protocol: PipelineParams) -> None:
-        """One scan; protocol is that of the pipeline's scores. A scan that is cropped to the
-        camera's view counts for its objects only. InputError where it cannot be read."""
+        """One scan; protocol is that of the pipeline's scores, for a sensor as high as the frame's.
+        A scan that is cropped to the camera's view counts for its objects only. InputError where it
+        cannot be read."""
         scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
+        protocol = with_values(protocol, {"ground.sensor_pose.height": frame.sensor_height})
         # The threshold's trial planes depend on the order of the points; here nothing shall.
         scan = scan.take(np.lexsort(scan.xyz.T))
         frame = Frame.of(frame.name, scan, truth, calibration)
