@@ -18,6 +18,7 @@ from lidar_perception.simulation.camera import FORWARD_CAMERA, kitti_labels
 from lidar_perception.simulation.drive import scan_at, scans
 from lidar_perception.simulation.scene import CROWDED
 from lidar_perception.simulation.sensor import SENSORS
+from lidar_perception.types import SENSOR_HEIGHT
 
 pytestmark = [pytest.mark.no_cover,  # others run these lines
               pytest.mark.usefixtures("streets", "tiny_sensor")]
@@ -133,6 +134,22 @@ def test_semantickitti_layout_reads_back(made):
         for moment, pose in enumerate(poses):  # as SemanticKITTI's own tools do
             pose = np.linalg.inv(to_camera) @ np.vstack([pose, [0, 0, 0, 1]]) @ to_camera
             assert np.allclose(pose, scan_at(3 + sequence, moment, TINY).pose, atol=1e-9)
+
+
+@pytest.mark.parametrize("layout, inner", [
+    ("kitti", "training/velodyne"), ("kitti-tracking", "training/velodyne/0000"),
+    ("semantickitti", "sequences/00")])
+def test_a_low_sensor_is_low_in_every_layout(tmp_path, layout, inner):
+    low = tmp_path / "low"
+    assert run(low, layout, 2, 1, "--mount-height", 0.6).exit_code == 0
+    for path in (low, low / inner):
+        recording = open_recording(path)
+        assert recording.mounted and {frame.sensor_height for frame in recording} == {0.6}
+    assert open_recording(low, sensor_height=1.0).frames[0].sensor_height == 1.0
+    for other in ("{", "[" * 10**4, '{"height": 480}',  # of another program
+                  '{"height": "1", "sensor_digest": ""}', '{"height": NaN, "sensor_digest": ""}'):
+        (low / "dataset.json").write_text(other)
+        assert open_recording(low).frames[0].sensor_height == SENSOR_HEIGHT
 
 
 def test_a_bag_goes_on_with_the_next_street(tmp_path):
