@@ -18,7 +18,7 @@ from lidar_perception.cli.data import as_mounted, data_option, opened
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.runs.terminal import console
-from lidar_perception.scoring.centres.report import pedestrians
+from lidar_perception.scoring.centres.report import pedestrians_of
 from lidar_perception.types import InputError
 from lidar_perception.wire.params import ViewParams
 
@@ -44,13 +44,13 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
       lidar-perception seed --data drive --frame 40 --at 18.0 8.6 -0.9 --out pedestrian.json
     """
     recording = opened(data)
-    params, frame = as_mounted(recording, params), _pick(recording, number, labelled=at is None)
+    params, frame = as_mounted(recording, params), _pick(recording, number, params.view, at is None)
     camera = frame.camera()
     if camera is None:
         params = replace(params, view=ViewParams(enabled=False))
     segmented = segment(frame.load(), camera, params)
     source = (clicked_seed(np.array(at), params.seed) if at is not None
-              else truth_seed(pedestrians(frame.truth())))
+              else truth_seed(pedestrians_of(frame, params.view.enabled)))
     template = source(segmented)
     save_seed(template, out)
     for row in to_pixels(template.silhouette(params))[::2]:
@@ -58,12 +58,13 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
     console.print(f"{out}: frame {frame.name}, height {template.height:.2f} m")
 
 
-def _pick(recording: Recording, number: int | None, labelled: bool) -> Frame:
+def _pick(recording: Recording, number: int | None, view: ViewParams,
+          labelled: bool) -> Frame:
     for i, frame in enumerate(recording):
         if i == number:
             return frame
         with suppress(InputError):
-            if number is None and (not labelled or len(pedestrians(frame.truth()))):
+            if number is None and (not labelled or len(pedestrians_of(frame, view.enabled))):
                 return frame
     raise InputError(f"{recording.path} has no frame {number}; it has {len(recording)}"
                      if number is not None else

@@ -15,6 +15,7 @@ from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import points_in_box
 from lidar_perception.param_fields import with_values
+from lidar_perception.scoring.kitti.camera_objects import in_image
 from lidar_perception.types import (
     CLASSES,
     PEDESTRIAN,
@@ -58,9 +59,12 @@ def load_labelled(frame: Frame) -> Labelled:
         raise InputError(f"{frame.points or frame.name} has no labels; put them beside the scans")
     if PEDESTRIAN not in truth.class_ids:
         raise InputError("no Pedestrian is labelled; the paper leaves such frames out")
-    scan, camera = frame.load(), frame.camera()
-    if camera is None:
+    scan, calibration = frame.load(), frame.calibration()
+    if calibration is None:
         raise InputError(f"{frame.name} has no camera calibration, to whose view the paper crops")
+    truth, camera = in_image(truth, calibration), calibration.camera()
+    if PEDESTRIAN not in truth.class_ids:
+        raise InputError("no Pedestrian is labelled in the image; the paper leaves such frames out")
     if not camera.in_view(scan.xyz).any():
         raise InputError(f"{frame.points or frame.name} has no point in the camera's view; "
                          "download it and its calibration again")

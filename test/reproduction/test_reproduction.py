@@ -224,7 +224,7 @@ def test_overlaps_of_boxes_that_are_known():
 
 
 @pytest.mark.parametrize("change, words", [
-    (lambda label: re.sub(r"(Pedestrian .*) \S+ \S+ \S+ (\S+)$", r"\1 4.00 -20.00 9.00 \2", label,
+    (lambda label: re.sub(r"(Pedestrian .*) \S+ \S+ \S+ (\S+)$", r"\1 4.00 -1.00 9.00 \2", label,
                           flags=re.M), "has 0 points"),
     (lambda label: label + "Car 0.00 0 0.00 0.00 0.00 0.00 0.00 9.00 90.00 90.00 0.00 3.00 20.00 "
      "0.00\n", "stands in a labelled Car")])

@@ -12,18 +12,32 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from samples import CALIBRATION, crowd
 
+from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams, SeedParams
 from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.reproduction.labelled import load_labelled
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, match_centres, range_bins
 from lidar_perception.scoring.centres.report import (
     CandidateReport,
     CandidateResult,
     by_pipeline,
+    of_frame,
     pedestrians,
+    pedestrians_of,
 )
+from lidar_perception.scoring.detections import Detected
+from lidar_perception.scoring.kitti.report import DetectionReport
 from lidar_perception.scoring.run import Skipped, fill, results
-from lidar_perception.types import CLASSES, PEDESTRIAN, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import (
+    CLASSES,
+    PEDESTRIAN,
+    Detections,
+    GroundTruth,
+    InputError,
+    LidarFrame,
+)
 
 seeds = st.integers(0, 2**32 - 1)
 small = st.integers(0, 5)
@@ -240,3 +254,28 @@ def test_only_pedestrians_count():
                            [PEDESTRIAN, CLASSES.index("Person_sitting"), CLASSES.index("Cyclist")])
     np.testing.assert_array_equal(pedestrians(mixed), boxes([1, 0, 0]))
     assert pedestrians(None).shape == (0, 7)
+
+
+def test_labels_behind_the_camera_are_not_missed_in_its_view():
+    cloud, truth = crowd(0)
+    scan, people = LidarFrame(cloud[:, :3], cloud[:, 3]), truth.of_class(PEDESTRIAN)
+    ahead, behind, around = (
+        Frame.of("a", scan, GroundTruth.of(own, [PEDESTRIAN] * len(own)), CALIBRATION)
+        for own in (people, people * [-1, -1, 1, 1, 1, 1, 1],
+                    np.concatenate([people, people * [-1, -1, 1, 1, 1, 1, 1]])))
+    expected, found = of_frame(ahead, PAPER), of_frame(around, PAPER)
+    np.testing.assert_array_equal(found.truth, people)
+    np.testing.assert_array_equal(found.boxes["final"], expected.boxes["final"])
+    assert of_frame(behind, PAPER) is None
+    assert len(pedestrians_of(around, view=False)) == 2 * len(people)
+
+    labels = around.truth()
+    detections = Detections(labels.boxes.astype(np.float32), labels.class_ids, np.ones(len(labels)))
+    report = DetectionReport()
+    report.update(Detected("a", labels, detections, CALIBRATION))
+    counts = report.compute()["pedestrian_centres"]["of_all"]["all"]
+    assert (counts["tp"], counts["fp"], counts["fn"]) == (len(people), 0, 0)
+
+    np.testing.assert_array_equal(load_labelled(around).pedestrians, people)
+    with pytest.raises(InputError, match="in the image"):
+        load_labelled(behind)

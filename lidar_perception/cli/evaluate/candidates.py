@@ -65,14 +65,14 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
     """The frame with most pedestrians of those that have candidates."""
     from lidar_perception.candidates.pipeline import find_candidates
     from lidar_perception.candidates.seeds import load_seed
-    from lidar_perception.scoring.centres.report import pedestrians, seed_source
+    from lidar_perception.scoring.centres.report import pedestrians_of, seed_source
     from lidar_perception.scoring.pictures import draw_frame
     best = report.with_most()
     if best is None:
         return
     template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
     frame = next(frame for frame in recording if frame.name == best)
-    truth = pedestrians(frame.truth())
+    truth = pedestrians_of(frame, params.view.enabled)
     segmented, found = find_candidates(frame.load(), seed_source(truth, template, params),
                                        frame.camera(), params)
     draw_frame(png, segmented.xyz, segmented.ground, segmented.cluster_ids, truth,

@@ -22,6 +22,7 @@ from lidar_perception.candidates.seeds import Seed, load_seed
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.scoring.centres.matching import RANGE_NAMES, Score, range_bins
+from lidar_perception.scoring.kitti.camera_objects import in_image
 from lidar_perception.types import PEDESTRIAN, GroundTruth, InputError
 
 TIMES = 10_000  # of a step that are kept
@@ -30,6 +31,15 @@ TIMES = 10_000  # of a step that are kept
 def pedestrians(truth: GroundTruth | None) -> np.ndarray:
     """(M, 7) true Pedestrian boxes; none where there are no labels."""
     return np.zeros((0, 7)) if truth is None else truth.of_class(PEDESTRIAN)
+
+
+def pedestrians_of(frame: Frame, view: bool = True) -> np.ndarray:
+    """(M, 7) true Pedestrian boxes of a frame; with view, where only the points in the camera's
+    view are looked at, those of which a part is in its image."""
+    truth = frame.truth()
+    if view and truth is not None and len(pedestrians(truth)):
+        truth = in_image(truth, frame.calibration())
+    return pedestrians(truth)
 
 
 @dataclass(frozen=True)
@@ -56,7 +66,7 @@ def by_pipeline(params: PipelineParams, recording: Recording
 def of_frame(frame: Frame, params: PipelineParams,
              template: Seed | None = None) -> CandidateResult | None:
     """The pipeline on one frame, with the seed of seed_source(); None without a pedestrian."""
-    truth = pedestrians(frame.truth())
+    truth = pedestrians_of(frame, params.view.enabled)
     if len(truth) == 0:
         return None
     scan, camera = frame.load(), frame.camera()

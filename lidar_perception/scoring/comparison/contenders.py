@@ -31,7 +31,7 @@ from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
 from lidar_perception.param_fields import with_values
-from lidar_perception.scoring.centres.report import pedestrians
+from lidar_perception.scoring.centres.report import pedestrians_of
 from lidar_perception.scoring.comparison.outcomes import Contender
 from lidar_perception.types import CLASSES, PEDESTRIAN, SENSOR_HEIGHT, InputError
 
@@ -192,7 +192,7 @@ def _no_seed(segmented):
 
 def _labelled(frame: Frame) -> SeedSource | None:
     """The paper's seed: the nearest label; None in frames without a pedestrian."""
-    truth = pedestrians(frame.truth())
+    truth = pedestrians_of(frame)
     return truth_seed(truth) if len(truth) else None
 
 

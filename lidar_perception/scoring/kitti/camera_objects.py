@@ -108,6 +108,14 @@ def camera_objects(objects: GroundTruth, calibration: Calibration | None) -> Cam
         regions=given[np.array([label["class"] == "DontCare" for label in labels], bool)])
 
 
+def in_image(truth: GroundTruth, calibration: Calibration | None) -> GroundTruth:
+    """The labels of which a part is in the image; all without a calibration. KITTI has no others;
+    who labels all around has."""
+    seen = np.flatnonzero(camera_objects(truth, calibration).pixels_high[:len(truth)] > 0)
+    return GroundTruth.of(truth.boxes[seen], truth.class_ids[seen],
+                          [truth.extras[i] for i in seen], truth.notes)
+
+
 def _without_camera(objects: GroundTruth, scores: np.ndarray) -> CameraObjects:
     count = len(objects)
     return CameraObjects(

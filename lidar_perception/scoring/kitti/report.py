@@ -52,8 +52,9 @@ class DetectionReport:
     def update(self, result: Detected) -> None:
         """One frame, as detections.py measures it.
 
-        With a calibration, detections outside the image are ignored, as labels end there. Without
-        one there are no scores in the image, and the difficulty is that of occlusion alone.
+        With a calibration, detections and labels outside the image are ignored, as KITTI's labels
+        end there. Without one there are no scores in the image, and the difficulty is that of
+        occlusion alone.
         InputError, with the frame's name, for a number that is not finite.
         """
         if result.problem is not None:
@@ -73,7 +74,8 @@ class DetectionReport:
         self.with_camera &= calibration is not None
         chosen = found.class_ids == PEDESTRIAN
         chosen &= objects.pixels_high[:len(found)] > 0
-        self.pedestrians.update(truth.of_class(PEDESTRIAN), found.boxes[chosen],
+        people = (truth.class_ids == PEDESTRIAN) & (true_objects.pixels_high[:len(truth)] > 0)
+        self.pedestrians.update(truth.boxes[people], found.boxes[chosen],
                                 objects.scores[:len(found)][chosen], result.name)
 
     def compute(self) -> dict:
