@@ -17,10 +17,12 @@ from lidar_perception.candidates.refine import STAGES
 from lidar_perception.cli.evaluate.candidates import candidates
 from lidar_perception.cli.evaluate.segmentation import segmentation
 from lidar_perception.clustering.params import CLUSTERING_METHODS
+from lidar_perception.data.frame import Frame, PointTruth
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import GROUND, MOVING, THINGS
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.ground.params import GROUND_METHODS
+from lidar_perception.scoring.points.report import SegmentationParams, by_methods
 from lidar_perception.scoring.points.segmentation import (
     PROTOCOLS,
     RANGE_NAMES,
@@ -35,7 +37,7 @@ from lidar_perception.scoring.points.segmentation import (
     true_ground,
 )
 from lidar_perception.scoring.points.tables import PUBLISHED
-from lidar_perception.types import CLASSES, GroundTruth, InputError
+from lidar_perception.types import CLASSES, SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 
 seeds = st.integers(0, 2**32 - 1)
 CAR, VAN, TRUCK = (CLASSES.index(name) for name in ("Car", "Van", "Truck"))
@@ -242,6 +244,19 @@ def test_each_protocol_by_hand():
         ground, counted = true_ground(semantic, z, name)
         assert [int(g) if c else None for g, c in zip(ground, counted)] == row, name
     assert set(PUBLISHED) <= set(PROTOCOLS)
+
+
+@pytest.mark.parametrize("height", [0.7, SENSOR_HEIGHT, 3.0])
+def test_low_vegetation_is_low_over_the_road_of_any_sensor(height):
+    rng = np.random.default_rng(0)
+    over = np.repeat([0.0, 0.4, 0.5], [400, 30, 20])
+    scan = LidarFrame(np.column_stack([rng.uniform(-9, 9, (450, 2)), over - height]
+                                      ).astype(np.float32))
+    labels = PointTruth(np.repeat([40, 70], [400, 50]).astype(np.uint16), np.zeros(450, np.uint16))
+    frame = replace(Frame.of("a", scan, sensor_height=height), point_truth=lambda: labels)
+    counts, _ = by_methods(SegmentationParams(), ("cloth",), (), None)(frame).ground["cloth"]
+    tp, fp, fn, tn = counts["with vegetation"]
+    assert (tp + fn, fp + tn) == (430, 20)
 
 
 def test_counts_and_ratios_of_ground_by_hand():

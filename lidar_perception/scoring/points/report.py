@@ -24,7 +24,7 @@ from lidar_perception.scoring.points.segmentation import (
     objects_of_instances,
     score_clusters,
 )
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
 from lidar_perception.wire.params import ViewParams
 
 
@@ -56,9 +56,10 @@ def by_methods(params: SegmentationParams, grounds: tuple[str, ...], clusterings
 
     def on_points(frame: Frame, labels: Any) -> SegmentationResult:
         scan, found, ground = frame.load(), {}, {}
+        z = scan.xyz[:, 2] + np.float32(frame.sensor_height - SENSOR_HEIGHT)
         for name in grounds:
             found[name], ms = timed(segment_ground, scan, replace(params.ground, method=name))
-            ground[name] = ground_by_protocol(found[name], labels.classes, scan.xyz[:, 2]), ms
+            ground[name] = ground_by_protocol(found[name], labels.classes, z), ms
         if not clusterings:
             return SegmentationResult(ground)
         chosen = found.get(params.ground.method)

@@ -6,7 +6,8 @@ out. Vegetation is
 
     without vegetation     left out too (Patchwork++, Lee et al., IROS 2022, Section IV-A);
     with vegetation        ground where lower than z = -1.3 m in the LiDAR frame, which is 0.43 m
-                           above the road, else not ground (Patchwork, Lim et al., RA-L 2021);
+                           above the road, wherever the sensor is, else not ground (Patchwork, Lim
+                           et al., RA-L 2021);
     vegetation not ground  not ground, the class as it is.
 
 A cluster and an object are compared by the points they share: IoU = |C and O| / |C or O|, and a
@@ -40,7 +41,7 @@ RANGE_LIMITS = np.array([15.0, 30.0, 45.0])
 def true_ground(semantic: np.ndarray, z: np.ndarray,
                 protocol: str) -> tuple[np.ndarray, np.ndarray]:
     """ground (N,) bool and counted (N,) bool of points with classes semantic (N,) and heights
-    z (N,) metres in the LiDAR frame. What is not counted is neither ground nor not ground."""
+    z (N,) metres, as from KITTI's sensor. What is not counted is neither ground nor not ground."""
     ground, counted = np.isin(semantic, GROUND), ~np.isin(semantic, UNLABELLED)
     vegetation = semantic == VEGETATION
     if protocol == "without vegetation":
@@ -58,7 +59,8 @@ def ground_counts(found: np.ndarray, ground: np.ndarray, counted: np.ndarray) ->
 
 def ground_by_protocol(found: np.ndarray, semantic: np.ndarray,
                        z: np.ndarray) -> dict[str, np.ndarray]:
-    """ground_counts of each protocol: found (N,) bool, classes (N,), heights (N,) metres."""
+    """ground_counts of each protocol: found (N,) bool, classes (N,), heights (N,) metres, as from
+    KITTI's sensor."""
     return {name: ground_counts(found, *true_ground(semantic, z, name)) for name in PROTOCOLS}
 
 
