@@ -7,14 +7,12 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
 from lidar_perception.data import bag_frames, cloud_files, semantickitti
 from lidar_perception.data.frame import Recording
 from lidar_perception.data.kitti import folder as kitti
+from lidar_perception.data.mounting import height_of
 from lidar_perception.data.nuscenes import folder as nuscenes
 from lidar_perception.runs.files import regular
-from lidar_perception.runs.folder import asked_of
 from lidar_perception.types import InputError
 
 # Each has recognises(path) and open_recording(path, ...); a new data set is one line here.
@@ -47,7 +45,7 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
     if len(recording) == 0:
         raise InputError(f"{path} ({recording.layout}) has no frame; record or download it again")
     if sensor_height is None and layout is not bag_frames:
-        sensor_height = _simulated_height(path)
+        sensor_height = height_of(path)
     if sensor_height is not None:
         frames = recording.frames
         recording = replace(recording, mounted=True, frames=(
@@ -57,12 +55,6 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
         open_recording, path, split=split, points=points, scans=scans,
         sensor_height=sensor_height))
     return recording if split is None else _of_split(recording, Path(split))
-
-
-def _simulated_height(path: Path) -> float | None:
-    """Metres of the sensor above the ground, where `simulate` has written the path."""
-    height = asked_of(path).get("height")
-    return float(height) if isinstance(height, (int, float)) and 0 < height < np.inf else None
 
 
 def with_topic(path: str | Path) -> tuple[Path, str]:

@@ -17,13 +17,14 @@ from lidar_perception.data import semantickitti
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.folder import GAP_NS, PERIOD_NS
 from lidar_perception.data.kitti.write import calibration_text, write_object_text, write_velodyne
+from lidar_perception.data.mounting import write_height
 from lidar_perception.labeling.datasets_nuscenes import NuscenesTables
 from lidar_perception.labeling.formats import kitti_object, kitti_tracking
 from lidar_perception.labeling.formats.nuscenes import LIKE
 from lidar_perception.labeling.labels import NO_TRACK, DriveLabels, FrameLabels, of_truth
 from lidar_perception.runs.files import whole_folder, write_bytes
 from lidar_perception.simulation.camera import FORWARD_CAMERA
-from lidar_perception.types import InputError
+from lidar_perception.types import SENSOR_HEIGHT, InputError
 
 # For a recording without a camera: its axes, level at the LiDAR, with KITTI's field of view.
 NO_CAMERA = replace(FORWARD_CAMERA, lidar_to_camera=np.array(
@@ -64,13 +65,16 @@ def write_dataset(layout: str, frames: Iterable[Frame], out: Path,
     then `out` is as it was.
 
     Frames get new numbers from 0, in KITTI's tracking layout by their time at 10 Hz. A drive ends
-    where the recording says so, at a gap of 5 s, and where the calibration changes.
+    where the recording says so, at a gap of 5 s, and where the calibration changes. How high the
+    sensor is, if not as KITTI's, is written beside, see data/mounting.py.
     """
     if layout not in LAYOUTS:
         raise InputError(f"there is no layout {layout!r}; there are {', '.join(LAYOUTS)}")
     summary = Summary()
     with whole_folder(out, force) as folder:
         for placed in LAYOUTS[layout](folder, _placed(frames, labels), summary):
+            if placed.number == 0 and placed.frame.sensor_height != SENSOR_HEIGHT:
+                write_height(folder, placed.frame.sensor_height)
             summary.frames += 1
             summary.boxes += len(placed.labels)
             summary.drives = placed.drive + 1

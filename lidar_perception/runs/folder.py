@@ -12,39 +12,19 @@ import json
 import os
 import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 
-from lidar_perception.runs.files import (
-    read_text,
-    refuse_others,
-    remove_temporaries,
-    write_bytes,
-    write_text,
-)
+from lidar_perception.runs.files import refuse_others, remove_temporaries, write_bytes, write_text
 from lidar_perception.runs.resuming import differences, locked
 from lidar_perception.types import InputError
 
 MARK, PARTS, RECORD = "INCOMPLETE", ".parts", "dataset.json"
-OURS = {"sensor_digest", "height"}  # in all of ours; other programs write a dataset.json, too
-MAX_BYTES = 1 << 16
-DEEPEST = 3  # training/velodyne/0000 can be opened, too
 
 
 def is_finished(folder: Path) -> bool:
     """Whether the folder is a whole data set of ours."""
     return (folder / RECORD).is_file() and not (folder / MARK).exists()
-
-
-def asked_of(path: Path) -> dict:
-    """What was asked for of the data set of ours that path is, or lies in; empty if it is none."""
-    for folder in (path, *path.absolute().parents[:DEEPEST]):
-        for name in (RECORD, MARK):
-            with suppress(InputError, ValueError, RecursionError):
-                asked = json.loads(read_text(folder / name, MAX_BYTES))
-                if isinstance(asked, dict) and asked.keys() >= OURS:
-                    return asked
-    return {}
 
 
 @contextmanager

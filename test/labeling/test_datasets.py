@@ -27,7 +27,7 @@ from lidar_perception.robot.poses import inverse, moved_boxes
 from lidar_perception.simulation.sensor import generic
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.testing.clouds import cloud_message
-from lidar_perception.types import Detections, GroundTruth, InputError, LidarFrame
+from lidar_perception.types import SENSOR_HEIGHT, Detections, GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import detection_markers
 from lidar_perception.wire.topics import ODOMETRY, POINTS
@@ -164,6 +164,17 @@ def test_without_a_camera_one_is_assumed_and_numbers_follow_the_time(tmp_path):
     found = DriveLabels([replace(of_truth("", 0, frame.truth()), name=a.name, stamp_ns=a.stamp_ns)
                          for a, frame in zip(frames, back)])
     same(labels, found, 2e-6)
+
+
+@pytest.mark.parametrize("layout", REAL)
+@pytest.mark.parametrize("height", [0.62, SENSOR_HEIGHT, 2.9])
+def test_the_sensor_is_as_high_in_the_folder_as_in_the_recording(tmp_path, layout, height):
+    points = PointTruth(np.zeros(3, np.uint16), np.zeros(3, np.uint16))
+    frames = frames_at([0, 0.1], point_truth=lambda: points, sensor_height=height)
+    write_dataset(layout, frames, tmp_path / "folder")
+    assert [f.sensor_height for f in open_recording(tmp_path / "folder")] == [height] * 2
+    assert (tmp_path / "folder/mount.json").exists() == (height != SENSOR_HEIGHT)
+    assert open_recording(tmp_path / "folder", sensor_height=1.0).frames[0].sensor_height == 1.0
 
 
 def test_point_labels_need_columns_and_go_only_where_they_fit(tmp_path, monkeypatch, capsys):
