@@ -56,7 +56,8 @@ def explain_nothing(usable: int, ground: np.ndarray,
     if usable == 0:
         return "the cloud is empty or has no finite point, or crop.* leaves none"
     if len(ground) == 0:
-        return "no point is in the camera's view; check the LiDAR-to-camera transform"
+        return ("no point is in the camera's view, or crop.* leaves none there; check the "
+                "LiDAR-to-camera transform")
     if not ground.any():
         return ("no ground found; is the sensor mounted at another height or angle? set "
                 "ground.sensor_pose")
