@@ -6,6 +6,7 @@ import json
 import math
 import multiprocessing
 import os
+import shutil
 import sys
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -23,6 +24,7 @@ from lidar_perception.cli.main import main
 from lidar_perception.geometry import points_in_box
 from lidar_perception.labeling import results, served, server, session  # noqa: F401
 
+BROWSER = shutil.which("chromium")
 PATIENCE = 60.0  # seconds
 NEAR = 20.0      # metres
 
@@ -135,6 +137,21 @@ class Label:
             sleep(0.02)
         page.wait_for_function("n => page.store.seq >= n", arg=self.state()["seq"])
         page.wait_for_function("() => page.store.draft === null")
+
+
+@contextmanager
+def opened(browser, url: str) -> Iterator:
+    context = browser.new_context(viewport={"width": 1280, "height": 720})
+    page, wrong = context.new_page(), []
+    page.set_default_timeout(60_000)
+    page.on("pageerror", lambda error: wrong.append(error))
+    page.on("request", lambda r: wrong.append(r.url) if "127.0.0.1" not in r.url
+            and not r.url.startswith(("data:", "blob:")) else None)
+    page.goto(url)
+    page.wait_for_selector("html[data-ready=true]", state="attached")
+    yield page
+    context.close()
+    assert wrong == []
 
 
 def boxes_of(track: dict) -> dict[int, list[float]]:

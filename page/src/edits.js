@@ -45,11 +45,6 @@ export function nudge({ forward = 0, left = 0, up = 0, turn = 0 }) {
   if (box) setDraft(turnBy(moveAlong(box, forward * STEP, left * STEP, up * STEP), turn * TURN));
 }
 
-export async function setNumbers(box) {
-  const track = chosen();
-  if (track) await act({ do: "box", track: track.id, frame: store.frame, box });
-}
-
 async function onTrack(action) {
   const track = editable() && chosen();
   return track ? act({ ...action, track: track.id }) : false;

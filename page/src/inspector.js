@@ -3,8 +3,8 @@
 import { getJson } from "./api.js";
 import { colourOfClass } from "./colours.js";
 import { element } from "./dom.js";
-import { copyOn, decide, interpolate, merge, removeBox, setNumbers, setTrackClass, snap, split, trim }
-  from "./edits.js";
+import { commit, copyOn, decide, interpolate, merge, removeBox, setDraft, setTrackClass, snap, split,
+         trim } from "./edits.js";
 import { on, selectedBox, selectedTrack, store } from "./store.js";
 
 const FIELDS = [["x", "m"], ["y", "m"], ["z", "m"], ["length", "m"], ["width", "m"],
@@ -13,6 +13,7 @@ const KINDS = { key: "set by hand", proposed: "proposed", interpolated: "interpo
 const panel = document.getElementById("inspector");
 const nothing = document.getElementById("nothing-selected");
 const number = (name) => document.getElementById(`field-${name}`);
+let typed = null; // the field in which something stands that was not taken yet
 
 const BUTTONS = [
   ["Snap", [["cluster", "C", "To the L-shape of its cluster", () => snap("cluster")],
@@ -29,9 +30,11 @@ const BUTTONS = [
 
 export function openInspector() {
   const fields = document.getElementById("numbers");
-  for (const [name, unit] of FIELDS) {
+  for (const [k, [name, unit]] of FIELDS.entries()) {
     const input = element("input", { id: `field-${name}`, type: "number", inputmode: "decimal",
-      step: unit === "m" ? 0.05 : 1, onchange: takeNumbers });
+      step: unit === "m" ? 0.05 : 1, oninput: () => { typed = input; },
+      onchange: () => takeNumber(k, input),
+      onkeydown: ({ key }) => { if (key === "Escape") giveUp(); } });
     fields.append(element("label", {}, element("span", {}, name), input, element("i", {}, unit)));
   }
   // What was typed is of the track and the frame that are left by this click, so it is taken first.
@@ -51,7 +54,8 @@ export function openInspector() {
   document.getElementById("accept").onclick = () => decide(pressed("accepted", "accept"));
   document.getElementById("reject").onclick = () => decide(pressed("rejected", "reject"));
   on("drive", fillClasses);
-  on("selection tracks draft frame drive", fill);
+  on("selection tracks draft drive", fill);
+  on("frame", giveUp); // of another frame it would be another box's
   on("selection tracks frame", askSilhouettes);
 }
 
@@ -62,24 +66,32 @@ function fillClasses() {
     element("option", { value: name }, k < 9 ? `${k + 1}  ${name}` : name)));
 }
 
-function takeNumbers() {
-  const box = selectedBox()?.box;
-  if (!box) return;
-  const values = FIELDS.map(([name]) => Number(number(name).value));
-  values[6] *= Math.PI / 180;
-  const good = values.every(Number.isFinite) && values.slice(3, 6).every((size) => size > 0);
-  if (good) setNumbers(values);
-  else fill({ all: true });
+/** The number that was typed; all others stay as they are, of which the fields show rounded ones. */
+async function takeNumber(k, input) {
+  typed = null;
+  const box = selectedBox()?.box.slice(), value = input.valueAsNumber; // NaN where nothing is left
+  if (box && Number.isFinite(value) && (value > 0 || k < 3 || k === 6)) {
+    box[k] = k === 6 ? value * Math.PI / 180 : value;
+    setDraft(box); // so that the number that is typed next goes with this one
+    await commit();
+  }
+  fill();
 }
 
-function fill({ all = false } = {}) {
+function giveUp() {
+  typed = null;
+  fill();
+}
+
+function fill() {
   const track = selectedTrack(), { found } = store;
   panel.hidden = !track && !found;
+  if (panel.hidden) typed = null;
   nothing.hidden = track !== null || store.mode === "view";
   document.getElementById("facts").replaceChildren(...(store.mode === "view" && (track || found)
     ? factsOf(track, found) : []).flatMap(([name, value]) =>
     [element("dt", {}, name), element("dd", {}, value)]));
-  if (found) fillFound(found, all);
+  if (found) fillFound(found);
   if (!track) return;
   document.getElementById("who").textContent = `Track ${track.id}`;
   const badge = document.getElementById("state");
@@ -96,27 +108,27 @@ function fill({ all = false } = {}) {
     : store.mode === "view" ? "" : KINDS[here.kind];
   document.getElementById("accept").setAttribute("aria-pressed", track.state === "accepted");
   document.getElementById("reject").setAttribute("aria-pressed", track.state === "rejected");
-  fillNumbers(here?.box, all);
+  fillNumbers(here?.box);
 }
 
-function fillNumbers(box, all) {
+function fillNumbers(box) {
   for (const [k, [name]] of FIELDS.entries()) {
     const input = number(name), value = box?.[k];
     input.disabled = !box || store.mode === "view";
-    if (document.activeElement === input && !store.draft && !all) continue; // being typed
+    if (input === typed) continue;
     input.value = value === undefined ? "" : k === 6 ? (value * 180 / Math.PI).toFixed(1) : value.toFixed(2);
   }
 }
 
 /** A label or a detection that is looked at. */
-function fillFound({ layer, row, wrong, colour }, all) {
+function fillFound({ layer, row, wrong, colour }) {
   document.getElementById("who").textContent = row[7];
   const badge = document.getElementById("state");
   badge.textContent = wrong ?? (layer === "labels" ? "label" : "detection");
   badge.className = `badge ${wrong ? "rejected" : ""}`;
   document.getElementById("swatch").style.background = colour;
   document.getElementById("kind").textContent = "";
-  fillNumbers(row, all);
+  fillNumbers(row);
 }
 
 /** What is known of it besides its box: [name, value]. */

@@ -4,86 +4,17 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
-import socket
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from labeling_pages import Label, boxes_of, drag, faces, labelled_person, middle, serving
+from labeling_pages import BROWSER, boxes_of, drag, faces, middle, opened, serving
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.geometry import wrap_angle
 
-BROWSER = shutil.which("chromium")
-sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 # Others run these lines.
 pytestmark = [pytest.mark.no_cover,
               pytest.mark.skipif(BROWSER is None, reason="chromium is not installed")]
-FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
-         "--disable-background-networking --disable-component-update --disable-sync").split()
-
-
-def free_port() -> int:
-    with socket.socket() as found:
-        found.bind(("127.0.0.1", 0))
-        return found.getsockname()[1]
-
-
-@pytest.fixture(scope="module")
-def browser():
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=BROWSER, args=FLAGS)
-        yield started
-        started.close()
-
-
-@pytest.fixture(scope="module")
-def labels(drive_bag, tmp_path_factory):
-    """The labelling of a drive, at the address that stays the same when its server is started
-    again."""
-    out, port = tmp_path_factory.mktemp("labels"), free_port()
-    arguments = ("label", "--data", str(drive_bag), "--out", str(out), "--no-open", "--no-propose",
-                 "--port", str(port))
-    with serving(*arguments) as server:
-        yield Label(server.process, server.url, out, arguments)
-
-
-@pytest.fixture(scope="module")
-def first_page(browser, labels):
-    with opened(browser, labels.url) as made:
-        yield made
-
-
-@pytest.fixture
-def page(first_page):
-    """A page on the first frame, in which nothing is selected: the same for all tests, as an
-    annotator's stays open."""
-    first_page.keyboard.press("Escape")
-    first_page.keyboard.press("Escape")
-    first_page.keyboard.press("Home")
-    return first_page
-
-
-@contextmanager
-def opened(browser, url):
-    context = browser.new_context(viewport={"width": 1280, "height": 720})
-    page, wrong = context.new_page(), []
-    page.set_default_timeout(60_000)
-    page.on("pageerror", lambda error: wrong.append(error))
-    page.on("request", lambda r: wrong.append(r.url) if "127.0.0.1" not in r.url
-            and not r.url.startswith(("data:", "blob:")) else None)
-    page.goto(url)
-    page.wait_for_selector("html[data-ready=true]", state="attached")
-    yield page
-    context.close()
-    assert wrong == []
-
-
-@pytest.fixture(scope="module")
-def person(drive_bag):
-    """(7,) the box of a labelled person near the sensor in the first frame."""
-    return labelled_person(next(iter(open_recording(drive_bag))))
 
 
 def test_a_click_on_a_person_makes_a_track_and_a_seed(page, labels, person):
@@ -193,6 +124,31 @@ def test_what_is_typed_or_held_is_of_the_track_and_the_frame_where_that_began(pa
     assert labels.lines()[-1]["frame"] == 0
     page.keyboard.press(",")
     page.wait_for_function("() => page.store.frame === 0")
+
+
+def test_a_typed_number_changes_this_one_alone_and_none_or_escape_changes_nothing(page, labels,
+                                                                                  person):
+    number = labels.chosen(page, person)
+    before, lines = labels.box(number), len(labels.lines())
+    for key, text, there in (("Enter", "", before), ("Enter", "1e99", before),
+                             ("Escape", "4.5", before), ("Enter", "4.567", [before[0], 4.567])):
+        page.click(f"#tracks [data-track='{number}']")
+        page.click("#field-y", click_count=3)
+        page.keyboard.press("Delete")
+        page.keyboard.type(text)
+        page.keyboard.press(key)
+        labels.wait(page, number, lambda t, y=there[1]: boxes_of(t)[0][1] == y)
+        page.wait_for_function("y => document.getElementById('field-y').value === y",
+                               arg=f"{there[1]:.2f}")
+    page.click("#errors .toast button")  # what was refused is said
+    assert labels.box(number) == [before[0], 4.567, *before[2:]]
+    assert len(labels.lines()) == lines + 1
+    page.focus("#field-x")
+    for text in "3.25", "2.125":  # the second before the first is saved
+        page.keyboard.press("Control+a")
+        page.keyboard.type(text)
+        page.keyboard.press("Tab")
+    labels.wait(page, number, lambda t: boxes_of(t)[0][:2] == [3.25, 2.125])
 
 
 def test_a_row_that_is_pressed_is_chosen_though_the_list_changes_meanwhile(page, labels, person):
