@@ -83,6 +83,7 @@ export async function show(frame) {
                         new Promise((resolve) => setTimeout(resolve, PATIENCE_MS))]);
   }
   if (store.wanted !== frame) return;
+  commit(); // what a key has moved meanwhile
   store.frame = frame;
   store.cloud = cloud;
   store.draft = null;

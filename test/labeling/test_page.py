@@ -151,6 +151,24 @@ def test_a_typed_number_changes_this_one_alone_and_none_or_escape_changes_nothin
     labels.wait(page, number, lambda t: boxes_of(t)[0][:2] == [3.25, 2.125])
 
 
+def test_keys_while_a_frame_is_on_its_way_are_of_the_one_that_is_shown(browser, page, labels,
+                                                                       person):
+    number = labels.chosen(page, person)
+    before, held = labels.box(number), []
+    with opened(browser, f"{labels.url}&track={number}") as other:
+        other.route("**/api/cloud/7*", lambda route: held.append(route))
+        other.keyboard.press("End")
+        other.keyboard.down("ArrowUp")
+        other.wait_for_function("() => page.store.draft")
+        while not held:
+            other.wait_for_timeout(10)
+        held.pop().continue_()
+        other.wait_for_function("() => page.store.frame === 7")
+        other.keyboard.up("ArrowUp")
+        labels.wait(other, number, lambda t: boxes_of(t)[0] != before)
+    assert math.dist(labels.box(number)[:2], before[:2]) == pytest.approx(0.05)
+
+
 def test_a_row_that_is_pressed_is_chosen_though_the_list_changes_meanwhile(page, labels, person):
     """As it does when an action of somebody comes from the server."""
     other, number = labels.chosen(page, person), labels.chosen(page, person)
