@@ -167,9 +167,10 @@ function selectNew(before) {
 }
 
 export async function checkFrame() {
-  if (!editable()) return;
-  const now = !store.checked.has(store.frame);
-  if (await act({ do: "check", frame: store.frame, checked: now }) && now) await goTo(store.frame + 1);
+  const { frame } = store, now = !store.checked.has(frame);
+  if (!editable() || store.wanted !== frame) return; // another one is on its way: not this one twice
+  const done = await act({ do: "check", frame, checked: now });
+  if (done && now && store.wanted === frame) await goTo(frame + 1);
 }
 
 export const undo = () => editable() && (store.canUndo ? act({ do: "undo" }) : say("Nothing to undo."));

@@ -169,6 +169,28 @@ def test_keys_while_a_frame_is_on_its_way_are_of_the_one_that_is_shown(browser, 
     assert math.dist(labels.box(number)[:2], before[:2]) == pytest.approx(0.05)
 
 
+def test_each_frame_is_checked_once_however_fast_the_key_is(browser, page, labels):
+    with opened(browser, labels.url) as other:
+        held = []
+        other.route("**/api/cloud/4*", lambda route: held.append(route))
+        for _ in range(3):
+            other.keyboard.press(".")
+        other.wait_for_function("() => page.store.frame === 3")
+        other.keyboard.press("k")
+        other.wait_for_function("() => page.store.wanted === 4")
+        other.keyboard.press("k")  # frame 4 is not shown yet
+        while not held:
+            other.wait_for_timeout(10)
+        held.pop().continue_()
+        other.wait_for_function("() => page.store.frame === 4")
+        other.keyboard.press("k")
+        other.wait_for_function("() => page.store.frame === 5")
+        assert labels.state()["checked"] == [3, 4]
+        for _ in range(2):
+            other.keyboard.press("Control+z")
+        other.wait_for_function("() => page.store.checked.size === 0")
+
+
 def test_a_row_that_is_pressed_is_chosen_though_the_list_changes_meanwhile(page, labels, person):
     """As it does when an action of somebody comes from the server."""
     other, number = labels.chosen(page, person), labels.chosen(page, person)
