@@ -50,7 +50,10 @@ export function openInspector() {
         onclick: run, "data-do": label }, label, element("kbd", {}, key)))));
   }
   const choice = document.getElementById("class");
-  choice.onchange = () => setTrackClass(choice.value);
+  choice.onchange = async () => {
+    await setTrackClass(choice.value);
+    fill(); // what could not be saved is not shown
+  };
   document.getElementById("accept").onclick = () => decide(pressed("accepted", "accept"));
   document.getElementById("reject").onclick = () => decide(pressed("rejected", "reject"));
   on("drive", fillClasses);

@@ -125,11 +125,15 @@ export function showHelp() {
 }
 
 export function openKeys() {
+  let pointed = null;
   addEventListener("keydown", press);
   addEventListener("keyup", (event) => { if (HELD.has(event.key)) commit(); });
   addEventListener("blur", () => commit());
   // After a click by mouse the keys are the page's again: Space plays, and presses no button twice.
   addEventListener("click", ({ detail, target }) => { if (detail) target.closest?.("button")?.blur(); });
+  // So after a choice by mouse, or an arrow that is to move the box would change its class.
+  addEventListener("pointerdown", ({ target }) => { pointed = target; }, { capture: true });
+  addEventListener("change", ({ target }) => { if (target === pointed && target.matches("select")) target.blur(); });
 }
 
 /** Fill the help, for label or view mode. */

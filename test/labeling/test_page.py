@@ -256,6 +256,25 @@ def test_the_class_of_a_seed_is_chosen_at_the_click(page, labels, person):
     page.keyboard.press("Escape")
 
 
+def test_an_arrow_moves_the_box_after_a_class_is_chosen_by_mouse(page, labels, person):
+    number = labels.chosen(page, person)
+    before = labels.box(number)
+    page.click("#class")
+    for key in "ArrowDown", "Enter":  # in the list that has opened
+        page.keyboard.press(key)
+    labels.wait(page, number, lambda t: t["class"] != "Pedestrian")
+    chosen = labels.tracks()[number]["class"]
+    page.keyboard.press("ArrowUp")
+    labels.wait(page, number, lambda t: boxes_of(t)[0] != before)
+    assert labels.tracks()[number]["class"] == chosen
+    page.route("**/api/do*", lambda route: route.abort())
+    page.select_option("#class", "Car")
+    page.wait_for_selector("#errors .toast")
+    page.wait_for_function("c => document.getElementById('class').value === c", arg=chosen)
+    page.unroute("**/api/do*")
+    page.click("#errors .toast button")
+
+
 def test_one_key_rejects_all_that_is_left_and_one_takes_it_back(page, labels, person):
     others = []
     for _ in range(2):
