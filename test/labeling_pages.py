@@ -140,13 +140,15 @@ class Label:
 
 
 @contextmanager
-def opened(browser, url: str) -> Iterator:
+def opened(browser, url: str, before: Callable = lambda page: None) -> Iterator:
+    """A page at an address; before: what is done with it first."""
     context = browser.new_context(viewport={"width": 1280, "height": 720})
     page, wrong = context.new_page(), []
     page.set_default_timeout(60_000)
     page.on("pageerror", lambda error: wrong.append(error))
     page.on("request", lambda r: wrong.append(r.url) if "127.0.0.1" not in r.url
             and not r.url.startswith(("data:", "blob:")) else None)
+    before(page)
     page.goto(url)
     page.wait_for_selector("html[data-ready=true]", state="attached")
     yield page

@@ -57,6 +57,7 @@ function toTrack(sent) {
 }
 
 export function setState(state) {
+  if (state.seq < store.seq) return; // on its way it was overtaken by an event
   store.tracks = new Map(state.tracks.map((track) => [track.id, toTrack(track)]));
   store.seeds = state.seeds ?? [];
   takeCounts(state);

@@ -126,71 +126,6 @@ def test_what_is_typed_or_held_is_of_the_track_and_the_frame_where_that_began(pa
     page.wait_for_function("() => page.store.frame === 0")
 
 
-def test_a_typed_number_changes_this_one_alone_and_none_or_escape_changes_nothing(page, labels,
-                                                                                  person):
-    number = labels.chosen(page, person)
-    before, lines = labels.box(number), len(labels.lines())
-    for key, text, there in (("Enter", "", before), ("Enter", "1e99", before),
-                             ("Escape", "4.5", before), ("Enter", "4.567", [before[0], 4.567])):
-        page.click(f"#tracks [data-track='{number}']")
-        page.click("#field-y", click_count=3)
-        page.keyboard.press("Delete")
-        page.keyboard.type(text)
-        page.keyboard.press(key)
-        labels.wait(page, number, lambda t, y=there[1]: boxes_of(t)[0][1] == y)
-        page.wait_for_function("y => document.getElementById('field-y').value === y",
-                               arg=f"{there[1]:.2f}")
-    page.click("#errors .toast button")  # what was refused is said
-    assert labels.box(number) == [before[0], 4.567, *before[2:]]
-    assert len(labels.lines()) == lines + 1
-    page.focus("#field-x")
-    for text in "3.25", "2.125":  # the second before the first is saved
-        page.keyboard.press("Control+a")
-        page.keyboard.type(text)
-        page.keyboard.press("Tab")
-    labels.wait(page, number, lambda t: boxes_of(t)[0][:2] == [3.25, 2.125])
-
-
-def test_keys_while_a_frame_is_on_its_way_are_of_the_one_that_is_shown(browser, page, labels,
-                                                                       person):
-    number = labels.chosen(page, person)
-    before, held = labels.box(number), []
-    with opened(browser, f"{labels.url}&track={number}") as other:
-        other.route("**/api/cloud/7*", lambda route: held.append(route))
-        other.keyboard.press("End")
-        other.keyboard.down("ArrowUp")
-        other.wait_for_function("() => page.store.draft")
-        while not held:
-            other.wait_for_timeout(10)
-        held.pop().continue_()
-        other.wait_for_function("() => page.store.frame === 7")
-        other.keyboard.up("ArrowUp")
-        labels.wait(other, number, lambda t: boxes_of(t)[0] != before)
-    assert math.dist(labels.box(number)[:2], before[:2]) == pytest.approx(0.05)
-
-
-def test_each_frame_is_checked_once_however_fast_the_key_is(browser, page, labels):
-    with opened(browser, labels.url) as other:
-        held = []
-        other.route("**/api/cloud/4*", lambda route: held.append(route))
-        for _ in range(3):
-            other.keyboard.press(".")
-        other.wait_for_function("() => page.store.frame === 3")
-        other.keyboard.press("k")
-        other.wait_for_function("() => page.store.wanted === 4")
-        other.keyboard.press("k")  # frame 4 is not shown yet
-        while not held:
-            other.wait_for_timeout(10)
-        held.pop().continue_()
-        other.wait_for_function("() => page.store.frame === 4")
-        other.keyboard.press("k")
-        other.wait_for_function("() => page.store.frame === 5")
-        assert labels.state()["checked"] == [3, 4]
-        for _ in range(2):
-            other.keyboard.press("Control+z")
-        other.wait_for_function("() => page.store.checked.size === 0")
-
-
 def test_a_row_that_is_pressed_is_chosen_though_the_list_changes_meanwhile(page, labels, person):
     """As it does when an action of somebody comes from the server."""
     other, number = labels.chosen(page, person), labels.chosen(page, person)
@@ -254,25 +189,6 @@ def test_the_class_of_a_seed_is_chosen_at_the_click(page, labels, person):
     assert tracks[number]["class"] != name and labels.lines()[-1]["class"] == name
     page.keyboard.press("4")  # as it was
     page.keyboard.press("Escape")
-
-
-def test_an_arrow_moves_the_box_after_a_class_is_chosen_by_mouse(page, labels, person):
-    number = labels.chosen(page, person)
-    before = labels.box(number)
-    page.click("#class")
-    for key in "ArrowDown", "Enter":  # in the list that has opened
-        page.keyboard.press(key)
-    labels.wait(page, number, lambda t: t["class"] != "Pedestrian")
-    chosen = labels.tracks()[number]["class"]
-    page.keyboard.press("ArrowUp")
-    labels.wait(page, number, lambda t: boxes_of(t)[0] != before)
-    assert labels.tracks()[number]["class"] == chosen
-    page.route("**/api/do*", lambda route: route.abort())
-    page.select_option("#class", "Car")
-    page.wait_for_selector("#errors .toast")
-    page.wait_for_function("c => document.getElementById('class').value === c", arg=chosen)
-    page.unroute("**/api/do*")
-    page.click("#errors .toast button")
 
 
 def test_one_key_rejects_all_that_is_left_and_one_takes_it_back(page, labels, person):
