@@ -38,11 +38,13 @@ const post = async (path, content) => (await ask(path, {
   body: JSON.stringify(content),
 })).json();
 
-let last = Promise.resolve();
+let last = Promise.resolve(), unsaved = 0; // actions that were not answered yet
+addEventListener("beforeunload", (event) => { if (unsaved) event.preventDefault(); }); // asks
 
 /** Send an action after those before it. True once it is in the journal; else a message is shown
  * and nothing has changed. */
 export function act(action) {
+  unsaved += 1;
   const sent = last.then(async () => {
     try {
       const { seq } = await post("/api/do", action);
@@ -51,6 +53,8 @@ export function act(action) {
     } catch (error) {
       sayError(`Not saved (${action.do.replace("_", " ")}): ${error.message}`);
       return false;
+    } finally {
+      unsaved -= 1;
     }
   });
   last = sent;

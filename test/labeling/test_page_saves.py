@@ -120,3 +120,20 @@ def test_a_state_that_comes_late_takes_nothing_back(browser, page, labels, perso
         other.keyboard.press(".")
         other.wait_for_function("() => page.store.frame === 1")
         assert other.evaluate(same, [number, name])
+
+
+def test_the_browser_asks_before_it_leaves_what_is_not_saved_yet(browser, labels):
+    held, asked = [], []
+    with opened(browser, labels.url) as other:
+        other.route("**/api/do*", lambda route: held.append(route))
+        other.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.dismiss()))
+        other.keyboard.press("k")
+        while not held:
+            other.wait_for_timeout(10)
+        other.close(run_before_unload=True)
+        held.pop().continue_()
+        other.wait_for_function("() => page.store.checked.size === 1 && page.store.frame === 1")
+        assert asked == ["beforeunload"]
+        other.unroute("**/api/do*")
+        other.keyboard.press("Control+z")
+        other.wait_for_function("() => page.store.checked.size === 0")
