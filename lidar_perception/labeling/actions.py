@@ -239,11 +239,11 @@ def _reject_rest(state: State, action: Action, motion: Motion) -> Made:
     return _only(state, *(replace(t, state=REJECTED) for t in left))
 
 
-def _accept(state: State, action: Action, motion: Motion) -> Made:
+def _accept(state: State, action: Action, motion: Motion, to: str = ACCEPTED) -> Made:
     track, seeds = track_of(state, action.get("track")), state.seeds
     if action.get("seed") is not None:  # the frame in which it is the best one
         seeds = _with_seed(seeds, frame_of(action, motion, "seed"), track.id)
-    return {track.id: replace(track, state=ACCEPTED)}, seeds, state.checked
+    return {track.id: replace(track, state=to)}, seeds, state.checked
 
 
 def _reject(state: State, action: Action, motion: Motion) -> Made:
@@ -253,7 +253,7 @@ def _reject(state: State, action: Action, motion: Motion) -> Made:
 
 
 def _reopen(state: State, action: Action, motion: Motion) -> Made:
-    return _only(state, replace(track_of(state, action.get("track")), state=PROPOSED))
+    return _accept(state, action, motion, PROPOSED)
 
 
 def _merge(state: State, action: Action, motion: Motion) -> Made:

@@ -37,6 +37,7 @@ from lidar_perception.labeling.state import (
     ACCEPTED,
     CLICK,
     KEY,
+    REJECTED,
     Box,
     Change,
     State,
@@ -87,8 +88,9 @@ class Session:
             return self.prepare(by, True) if action["do"] == "propose" else self.cancel()
         with self._lock:
             seq, name = self._record(self._computed(_asked(action)), by), action.get("do")
-            # What was made while a click was followed is undone to the track of before.
-            again = name in ("undo", "redo") and not self._what
+            # What was made while a click was followed is undone to the track of before; one that
+            # was rejected meanwhile was followed no further.
+            again = name in ("undo", "redo", "accept", "reopen") and not self._what
             if (name == "seed" or again) and self._waiting():
                 self._start("following", lambda: self._follow(by, None if again else seq))
         return seq
@@ -209,9 +211,11 @@ class Session:
             return {**action, "box": rounded(self._snapped(action))}
         if name == "import":
             return self._imported(action)
-        if name == "accept":
+        if name in ("accept", "reopen"):
             track = track_of(self.state, action.get("track"))
-            if track.class_name == CLASSES[PEDESTRIAN] and track.boxes:
+            clicked = track.source == CLICK and track.state == REJECTED  # it was a seed before
+            if track.boxes and (clicked or (name == "accept"
+                                            and track.class_name == CLASSES[PEDESTRIAN])):
                 return {**action, "seed": track.nearest_frame()}
         return action
 
@@ -327,7 +331,7 @@ def _asked(action: Mapping[str, Any]) -> Action:
         raise InputError("poses come from the drive")
     computed = {"seed": ("track", "tracks", "removed"), "propose": ("tracks", "removed"),
                 "import": ("tracks", "removed", "kept"),
-                "accept": ("seed",), "snap": ("box",)}
+                "accept": ("seed",), "reopen": ("seed",), "snap": ("box",)}
     unwanted = ("seq", "time", "by", "joins", "beside", *computed.get(str(action.get("do")), ()))
     return {k: v for k, v in action.items() if k not in unwanted}
 

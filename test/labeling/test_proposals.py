@@ -240,6 +240,26 @@ def test_a_correction_that_is_undone_while_a_click_was_followed_leaves_it_follow
         assert found.boxes.keys() == followed.boxes.keys() and not found.nearby
 
 
+@pytest.mark.parametrize("verb", ["accept", "reopen"])
+def test_a_click_that_is_rejected_while_it_is_followed_is_followed_once_that_is_taken_back(
+        made, monkeypatch, verb):
+    monkeypatch.setattr("lidar_perception.labeling.session.NEARBY", 1)
+    made.propose(here=True)
+    begun, start = [], made._start
+    monkeypatch.setattr(made, "_start", lambda *asked: begun.append(asked))  # slowly
+    _, track = click(made)
+    made.do({"do": "reject", "track": track.id})
+    (_, work), = begun
+    work()
+    assert made.state.tracks[track.id].nearby
+    monkeypatch.setattr(made, "_start", start)
+    made.do({"do": verb, "track": track.id})
+    made.wait()
+    found = made.state.tracks[track.id]
+    assert len(found.boxes) >= FRAMES - 1 and not found.nearby
+    assert [number for _, number in made.state.seeds] == [track.id]
+
+
 def test_what_was_only_looked_at_by_the_server_is_nobodys_to_undo(made):
     """The first proposals come when they come: they take nothing from redo, nor a seed with them
     when they are undone."""
