@@ -75,7 +75,8 @@ export async function loadState() {
   setState(await getJson("/api/state"));
 }
 
-export const exportLabels = (content) => post("/api/export", content);
+/** What was done before is in it too. */
+export const exportLabels = (content) => last.then(() => post("/api/export", content));
 
 export function nextUncertain(after, only) {
   return getJson(`/api/next?after=${after ?? 0}${only ? `&class=${encodeURIComponent(only)}` : ""}`);

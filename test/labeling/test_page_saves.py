@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 
 import pytest
@@ -137,3 +138,21 @@ def test_the_browser_asks_before_it_leaves_what_is_not_saved_yet(browser, labels
         other.unroute("**/api/do*")
         other.keyboard.press("Control+z")
         other.wait_for_function("() => page.store.checked.size === 0")
+
+
+def test_an_export_has_what_was_done_before_it_though_that_is_saved_slowly(page, labels, person):
+    number, held = labels.chosen(page, person), []
+    before = labels.box(number)
+    page.route("**/api/do*", lambda route: held.append(route))
+    page.keyboard.press("Shift+ArrowUp")
+    while not held:
+        page.wait_for_timeout(10)
+    page.click("#export")
+    page.select_option("#export-format", "sustech")
+    page.click("#export-form button.primary")
+    held.pop().continue_()
+    page.wait_for_selector("#export-dialog", state="hidden")
+    page.unroute("**/api/do*")
+    written = json.loads(min((labels.out / "labels").iterdir()).read_text())
+    heights = {each["obj_id"]: each["psr"]["position"]["z"] for each in written}
+    assert heights[str(number)] == labels.box(number)[2] > before[2]
