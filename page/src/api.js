@@ -48,7 +48,7 @@ export function act(action) {
   const sent = last.then(async () => {
     try {
       const { seq } = await post("/api/do", action);
-      await arrived(seq);
+      await arrived(seq).catch(() => null); // it is saved; the state comes with the connection
       return true;
     } catch (error) {
       sayError(`Not saved (${action.do.replace("_", " ")}): ${error.message}`);

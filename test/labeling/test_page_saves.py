@@ -156,3 +156,16 @@ def test_an_export_has_what_was_done_before_it_though_that_is_saved_slowly(page,
     written = json.loads(min((labels.out / "labels").iterdir()).read_text())
     heights = {each["obj_id"]: each["psr"]["position"]["z"] for each in written}
     assert heights[str(number)] == labels.box(number)[2] > before[2]
+
+
+def test_what_was_saved_is_not_said_to_be_lost_where_no_answer_to_it_comes(browser, labels):
+    def deaf(page):
+        page.add_init_script("WebSocket = class {}")
+
+    lines = len(labels.lines())
+    with opened(browser, labels.url, deaf) as other:
+        other.route("**/api/state*", lambda route: route.abort())
+        other.keyboard.press("k")
+        other.wait_for_function("() => page.store.frame === 1")
+        assert other.locator("#errors .toast", has_text="Not saved").count() == 0
+    assert [line["do"] for line in labels.lines()[lines:]] == ["check"]
