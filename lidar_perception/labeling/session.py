@@ -238,9 +238,12 @@ class Session:
         path = Path(out).expanduser()
         if not out or ".." in path.parts:
             raise InputError(f"{out!r} is no name for an export; give one without '..'")
+        path = self.journal.path.parent / path
+        if path.resolve() == self.journal.path.resolve():
+            raise InputError(f"{path} is the journal of these labels; give another name")
         with self._exporting:  # a button may be pressed twice
-            written = export_labels(to_labels(self.state, self.drive.frames), named,
-                                    self.journal.path.parent / path, self.drive.frames, force)
+            written = export_labels(to_labels(self.state, self.drive.frames), named, path,
+                                    self.drive.frames, force)
         nearby = [t.id for t in self.state.tracks.values() if t.nearby and t.placed]
         return {"path": str(written.path), "boxes": written.boxes, "frames": written.frames,
                 "left_out": [*written.left_out, *(

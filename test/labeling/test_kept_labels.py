@@ -136,6 +136,15 @@ def test_two_exports_at_once_are_both_whole_or_refused(tmp_path):
         assert not [n for n in os.listdir(tmp_path) if n.endswith(".tmp")]
 
 
+@pytest.mark.parametrize("name", ["journal.jsonl", "./other/journal.jsonl"])
+def test_no_export_is_written_over_the_journal(tmp_path, name):
+    with session(drive(), tmp_path) as made:
+        labelled(made)
+        (tmp_path / "other").symlink_to(tmp_path)
+        with pytest.raises(InputError, match="is the journal"):
+            made.export("nuscenes_detection", name, force=True)
+
+
 def test_numbers_that_are_none_are_null_in_the_journal():
     """As the velocity in nuScenes of what was labelled once."""
     none, box = float("nan"), np.array([BOX])
