@@ -61,8 +61,11 @@ class Journal:
 
     def append(self, line: Mapping[str, Any]) -> None:
         """Write a line, to the disk. InputError where that cannot be; the file is as it was."""
-        content = _encoded(line)
-        if os.fstat(self._file).st_size != self._size:  # on a file system without locks
+        content, there = _encoded(line), os.fstat(self._file)
+        if there.st_nlink == 0:  # what is written would be gone with this process
+            raise InputError(f"{self.path} was removed or replaced; nothing was done: export what "
+                             "there is, and start again")
+        if there.st_size != self._size:  # on a file system without locks
             raise InputError(f"another process has written {self.path}; nothing was done: end one "
                              "of them, and start again")
         try:

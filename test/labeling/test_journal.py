@@ -145,6 +145,18 @@ def test_a_full_disk_is_said_and_the_journal_goes_on_when_there_is_room(tmp_path
         assert journal.lines[-1]["do"] == "redo"
 
 
+@pytest.mark.parametrize("replaced", [False, True])
+def test_a_journal_that_was_removed_while_it_is_open_takes_no_more(tmp_path, replaced):
+    with opened(tmp_path, HEAD) as journal:
+        journal.append(lines(1)[0])
+        (tmp_path / NAME).unlink()
+        if replaced:
+            (tmp_path / NAME).write_text("other")
+        with pytest.raises(InputError, match="removed or replaced"):
+            journal.append(lines(2)[1])
+    assert not replaced or (tmp_path / NAME).read_text() == "other"
+
+
 def test_a_folder_that_cannot_be_written_is_said(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="is a file"), opened(tmp_path / "file", HEAD):
