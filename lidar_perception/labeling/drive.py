@@ -134,8 +134,8 @@ class Drive:
 
     @cached_property
     def known_by(self) -> dict[str, Any]:
-        """Its journal's header: names, stamps, and a digest of the first and the last cloud, ""
-        where they cannot be read."""
+        """Its journal's header: names, stamps, a digest of the first and the last cloud, "" where
+        they cannot be read, and whether there are poses."""
         try:
             clouds = b"".join(self.frames[i].load().xyz.tobytes() for i in (0, -1))
         except InputError:
@@ -143,7 +143,7 @@ class Drive:
         else:
             digest = hashlib.sha256(clouds).hexdigest()[:16]
         return header(self.name, [f.name for f in self.frames],
-                      [f.stamp_ns for f in self.frames], digest)
+                      [f.stamp_ns for f in self.frames], digest, self.motion.poses is not None)
 
     @cached_property
     def motion(self) -> Motion:

@@ -21,13 +21,14 @@ NAME, VERSION = "journal.jsonl", 1
 
 
 def header(drive: str, names: Sequence[str], stamps_ns: Sequence[int],
-           clouds: str = "") -> dict[str, Any]:
+           clouds: str = "", posed: bool | None = None) -> dict[str, Any]:
     """What a journal says of its drive: one of other frames is another. clouds: a digest of some;
-    where it is the same, the folder of the drive may have any name."""
+    where it is the same, the folder of the drive may have any name. posed: whether the drive knows
+    where the sensor was."""
     stamps = hashlib.sha256(" ".join(map(str, stamps_ns)).encode()).hexdigest()[:16]
     return {"journal": VERSION, "drive": drive, "frames": len(names),
             "first": names[0] if names else "", "last": names[-1] if names else "",
-            "stamps_sha": stamps, "clouds": clouds}
+            "stamps_sha": stamps, "clouds": clouds, "posed": posed}
 
 
 def _encoded(line: Mapping[str, Any]) -> bytes:
@@ -126,6 +127,12 @@ class Journal:
             asked.pop("clouds")
         elif found["clouds"] == asked["clouds"]:
             asked.pop("drive")
+        posed = asked.pop("posed", None), found.get("posed")  # the latter None: of before
+        if set(posed) == {True, False}:
+            now, then = ("with" if each else "without" for each in posed)
+            raise InputError(f"{self.path} was made {then} poses of the sensor, and the drive is "
+                             f"{now} them now, by which boxes between those set by hand would be "
+                             "others; give the drive as it was, or another --out")
         if different := differences({k: found.get(k) for k in asked}, asked):
             raise InputError(f"{self.path} is the journal of another drive: "
                              f"{'; '.join(different)}; give another --out")

@@ -136,6 +136,19 @@ def test_two_exports_at_once_are_both_whole_or_refused(tmp_path):
         assert not [n for n in os.listdir(tmp_path) if n.endswith(".tmp")]
 
 
+def test_a_journal_is_not_replayed_with_poses_that_were_not_there(tmp_path):
+    """As of KITTI's oxts that came later: boxes between others would be elsewhere."""
+    bare, posed = drive(), Drive("monday", Recording(Path("monday"), "made up", [
+        replace(frame, pose=lambda: np.eye(4)) for frame in frames()]))
+    for k, (now, then) in enumerate(((bare, posed), (posed, bare))):
+        with session(now, tmp_path / str(k)) as made:
+            labelled(made)
+        with pytest.raises(InputError, match="poses"), session(then, tmp_path / str(k)):
+            pass
+        with session(now, tmp_path / str(k)) as made:
+            assert len(made.state.tracks) == 1
+
+
 @pytest.mark.parametrize("name", ["journal.jsonl", "./other/journal.jsonl"])
 def test_no_export_is_written_over_the_journal(tmp_path, name):
     with session(drive(), tmp_path) as made:
