@@ -21,6 +21,7 @@ NEAREST, FARTHEST = 20, 15.0  # points of the ground, and metres, where few are 
 PIECE = 0.2        # of the points of the largest cluster there: smaller ones are something else
 PIECES = 0.55      # of the usual length: so far from a click there are pieces of the same vehicle,
 MOST = 0.8         # if more of their points than this are there
+BESIDE = 0.1       # metres beyond its nearest point that are taken at least
 LARGER = 1.5       # times the usual length: more than the object that was clicked
 LONG = 2.5         # metres: what is usually longer hides its far side
 WIDER = 1.3        # times the width: a side that is no longer than this is the front or the rear
@@ -39,8 +40,9 @@ def around_click(scan: Scan, click: Array, class_name: str) -> Array:
         members |= ((inside > MOST * whole) & (np.arange(len(whole)) > 0))[scan.cluster_ids]
     box = _around(scan, members)
     if usual is not None and box[3] > LARGER * usual[0]:  # it has grown together with others
-        around = np.hypot(*(scan.xyz[:, :2] - click[:2]).T) < usual[0] * PIECES
-        box = _around(scan, members & around)
+        apart = np.hypot(*(scan.xyz[:, :2] - click[:2]).T)
+        reach = max(usual[0] * PIECES, apart[members].min() + BESIDE)  # also of a click beside it
+        box = _around(scan, members & (apart < reach))
     return completed(box, usual)
 
 

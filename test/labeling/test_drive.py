@@ -12,7 +12,7 @@ from test_proposals import SEED
 from lidar_perception.data.frame import Recording
 from lidar_perception.geometry import box_corners
 from lidar_perception.labeling.drive import Clouds, Scan, one_drive
-from lidar_perception.labeling.snap import headed, to_size
+from lidar_perception.labeling.snap import around_click, headed, to_size
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.types import InputError
 
@@ -69,3 +69,13 @@ def test_a_box_has_four_ways_to_say_it():
     for turn in range(-4, 5):
         again = headed(headed(box, 0.3 + turn * np.pi / 2), 0.35)
         assert again == pytest.approx(box)
+
+
+def test_a_click_beside_a_wall_gives_a_box_of_its_nearest_part():
+    """It is too long for a person, and farther from the click than a person is long."""
+    y, z = np.meshgrid(np.arange(-4, 4, 0.1), np.arange(-1.5, 0.5, 0.1))
+    xyz = np.stack([np.full(y.size, 9.0), y.ravel(), z.ravel()], 1).astype(np.float32)
+    scan = Scan(xyz, np.zeros(len(xyz), np.uint8), np.zeros(len(xyz), bool),
+                np.ones(len(xyz), np.int32))
+    box = around_click(scan, np.array([8.0, 0.0, -1.0]), "Pedestrian")
+    assert abs(box[0] - 9.0) < 0.5 and abs(box[1]) < 0.3 and box[3] < 1.5
