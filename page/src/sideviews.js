@@ -75,7 +75,7 @@ function gather() {
 
 function grab(view, event) {
   const name = event.target.dataset?.handle, start = selectedBox()?.box;
-  if (!name || !start || event.button !== 0 || store.mode !== "label") return;
+  if (!name || !start || !anchor || event.button !== 0 || store.mode !== "label") return;
   event.preventDefault();
   const area = view.layer.getBoundingClientRect(), scale = scaleOf(view, area.width, area.height);
   const held = anchor.slice(), first = [event.clientX, event.clientY];
