@@ -273,12 +273,10 @@ def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(capsy
         killed.kill()
         killed.wait()
         end = monotonic() + 10
-
-        def left():
-            return any(segment.exists() or Path(f"{segment}_el").exists() for segment in theirs)
-        while left() and monotonic() < end:
+        while (left := [s for s in theirs if s.exists() or Path(f"{s}_el").exists()]
+               ) and monotonic() < end:
             remove_as_if_old()  # another node that starts may hold their locks just now
-        assert not left()
+        assert not left
         assert all(segment.exists() for segment in others)
         living.kill()
     assert "that killed processes left in /dev/shm" in capsys.readouterr().err
