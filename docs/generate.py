@@ -19,7 +19,7 @@ from lidar_perception.detectors.fused.params import FusedDetectorParams
 from lidar_perception.detectors.pointnet.params import PointNetDetectorParams
 from lidar_perception.detectors.pointpillars.params import DetectorParams
 from lidar_perception.nodes.graph import NETWORKS
-from lidar_perception.nodes.main import node_parameters
+from lidar_perception.nodes.known import node_parameters
 from lidar_perception.param_fields import flatten
 
 CONFIG = Path(__file__).parents[1] / "config"

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from lidar_perception.nodes import NODES
-from lidar_perception.nodes.main import help_text, node_parameters
+from lidar_perception.nodes.known import node_parameters
+from lidar_perception.nodes.main import help_text
 from lidar_perception.param_fields import parameter_fields
 
 ROOT = Path(__file__).resolve().parents[1]

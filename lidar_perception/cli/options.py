@@ -12,8 +12,10 @@ import click
 import yaml
 
 from lidar_perception.candidates.configurations import CONFIGURATIONS
+from lidar_perception.nodes.known import misspelt
 from lidar_perception.param_fields import flatten, new_name, parameter_fields, with_values
 from lidar_perception.runs.files import read_text, short
+from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
 MAX_BYTES, MAX_NAMES = 10**6, 10_000  # of a parameter file; aliases in YAML make many of few bytes
@@ -95,6 +97,7 @@ def read_config(path: Path, params: Any) -> dict[str, Any]:
     if not isinstance(content, dict | None):
         raise InputError(f"{path} is no parameter file; see config/ for the form")
     known, values, visited = parameter_fields(params), {}, count()
+    others = []
     for node, section in (content or {}).items():
         if not (isinstance(section, dict)
                 and isinstance(section.get("ros__parameters", ()), dict | None)):
@@ -108,6 +111,10 @@ def read_config(path: Path, params: Any) -> dict[str, Any]:
                 raise InputError(f"{path}: '{name}' is called '{new}' now; rename it")
             elif any(k.startswith(f"{name}.") or name.startswith(f"{k}.") for k in known):
                 raise InputError(f"{path}: '{name}' is {_wrong_level(name, known)}")
+            else:
+                others.append(name)
+    for line in misspelt(others):
+        errors.print(f"{path}: {line}")
     return values
 
 

@@ -11,26 +11,16 @@ import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from lidar_perception.nodes import NODES, require_rclpy
+from lidar_perception.nodes.known import misspelt, node_parameters
 from lidar_perception.nodes.shared_memory import fed_by_a_driver, use_large_shared_memory
 from lidar_perception.runs.memory import keep_freed
 from lidar_perception.runs.threads import one_thread_each
 
 if TYPE_CHECKING:
     from lidar_perception.nodes.stopping import Stop
-
-
-def node_parameters(name: str) -> dict[str, Any]:
-    """Name of each parameter of a node -> its dataclass field, with the node's default."""
-    from lidar_perception.param_fields import parameter_fields
-    found: dict[str, Any] = {}
-    for path in NODES[name][1:]:
-        module, _, params = path.rpartition(".")
-        made = getattr(importlib.import_module(f"lidar_perception.{module}"), params)()
-        found |= parameter_fields(made)
-    return found
 
 
 def help_text(name: str) -> str:
@@ -105,6 +95,8 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = node_class()
         node.start()
+        for line in misspelt(n for n in node._parameter_overrides if not node.has_parameter(n)):
+            node.get_logger().warning(line)
         stop.react = lambda: node.stop.set_result(None)
         node.get_logger().info(f"ready: code loaded and warmed up in {seconds:.1f} s")
         executor = SingleThreadedExecutor()

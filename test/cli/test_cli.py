@@ -252,8 +252,17 @@ def test_a_value_that_is_refused_is_shown_as_far_as_a_line_goes(tmp_path):
 
 @pytest.mark.parametrize("file", sorted(Path(__file__).parents[2].glob("config/*.yaml")),
                          ids=lambda path: path.name)
-def test_our_parameter_files_are_read_whatever_the_command(file):
+def test_our_parameter_files_are_read_whatever_the_command(file, capsys):
     read_config(file, PipelineParams())
+    assert not capsys.readouterr().err
+
+
+def test_a_parameter_that_is_misspelt_is_said_and_those_of_others_are_not(tmp_path, capsys):
+    file = write(tmp_path / "p.yaml", "/**:\n  ros__parameters:\n    other: {ground: 1}\n"
+                 "    input.ahead: 3.0\n    ground: {sensor_pose: {heigth: 0.6}}\n")
+    assert read_config(file, PipelineParams()) == {}
+    said, = capsys.readouterr().err.splitlines()
+    assert ".heigth', so it changes nothing; is 'ground.sensor_pose.height' meant" in said
 
 
 def test_a_pipe_is_no_parameter_file_and_is_not_waited_for(tmp_path):

@@ -11,7 +11,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from lidar_perception.nodes.graph import graph_of
-from lidar_perception.nodes.main import node_parameters
+from lidar_perception.nodes.known import node_parameters
 from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -36,14 +36,16 @@ def test_every_node_ends_with_code_0(processes, peer, tmp_path, drive_bag):
     arguments = {"bag_player": {"bag": str(drive_bag), "loop": True, "wait_timeout": 0.0},
                  "bag_recorder": {"bag": str(tmp_path / "bag"), "topics": ["/nothing"]}}
     for node in NODES:
-        processes.start(node, {}, arguments.get(node, {}))
+        processes.start(node, {}, {**arguments.get(node, {}), "input.queu": 5})
     peer.wait(lambda: set(NODES) <= set(peer.diagnostics), "all nodes")
     for i, process in enumerate(processes.running.values()):
         process.send_signal(SIGNALS[i % 2])
     # Two seconds for each as a rule; where DDS hangs, stopping.py ends a node after 6.5.
     peer.until(lambda: all(map(processes.ended, NODES)), 15.0)
     assert {n: p.returncode for n, p in processes.running.items()} == dict.fromkeys(NODES, 0)
-    assert not any("Traceback" in processes.log(node) for node in NODES)
+    logs = [*map(processes.log, NODES)]
+    assert not any("Traceback" in log for log in logs)
+    assert all("'input.queu', so it changes nothing; is 'input.queue' meant" in log for log in logs)
 
 
 @pytest.mark.parametrize("number", SIGNALS)
