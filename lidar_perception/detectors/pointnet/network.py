@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 from torch.nn.utils.fusion import fuse_linear_bn_eval
 
 from lidar_perception.detectors.checkpoint import Header, load
@@ -49,6 +50,16 @@ class LinearNormRelu(nn.Sequential):
 
     def forward(self, x: Tensor) -> Tensor:
         return super().forward(x.reshape(-1, x.shape[-1])).view(*x.shape[:-1], -1)
+
+    def grouped(self, own: Tensor, features: Tensor, indices: Tensor) -> Tensor:
+        """forward of own (B, M, k, c) beside the rows of features (B, N, C) at indices (B, M, k):
+        each row goes through the layer once, however many groups it is in."""
+        linear, norm, relu = self
+        assert isinstance(linear, nn.Linear)
+        of_own, of_rows = linear.weight.split([own.shape[-1], features.shape[-1]], dim=1)
+        x = functional.linear(own, of_own, linear.bias).add_(
+            taken(functional.linear(features, of_rows), indices))
+        return relu(norm(x.flatten(0, 2))).view(x.shape)
 
 
 def mlp(*channels: int) -> nn.Sequential:
@@ -110,14 +121,16 @@ class CoarseNet(nn.Module):
     def __init__(self, channels: int, out: int, radius: float, neighbours: int):
         super().__init__()
         self.radius, self.neighbours = radius, neighbours
-        self.net = mlp(channels + 3, out)
+        self.net = nn.Sequential(LinearNormRelu(channels + 3, out))
 
     def forward(self, xyz: Tensor, features: Tensor, valid: Tensor, count: int) -> Tensor:
         centres = xyz[:, :count]
         squared, indices = nearest(centres, xyz, valid, self.neighbours)
         indices = torch.where(squared <= self.radius**2, indices, indices[..., :1])
         around = (taken(xyz, indices) - centres[:, :, None]) / self.radius
-        return self.net(torch.cat([around, taken(features, indices)], dim=-1)).amax(dim=2)
+        layer = self.net[0]
+        assert isinstance(layer, LinearNormRelu)
+        return layer.grouped(around, features, indices).amax(dim=2)
 
 
 class PointNet(nn.Module):
