@@ -41,9 +41,9 @@ const post = async (path, content) => (await ask(path, {
 let last = Promise.resolve(), unsaved = 0; // actions that were not answered yet
 addEventListener("beforeunload", (event) => { if (unsaved) event.preventDefault(); }); // asks
 
-/** Send an action after those before it. True once it is in the journal; else a message is shown
- * and nothing has changed. */
-export function act(action) {
+/** Send an action after those before it. True once it is in the journal; else that is told, by a
+ * message where not otherwise, and nothing has changed. */
+export function act(action, tell = sayError) {
   unsaved += 1;
   const sent = last.then(async () => {
     try {
@@ -51,7 +51,7 @@ export function act(action) {
       await arrived(seq).catch(() => null); // it is saved; the state comes with the connection
       return true;
     } catch (error) {
-      sayError(`Not saved (${action.do.replace("_", " ")}): ${error.message}`);
+      tell(`Not saved (${action.do.replace("_", " ")}): ${error.message}`);
       return false;
     } finally {
       unsaved -= 1;

@@ -147,7 +147,8 @@ async function sendExport(event) {
 
 async function sendImport(event) {
   event.preventDefault();
-  if (await act({ do: "import", path: by("import-path").value, format: by("import-format").value })) {
-    by("import-dialog").close();
-  }
+  const line = by("import-error"); // a message would be behind the dialog
+  line.textContent = "";
+  if (await act({ do: "import", path: by("import-path").value, format: by("import-format").value },
+    (text) => { line.textContent = text; })) by("import-dialog").close();
 }

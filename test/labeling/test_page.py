@@ -252,6 +252,15 @@ def test_an_export_is_written_and_nothing_is_written_over_it(page, labels, perso
     assert "openlabel" in json.loads((labels.out / "labels.json").read_text())
 
 
+def test_why_nothing_was_imported_is_said_where_one_looks(page, labels):
+    page.click("#import")
+    page.fill("#import-path", "/nowhere")
+    page.click("#import-form button.primary")
+    page.wait_for_function("() => document.getElementById('import-error').textContent")
+    assert "/nowhere" in page.inner_text("#import-dialog #import-error")
+    assert "/nowhere" not in page.inner_text("#errors")
+
+
 def test_help_lists_the_keys_and_needs_no_mouse(page):
     page.keyboard.press("?")
     page.wait_for_selector("#help[open]")
