@@ -94,9 +94,9 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         node = node_class()
-        node.start()
         for line in misspelt(n for n in node._parameter_overrides if not node.has_parameter(n)):
-            node.get_logger().warning(line)
+            node.get_logger().warning(line)  # before anything that takes long
+        node.start()
         stop.react = lambda: node.stop.set_result(None)
         node.get_logger().info(f"ready: code loaded and warmed up in {seconds:.1f} s")
         executor = SingleThreadedExecutor()
