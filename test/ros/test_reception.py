@@ -248,20 +248,21 @@ def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(capsy
         maps = Path(f"/proc/{process.pid}/maps").read_text()
         return {Path(p) for p in re.findall(r"/dev/shm/fastrtps_[0-9a-f]{16}$", maps, re.M)}
 
-    def short():
-        """A process alone in its domain, or each would have segments of others open, too."""
+    def short():  # alone in its domain: who shares one has segments of others open, too
         code = "import rclpy; rclpy.init(); node = rclpy.create_node('short'); print(); input()"
-        return subprocess.Popen(
-            [sys.executable, "-c", code], text=True, stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE, env={**os.environ, "ROS_DOMAIN_ID": str(private_domain())})
+        while True:
+            process = subprocess.Popen(
+                [sys.executable, "-c", code], text=True, stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE, env={**os.environ, "ROS_DOMAIN_ID": str(private_domain())})
+            process.stdout.readline()
+            if len(segments(process)) == 1:
+                return process
+            process.communicate("")
 
     with short() as killed, short() as living:
-        for process in killed, living:
-            process.stdout.readline()
         theirs, others = segments(killed), segments(living)
 
-        def remove_as_if_old():
-            """And young again at once: every node that starts on this machine removes them, too."""
+        def remove_as_if_old():  # and young again at once: every node that starts removes them, too
             for age in (0, 0), None:
                 for segment in theirs | others:
                     with suppress(FileNotFoundError):
@@ -276,8 +277,7 @@ def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(capsy
         while (left := [s for s in theirs if s.exists() or Path(f"{s}_el").exists()]
                ) and monotonic() < end:
             remove_as_if_old()  # another node that starts may hold their locks just now
-        assert not left
-        assert all(segment.exists() for segment in others)
+        assert not left and all(segment.exists() for segment in others)
         living.kill()
     assert "that killed processes left in /dev/shm" in capsys.readouterr().err
 
