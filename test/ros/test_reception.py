@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from time import monotonic
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -21,8 +19,7 @@ from rclpy.executors import SingleThreadedExecutor
 from test_bad_input import CLOUD, MARKERS, cloud
 
 from lidar_perception.nodes import reception as reception_module
-from lidar_perception.nodes import shared_memory
-from lidar_perception.nodes.graph import STAGES, private_domain
+from lidar_perception.nodes.graph import STAGES
 from lidar_perception.nodes.ground_segmentation import GroundSegmentation
 from lidar_perception.nodes.reception import (
     BEST_EFFORT,
@@ -223,63 +220,6 @@ def test_a_sensor_that_slows_down_is_seen_by_its_own_clock():
         info["source_timestamp"] = 29 * 10**8 + (info["publication_sequence_number"] - 29) * 10**9
         arrivals.add([info], 0)
     assert arrivals.learned == pytest.approx(10) and arrivals.rate() == pytest.approx(1)
-
-
-@pytest.mark.parametrize("remap, buffer, profile", [
-    ("~/input/points:=/velodyne_points", 8 << 20, "fastdds_driver.xml"),
-    ("~/input/points:=/velodyne_points", 212_992, "fastdds.xml"),
-    ("~/input/points:=clustering/output/points", 8 << 20, "fastdds.xml")])
-def test_clouds_of_a_driver_come_by_udp_where_a_socket_holds_one(remap, buffer, profile,
-                                                                 monkeypatch):
-    monkeypatch.setattr(shared_memory, "socket_buffer", lambda: buffer)
-    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=1 << 20, f_frsize=4096))
-    for name in PROFILE_VARIABLES:
-        monkeypatch.setenv(name, "")
-    arguments = ["pointpillars_detector", "--ros-args", "-r", remap]
-    shared_memory.use_large_shared_memory(shared_memory.fed_by_a_driver(arguments))
-    assert {Path(os.environ[name]).name for name in PROFILE_VARIABLES} == {profile}
-    assert Path(os.environ[PROFILE_VARIABLES[0]]).is_file()
-    shared_memory.use_large_shared_memory(True)  # what is set stays
-    assert Path(os.environ[PROFILE_VARIABLES[0]]).name == profile
-
-
-def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(capsys):
-    def segments(process) -> set[Path]:
-        maps = Path(f"/proc/{process.pid}/maps").read_text()
-        return {Path(p) for p in re.findall(r"/dev/shm/fastrtps_[0-9a-f]{16}$", maps, re.M)}
-
-    def short():  # alone in its domain: who shares one has segments of others open, too
-        code = "import rclpy; rclpy.init(); node = rclpy.create_node('short'); print(); input()"
-        while True:
-            process = subprocess.Popen(
-                [sys.executable, "-c", code], text=True, stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE, env={**os.environ, "ROS_DOMAIN_ID": str(private_domain())})
-            process.stdout.readline()
-            if len(segments(process)) == 1:
-                return process
-            process.communicate("")
-
-    with short() as killed, short() as living:
-        theirs, others = segments(killed), segments(living)
-
-        def remove_as_if_old():  # and young again at once: every node that starts removes them, too
-            for age in (0, 0), None:
-                for segment in theirs | others:
-                    with suppress(FileNotFoundError):
-                        os.utime(f"{segment}_el", age)
-                if age:
-                    shared_memory.remove_dead_segments()
-        remove_as_if_old()
-        assert theirs and others and all(segment.exists() for segment in theirs | others)
-        killed.kill()
-        killed.wait()
-        end = monotonic() + 10
-        while (left := [s for s in theirs if s.exists() or Path(f"{s}_el").exists()]
-               ) and monotonic() < end:
-            remove_as_if_old()  # another node that starts may hold their locks just now
-        assert not left and all(segment.exists() for segment in others)
-        living.kill()
-    assert "that killed processes left in /dev/shm" in capsys.readouterr().err
 
 
 OVERRIDE = f"qos_overrides./{NODE}/input/points.subscription.reliability"

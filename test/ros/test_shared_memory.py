@@ -1,0 +1,91 @@
+"""What Fast DDS keeps in shared memory: the profile of a node, and what killed ones have left."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from time import monotonic
+from types import SimpleNamespace
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from lidar_perception.nodes import shared_memory
+from lidar_perception.nodes.graph import private_domain
+from lidar_perception.nodes.shared_memory import PROFILE_VARIABLES
+
+
+@pytest.mark.parametrize("remap, buffer, profile", [
+    ("~/input/points:=/velodyne_points", 8 << 20, "fastdds_driver.xml"),
+    ("~/input/points:=/velodyne_points", 212_992, "fastdds.xml"),
+    ("~/input/points:=clustering/output/points", 8 << 20, "fastdds.xml")])
+def test_clouds_of_a_driver_come_by_udp_where_a_socket_holds_one(remap, buffer, profile,
+                                                                 monkeypatch):
+    monkeypatch.setattr(shared_memory, "socket_buffer", lambda: buffer)
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_bavail=1 << 20, f_frsize=4096))
+    for name in PROFILE_VARIABLES:
+        monkeypatch.setenv(name, "")
+    arguments = ["pointpillars_detector", "--ros-args", "-r", remap]
+    shared_memory.use_large_shared_memory(shared_memory.fed_by_a_driver(arguments))
+    assert {Path(os.environ[name]).name for name in PROFILE_VARIABLES} == {profile}
+    assert Path(os.environ[PROFILE_VARIABLES[0]]).is_file()
+    shared_memory.use_large_shared_memory(True)  # what is set stays
+    assert Path(os.environ[PROFILE_VARIABLES[0]]).name == profile
+
+
+def segments(pid: int | str) -> set[Path]:
+    """Those that a process has open, its own and those of others in its domain."""
+    with suppress(OSError):  # it has ended, or is another user's
+        maps = Path(f"/proc/{pid}/maps").read_text()
+        return {Path(p) for p in re.findall(r"/dev/shm/fastrtps_[0-9a-f]{16}$", maps, re.M)}
+    return set()
+
+
+def alone(process) -> bool:
+    """Whether nobody else has its segments open, nor it anybody else's."""
+    return all(segments(process.pid).isdisjoint(segments(other.name))
+               for other in Path("/proc").glob("[0-9]*") if other.name != str(process.pid))
+
+
+def short():
+    """A process alone in its domain."""
+    code = "import rclpy; rclpy.init(); node = rclpy.create_node('short'); print(); input()"
+    while True:
+        process = subprocess.Popen(
+            [sys.executable, "-c", code], text=True, stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE, env={**os.environ, "ROS_DOMAIN_ID": str(private_domain())})
+        process.stdout.readline()
+        if alone(process):
+            return process
+        process.communicate("\n")
+
+
+def test_what_a_killed_process_left_in_shared_memory_goes_and_nothing_else(capsys):
+    with short() as killed, short() as living:
+        theirs, others = segments(killed.pid), segments(living.pid)
+
+        def remove_as_if_old():
+            """And young again at once: every node that starts on this machine removes them, too."""
+            for age in (0, 0), None:
+                for segment in theirs | others:
+                    with suppress(FileNotFoundError):
+                        os.utime(f"{segment}_el", age)
+                if age:
+                    shared_memory.remove_dead_segments()
+        remove_as_if_old()
+        assert theirs and others and all(segment.exists() for segment in theirs | others)
+        killed.kill()
+        killed.wait()
+        end = monotonic() + 10
+        while (left := [s for s in theirs if s.exists() or Path(f"{s}_el").exists()]
+               ) and monotonic() < end:
+            remove_as_if_old()  # another node that starts may hold their locks just now
+        assert not left
+        assert all(segment.exists() for segment in others)
+        living.kill()
+    assert "that killed processes left in /dev/shm" in capsys.readouterr().err
