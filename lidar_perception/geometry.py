@@ -1,4 +1,4 @@
-"""Boxes and ranges; frames as in types.py."""
+"""Boxes, ranges, and a counting sort; frames as in types.py."""
 
 from __future__ import annotations
 
@@ -73,19 +73,29 @@ def _lowest(values: np.ndarray) -> float:
 
 
 @njit(cache=True, nogil=True)
+def stable_order(keys, count, first):
+    """order (N,): `first` reordered by keys (N,) 0..count-1, equal keys keep their order; and start
+    (count + 1,): those of key k are from start[k] to start[k + 1]. Counting sort."""
+    start = np.zeros(count + 1, np.int64)
+    for key in keys:
+        start[key + 1] += 1
+    for i in range(count):
+        start[i + 1] += start[i]
+    place, order = start[:-1].copy(), np.empty(len(keys), np.int64)
+    for i in first:
+        order[place[keys[i]]] = i
+        place[keys[i]] += 1
+    return order, start
+
+
+@njit(cache=True, nogil=True)
 def _points_in_boxes(xyz, boxes, margin, begin, end, low, high):
     scale = (SLABS - 1) / max(high - low, 1e-3)
-    start = np.zeros(SLABS + 1, np.int64)
+    slab = np.full(len(xyz), SLABS)  # of what no box can hold, too
     for i in range(len(xyz)):
         if low <= xyz[i, 0] <= high:
-            start[int((xyz[i, 0] - low) * scale) + 1] += 1
-    start = np.cumsum(start)
-    place, order = start.copy(), np.empty(start[-1], np.int64)
-    for i in range(len(xyz)):
-        if low <= xyz[i, 0] <= high:
-            slab = int((xyz[i, 0] - low) * scale)
-            order[place[slab]] = i
-            place[slab] += 1
+            slab[i] = int((xyz[i, 0] - low) * scale)
+    order, start = stable_order(slab, SLABS + 1, np.arange(len(xyz)))
     first, inside = np.zeros(len(boxes) + 1, np.int64), np.empty(len(order), np.int64)
     count = 0
     for k in range(len(boxes)):

@@ -13,12 +13,11 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from lidar_perception.clustering.dense import dbscan_by_cells
-from lidar_perception.clustering.grid import stable_order
 from lidar_perception.clustering.growing import dbscan_by_growing
 from lidar_perception.clustering.params import DbscanParams
 from lidar_perception.clustering.thinned import SLACK, patience, thinned
 from lidar_perception.clustering.tree import touching, tree_of
-from lidar_perception.geometry import horizontal_range
+from lidar_perception.geometry import horizontal_range, stable_order
 
 
 def distance_aware_dbscan(xyz: np.ndarray, params: DbscanParams = DbscanParams()) -> np.ndarray:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from lidar_perception.geometry import stable_order
+
 
 @njit(cache=True, nogil=True)
 def _hash(ix, iy, mask):
@@ -88,22 +90,6 @@ def _order_by_height(z):
     if high - low > 8 * len(z) + 4096:  # far outliers: too many levels to count
         return np.argsort(z, kind="mergesort")
     return stable_order((z - low).astype(np.int32), high - low + 1, np.arange(len(z)))[0]
-
-
-@njit(cache=True, nogil=True)
-def stable_order(keys, count, first):
-    """order (N,): `first` reordered by keys (N,) 0..count-1, equal keys keep their order; and start
-    (count + 1,): those of key k are from start[k] to start[k + 1]. Counting sort."""
-    start = np.zeros(count + 1, np.int64)
-    for key in keys:
-        start[key + 1] += 1
-    for i in range(count):
-        start[i + 1] += start[i]
-    place, order = start[:-1].copy(), np.empty(len(keys), np.int64)
-    for i in first:
-        order[place[keys[i]]] = i
-        place[keys[i]] += 1
-    return order, start
 
 
 @njit(cache=True, nogil=True)

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from lidar_perception.clustering.grid import stable_order
-from lidar_perception.geometry import points_in_boxes
+from lidar_perception.geometry import points_in_boxes, stable_order
 from lidar_perception.groups import groups_of
 from lidar_perception.types import SENSOR_HEIGHT, LidarFrame
 
