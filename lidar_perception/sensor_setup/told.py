@@ -61,14 +61,14 @@ def told_by(poses: BagPoses | None, numbers: Sequence[int], stamps_ns: np.ndarra
     mount = poses.mounted(base) if base else None
     moved = {}
     # Odometry that does not say what it is of does not say where the base went.
-    for number in numbers if poses.carrier or not poses.odometry else ():
+    nameless = poses.odometry and not poses.carrier
+    for number in () if nameless else numbers:
         pose = _base_pose(poses, int(stamps_ns[number]), mount if base else np.eye(4))
         if pose is not None:
             moved[number] = pose
     unposed = "" if 2 * len(moved) >= len(numbers) or not poses.known else (
-        f"{len(numbers) - len(moved)} of {len(numbers)} clouds have no pose at their time"
-        if poses.carrier or not poses.odometry else
-        "its odometry does not say in child_frame_id what it is of")
+        "its odometry does not say in child_frame_id what it is of" if nameless else
+        f"{len(numbers) - len(moved)} of {len(numbers)} clouds have no pose at their time")
     return Told(base, mount, poses.mounted(FOOTPRINT), moved, poses.left_out, unposed)
 
 
