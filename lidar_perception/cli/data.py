@@ -154,11 +154,11 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
 
 def as_mounted(recording: Any, params: Any) -> Any:
     """params with the height of the recording's sensor, unless they have another than KITTI's."""
-    from lidar_perception.param_fields import with_values
+    from lidar_perception.ground.params import mounted
     from lidar_perception.types import SENSOR_HEIGHT
     if params.ground.sensor_pose.height != SENSOR_HEIGHT:
         return params
-    return with_values(params, {"ground.sensor_pose.height": recording.frames[0].sensor_height})
+    return mounted(params, recording.frames[0].sensor_height)
 
 
 def write_json(path: Path | None, content: dict) -> None:

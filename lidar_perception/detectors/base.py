@@ -17,8 +17,8 @@ from lidar_perception.detectors.checkpoint import Header
 from lidar_perception.detectors.contract import Found, require_columns
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
+from lidar_perception.ground.params import mounted
 from lidar_perception.ground.segment import cropped_as_mounted
-from lidar_perception.param_fields import with_values
 from lidar_perception.types import InputError, LidarFrame
 
 Result = TypeVar("Result")
@@ -118,7 +118,7 @@ class NetworkDetector:
     def mounted_at(self, height: float) -> Self:
         """The same detector, of the same network, for a sensor so many metres above the ground."""
         other = copy.copy(self)
-        other.params = with_values(self.params, {"ground.sensor_pose.height": height})
+        other.params = mounted(self.params, height)
         return other
 
     def bring_to(self, device: torch.device) -> None:

@@ -13,6 +13,7 @@ from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import explain_nothing
 from lidar_perception.detectors.contract import Found, require_columns
+from lidar_perception.ground.params import mounted
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, PEDESTRIAN, LidarFrame
 
@@ -49,8 +50,7 @@ class CandidateDetector:
 
     def mounted_at(self, height: float) -> CandidateDetector:
         """The same detector for a sensor so many metres above the ground."""
-        return CandidateDetector(self.seed, self.camera, with_values(
-            self.params, {"ground.sensor_pose.height": height}))
+        return CandidateDetector(self.seed, self.camera, mounted(self.params, height))
 
     def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeVar
 
-from lidar_perception.param_fields import MAX_INT, Params, param
+from lidar_perception.param_fields import MAX_INT, Params, param, with_values
 from lidar_perception.types import SENSOR_HEIGHT
 
 
@@ -116,3 +117,11 @@ class ObstacleParams(Params):
         if 0.0 < self.max_height < self.min_height:
             raise ValueError(f"max_height = {self.max_height} must not be below min_height = "
                              f"{self.min_height}, or 0")
+
+
+Grounded = TypeVar("Grounded")  # a dataclass of parameters with a group ground
+
+
+def mounted(params: Grounded, height: float) -> Grounded:
+    """params for a sensor so many metres above the ground."""
+    return with_values(params, {"ground.sensor_pose.height": height})

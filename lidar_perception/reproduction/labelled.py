@@ -14,7 +14,7 @@ from lidar_perception.candidates.segmented import Segmented
 from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import points_in_box
-from lidar_perception.param_fields import with_values
+from lidar_perception.ground.params import mounted
 from lidar_perception.scoring.kitti.camera_objects import in_image
 from lidar_perception.types import (
     CLASSES,
@@ -42,13 +42,10 @@ class Labelled:
     def pedestrians(self) -> np.ndarray:
         return self.truth.of_class(PEDESTRIAN)
 
-    def mounted(self, params: PipelineParams) -> PipelineParams:
-        """params for a sensor as high as this one."""
-        return with_values(params, {"ground.sensor_pose.height": self.height})
-
     def segmented(self, params: PipelineParams, scan: LidarFrame | None = None) -> Segmented:
         """The frame, or another scan of the same sensor, up to the boxes."""
-        return segment(self.frame if scan is None else scan, self.camera, self.mounted(params))
+        return segment(self.frame if scan is None else scan, self.camera,
+                       mounted(params, self.height))
 
 
 def load_labelled(frame: Frame) -> Labelled:

@@ -22,6 +22,7 @@ from lidar_perception.detectors.nms import suppressed
 from lidar_perception.detectors.pointnet.clusters import clusters_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.rescoring import rescored_by, seen_by
+from lidar_perception.ground.params import mounted
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
 
@@ -62,8 +63,8 @@ class RescoredCandidates:
 
     def mounted_at(self, height: float) -> RescoredCandidates:
         """The same detector for a sensor so many metres above the ground."""
-        pipeline = with_values(self.pipeline, {"ground.sensor_pose.height": height})
-        return RescoredCandidates(self.classifier, self.seed, self.camera, self.params, pipeline)
+        return RescoredCandidates(self.classifier, self.seed, self.camera, self.params,
+                                  mounted(self.pipeline, height))
 
     def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:

@@ -19,6 +19,7 @@ from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.folder import PERIOD_NS
+from lidar_perception.ground.params import mounted
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.param_fields import flatten, with_values
@@ -50,7 +51,7 @@ def measure(frames: Sequence[Frame], number: int) -> dict[str, Any]:
     scans = [f.load().xyz for f in before] + [labelled.frame.xyz]
     ages = np.array([frames[number].stamp_ns - f.stamp_ns for f in before] + [0]) / 1e9
     poses = np.array([*map(Odometry(), scans)])
-    ground = labelled.mounted(BEST).ground
+    ground = mounted(BEST, labelled.height).ground
     obstacles = [xyz[~segment_ground(LidarFrame(xyz), ground)] for xyz in scans]
     single = labelled.segmented(BEST)
     seed = functools.partial(nearest_seed, single, labelled)

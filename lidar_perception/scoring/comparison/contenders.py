@@ -30,6 +30,7 @@ from lidar_perception.detectors.pointnet.weights_file import weights_file as poi
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file as pointpillars_file
+from lidar_perception.ground.params import mounted
 from lidar_perception.param_fields import with_values
 from lidar_perception.scoring.centres.report import pedestrians_of
 from lidar_perception.scoring.comparison.outcomes import Contender
@@ -132,13 +133,9 @@ def _name(detector: NetworkDetector, taken: Sequence[str]) -> str:
     return name
 
 
-def _mounted(params: PipelineParams, sensor_height: float) -> PipelineParams:
-    return with_values(params, {"ground.sensor_pose.height": sensor_height})
-
-
 def _candidates(sensor_height: float) -> list[Contender]:
     """STM-CPA of both configurations with the paper's seed, and the better one with its own."""
-    paper, best = (_mounted(params, sensor_height) for params in (PAPER, BEST))
+    paper, best = (mounted(params, sensor_height) for params in (PAPER, BEST))
     return [_seeded("STM-CPA paper", CandidateDetector, paper, _labelled),
             _seeded("STM-CPA best", CandidateDetector, best, _labelled),
             _seeded("STM-CPA best, auto", CandidateDetector, best, _own_seed(best))]
@@ -157,7 +154,7 @@ def _hybrids(opened: Sequence[Opened], device: str, sensor_height: float
         classifiers.insert(0, (judge, str(judge_file())))
     if not classifiers:
         return [], [Missing(name, "no PointNet has weights") for name in names]
-    (classifier, source), best = classifiers[0], _mounted(BEST, sensor_height)
+    (classifier, source), best = classifiers[0], mounted(BEST, sensor_height)
 
     def rescored(seed, camera, pipeline):
         return RescoredCandidates(classifier, seed, camera, RescoringParams(), pipeline)
