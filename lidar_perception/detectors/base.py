@@ -39,7 +39,7 @@ class NetworkDetector:
     def __init__(self, header: Header, device: torch.device, params: Any):
         self.header, self.config, self.params = header, header.config, params
         self.place = Place(device)
-        self.doubt: str | None = None  # why scores may be no probabilities
+        self.doubt: str | None = None  # of its scores, or of its classes
 
     def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:

@@ -70,6 +70,7 @@ def doubts(path: Path, height: float) -> list[str]:
     are for one at another height, or that their scores are no probabilities."""
     if path.suffix == SUFFIX:
         fusion = read_fusion(path)
-        return [*filter(None, [fusion.doubt]), *doubts(fusion.proposer, height)]
+        return [*filter(None, [fusion.doubt]), *doubts(fusion.proposer, height),
+                *doubts(fusion.classifier, height)]
     other = read_header(path).unlike(height) if path.suffix == ".safetensors" else None
     return [f"{path}: {other}"] if other else []

@@ -37,7 +37,7 @@ class DetectorNode(ManagedNode):
         self.counts.update(network=f"{self.name_of(config)}, {' '.join(config.classes)}",
                            device=str(self.detector.device))
         if self.detector.doubt:  # beside the state, which says what the node waits for
-            self.counts["scores"] = "not calibrated"
+            self.counts["doubt"] = self.detector.doubt
             self.get_logger().warning(self.detector.doubt)
         if self.detector.fallback:
             self.report(WARN, self.detector.fallback)

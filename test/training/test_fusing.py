@@ -4,6 +4,7 @@ networks, and any file that somebody wrote is used or refused in one line."""
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from lidar_perception.camera import Camera
 from lidar_perception.campaign.mutation import mutate_text
 from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.data.frame import Frame
+from lidar_perception.detectors.checkpoint import read_header, save_header
 from lidar_perception.detectors.fused.detector import FusedDetector, Look, load_fused_detector
 from lidar_perception.detectors.fused.fusion import (
     KNOTS,
@@ -151,6 +153,18 @@ def test_the_curves_of_the_package_are_those_of_its_weights_and_of_no_others(oth
     for group in "weights", "classifier":
         with pytest.raises(InputError, match=rf"no checkpoint nowhere; .* fused.{group}"):
             fusion_of("", FusedParams(**{group: "nowhere"}))
+
+
+def test_what_it_never_detects_and_a_network_from_elsewhere_are_said(others):
+    path, models = others
+    classifier = path.parent / "own/pointnet.safetensors"
+    save_header(classifier, replace(read_header(classifier), training={
+        "sensor": {"name": "vlp-16", "height": 0.6}}))
+    del models["Cyclist"]
+    write_fusion(path, (None, classifier), models, {})
+    said, = doubts(path, 1.73)
+    assert str(classifier) in said and "the sensor vlp-16 at 0.6 m" in said
+    assert open_detector(path, "cpu").doubt.startswith("fused detects no Cyclist, as there are")
 
 
 def test_a_detector_weighs_by_its_own_curves(others):

@@ -6,7 +6,7 @@ is read without loading torch.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from hashlib import sha256
@@ -64,6 +64,15 @@ class Fusion:
         return (f"the curves of fused were fitted to other weights than {' and '.join(others)}, so "
                 "that its scores are no checked probabilities; `lidar-perception train fused` fits "
                 "them")
+
+    def unfitted(self, classes: Iterable[str]) -> str | None:
+        """What to say where the proposer knows classes that have no curves, None where it has none.
+        """
+        others = [name for name in classes if name not in self.models]
+        if not others:
+            return None
+        return (f"fused detects no {' and no '.join(others)}, as there are curves for "
+                f"{', '.join(self.models)} alone; {self.proposer} by itself does")
 
 
 def digest(path: Path) -> str:
