@@ -36,6 +36,7 @@ class Seen:
     truth: GroundTruth
     stamp_ns: int = 0
     pose: np.ndarray | None = None
+    calibration: Calibration | None = None
 
 
 def measure_recording(recording: Recording) -> dict:
@@ -53,15 +54,16 @@ def measure_recording(recording: Recording) -> dict:
             if frame.sequence not in drives:
                 pose_of = recorded_poses(source)
             drives.setdefault(frame.sequence, []).append(
-                Seen(detector(scan).detections, truth, frame.stamp_ns, pose_of(frame, scan.xyz)))
-    return measure_tracking(drives, recording.frames[0].calibration()) if drives else {}
+                Seen(detector(scan).detections, truth, frame.stamp_ns, pose_of(frame, scan.xyz),
+                     frame.calibration()))
+    return measure_tracking(drives) if drives else {}
 
 
-def measure_tracking(drives: Mapping[str, Sequence[Seen]], calibration: Calibration | None,
+def measure_tracking(drives: Mapping[str, Sequence[Seen]],
                      params: TrackingParams = TrackingParams()) -> dict:
     """By "ours" and "plain AB3DMOT": the scores of TrackingReport, by centres, and ms, the median
     time of a frame."""
-    return {name: _measured(drives, calibration, make) for name, make in (
+    return {name: _measured(drives, make) for name, make in (
         ("plain AB3DMOT", lambda: peer(PlainAb3dmot())), ("ours", lambda: tracker(params)))}
 
 
@@ -80,8 +82,7 @@ def tracker(params: TrackingParams) -> Step:
     return step
 
 
-def _measured(drives: Mapping[str, Sequence[Seen]], calibration: Calibration | None,
-              make: Callable[[], Step]) -> dict:
+def _measured(drives: Mapping[str, Sequence[Seen]], make: Callable[[], Step]) -> dict:
     report, ms = TrackingReport(), []
     for name, frames in drives.items():
         step = make()
@@ -89,7 +90,8 @@ def _measured(drives: Mapping[str, Sequence[Seen]], calibration: Calibration | N
             start = perf_counter()
             ids, found = step(seen)
             ms.append((perf_counter() - start) * 1e3)
-            report.update(observe(name, i, seen.truth, tracked_labels(ids, found), calibration))
+            report.update(observe(name, i, seen.truth, tracked_labels(ids, found),
+                                  seen.calibration))
     return {**report.compute(), "ms": float(np.median(ms)) if ms else None}
 
 

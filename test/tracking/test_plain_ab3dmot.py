@@ -39,7 +39,7 @@ def test_it_follows_a_straight_way_and_poses_make_what_stands_stand():
 def test_both_trackers_are_scored_on_the_same_frames():
     frames = [Seen(one(10 + i), GroundTruth.of(one(10 + i).boxes, [CAR], [{
         "track_id": 5, "occluded": 0, "truncated": 0.0}]), 10**18 + i * 10**8) for i in range(12)]
-    content = measure_tracking({"a": frames}, None)
+    content = measure_tracking({"a": frames})
     assert list(content) == ["plain AB3DMOT", "ours"]
     for scores in content.values():
         car = scores["classes"]["Car"]
