@@ -75,7 +75,7 @@ class ConfidenceParams(Params):
     """A probability for each candidate from its shape and its likeness to the seed."""
 
     enabled: bool = param(False, "Accept by confidence instead of by similarity alone, and give "
-                          "it as the score.")
+                          "it as the score. It was fitted to what the configuration best finds.")
     threshold: float = param(0.5, "Least confidence of a candidate.", low=0.0, high=1.0)
 
 
