@@ -33,7 +33,10 @@ LATCHED_QOS = dict(history="keep_last", depth=1, reliability="reliable",
                    durability="transient_local")
 
 
-class _Plain(yaml.SafeDumper):
+_Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # faster, where it was built
+
+
+class _Plain(_Dumper):
     """YAML without anchors, as other readers of metadata.yaml expect it."""
 
     def ignore_aliases(self, data: Any) -> bool:

@@ -70,14 +70,15 @@ def cloud_topic(bag: Bag, points: str = "") -> str:
 
 def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
     """Frames of the clouds on a topic, see cloud_topic."""
-    with Bag(path) as bag:
-        points = cloud_topic(bag, points)
-        topics = {topic for topic, count in bag.counts.items() if count}
-        frames = BagFrames(path, points, bag.topics[points], bag.counts[points])
-        labelled = False
-        with suppress(InputError):  # a damaged cloud is named when it is read
-            labelled = any(frames.labelled(data) is not None
-                           for _, _, data in islice(bag.raw({points}), 1))
+    opened = KeptOpen(path)
+    bag = opened.bag()
+    points = cloud_topic(bag, points)
+    topics = {topic for topic, count in bag.counts.items() if count}
+    frames = BagFrames(path, points, bag.topics[points], bag.counts[points], opened=opened)
+    labelled = False
+    with suppress(InputError):  # a damaged cloud is named when it is read
+        labelled = any(frames.labelled(data) is not None
+                       for _, _, data in islice(bag.raw({points}), 1))
     has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | {
         *[POINT_LABELS] * labelled, *[POSES] * frames.poses.known}
     return Recording(path, layout(path, points), frames, has, mounted=False)
@@ -94,14 +95,14 @@ class BagFrames(Sequence):
     by its time after one look through the bag for the times of all."""
 
     def __init__(self, path: Path, points: str, kind: str, count: int,
-                 sensor_height: float = SENSOR_HEIGHT):
+                 sensor_height: float = SENSOR_HEIGHT, opened: KeptOpen | None = None):
         self.path, self.points, self.kind, self.clouds = path, points, kind, count
         self.sensor_height = sensor_height
-        self.opened = KeptOpen(path)
+        self.opened = opened or KeptOpen(path)
 
     def mounted_at(self, sensor_height: float) -> BagFrames:
         """The frames of a sensor at that height."""
-        return BagFrames(self.path, self.points, self.kind, self.clouds, sensor_height)
+        return BagFrames(self.path, self.points, self.kind, self.clouds, sensor_height, self.opened)
 
     def __len__(self) -> int:
         return self.clouds
@@ -139,12 +140,11 @@ class BagFrames(Sequence):
         times: Counter[int] = Counter()
         names: Counter[int] = Counter()
         rows = []
-        with Bag(self.path) as bag:
-            for _, time, data in bag.raw({self.points}):
-                stamp = _stamp(data, time)
-                names[stamp] += 1
-                rows.append((time, times[time], stamp, names[stamp]))
-                times[time] += 1
+        for _, time, data in self.opened.bag().raw({self.points}):
+            stamp = _stamp(data, time)
+            names[stamp] += 1
+            rows.append((time, times[time], stamp, names[stamp]))
+            times[time] += 1
         return rows
 
     def _read(self, time: int, before: int) -> bytes:
@@ -158,14 +158,13 @@ class BagFrames(Sequence):
         truth: dict[int, GroundTruth] = {}
         infos: list[tuple[int, Any]] = []
         transforms: list[tuple[int, Any]] = []
-        with Bag(self.path) as bag:
-            wanted = {TRUTH, CAMERA_INFO, EXTRINSICS} & set(bag.topics)
-            for topic, time, msg in bag.messages(wanted):
-                if topic == TRUTH:
-                    objects = from_marker_array(msg)
-                    truth[objects.stamp_ns or time] = to_truth(objects)
-                else:
-                    (infos if topic == CAMERA_INFO else transforms).append((time, msg))
+        bag = self.opened.bag()
+        for topic, time, msg in bag.messages({TRUTH, CAMERA_INFO, EXTRINSICS} & {*bag.topics}):
+            if topic == TRUTH:
+                objects = from_marker_array(msg)
+                truth[objects.stamp_ns or time] = to_truth(objects)
+            else:
+                (infos if topic == CAMERA_INFO else transforms).append((time, msg))
         return truth, infos, transforms
 
     @cached_property
@@ -179,9 +178,8 @@ class BagFrames(Sequence):
     @cached_property
     def poses(self) -> BagPoses:
         """Of the frame that the first cloud is in."""
-        with Bag(self.path) as bag:
-            first = next(bag.raw({self.points}), None)
-        return BagPoses(self.path, _frame_id(first[2]) if first else "")
+        first = next(self.opened.bag().raw({self.points}), None)
+        return BagPoses(self.path, _frame_id(first[2]) if first else "", self.opened)
 
     def _frame(self, i: int, time: int, stamp: int, which: int,
                data: Callable[[], bytes]) -> Frame:

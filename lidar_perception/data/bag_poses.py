@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag import KeptOpen
 from lidar_perception.robot.poses import inverse, moved_boxes
 from lidar_perception.robot.tree import Missing, TransformTree
 from lidar_perception.types import InputError
@@ -47,11 +47,12 @@ class BagPoses:
     in odom where that is above the sensor, else in the topmost frame that it moves in.
     """
 
-    def __init__(self, path: Path, frame_id: str):
+    def __init__(self, path: Path, frame_id: str, opened: KeptOpen | None = None):
         self.path, self.frame_id = path, frame_id.lstrip("/")
+        self.opened = opened or KeptOpen(path)
         self.left_out = 0  # transforms and odometry that are no poses
-        with Bag(path) as bag:
-            topics = {name: kind for name, kind in bag.topics.items() if bag.counts[name]}
+        bag = self.opened.bag()
+        topics = {name: kind for name, kind in bag.topics.items() if bag.counts[name]}
         self.transforms = {name for name in (TF, TF_STATIC) if topics.get(name) == TF_MESSAGE}
         self.odometry = odometry_topic(topics)
 
@@ -91,8 +92,7 @@ class BagPoses:
     @cached_property
     def _first(self) -> Any:
         """The first message of the odometry."""
-        with Bag(self.path) as bag:
-            return next(msg for *_, msg in bag.messages({self.odometry}))
+        return next(msg for *_, msg in self.opened.bag().messages({self.odometry}))
 
     @cached_property
     def fixed(self) -> str:
@@ -162,27 +162,25 @@ class BagPoses:
     @cached_property
     def _odometry(self) -> TransformTree:
         tree = TransformTree(keeps_all=True)
-        with Bag(self.path) as bag:
-            for _, _, msg in bag.messages({self.odometry} - {""}):
-                try:
-                    add_odometry(tree, msg)
-                except InputError:
-                    self.left_out += 1
+        for _, _, msg in self.opened.bag().messages({self.odometry} - {""}):
+            try:
+                add_odometry(tree, msg)
+            except InputError:
+                self.left_out += 1
         return tree
 
     @cached_property
     def _seen(self) -> TransformTree:
         """What is fixed, and of what moves the first, until something above the sensor moves."""
         tree = TransformTree(keeps_all=True)
-        with Bag(self.path) as bag:
-            for _, _, msg in bag.messages({TF_STATIC} & self.transforms):
-                self._add(tree, msg, True)
-        with Bag(self.path) as bag:
-            for i, (_, _, msg) in enumerate(bag.messages({TF} & self.transforms)):
-                if i >= FIRST and (self.odometry or not all(map(tree.fixed, _chain_in(
-                        tree, self.frame_id)))):
-                    break  # wheels may turn for long before the robot is localised
-                self._add(tree, msg, False)
+        bag = self.opened.bag()
+        for _, _, msg in bag.messages({TF_STATIC} & self.transforms):
+            self._add(tree, msg, True)
+        for i, (_, _, msg) in enumerate(bag.messages({TF} & self.transforms)):
+            if i >= FIRST and (self.odometry or not all(map(tree.fixed, _chain_in(
+                    tree, self.frame_id)))):
+                break  # wheels may turn for long before the robot is localised
+            self._add(tree, msg, False)
         return tree
 
     @cached_property
@@ -196,11 +194,10 @@ class BagPoses:
     def _tree(self) -> TransformTree:
         """All of what moves and what is fixed, above the sensor and what the odometry is of."""
         tree, above = TransformTree(keeps_all=True), {*self._above, *self._chain(self.carrier)}
-        with Bag(self.path) as bag:
-            for topic, _, msg in bag.messages(self.transforms):
-                msg.transforms[:] = [each for each in msg.transforms
-                                     if each.child_frame_id.lstrip("/") in above]
-                self._add(tree, msg, topic == TF_STATIC)
+        for topic, _, msg in self.opened.bag().messages(self.transforms):
+            msg.transforms[:] = [each for each in msg.transforms
+                                 if each.child_frame_id.lstrip("/") in above]
+            self._add(tree, msg, topic == TF_STATIC)
         return tree
 
     def _add(self, tree: TransformTree, msg: object, static: bool) -> None:
