@@ -138,6 +138,7 @@ def test_every_version_is_timed_step_by_step_on_random_weights(one_thread, capsy
                    **dict.fromkeys(("v2", "v3", "v4"), (True, True))}
 
 
+@pytest.mark.no_cover
 def test_a_frame_is_timed_beside_busy_processes(monkeypatch, capsys):
     monkeypatch.setenv("GOMP_SPINCOUNT", "7")
     monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)  # a command before it may have set it

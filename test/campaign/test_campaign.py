@@ -111,11 +111,11 @@ def test_a_part_that_cannot_start_is_a_failure_with_a_reason(tmp_path, monkeypat
         run_campaign(tmp_path, 1.0, 1, ["elsewhere"], 1)
 
 
-def test_parts_that_need_ros_say_so_where_there_is_none(tmp_path, monkeypatch):
+def test_parts_that_need_ros_say_so_where_there_is_none(planted, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rclpy", None)
-    messages, files_ = run_campaign(tmp_path, 2, 1, ["messages", "files"], 1)
+    messages, other = run_campaign(tmp_path / "out", 2, 1, ["messages", "planted"], 1)
     assert "source ROS 2 Jazzy" in messages.problem and messages.tried == 0 and messages.failed()
-    assert files_.tried == 1 and not files_.failed()
+    assert other.tried == 1 and not other.failed()
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"part": 1}', "[" * 10**5])
