@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import tracking_reference as slow
+from rich.console import Console
 
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.results import read_tracking_results, write_tracking_results
@@ -17,6 +18,7 @@ from lidar_perception.scoring.tracking.hota import HotaCounts, hota_counts
 from lidar_perception.scoring.tracking.over_recall import over_recall
 from lidar_perception.scoring.tracking.pairs import Pairs, pairs_of, tracked_labels, without_ignored
 from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, observe
+from lidar_perception.scoring.tracking.tables import print_tracking_report
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import CLASSES, Detections, GroundTruth, InputError, LidarFrame
 
@@ -134,6 +136,21 @@ def test_drives_that_share_a_bag_are_scored_as_if_they_had_names():
 
     assert content(False) == content(True)
     assert content(False)["sequences"] == 2 and content(False)["classes"]["Car"]["switches"] == 0
+
+
+def test_frames_whose_pose_is_not_known_are_counted_and_said(capsys):
+    poses = [np.eye(4), None, None]
+    frames = [Frame.of(f"a/{i}", LidarFrame(np.ones((1, 3), np.float32), None, 10**8 * (i + 1)),
+                       truth, sequence="a", index=i, pose=lambda i=i: poses[i])
+              for i, (truth, _) in enumerate(drive(frames=3))]
+    for ego, unknown in ("recording", 2), ("none", 0):
+        report = TrackingReport()
+        fill(report, Recording("a", "", frames), by_tracker(
+            lambda: lambda scan: Found(Detections.none()), ego=ego))
+        print_tracking_report({"ego": ego, **report.compute()}, Console(width=200))
+        assert report.compute()["without_pose"] == unknown
+        said = capsys.readouterr().out
+        assert ("no pose: 2 of 3 frames" in said and "--ego kiss_icp" in said) == bool(unknown)
 
 
 def test_neighbour_classes_and_what_is_cut_off_neither_help_nor_harm():

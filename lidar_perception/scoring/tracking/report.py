@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 from lidar_perception.camera import Calibration
@@ -22,7 +22,7 @@ from lidar_perception.scoring.tracking.pairs import (
     tracked_labels,
     without_ignored,
 )
-from lidar_perception.tracking.ego import recorded_poses, recorded_source
+from lidar_perception.tracking.ego import NO_SOURCE, recorded_poses, recorded_source
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import GroundTruth, InputError
@@ -30,11 +30,13 @@ from lidar_perception.types import GroundTruth, InputError
 
 @dataclass(frozen=True)
 class Observation:
-    """One frame, number index of its sequence, by class; small, and can go between processes."""
+    """One frame, number index of its sequence, by class; small, and can go between processes.
+    posed: whether the source of poses had one for it."""
 
     sequence: str
     index: int
     pairs: dict[str, Pairs]
+    posed: bool = True
 
 
 def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
@@ -76,11 +78,14 @@ def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, ego: str,
         if truth is not None:
             ids_of(truth, "label")  # before the detector's work
         scan = frame.load()
-        tracks = tracker(detector(scan).detections, frame.stamp_ns, pose_of(frame, scan.xyz))
+        pose = pose_of(frame, scan.xyz)
+        tracks = tracker(detector(scan).detections, frame.stamp_ns, pose)
         if truth is None:
             return None
-        return observe(frame.sequence or f"drive {number}", frame.index, truth,
-                       tracked_labels(tracks.ids, tracks.detections), frame.calibration())
+        return replace(observe(
+            frame.sequence or f"drive {number}", frame.index, truth,
+            tracked_labels(tracks.ids, tracks.detections), frame.calibration()),
+            posed=pose is not None or ego == NO_SOURCE)
     return measure
 
 
@@ -89,19 +94,23 @@ class TrackingReport:
     """Frames of sequences. A frame that comes twice counts once, the last time."""
 
     frames: dict[tuple[str, int], dict[str, Pairs]] = field(default_factory=dict)
+    unposed: set[tuple[str, int]] = field(default_factory=set)
     skipped: list[str] = field(default_factory=list)
 
     def update(self, observation: Observation) -> None:
         """One frame more."""
-        self.frames[observation.sequence, observation.index] = observation.pairs
+        key = observation.sequence, observation.index
+        self.frames[key] = observation.pairs
+        (self.unposed.discard if observation.posed else self.unposed.add)(key)
 
     def compute(self) -> dict:
-        """What the JSON file holds: frames, sequences, and by class the scores, 0..1, and their
-        counts; None for a class that has neither label nor track."""
+        """What the JSON file holds: frames, those of them without a pose, sequences, and by class
+        the scores, 0..1, and their counts; None for a class that has neither label nor track."""
         names = sorted({sequence for sequence, _ in self.frames})
         ordered = {name: [self.frames[key] for key in sorted(self.frames) if key[0] == name]
                    for name in names}
-        return {"frames": len(self.frames), "sequences": len(names), "skipped": self.skipped,
+        return {"frames": len(self.frames), "without_pose": len(self.unposed),
+                "sequences": len(names), "skipped": self.skipped,
                 "classes": {name: _class([[frame[name] for frame in frames]
                                           for frames in ordered.values()]) for name in DETECTED}}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rich.console import Console
+from rich.text import Text
 
 from lidar_perception.scoring.tables import narrow_table, print_skipped
 
@@ -23,4 +24,9 @@ def print_tracking_report(content: dict, console: Console) -> None:
     table.caption = ("HOTA and MOTA by centres within 2 m, sAMOTA by 3D IoU 0.25. IDSW: a track "
                      "that took another number.")
     console.print(table)
+    if content["without_pose"]:
+        console.print(Text("no pose", "yellow") + f": {content['without_pose']} of "
+                      f"{content['frames']} frames, whose tracks go on as before, or relative to "
+                      "the sensor; see whether the odometry or TF of the recording has the clock "
+                      "of its clouds, or take --ego kiss_icp")
     print_skipped(content["skipped"], console)
