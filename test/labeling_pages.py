@@ -126,7 +126,7 @@ class Label:
         page.uncheck("#advance")
         page.locator("#scene").focus()
         page.keyboard.press("f")
-        page.wait_for_timeout(50)
+        drawn(page)
         return number
 
     def wait(self, page, number: int, true) -> None:
@@ -169,8 +169,15 @@ def faces(box: list[float]) -> dict[str, float]:
             for k, axis in enumerate("xyz") for sign in "+-"}
 
 
+def drawn(page) -> None:
+    """Wait until what the page knows by now is drawn, which on a busy machine takes a while."""
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => "
+                  "requestAnimationFrame(done)))")
+
+
 def middle(page, selector: str) -> tuple[float, float]:
     """Of an element, on the page."""
+    drawn(page)
     area = page.locator(selector).bounding_box()
     return area["x"] + area["width"] / 2, area["y"] + area["height"] / 2
 

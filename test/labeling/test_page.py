@@ -51,6 +51,20 @@ def test_keys_accept_reject_and_open_again_and_the_progress_is_in_sight(page, la
                                ".startsWith(s)", arg=f"{progress['left']} left")
 
 
+def test_all_is_in_reach_in_half_a_screen(page, labels, person):
+    labels.chosen(page, person)
+    whole = page.viewport_size
+    page.set_viewport_size({"width": 800, "height": 900})
+    parts = "header nav button, #frame-name, #filters button, #numbers input, #actions button"
+    outside = page.evaluate("""parts => [...document.querySelectorAll(parts)]
+        .filter(each => each.getBoundingClientRect().right > innerWidth)
+        .map(each => each.id || each.textContent)""", parts)
+    under = page.evaluate("""() => document.getElementById('timeline').getBoundingClientRect().right
+        - document.getElementById('right').getBoundingClientRect().left""")
+    page.set_viewport_size(whole)
+    assert outside == [] and under < 1
+
+
 @pytest.mark.parametrize(("where", "name", "way"), [
     ("[data-view=top]", "+x", (40, 0)), ("[data-view=side]", "+z", (0, -25)),
     ("[data-view=front]", "-y", (20, 0)), ("#handles", "+z", (0, -40))])
