@@ -39,7 +39,7 @@ from lidar_perception.detectors.pointnet.weights_file import weights_file
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.losses import detection_loss
 from lidar_perception.detectors.pointpillars.network import Outputs
-from lidar_perception.detectors.pointpillars.targets import stacked
+from lidar_perception.detectors.pointpillars.targets import dense
 from lidar_perception.labeling.exchange import import_labels
 from lidar_perception.runs.files import refuse_others
 from lidar_perception.runs.resuming import locked
@@ -48,7 +48,7 @@ from lidar_perception.training.cache import write_arrays
 from lidar_perception.training.out import STATE
 from lidar_perception.training.params import AugmentParams
 from lidar_perception.training.plan import TooShort
-from lidar_perception.training.pointpillars.task import Preparation, targets_of
+from lidar_perception.training.pointpillars.task import Preparation
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
 
 SENSOR = "generic:16,-14,3,2,10"
@@ -241,8 +241,8 @@ def test_regions_give_no_gradient_and_change_none_elsewhere():
         torch.manual_seed(1)
         outputs = Outputs(*(torch.randn(1, len(anchors), n, requires_grad=True)
                             for n in (len(config.classes), 7, 2)))
-        detection_loss(outputs, stacked([targets_of(sample, anchors, config)]), kinds
-                       ).total.backward()
+        targets = dense([sample.targets], len(anchors), torch.device("cpu"))
+        detection_loss(outputs, targets, kinds).total.backward()
         return torch.cat([part.grad.flatten(2) for part in outputs], dim=2)[0].abs().sum(dim=1)
 
     region, background = gradient([DONT_CARE, PEDESTRIAN]), gradient([CLASSES.index("Misc"),

@@ -22,8 +22,9 @@ from lidar_perception.detectors.pointpillars.targets import (
     Targets,
     anchors_near,
     assign,
+    dense,
     nearest_axis_iou,
-    stacked,
+    sparse,
 )
 
 seeds = st.integers(0, 2**32 - 1)
@@ -181,12 +182,26 @@ def random_outputs(anchors, clouds=1):
     return Outputs(*(torch.randn(clouds, len(anchors), n) for n in (3, 7, 2)))
 
 
+def batch(clouds: list[Targets]) -> Targets:
+    return dense([sparse(cloud) for cloud in clouds], clouds[0].labels.shape[1],
+                 torch.device("cpu"))
+
+
+def test_targets_without_the_background_hold_everything():
+    config = tiny("v0")
+    anchors = make_anchors(config)
+    clouds = [assign(anchors, config, BOXES[:n], LABELS[:n]) for n in (2, 0, 1)]
+    assert {BACKGROUND, IGNORED, *range(2)} <= set(clouds[0].labels.flatten().tolist())
+    for whole, *parts in zip(batch(clouds), *clouds):
+        assert torch.equal(whole, torch.cat(parts))
+
+
 def test_losses_of_a_batch_twice_are_the_same_and_do_not_see_what_is_ignored():
     config = tiny("v0")
     anchors, kinds = make_anchors(config), anchor_classes(config)
     targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors)
     once = detection_loss(out, targets, kinds)
-    twice = detection_loss(Outputs(*(torch.cat([t, t]) for t in out)), stacked([targets, targets]),
+    twice = detection_loss(Outputs(*(torch.cat([t, t]) for t in out)), batch([targets, targets]),
                            kinds)
     for a, b in zip(once, twice):
         torch.testing.assert_close(a, b)
@@ -201,7 +216,7 @@ def test_scores_of_every_class_weigh_alike_however_many_anchors_it_is_on():
     config = tiny("v0")
     anchors, kinds = make_anchors(config), anchor_classes(config)
     targets, out = assign(anchors, config, BOXES, LABELS), random_outputs(anchors, 2)
-    targets = stacked([targets, assign(anchors, config, BOXES[:1], LABELS[:1])])
+    targets = batch([targets, assign(anchors, config, BOXES[:1], LABELS[:1])])
     parts = []
     for kind in range(3):
         mine = kinds == kind

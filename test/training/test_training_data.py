@@ -21,7 +21,7 @@ from training_toy import STILL, broken_folder, keep_all
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.pointpillars.anchors import anchor_classes, make_anchors
 from lidar_perception.detectors.pointpillars.config import RANGES, network_config
-from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED
+from lidar_perception.detectors.pointpillars.targets import BACKGROUND, IGNORED, dense
 from lidar_perception.geometry import within, wrap_angle
 from lidar_perception.simulation import drive
 from lidar_perception.simulation.camera import kitti_labels, turned_camera
@@ -38,7 +38,6 @@ from lidar_perception.training.pointpillars.task import (
     frame_to_validate,
     make_loss,
     narrowed,
-    targets_of,
     validation_report,
 )
 from lidar_perception.training.record import metrics_of
@@ -132,6 +131,10 @@ def scene_of_two(**changes) -> TrainingScene:
                            class_ids=np.array([CAR, PEDESTRIAN])), **changes})
 
 
+def labels_of(sample: Sample, anchors: torch.Tensor) -> torch.Tensor:
+    return dense([sample.targets], len(anchors), torch.device("cpu")).labels[0]
+
+
 @pytest.mark.parametrize("version", ["v0", "v2", "v4"])
 def test_samples_hold_what_the_version_sees(version):
     config = tiny(version)
@@ -166,13 +169,13 @@ def test_what_nobody_needs_to_find_is_neither_object_nor_background():
     anchors, kinds = make_anchors(config), anchor_classes(config)
     rng = np.random.default_rng(0)
     whole = Preparation(config, STILL)(scene_of_two(), rng)
-    found = targets_of(whole, anchors, config).labels[0]
+    found = labels_of(whole, anchors)
     for scene, prepare in (
             (scene_of_two(wanted=np.array([False, True])), Preparation(config, STILL)),
             (scene_of_two(class_ids=np.array([VAN, PEDESTRIAN])), Preparation(config, STILL))):
         sample = prepare(scene, rng)
         assert sample.counted.tolist() == [False, True]
-        labels = targets_of(sample, anchors, config).labels[0]
+        labels = labels_of(sample, anchors)
         assert (labels != 0).all() and torch.equal(labels[kinds == 1], found[kinds == 1])
         near = (labels == IGNORED) & (kinds == 0)
         assert near.any() and (near | (labels == BACKGROUND) | (kinds != 0)).all()
@@ -188,7 +191,7 @@ def test_a_scene_that_the_network_cannot_see_is_skipped():
     far = Preparation(tiny(), STILL)(scene_of_two(boxes=BOXES.numpy() + [90, 0, 0, 0, 0, 0, 0]),
                                      np.random.default_rng(0))
     assert len(far.boxes) == 0 and len(far.labels) == 0
-    assert (targets_of(far, make_anchors(tiny()), tiny()).labels == BACKGROUND).all()
+    assert (labels_of(far, make_anchors(tiny())) == BACKGROUND).all()
 
 
 def test_a_perfect_detector_scores_and_a_blind_one_does_not(tmp_path):
@@ -220,7 +223,9 @@ def test_without_a_camera_only_what_the_network_sees_is_to_be_found(where):
 
 def test_samples_are_plain_arrays_that_other_processes_can_send():
     sample = Preparation(tiny("v4"), STILL)(scene_of_two(), np.random.default_rng(0))
-    assert all(isinstance(value, np.ndarray) for value in vars(sample).values())
+    values = {**vars(sample), **sample.targets._asdict()}
+    assert values.pop("targets") is sample.targets
+    assert all(isinstance(value, np.ndarray) for value in values.values())
     assert isinstance(Item(sample).sample, Sample)
 
 

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +23,16 @@ class Targets(NamedTuple):
     labels: Tensor
     codes: Tensor
     bins: Tensor
+
+
+class SparseTargets(NamedTuple):
+    """Targets of one cloud at the anchors that are not background, which are few: anchors (K,)
+    int64; labels (K,), codes (K, 7) and bins (K,) as in Targets."""
+
+    anchors: np.ndarray
+    labels: np.ndarray
+    codes: np.ndarray
+    bins: np.ndarray
 
 
 def assign(anchors: Tensor, config: NetworkConfig, boxes: Tensor, labels: Tensor) -> Targets:
@@ -67,9 +78,26 @@ def anchors_near(anchors: Tensor, config: NetworkConfig, boxes: Tensor, index: i
     return (first + torch.arange(len(config.yaws), device=anchors.device)).reshape(-1)
 
 
-def stacked(targets: Sequence[Targets]) -> Targets:
-    """The targets of several clouds as one batch."""
-    return Targets(*(torch.cat(parts) for parts in zip(*targets)))
+def sparse(targets: Targets) -> SparseTargets:
+    """The targets of one cloud (B = 1) without the background."""
+    labels = targets.labels[0]
+    anchors = torch.nonzero(labels != BACKGROUND)[:, 0]
+    return SparseTargets(anchors.numpy(), *(part[0][anchors].numpy() for part in targets))
+
+
+def dense(clouds: Sequence[SparseTargets], anchors: int, device: torch.device) -> Targets:
+    """The targets of B clouds that have so many anchors each, on a device."""
+    where = np.concatenate([cloud.anchors + i * anchors for i, cloud in enumerate(clouds)])
+    places = torch.from_numpy(where).to(device)
+
+    def spread(parts: Sequence[np.ndarray], elsewhere: int) -> Tensor:
+        values = torch.from_numpy(np.concatenate(parts)).to(device)
+        shape = (len(clouds) * anchors, *values.shape[1:])
+        out = torch.full(shape, elsewhere, dtype=values.dtype, device=device)
+        return out.index_copy_(0, places, values).view(len(clouds), anchors, *values.shape[1:])
+
+    return Targets(spread([c.labels for c in clouds], BACKGROUND),
+                   spread([c.codes for c in clouds], 0), spread([c.bins for c in clouds], 0))
 
 
 def nearest_axis_iou(boxes: Tensor, others: Tensor) -> Tensor:

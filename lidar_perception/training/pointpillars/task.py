@@ -32,11 +32,13 @@ from lidar_perception.detectors.pointpillars.pillars import make_pillars
 from lidar_perception.detectors.pointpillars.targets import (
     BACKGROUND,
     IGNORED,
+    SparseTargets,
     Targets,
     anchors_near,
     assign,
+    dense,
     nearest_axis_iou,
-    stacked,
+    sparse,
 )
 from lidar_perception.detectors.view import visible
 from lidar_perception.geometry import within
@@ -73,13 +75,15 @@ REGION = -2  # label of a box of the class DontCare
 class Sample:
     """One scene for the network: points and cluster_map as in expert.NetworkInput; boxes (M, 7)
     float32, labels (M,) int64 into the config's classes, REGION for a region of which nothing is
-    learned; counted (M,) bool: to be found, the others may be found or not."""
+    learned; counted (M,) bool: to be found, the others may be found or not; targets: what of
+    them is to be found at which anchors, made here as many processes prepare and one trains."""
 
     points: np.ndarray
     cluster_map: np.ndarray | None
     boxes: np.ndarray
     labels: np.ndarray
     counted: np.ndarray
+    targets: SparseTargets
 
 
 @dataclass(frozen=True)
@@ -96,8 +100,12 @@ class Preparation:
     def _objects(self) -> Database | None:
         return None if self.database is None else Database.load(self.database)
 
+    @cached_property
+    def _anchors(self) -> Tensor:
+        return make_anchors(self.config)
+
     def __getstate__(self) -> dict:
-        return {k: v for k, v in self.__dict__.items() if k != "_objects"}
+        return {k: v for k, v in self.__dict__.items() if k not in ("_objects", "_anchors")}
 
     def __call__(self, scene: TrainingScene, rng: np.random.Generator) -> Sample:
         """InputError if the network would see no point."""
@@ -113,7 +121,8 @@ class Preparation:
         if len(inputs.points) < 2:
             raise InputError("a scene has no point where the network looks")
         boxes, labels, counted = self._objects_to_find(raised(scene, lower[2]), seen.xyz)
-        return Sample(inputs.points, inputs.cluster_map, boxes, labels, counted)
+        targets = _targets(boxes, labels, counted, self._anchors, self.config)
+        return Sample(inputs.points, inputs.cluster_map, boxes, labels, counted, sparse(targets))
 
     def _objects_to_find(self, scene: TrainingScene, xyz: np.ndarray) -> tuple[np.ndarray, ...]:
         low, high = np.array(self.config.low), np.array(self.config.high)
@@ -150,17 +159,16 @@ def narrowed(config: NetworkConfig, ahead: float, aside: float) -> NetworkConfig
     return replace(config, low=(back, right, bottom), high=(front, left, top))
 
 
-def targets_of(sample: Sample, anchors: Tensor, config: NetworkConfig) -> Targets:
+def _targets(boxes: np.ndarray, labels: np.ndarray, counted: np.ndarray, anchors: Tensor,
+             config: NetworkConfig) -> Targets:
     """The targets of one sample. Anchors on objects that are not counted, and those of any class
     that touch a region, are neither object nor background."""
-    boxes = torch.from_numpy(sample.boxes).to(anchors.device)
-    labels = torch.from_numpy(sample.labels).to(anchors.device)
-    counted = torch.from_numpy(sample.counted).to(anchors.device)
-    targets = assign(anchors, config, boxes[counted], labels[counted])
+    boxes_of, kinds, wanted = map(torch.from_numpy, (boxes, labels, counted))
+    targets = assign(anchors, config, boxes_of[wanted], kinds[wanted])
     found = targets.labels[0]
     for index, spec in enumerate(config.anchors):
-        for others, least in ((boxes[~counted & (labels == index)], spec.unmatched),
-                              (boxes[labels == REGION], TOUCHED)):
+        for others, least in ((boxes_of[~wanted & (kinds == index)], spec.unmatched),
+                              (boxes_of[kinds == REGION], TOUCHED)):
             mine = anchors_near(anchors, config, others, index)
             if len(mine):
                 near = nearest_axis_iou(anchors[mine], others).max(dim=1).values >= least
@@ -171,13 +179,13 @@ def targets_of(sample: Sample, anchors: Tensor, config: NetworkConfig) -> Target
 
 def make_loss(config: NetworkConfig, device: torch.device) -> Callable:
     """loss(network, samples) -> total, parts, as the loop wants it."""
-    anchors, classes = make_anchors(config, device), anchor_classes(config, device)
+    classes = anchor_classes(config, device)
 
     def loss(network: nn.Module, samples: Sequence[Sample]) -> tuple[Tensor, dict[str, Tensor]]:
         pillars = make_pillars([torch.from_numpy(s.points).to(device) for s in samples], config)
         drawn = [s.cluster_map for s in samples if s.cluster_map is not None]
         maps = torch.from_numpy(np.stack(drawn)).to(device) if drawn else None
-        targets = stacked([targets_of(sample, anchors, config) for sample in samples])
+        targets = dense([sample.targets for sample in samples], len(classes), device)
         losses = detection_loss(network(pillars, maps), targets, classes)
         return losses.total, {"classes": losses.classes.detach(), "boxes": losses.boxes.detach(),
                               "directions": losses.directions.detach()}
