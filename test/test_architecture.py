@@ -31,7 +31,7 @@ NUMBERS = ["numpy", "scipy", "numba"]
 STRANGERS = {
     "classes": [], "types": ["numpy"], "param_fields": [], "geometry": ["numpy", "numba"],
     "camera": NUMBERS,
-    "groups": ["numpy"], "robot": ["numpy", "scipy"], "runs": ["rich", "jinja2"],
+    "groups": ["numpy"], "robot": ["numpy", "scipy"], "runs": ["rich", "jinja2", "threadpoolctl"],
     "wire": ["numpy", "scipy", "rosbags", "msg_utils"],
     "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils", "lz4", "zstandard"],
     "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,

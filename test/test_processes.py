@@ -10,7 +10,9 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from threadpoolctl import threadpool_info
 
 HELD = []
 ROOT = Path(__file__).resolve().parents[1]
@@ -22,6 +24,29 @@ def holding() -> Callable[[int], bytes]:
     return lambda item: bytes(300_000)
 
 
+def counting() -> Callable[[int], int]:
+    """Work that says with how many threads matrices are multiplied."""
+    np.ones((2, 2)) @ np.ones((2, 2))
+    return lambda item: max(library["num_threads"] for library in threadpool_info())
+
+
+def result_of(script: str, **environment: str) -> subprocess.CompletedProcess:
+    path = os.pathsep.join(map(str, (ROOT, ROOT / "test")))
+    return subprocess.run([sys.executable, "-c", script], text=True, capture_output=True,
+                          env={**os.environ, "PYTHONPATH": path, **environment}, check=False)
+
+
+@pytest.mark.skipif(os.cpu_count() == 1, reason="has one core")
+def test_processes_that_share_the_cores_compute_with_one_thread_each():
+    """Threads of linear algebra wait actively, for each other and for those of other processes."""
+    script = ("from lidar_perception.runs.processes import in_order, in_processes\n"
+              "from test_processes import counting\n"
+              "print(*in_processes(counting, [0, 1], 2, 'worked'),\n"
+              "      *in_order(counting, [0], 1, 1, 'worked'),\n"
+              "      *in_processes(counting, [0], 1, 'worked', apart=True))\n")
+    assert result_of(script, OPENBLAS_NUM_THREADS="2").stdout.split() == ["1", "1", "1", "2"]
+
+
 def test_processes_that_are_ended_give_back_what_they_hold():
     script = ("import itertools\n"
               "from lidar_perception.runs.processes import in_order\n"
@@ -30,9 +55,7 @@ def test_processes_that_are_ended_give_back_what_they_hold():
               "    made = in_order(holding, itertools.count(), 2, 4, 'worked')\n"
               "    assert [len(next(made)) for _ in range(3)] == [300_000] * 3\n"
               "    made.close()\n")
-    path = os.pathsep.join(map(str, (ROOT, ROOT / "test")))
-    run = subprocess.run([sys.executable, "-c", script], text=True, capture_output=True,
-                         env={**os.environ, "PYTHONPATH": path}, check=False)
+    run = result_of(script)
     assert (run.returncode, run.stderr) == (0, "")
 
 

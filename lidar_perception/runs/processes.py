@@ -20,6 +20,7 @@ from queue import SimpleQueue
 from threading import Thread
 from typing import Any, cast
 
+from lidar_perception.runs.threads import one_thread_here
 from lidar_perception.types import InputError
 
 
@@ -28,9 +29,10 @@ def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, job
     """start()(item) of all items, in the order in which they are done.
 
     start is called once in each of `jobs` new processes, and can be pickled; with one job or one
-    item there is no new process, unless they are to be done apart. They are forked from a process
-    that has imported what start needs, and nothing else has run in. InputError, and the end of all
-    processes, where one fails: its own, or, naming what it did ("wrote frames"), where a process
+    item there is no new process, unless they are to be done apart. Several processes share the
+    cores, so each computes with one thread. They are forked from a process that has imported what
+    start needs, and nothing else has run in. InputError, and the end of all processes, where one
+    fails: its own, or, naming what it did ("wrote frames"), where a process
     ended. They end with the iterator too.
     """
     jobs = min(jobs, len(items))
@@ -43,7 +45,7 @@ def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, job
     try:
         for j in range(jobs):
             receiver, sender = context.Pipe(duplex=False)
-            running[receiver] = _begun(context, _work, start, items[j::jobs], sender)
+            running[receiver] = _begun(context, _work, start, items[j::jobs], jobs > 1, sender)
         while running:
             for receiver in cast(list[Connection], wait(list(running))):
                 yield from _receive(receiver, running, what)
@@ -54,8 +56,8 @@ def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, job
 def in_order(start: Callable[[], Callable[[Any], Any]], items: Iterable, jobs: int, ahead: int,
              what: str) -> Generator:
     """start()(item) of all items, of which there may be no end, in their order. As in_processes,
-    with a new process for a single job too; each makes up to `ahead` items that nobody has asked
-    for yet."""
+    with a new process, of one thread, for a single job too; each makes up to `ahead` items that
+    nobody has asked for yet."""
     waiting = iter(items)
     first = list(islice(waiting, jobs * ahead))
     context = _context(start)
@@ -125,7 +127,9 @@ def _receive(receiver: Connection, running: dict[Connection, ForkServerProcess],
     yield result
 
 
-def _work(start: Callable, items: Sequence, sender: Connection) -> None:
+def _work(start: Callable, items: Sequence, shared: bool, sender: Connection) -> None:
+    if shared:
+        one_thread_here()
     parent = multiprocessing.parent_process()
     with suppress(BrokenPipeError):  # nobody is there any more
         try:
@@ -146,6 +150,7 @@ def _asked(pipe: Connection, item: Any) -> Connection:
 
 
 def _serve(start: Callable, pipe: Connection) -> None:
+    one_thread_here()
     signal.signal(signal.SIGTERM, _leave)
     results: SimpleQueue[Any] = SimpleQueue()
     Thread(target=_send, args=(results, pipe), daemon=True).start()

@@ -12,7 +12,6 @@ from reading the frame in it, skips the frame.
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import closing
@@ -130,8 +129,6 @@ def _reopening(recording: Recording) -> Callable[[], Recording]:
 def _worker(reopen: Callable[[], Recording], start: Start) -> Callable[[int], tuple[int, Any]]:
     """What takes the number of a frame to what is measured of it, made in the process that will
     use it: frames are not sent to another."""
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # for libraries that are loaded later
-    threadpool_limits(1)
     recording = reopen()
     measure = start(recording)
     return lambda i: (i, _measured(measure, recording.frames[i]))

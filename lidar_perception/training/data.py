@@ -11,9 +11,7 @@ from functools import partial
 from itertools import count
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
-import torch
 
 from lidar_perception.runs.processes import in_order
 from lidar_perception.runs.terminal import errors
@@ -126,15 +124,8 @@ def loaded(items: Any, numbers: Iterator[list[int]], jobs: int) -> Iterator[list
     if jobs == 0:
         yield from map(_maker(items), numbers)
     else:
-        yield from in_order(partial(_alone, items), numbers, jobs, AHEAD, "prepared scenes")
+        yield from in_order(partial(_maker, items), numbers, jobs, AHEAD, "prepared scenes")
 
 
 def _maker(items: Any) -> Callable[[list[int]], list[Any]]:
     return lambda each: [items[n] for n in each]
-
-
-def _alone(items: Any) -> Callable[[list[int]], list[Any]]:
-    """As _maker, in a process beside others."""
-    torch.set_num_threads(1)
-    numba.set_num_threads(1)
-    return _maker(items)
