@@ -6,7 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol, Self
 
-from lidar_perception.detectors.checkpoint import POINTNET, POINTPILLARS, network_of, read_header
+from lidar_perception.detectors.checkpoint import (
+    POINTNET,
+    POINTPILLARS,
+    Header,
+    network_of,
+    read_header,
+)
 from lidar_perception.detectors.contract import FUSED, Detector
 from lidar_perception.detectors.fused.detector import load_fused_detector
 from lidar_perception.detectors.fused.fusion import SUFFIX, read_fusion
@@ -67,10 +73,17 @@ def kind_of(path: Path) -> str:
 
 def doubts(path: Path, height: float) -> list[str]:
     """What to say of weights that are used with a sensor so many metres above the ground: that they
-    are for one at another height, or that their scores are no probabilities."""
+    are for one at another height, that their scores are no probabilities, or that some of their
+    classes are never detected. Of an exported network nothing is known."""
     if path.suffix == SUFFIX:
         fusion = read_fusion(path)
-        return [*filter(None, [fusion.doubt]), *doubts(fusion.proposer, height),
-                *doubts(fusion.classifier, height)]
-    other = read_header(path).unlike(height) if path.suffix == ".safetensors" else None
+        known = _header(fusion.proposer)
+        return [*fusion.doubts(known.config.classes if known else ()),
+                *doubts(fusion.proposer, height), *doubts(fusion.classifier, height)]
+    known = _header(path)
+    other = known.unlike(height) if known else None
     return [f"{path}: {other}"] if other else []
+
+
+def _header(path: Path) -> Header | None:
+    return read_header(path) if path.suffix == ".safetensors" else None

@@ -206,8 +206,7 @@ def load_fused_detector(path: str | Path = "", device: str = "auto",
     classifier = load_pointnet_detector(fusion.classifier, device, PointNetDetectorParams(
         pointnet=PointNetParams(warm_up=False, cpu_fallback=settings.cpu_fallback)))
     detector = FusedDetector(proposer, classifier, params, fusion.models)
-    said = fusion.doubt, fusion.unfitted(detector.classes)
-    detector.doubt = "; ".join(filter(None, said)) or None
+    detector.doubt = "; ".join(fusion.doubts(detector.classes)) or None
     if settings.warm_up:
         detector.warm_up()
     return detector

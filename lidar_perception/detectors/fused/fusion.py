@@ -65,14 +65,12 @@ class Fusion:
                 "that its scores are no checked probabilities; `lidar-perception train fused` fits "
                 "them")
 
-    def unfitted(self, classes: Iterable[str]) -> str | None:
-        """What to say where the proposer knows classes that have no curves, None where it has none.
-        """
+    def doubts(self, classes: Iterable[str]) -> list[str]:
+        """The doubt, and what to say where the proposer's classes are not all among the curves'."""
         others = [name for name in classes if name not in self.models]
-        if not others:
-            return None
-        return (f"fused detects no {' and no '.join(others)}, as there are curves for "
-                f"{', '.join(self.models)} alone; {self.proposer} by itself does")
+        return [*filter(None, [self.doubt]), *(
+            [f"fused detects no {' and no '.join(others)}, as there are curves for "
+             f"{', '.join(self.models)} alone; {self.proposer} by itself does"] if others else [])]
 
 
 def digest(path: Path) -> str:
