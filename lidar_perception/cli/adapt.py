@@ -9,10 +9,9 @@ from typing import Any
 import click
 
 from lidar_perception.adapting.params import MADE, RECORD, REPORT, TITLE, AdaptParams
-from lidar_perception.cli.data import WHAT, a_path, device_option
+from lidar_perception.cli.data import WHAT, a_path, device_option, jobs_for_all_cores
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.runs.files import read_text, refuse_others
-from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console, errors
 from lidar_perception.types import InputError
 
@@ -30,9 +29,7 @@ from lidar_perception.types import InputError
 @click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one.")
 @click.option("--force", is_flag=True, help="Replace an earlier run in --out.")
 @device_option
-@click.option("--jobs", type=click.IntRange(0), default=lambda: min(cores(), 8),
-              show_default="one for each core, 8 at most",
-              help="Processes that prepare scenes; 0: only this one. The result is the same.")
+@jobs_for_all_cores("Processes that prepare scenes; 0: only this one.")
 @parameter_options(AdaptParams())
 def adapt(data: Path, weights: Path, out: Path, budget: float, resume: bool, force: bool,
           device: str, jobs: int, params: AdaptParams) -> None:

@@ -13,12 +13,14 @@ from typing import Any
 import click
 
 from lidar_perception.runs.files import write_text
+from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
 WHAT = ("KITTI (object, tracking, raw), nuScenes or SemanticKITTI folder, bag (rosbag2, or .bag "
         "of ROS 1), .pcd or .bin files, or what `simulate` wrote. BAG:/TOPIC names the clouds of a "
         "bag that has several.")
+MOST_JOBS = 16  # processes by default; as many feed a GPU
 
 
 def a_path(name: str, what: str, metavar: str = "FILE", **more: Any) -> Callable:
@@ -41,6 +43,13 @@ def out_file(name: str, what: str, *names: str, **more: Any) -> Callable:
     """An option that takes the path of a file to write."""
     return click.option(name, *names, type=OutFile(path_type=Path), metavar="FILE", help=what,
                         **more)
+
+
+def jobs_for_all_cores(what: str, least: int = 0) -> Callable:
+    """--jobs, of processes that do what is said and none of which changes the result."""
+    return click.option("--jobs", type=click.IntRange(least),
+                        default=lambda: min(cores(), MOST_JOBS), show_default=f"one for each "
+                        f"core, {MOST_JOBS} at most", help=f"{what} The result is the same.")
 
 
 data_option = a_path("--data", WHAT, "PATH", required=True)

@@ -13,9 +13,8 @@ from typing import Any
 import click
 
 from lidar_perception import __version__
-from lidar_perception.cli.data import a_path, device_option, out_file
+from lidar_perception.cli.data import a_path, device_option, jobs_for_all_cores, out_file
 from lidar_perception.cli.options import parameter_options
-from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import console
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.params import FusedTraining, PointNetTraining, PointPillarsTraining
@@ -39,9 +38,7 @@ OPTIONS = (
     a_path("--init", "Start from the weights of this checkpoint, as far as they fit; `package`: "
            "those that come with the package.", "FILE|package"),
     device_option,
-    click.option("--jobs", type=click.IntRange(0), default=lambda: min(cores(), 8),
-                 show_default="one for each core, 8 at most",
-                 help="Processes that prepare scenes; 0: only this one. The result is the same."),
+    jobs_for_all_cores("Processes that prepare scenes; 0: only this one."),
     click.option("--budget", type=float, metavar="HOURS", help="How long all of it may take on "
                  "this machine: scans, steps and validations are chosen so, where they are not "
                  "given. At the end of it the run stops, and can be resumed. Default: 2, and no "
@@ -143,9 +140,7 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
 @out_file("--out", "File to write (.json), which is then what --weights and `fused.weights` take.",
           required=True)
 @click.option("--force", is_flag=True, help="Replace --out.")
-@click.option("--jobs", type=click.IntRange(1), default=lambda: min(cores(), 8),
-              show_default="one for each core, 8 at most",
-              help="Processes that look at scans. The result is the same.")
+@jobs_for_all_cores("Processes that look at scans.", 1)
 @parameter_options(FusedTraining())
 def fused(weights: Path | None, classifier: Path | None, out: Path, force: bool, jobs: int,
           params: FusedTraining) -> None:
