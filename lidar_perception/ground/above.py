@@ -31,7 +31,7 @@ def height_above(xyz: np.ndarray, ground: np.ndarray) -> np.ndarray:
     up: above the mean height of those in the CELL m wide cell around it, or in the nearest cell,
     by its centre, that has some."""
     cells = np.floor(ground[:, :2].astype(np.float64) / CELL)
-    _, first, cell, count = np.unique(cells @ [2.0**26, 1.0], return_index=True,
+    _, first, cell, count = np.unique(cells[:, 0] * 2.0**26 + cells[:, 1], return_index=True,
                                       return_inverse=True, return_counts=True)
     mean = np.bincount(cell, ground[:, 2].astype(np.float64)) / count
     return xyz[:, 2] - mean[cKDTree((cells[first] + 0.5) * CELL).query(xyz[:, :2])[1]]

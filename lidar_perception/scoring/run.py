@@ -12,6 +12,7 @@ from reading the frame in it, skips the frame.
 from __future__ import annotations
 
 import functools
+import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import closing
@@ -139,6 +140,7 @@ _kept_open = functools.lru_cache(maxsize=1)(lambda run, reopen, start: _worker(r
 
 def _on_cluster(run: str, reopen: Callable[[], Recording], start: Start, i: int) -> tuple[int, Any]:
     """As a worker, in a process that may serve other runs before and after."""
+    os.environ.setdefault("OMP_NUM_THREADS", "1")  # for libraries that are loaded later
     with threadpool_limits(1):
         return _kept_open(run, reopen, start)(i)
 

@@ -79,7 +79,7 @@ def anchors_near(anchors: Tensor, config: NetworkConfig, boxes: Tensor, index: i
 
 
 def sparse(targets: Targets) -> SparseTargets:
-    """The targets of one cloud (B = 1) without the background."""
+    """The targets of one cloud (B = 1), on the CPU, without the background."""
     labels = targets.labels[0]
     anchors = torch.nonzero(labels != BACKGROUND)[:, 0]
     return SparseTargets(anchors.numpy(), *(part[0][anchors].numpy() for part in targets))
