@@ -171,7 +171,8 @@ def _draw(axes: Axes, points: dict[str, tuple[float, float, float]], legend: str
 
 def _ticks(low: float, high: float):
     from matplotlib.ticker import FixedLocator
-    return FixedLocator([step * 10.0 ** power for power in range(-3, 7) for step in (1, 2, 5)
+    steps = (1, 2, 5) if high < 1e3 * low else (1, 3)  # whose numbers have room beside each other
+    return FixedLocator([step * 10.0 ** power for power in range(-3, 7) for step in steps
                          if low <= step * 10.0 ** power <= high])
 
 
