@@ -77,8 +77,7 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     frames = BagFrames(path, points, bag.topics[points], bag.counts[points], opened=opened)
     labelled = False
     with suppress(InputError):  # a damaged cloud is named when it is read
-        labelled = any(frames.labelled(data) is not None
-                       for _, _, data in islice(bag.raw({points}), 1))
+        labelled = frames.first is not None and frames.labelled(frames.first) is not None
     has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | {
         *[POINT_LABELS] * labelled, *[POSES] * frames.poses.known}
     return Recording(path, layout(path, points), frames, has, mounted=False)
@@ -176,10 +175,14 @@ class BagFrames(Sequence):
                             if file.is_file() and file.suffix != ".yaml"))
 
     @cached_property
+    def first(self) -> bytes | None:
+        """The first cloud, serialised; None where there is none."""
+        return next((bytes(data) for _, _, data in self.opened.bag().raw({self.points})), None)
+
+    @cached_property
     def poses(self) -> BagPoses:
         """Of the frame that the first cloud is in."""
-        first = next(self.opened.bag().raw({self.points}), None)
-        return BagPoses(self.path, _frame_id(first[2]) if first else "", self.opened)
+        return BagPoses(self.path, _frame_id(self.first) if self.first else "", self.opened)
 
     def _frame(self, i: int, time: int, stamp: int, which: int,
                data: Callable[[], bytes]) -> Frame:
