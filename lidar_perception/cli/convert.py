@@ -105,12 +105,13 @@ def _seen(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], An
         deskew = deskew or asked
     if not deskew:
         return partial(levelled, robot=robot)
+    from lidar_perception.data.bag import KeptOpen
     from lidar_perception.data.bag_poses import BagPoses
     if not bag_frames.recognises(recording.path):
         raise InputError(f"{recording.path} is no bag, so that nothing says how its sensor moved, "
                          "which --deskew needs")
     first = recording.frames[len(recording) // 2]
-    poses = BagPoses(recording.path, first.load().frame_id).at
+    poses = BagPoses(KeptOpen(recording.path), first.load().frame_id).at
     levelled(first, robot, poses).load()  # what lacks in all of them is said at once
     return partial(levelled, robot=robot, poses=poses)
 

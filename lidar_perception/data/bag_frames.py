@@ -74,7 +74,7 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     bag = opened.bag()
     points = cloud_topic(bag, points)
     topics = {topic for topic, count in bag.counts.items() if count}
-    frames = BagFrames(path, points, bag.topics[points], bag.counts[points], opened=opened)
+    frames = BagFrames(opened, points, bag.topics[points], bag.counts[points])
     labelled = False
     with suppress(InputError):  # a damaged cloud is named when it is read
         labelled = frames.first is not None and frames.labelled(frames.first) is not None
@@ -93,15 +93,14 @@ class BagFrames(Sequence):
     once, and each frame holds its cloud; a frame by its number reads it when it is asked for, found
     by its time after one look through the bag for the times of all."""
 
-    def __init__(self, path: Path, points: str, kind: str, count: int,
-                 sensor_height: float = SENSOR_HEIGHT, opened: KeptOpen | None = None):
-        self.path, self.points, self.kind, self.clouds = path, points, kind, count
-        self.sensor_height = sensor_height
-        self.opened = opened or KeptOpen(path)
+    def __init__(self, opened: KeptOpen, points: str, kind: str, count: int,
+                 sensor_height: float = SENSOR_HEIGHT):
+        self.opened, self.points, self.kind, self.clouds = opened, points, kind, count
+        self.path, self.sensor_height = opened.path, sensor_height
 
     def mounted_at(self, sensor_height: float) -> BagFrames:
         """The frames of a sensor at that height."""
-        return BagFrames(self.path, self.points, self.kind, self.clouds, sensor_height, self.opened)
+        return BagFrames(self.opened, self.points, self.kind, self.clouds, sensor_height)
 
     def __len__(self) -> int:
         return self.clouds
@@ -182,7 +181,7 @@ class BagFrames(Sequence):
     @cached_property
     def poses(self) -> BagPoses:
         """Of the frame that the first cloud is in."""
-        return BagPoses(self.path, _frame_id(self.first) if self.first else "", self.opened)
+        return BagPoses(self.opened, _frame_id(self.first) if self.first else "")
 
     def _frame(self, i: int, time: int, stamp: int, which: int,
                data: Callable[[], bytes]) -> Frame:

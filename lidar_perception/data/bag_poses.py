@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from itertools import takewhile
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,9 +46,8 @@ class BagPoses:
     in odom where that is above the sensor, else in the topmost frame that it moves in.
     """
 
-    def __init__(self, path: Path, frame_id: str, opened: KeptOpen | None = None):
-        self.path, self.frame_id = path, frame_id.lstrip("/")
-        self.opened = opened or KeptOpen(path)
+    def __init__(self, opened: KeptOpen, frame_id: str):
+        self.opened, self.path, self.frame_id = opened, opened.path, frame_id.lstrip("/")
         self.left_out = 0  # transforms and odometry that are no poses
         bag = self.opened.bag()
         topics = {name: kind for name, kind in bag.topics.items() if bag.counts[name]}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data import bag_frames
-from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag import Bag, KeptOpen
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.cloud_files import cloud_files, named_times, to_message
 from lidar_perception.data.frame import Frame
@@ -64,7 +64,7 @@ def _of_bag(path: Path, topic: str) -> RawClouds:
         topic = bag_frames.cloud_topic(bag, topic)
         if not bag.counts[topic]:
             raise InputError(f"{path} has no cloud on {topic}; record it again")
-        frames = bag_frames.BagFrames(path, topic, bag_frames.CLOUD, bag.counts[topic])
+        frames = bag_frames.BagFrames(KeptOpen(path), topic, bag_frames.CLOUD, bag.counts[topic])
     return RawClouds(path, bag_frames.layout(path, topic), len(frames), frames.stamps(),
                      frames.message, frames.poses, topic)
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag import Bag, KeptOpen
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.wire.topics import TRUTH
 from msg_utils.markers import MarkedObjects, from_marker_array
@@ -28,7 +28,7 @@ def answered(path: Path, *topics: str) -> list[list[Answered]]:
     with Bag(path) as bag:
         found = by_stamp(bag, (*topics, TRUTH))
     truth = found[TRUTH]
-    poses = BagPoses(path, next((each.frame_id for each in truth.values()), ""))
+    poses = BagPoses(KeptOpen(path), next((each.frame_id for each in truth.values()), ""))
     return [[Answered(stamp, truth[stamp], poses.brought(found[topic][stamp], topic))
              for stamp in sorted(found[topic].keys() & truth.keys())] for topic in topics]
 

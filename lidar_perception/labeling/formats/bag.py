@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.data.bag import Bag
+from lidar_perception.data.bag import Bag, KeptOpen
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.frame import Frame, frame_id_of
 from lidar_perception.data.to_bag import write_bag
@@ -37,7 +37,7 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
                              f"{MARKERS} or {DETECTIONS}; give another topic")
         markers = bag.topics[topic] == MARKERS
         found: dict[int, MarkedObjects] = {}
-        poses = BagPoses(path, frame_id_of(frames))
+        poses = BagPoses(KeptOpen(path), frame_id_of(frames))
         for _, time, msg in bag.messages({topic}):
             objects = from_marker_array(msg) if markers else from_detection_array(msg)
             found[objects.stamp_ns or time] = poses.brought(objects, topic)
