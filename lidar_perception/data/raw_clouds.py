@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data import bag_frames
-from lidar_perception.data.bag import Bag, KeptOpen
+from lidar_perception.data.bag import KeptOpen
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.cloud_files import cloud_files, named_times, to_message
 from lidar_perception.data.frame import Frame
@@ -60,11 +60,12 @@ def open_clouds(path: str | Path, topic: str | None = None) -> RawClouds:
 
 
 def _of_bag(path: Path, topic: str) -> RawClouds:
-    with Bag(path) as bag:
-        topic = bag_frames.cloud_topic(bag, topic)
-        if not bag.counts[topic]:
-            raise InputError(f"{path} has no cloud on {topic}; record it again")
-        frames = bag_frames.BagFrames(KeptOpen(path), topic, bag_frames.CLOUD, bag.counts[topic])
+    opened = KeptOpen(path)
+    bag = opened.bag()
+    topic = bag_frames.cloud_topic(bag, topic)
+    if not bag.counts[topic]:
+        raise InputError(f"{path} has no cloud on {topic}; record it again")
+    frames = bag_frames.BagFrames(opened, topic, bag_frames.CLOUD, bag.counts[topic])
     return RawClouds(path, bag_frames.layout(path, topic), len(frames), frames.stamps(),
                      frames.message, frames.poses, topic)
 

@@ -158,10 +158,10 @@ def recorded(poses: BagPoses, stamps: list[int]) -> Results:
     """What a bag holds beside its clouds, whose poses and stamps are given: detections of every
     node, tracks. A message belongs to the cloud of its stamp. A topic whose boxes nothing connects
     with the clouds' frame is left out, and that is said."""
-    with Bag(poses.path) as bag:
-        wanted = {topic for topic, kind in bag.topics.items() if kind == MARKERS and topic != TRUTH
-                  and topic.endswith((FOUND, TRACKS))}
-        found = by_stamp(bag, sorted(wanted))
+    bag = poses.opened.bag()
+    wanted = {topic for topic, kind in bag.topics.items() if kind == MARKERS and topic != TRUTH
+              and topic.endswith((FOUND, TRACKS))}
+    found = by_stamp(bag, sorted(wanted))
     numbers = {stamp: i for i, stamp in enumerate(stamps)}
     sources: dict[str, Source] = {}
     tracks: list[dict[str, Any]] = []

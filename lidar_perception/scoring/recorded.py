@@ -25,10 +25,10 @@ def answered(path: Path, *topics: str) -> list[list[Answered]]:
     """For each of these topics of a bag, the labelled frames that have an answer on it, in order of
     time; of equal stamps the last. Answers are in the frame of the labels; InputError where nothing
     connects theirs with it."""
-    with Bag(path) as bag:
-        found = by_stamp(bag, (*topics, TRUTH))
+    opened = KeptOpen(path)
+    found = by_stamp(opened.bag(), (*topics, TRUTH))
     truth = found[TRUTH]
-    poses = BagPoses(KeptOpen(path), next((each.frame_id for each in truth.values()), ""))
+    poses = BagPoses(opened, next((each.frame_id for each in truth.values()), ""))
     return [[Answered(stamp, truth[stamp], poses.brought(found[topic][stamp], topic))
              for stamp in sorted(found[topic].keys() & truth.keys())] for topic in topics]
 
