@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from functools import partial
 from itertools import chain, combinations
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import numpy as np
 import pytest
 from tracking_samples import pose
 
-from lidar_perception.data.frame import POSES, Recording
+from lidar_perception.data.frame import POSES, Frame, Recording
+from lidar_perception.scoring.tracking import report
 from lidar_perception.scoring.tracking.report import ego_of
 from lidar_perception.simulation.drive import scans
 from lidar_perception.tracking import ego
@@ -56,6 +58,23 @@ def test_recorded_poses_come_before_the_scans_and_what_is_asked_for_is_not_repla
         for wanted in RECORDED_EGO:
             assert ego_of(recording, wanted) == recorded_source(poses, wanted)
             assert wanted == "auto" or recorded_source(poses, wanted) == wanted
+
+
+@pytest.mark.parametrize("installed", [True, False])
+@pytest.mark.parametrize("posed", [0, 80, 120, 200])
+def test_poses_that_most_frames_have_not_give_way_to_the_scans(monkeypatch, installed, posed):
+    for module in ego, report:
+        monkeypatch.setattr(module, "has_odometry", lambda: installed)
+
+    def pose(number):
+        if number == 100:
+            raise InputError("it cannot be read")
+        return np.eye(4) if number < posed else None
+
+    frames = [Frame(str(i), i, lambda: None, pose=partial(pose, i)) for i in range(200)]
+    recording = Recording(Path("drive"), "", frames, frozenset({POSES}))
+    assert ego_of(recording) == ("kiss_icp" if installed and posed < 100 else "recording")
+    assert ego_of(recording, "recording") == "recording"
 
 
 def test_without_the_extra_it_is_said_how_to_get_it(monkeypatch):

@@ -6,6 +6,7 @@ from functools import partial
 from pathlib import Path
 
 import click
+from rich.text import Text
 
 from lidar_perception.cli.data import (
     a_path,
@@ -34,7 +35,7 @@ from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
 @click.option("--ego", type=click.Choice(RECORDED_EGO), default="auto", show_default=True,
               help="The sensor's motion: from the recording's poses; from the scans, by KISS-ICP "
               "(the extra [odometry]); or none: tracks are relative to the sensor. auto: the first "
-              "of these that is available.")
+              "of these that is available, poses where most frames have one.")
 @json_option
 @parameter_options(TrackingParams())
 def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, device: str,
@@ -49,7 +50,7 @@ def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, d
       lidar-perception evaluate tracking --data /data/kitti/tracking --json tracks.json
       lidar-perception evaluate tracking --data drive --ego kiss_icp --weights v4.safetensors
     """
-    from lidar_perception.data.frame import BOXES
+    from lidar_perception.data.frame import BOXES, POSES
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.scoring.run import fill
     from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, ego_of
@@ -59,7 +60,11 @@ def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, d
     recording.require(BOXES, "evaluate tracking")
     open_ = partial(open_detector, weights, device, min_score=params.min_score,
                     sensor_height=recording.frames[0].sensor_height)
-    report, ego = TrackingReport(), ego_of(recording, ego)
+    report, asked, ego = TrackingReport(), ego, ego_of(recording, ego)
+    if (asked, ego) == ("auto", "kiss_icp") and POSES in recording.has:
+        console.print(Text("no pose", "yellow") + ": most frames have none, so poses are by "
+                      "KISS-ICP; see whether the odometry or TF of the recording has the clock of "
+                      "its clouds")
     fill(report, recording, by_tracker(open_, params, ego), limit=limit)
     if not report.frames:
         raise no_labels(recording, report.skipped)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -22,10 +23,18 @@ from lidar_perception.scoring.tracking.pairs import (
     tracked_labels,
     without_ignored,
 )
-from lidar_perception.tracking.ego import NO_SOURCE, recorded_poses, recorded_source
+from lidar_perception.tracking.ego import (
+    NO_SOURCE,
+    has_odometry,
+    recorded_poses,
+    recorded_source,
+    usable,
+)
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import GroundTruth, InputError
+
+LOOKED_AT = 20  # frames, whether they have poses
 
 
 @dataclass(frozen=True)
@@ -50,8 +59,22 @@ def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
 
 def ego_of(recording: Recording, wanted: str = "auto") -> str:
     """Whence the sensor's motion comes, of RECORDED_EGO all but auto, which is: the poses of the
-    recording, where it has any, else KISS-ICP, where that is installed, else none."""
-    return recorded_source(POSES in recording.has, wanted)
+    recording, where most of its frames have one, else KISS-ICP, where that is installed, else those
+    poses that there are, else none."""
+    if wanted != "auto":
+        return recorded_source(True, wanted)
+    return recorded_source(POSES in recording.has and (
+        not has_odometry() or most_have_poses(recording.frames)))
+
+
+def most_have_poses(frames: Sequence[Frame]) -> bool:
+    """Whether half of LOOKED_AT of them, evenly among all, have a pose that can be used: odometry
+    with another clock than the clouds' gives none."""
+    some, posed = frames[::max(1, len(frames) // LOOKED_AT)], 0
+    for frame in some:
+        with suppress(InputError):  # said where the frame is measured
+            posed += usable(frame.pose())
+    return 2 * posed >= len(some)
 
 
 def by_tracker(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
