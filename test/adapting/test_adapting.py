@@ -56,7 +56,7 @@ SMALL = AdaptParams(rounds=1, steps=3, batch=1, frames=100, scans=2, val_scans=1
 STILL = AugmentParams(crowded=0.0, object_turn=0.0, object_shift=0.0, flip=0.0, turn=0.0, scale=0.0,
                       dropout=0.0, intensity=0.0, height=0.0, tilt=0.0, beam_noise=0.0,
                       range_noise=0.0)
-pytestmark = pytest.mark.usefixtures("one_thread_for_all")
+pytestmark = pytest.mark.usefixtures("one_thread_for_all", "streets")
 
 
 @pytest.fixture(scope="module")
