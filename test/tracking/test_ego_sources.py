@@ -66,12 +66,12 @@ def test_poses_that_most_frames_have_not_give_way_to_the_scans(monkeypatch, inst
     for module in ego, report:
         monkeypatch.setattr(module, "has_odometry", lambda: installed)
 
-    def pose(number):
+    def pose_of(number):
         if number == 100:
             raise InputError("it cannot be read")
         return np.eye(4) if number < posed else None
 
-    frames = [Frame(str(i), i, lambda: None, pose=partial(pose, i)) for i in range(200)]
+    frames = [Frame(str(i), i, lambda: None, pose=partial(pose_of, i)) for i in range(200)]
     recording = Recording(Path("drive"), "", frames, frozenset({POSES}))
     assert ego_of(recording) == ("kiss_icp" if installed and posed < 100 else "recording")
     assert ego_of(recording, "recording") == "recording"

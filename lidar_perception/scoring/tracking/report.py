@@ -62,7 +62,7 @@ def ego_of(recording: Recording, wanted: str = "auto") -> str:
     recording, where most of its frames have one, else KISS-ICP, where that is installed, else those
     poses that there are, else none."""
     if wanted != "auto":
-        return recorded_source(True, wanted)
+        return wanted
     return recorded_source(POSES in recording.has and (
         not has_odometry() or most_have_poses(recording.frames)))
 
