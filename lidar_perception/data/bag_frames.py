@@ -77,7 +77,7 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     frames = BagFrames(opened, points, bag.topics[points], bag.counts[points])
     labelled = False
     with suppress(InputError):  # a damaged cloud is named when it is read
-        labelled = frames.first is not None and frames.labelled(frames.first) is not None
+        labelled = frames.first is not None and frames.labelled(frames.first[1]) is not None
     has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | {
         *[POINT_LABELS] * labelled, *[POSES] * frames.poses.known}
     return Recording(path, layout(path, points), frames, has, mounted=False)
@@ -90,8 +90,9 @@ def layout(path: Path, points: str) -> str:
 
 class BagFrames(Sequence):
     """The frames in order of time; native() of each gives its message. Iterating reads the bag
-    once, and each frame holds its cloud; a frame by its number reads it when it is asked for, found
-    by its time after one look through the bag for the times of all."""
+    once, and each frame holds its cloud. So does the first one by its number; another one by its
+    number reads it when it is asked for, found by its time after one look through the bag for the
+    times of all."""
 
     def __init__(self, opened: KeptOpen, points: str, kind: str, count: int,
                  sensor_height: float = SENSOR_HEIGHT):
@@ -128,6 +129,9 @@ class BagFrames(Sequence):
         if not -self.clouds <= i < self.clouds:
             raise IndexError(i)
         i %= self.clouds
+        if i == 0 and self.first is not None:
+            time, data = self.first
+            return self._frame(0, time, _stamp(data, time), 1, lambda: data)
         time, before, stamp, which = self._index[i]
         return self._frame(i, time, stamp, which, partial(self._read, time, before))
 
@@ -174,14 +178,15 @@ class BagFrames(Sequence):
                             if file.is_file() and file.suffix != ".yaml"))
 
     @cached_property
-    def first(self) -> bytes | None:
-        """The first cloud, serialised; None where there is none."""
-        return next((bytes(data) for _, _, data in self.opened.bag().raw({self.points})), None)
+    def first(self) -> tuple[int, bytes] | None:
+        """Time of the first cloud, and it, serialised; None where there is none."""
+        raw = self.opened.bag().raw({self.points})
+        return next(((time, bytes(data)) for _, time, data in raw), None)
 
     @cached_property
     def poses(self) -> BagPoses:
         """Of the frame that the first cloud is in."""
-        return BagPoses(self.opened, _frame_id(self.first) if self.first else "")
+        return BagPoses(self.opened, _frame_id(self.first[1]) if self.first else "")
 
     def _frame(self, i: int, time: int, stamp: int, which: int,
                data: Callable[[], bytes]) -> Frame:

@@ -11,6 +11,7 @@ from bag_samples import cloud_frame, message_bytes, same_cloud
 from recording_samples import MADE, each_recording
 from samples import STAMP, object_folder, scene, write
 
+from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.frame import CAMERA, Frame
 from lidar_perception.data.open import open_recording
@@ -49,6 +50,15 @@ def test_frames_of_a_bag_by_number_are_those_of_iterating(written, tmp_path):
 
 def scene_of(frame):
     return next(i for i in range(3) if same_cloud(scene(i), frame.load().xyz))
+
+
+def test_the_first_frame_is_known_without_a_look_through_the_bag(written, monkeypatch):
+    """An hour of clouds takes minutes to look through, and many commands ask for the first only."""
+    stamped = []
+    monkeypatch.setattr(bag_frames, "_stamp", lambda data, time: stamped.append(time) or time)
+    frames = open_recording(written).frames
+    assert frames[0].index == frames[-3].index == 0 and len({*stamped}) == 1
+    assert frames[1].index == 1 and len({*stamped}) == 3
 
 
 def test_a_frame_of_a_bag_by_number_is_read_when_it_is_asked_for(written, tmp_path):

@@ -13,7 +13,7 @@ from tracking_samples import pose
 
 from lidar_perception.data.frame import POSES, Frame, Recording
 from lidar_perception.scoring.tracking import report
-from lidar_perception.scoring.tracking.report import ego_of
+from lidar_perception.scoring.tracking.report import LOOKED_AT, ego_of
 from lidar_perception.simulation.drive import scans
 from lidar_perception.tracking import ego
 from lidar_perception.tracking.ego import (
@@ -53,28 +53,33 @@ def test_recorded_poses_come_before_the_scans_and_what_is_asked_for_is_not_repla
     monkeypatch.setattr(ego, "has_odometry", lambda: installed)
     assert recorded_source(True) == "recording"
     assert recorded_source(False) == ("kiss_icp" if installed else NO_SOURCE)
+    frames = [Frame("0", 0, lambda: None, pose=lambda: np.eye(4))]
     for poses in True, False:
-        recording = Recording(Path("drive"), "", [], frozenset({POSES} if poses else ()))
+        recording = Recording(Path("drive"), "", frames, frozenset({POSES} if poses else ()))
         for wanted in RECORDED_EGO:
             assert ego_of(recording, wanted) == recorded_source(poses, wanted)
             assert wanted == "auto" or recorded_source(poses, wanted) == wanted
 
 
 @pytest.mark.parametrize("installed", [True, False])
-@pytest.mark.parametrize("posed", [0, 80, 120, 200])
-def test_poses_that_most_frames_have_not_give_way_to_the_scans(monkeypatch, installed, posed):
+@pytest.mark.parametrize("first", [0, LOOKED_AT - 1, LOOKED_AT, 200])
+def test_poses_that_the_first_frames_have_not_give_way_to_the_scans(monkeypatch, installed, first):
+    """And no frame after these is read to see it: a bag can be an hour long."""
     for module in ego, report:
         monkeypatch.setattr(module, "has_odometry", lambda: installed)
+    read = []
 
     def pose_of(number):
-        if number == 100:
+        read.append(number)
+        if number == 3:
             raise InputError("it cannot be read")
-        return np.eye(4) if number < posed else None
+        return np.eye(4) if number >= first else np.full((4, 4), np.nan)
 
     frames = [Frame(str(i), i, lambda: None, pose=partial(pose_of, i)) for i in range(200)]
     recording = Recording(Path("drive"), "", frames, frozenset({POSES}))
-    assert ego_of(recording) == ("kiss_icp" if installed and posed < 100 else "recording")
+    assert ego_of(recording) == ("kiss_icp" if installed and first >= LOOKED_AT else "recording")
     assert ego_of(recording, "recording") == "recording"
+    assert read == [*range(min(first + 1, LOOKED_AT))] * installed
 
 
 def test_without_the_extra_it_is_said_how_to_get_it(monkeypatch):

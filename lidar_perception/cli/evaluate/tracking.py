@@ -35,7 +35,7 @@ from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
 @click.option("--ego", type=click.Choice(RECORDED_EGO), default="auto", show_default=True,
               help="The sensor's motion: from the recording's poses; from the scans, by KISS-ICP "
               "(the extra [odometry]); or none: tracks are relative to the sensor. auto: the first "
-              "of these that is available, poses where most frames have one.")
+              "of these that is available, poses where one of the first frames has one.")
 @json_option
 @parameter_options(TrackingParams())
 def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, device: str,
@@ -62,7 +62,7 @@ def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, d
                     sensor_height=recording.frames[0].sensor_height)
     report, asked, ego = TrackingReport(), ego, ego_of(recording, ego)
     if (asked, ego) == ("auto", "kiss_icp") and POSES in recording.has:
-        console.print(Text("no pose", "yellow") + ": most frames have none, so poses are by "
+        console.print(Text("no pose", "yellow") + ": the first frames have none, so poses are by "
                       "KISS-ICP; see whether the odometry or TF of the recording has the clock of "
                       "its clouds")
     fill(report, recording, by_tracker(open_, params, ego), limit=limit)

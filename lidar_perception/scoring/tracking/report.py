@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import suppress
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import islice
 
 from lidar_perception.camera import Calibration
 from lidar_perception.classes import DETECTED
@@ -34,7 +34,7 @@ from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import GroundTruth, InputError
 
-LOOKED_AT = 20  # frames, whether they have poses
+LOOKED_AT = 50  # frames, the first ones, whether one of them has a pose
 
 
 @dataclass(frozen=True)
@@ -59,22 +59,21 @@ def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
 
 def ego_of(recording: Recording, wanted: str = "auto") -> str:
     """Whence the sensor's motion comes, of RECORDED_EGO all but auto, which is: the poses of the
-    recording, where most of its frames have one, else KISS-ICP, where that is installed, else those
-    poses that there are, else none."""
+    recording, where one of its first LOOKED_AT frames has one, else KISS-ICP, where that is
+    installed, else those poses that there are, else none."""
     if wanted != "auto":
         return wanted
     return recorded_source(POSES in recording.has and (
-        not has_odometry() or most_have_poses(recording.frames)))
+        not has_odometry() or any(map(has_pose, islice(recording.frames, LOOKED_AT)))))
 
 
-def most_have_poses(frames: Sequence[Frame]) -> bool:
-    """Whether half of LOOKED_AT of them, evenly among all, have a pose that can be used: odometry
-    with another clock than the clouds' gives none."""
-    some, posed = frames[::max(1, len(frames) // LOOKED_AT)], 0
-    for frame in some:
-        with suppress(InputError):  # said where the frame is measured
-            posed += usable(frame.pose())
-    return 2 * posed >= len(some)
+def has_pose(frame: Frame) -> bool:
+    """Whether a frame has a pose that can be used: odometry with another clock than the clouds'
+    gives none."""
+    try:
+        return usable(frame.pose())
+    except InputError:  # said where the frame is measured
+        return False
 
 
 def by_tracker(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
