@@ -6,7 +6,6 @@ import json
 import math
 import multiprocessing
 import os
-import shutil
 import sys
 import urllib.request
 from collections.abc import Callable, Iterator
@@ -24,7 +23,6 @@ from lidar_perception.cli.main import main
 from lidar_perception.geometry import points_in_box
 from lidar_perception.labeling import results, served, server, session  # noqa: F401
 
-BROWSER = shutil.which("chromium")
 PATIENCE = 60.0  # seconds
 NEAR = 20.0      # metres
 

@@ -19,7 +19,9 @@ from lidar_perception.labeling.server import serve
 from lidar_perception.runs.files import write_bytes
 from lidar_perception.types import InputError
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# Those that have no window anyway take a fifth less time.
+BROWSERS = ("chromium-headless-shell", "chrome-headless-shell", "chromium", "chromium-browser",
+            "google-chrome", "google-chrome-stable")
 FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader",
          "--hide-scrollbars", "--disable-quic", "--no-first-run", "--disable-sync",
          "--disable-background-networking", "--disable-component-update", "--mute-audio",
@@ -30,12 +32,16 @@ IS_READY = "document.documentElement.dataset.ready === 'true'"
 Call = Callable[..., Awaitable[dict[str, Any]]]
 
 
+def browser_here() -> str | None:
+    """The path of a browser that needs no window, the first of BROWSERS that is installed."""
+    return next(filter(None, map(shutil.which, BROWSERS)), None)
+
+
 async def screenshot_of(served: Served, path: Path, query: str = "",
                         size: tuple[int, int] = SIZE) -> None:
     """Write a PNG of the page with what is served, as it is once all is shown. query: of the page's
     address, such as frame=12. InputError where there is no browser, or the page does not come."""
-    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if browser is None:
+    if (browser := browser_here()) is None:
         raise InputError("a screenshot needs chromium; install it (apt install chromium), or leave "
                          "out --screenshot and open the page in another browser")
     address: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -73,7 +79,7 @@ async def _devtools(browser: str, size: tuple[int, int]) -> AsyncIterator[Call]:
             "about:blank", stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.DEVNULL,
             stderr=asyncio.subprocess.DEVNULL)
         try:
-            port = await _port(Path(profile) / "DevToolsActivePort", process)
+            port = await _port(browser, Path(profile) / "DevToolsActivePort", process)
             async with aiohttp.ClientSession() as http:
                 async with http.get(f"http://127.0.0.1:{port}/json/list") as reply:
                     page = next(p for p in await reply.json() if p["type"] == "page")
@@ -88,13 +94,13 @@ async def _devtools(browser: str, size: tuple[int, int]) -> AsyncIterator[Call]:
             await process.wait()
 
 
-async def _port(file: Path, process: asyncio.subprocess.Process) -> int:
+async def _port(browser: str, file: Path, process: asyncio.subprocess.Process) -> int:
     end = asyncio.get_running_loop().time() + START
     while asyncio.get_running_loop().time() < end and process.returncode is None:
         with contextlib.suppress(OSError, ValueError, IndexError):
             return int(file.read_text().splitlines()[0])
         await asyncio.sleep(0.05)
-    raise InputError("chromium did not start; try it by hand: chromium --headless about:blank")
+    raise InputError(f"{browser} did not start; try it by hand: {browser} --headless about:blank")
 
 
 def _caller(socket: aiohttp.ClientWebSocketResponse) -> Call:

@@ -5,12 +5,10 @@ from __future__ import annotations
 import socket
 
 import pytest
-from labeling_pages import BROWSER, Label, labelled_person, opened, serving
+from browsing import browsing
+from labeling_pages import Label, labelled_person, opened, serving
 
 from lidar_perception.data.open import open_recording
-
-FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
-         "--disable-background-networking --disable-component-update --disable-sync").split()
 
 
 def free_port() -> int:
@@ -21,11 +19,8 @@ def free_port() -> int:
 
 @pytest.fixture(scope="module")
 def browser():
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    with sync_api.sync_playwright() as playwright:
-        started = playwright.chromium.launch(executable_path=BROWSER, args=FLAGS)
+    with browsing() as started:
         yield started
-        started.close()
 
 
 @pytest.fixture(scope="module")

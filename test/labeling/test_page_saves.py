@@ -6,11 +6,9 @@ import json
 import math
 
 import pytest
-from labeling_pages import BROWSER, boxes_of, opened
+from labeling_pages import boxes_of, opened
 
-# Others run these lines.
-pytestmark = [pytest.mark.no_cover,
-              pytest.mark.skipif(BROWSER is None, reason="chromium is not installed")]
+pytestmark = pytest.mark.no_cover  # others run these lines
 
 
 def test_a_typed_number_changes_this_one_alone_and_none_or_escape_changes_nothing(page, labels,

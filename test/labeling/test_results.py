@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from lidar_perception.data.bag import BagWriter, KeptOpen
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.open import open_recording
 from lidar_perception.labeling.drive import one_drive, scanned
+from lidar_perception.labeling.picture import browser_here
 from lidar_perception.labeling.results import (
     Results,
     Source,
@@ -140,7 +140,7 @@ def test_result_files_that_are_not_there_are_named(tmp_path):
         by_files(tmp_path / "none")
 
 
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+@pytest.mark.skipif(browser_here() is None, reason="chromium is not installed")
 def test_a_screenshot_is_a_picture_of_the_page(drive_bag, tmp_path):
     import matplotlib.image
     picture = tmp_path / "page.png"

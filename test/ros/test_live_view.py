@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 import sys
 import urllib.request
 
@@ -13,6 +12,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
+from browsing import browsing
 from test_robot_frames import mounted, transforms
 
 from lidar_perception.nodes.graph import SINGLE
@@ -114,14 +114,8 @@ def test_frames_hold_the_columns_and_boxes_that_are_published(looking, heard, sh
 
 
 def test_the_newest_frame_appears_and_one_can_pause_and_step_back(looking, heard, shared_peer):
-    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if (browser := shutil.which("chromium")) is None:
-        pytest.skip("chromium is not installed")
-    with sync_api.sync_playwright() as playwright:
-        page = playwright.chromium.launch(executable_path=browser, args=[
-            "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--disable-quic",
-            "--no-first-run", "--disable-background-networking", "--disable-component-update",
-            "--disable-sync"]).new_page(viewport={"width": 1280, "height": 720})
+    with browsing() as browser:
+        page = browser.new_page(viewport={"width": 1280, "height": 720})
         page.set_default_timeout(120_000)
         page.goto(looking.url)
         page.wait_for_selector("html[data-ready=true]", state="attached")

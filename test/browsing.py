@@ -1,0 +1,25 @@
+"""A browser for tests of pages."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from lidar_perception.labeling.picture import browser_here
+
+FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
+         "--disable-background-networking --disable-component-update --disable-sync").split()
+
+
+@contextmanager
+def browsing() -> Iterator:
+    """Playwright's browser, without a window; where there is none, the test is skipped."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if (path := browser_here()) is None:
+        pytest.skip("chromium is not installed")
+    with sync_api.sync_playwright() as playwright:
+        started = playwright.chromium.launch(executable_path=path, args=FLAGS)
+        yield started
+        started.close()
