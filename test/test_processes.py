@@ -3,16 +3,21 @@ with those that work on clouds."""
 
 from __future__ import annotations
 
+import itertools
 import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from time import sleep
 
 import numpy as np
 import pytest
 from threadpoolctl import threadpool_info
+
+from lidar_perception.runs import processes
 
 HELD = []
 ROOT = Path(__file__).resolve().parents[1]
@@ -22,6 +27,12 @@ def holding() -> Callable[[int], bytes]:
     """Work that holds many semaphores of the system and makes more than a pipe takes."""
     HELD.extend(multiprocessing.get_context("forkserver").Semaphore() for _ in range(40))
     return lambda item: bytes(300_000)
+
+
+def stubborn() -> Callable[[int], int]:
+    """Work that says who does it, and then takes long, whatever it is told."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    return lambda item: os.getpid() if item < 2 else sleep(600)
 
 
 def counting() -> Callable[[int], int]:
@@ -57,6 +68,17 @@ def test_processes_that_are_ended_give_back_what_they_hold():
               "    made.close()\n")
     run = result_of(script)
     assert (run.returncode, run.stderr) == (0, "")
+
+
+def test_a_process_that_does_not_end_when_it_is_asked_to_is_killed(monkeypatch):
+    """Else who waits for its end would wait for ever."""
+    monkeypatch.setattr(processes, "PATIENCE", 0.2)
+    made = processes.in_order(stubborn, itertools.count(), 2, 2, "worked")
+    stuck = [next(made), next(made)]
+    made.close()
+    for process in stuck:
+        with pytest.raises(ProcessLookupError):
+            os.kill(process, 0)
 
 
 @pytest.mark.skipif(os.confstr("CS_GNU_LIBC_VERSION") is None, reason="not glibc")

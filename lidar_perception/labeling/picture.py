@@ -6,7 +6,9 @@ import asyncio
 import base64
 import contextlib
 import itertools
+import os
 import shutil
+import signal
 import tempfile
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
@@ -77,7 +79,7 @@ async def _devtools(browser: str, size: tuple[int, int]) -> AsyncIterator[Call]:
         process = await asyncio.create_subprocess_exec(
             browser, *FLAGS, f"--window-size={size[0]},{size[1]}", f"--user-data-dir={profile}",
             "about:blank", stdin=asyncio.subprocess.DEVNULL, stdout=asyncio.subprocess.DEVNULL,
-            stderr=asyncio.subprocess.DEVNULL)
+            stderr=asyncio.subprocess.DEVNULL, start_new_session=True)
         try:
             port = await _port(browser, Path(profile) / "DevToolsActivePort", process)
             async with aiohttp.ClientSession() as http:
@@ -90,7 +92,7 @@ async def _devtools(browser: str, size: tuple[int, int]) -> AsyncIterator[Call]:
                     yield call
         finally:
             with contextlib.suppress(ProcessLookupError):
-                process.kill()
+                os.killpg(process.pid, signal.SIGKILL)  # the command may be a script that waits
             await process.wait()
 
 

@@ -18,10 +18,13 @@ from multiprocessing.context import ForkServerContext, ForkServerProcess
 from multiprocessing.reduction import ForkingPickler
 from queue import SimpleQueue
 from threading import Thread
+from time import monotonic
 from typing import Any, cast
 
 from lidar_perception.runs.threads import one_thread_here
 from lidar_perception.types import InputError
+
+PATIENCE = 30.0  # seconds, with processes that have been asked to end
 
 
 def in_processes(start: Callable[[], Callable[[Any], Any]], items: Sequence, jobs: int,
@@ -98,7 +101,10 @@ def _end(running: dict[Connection, ForkServerProcess]) -> None:
         process.terminate()
     for pipe in running:
         pipe.close()
+    end = monotonic() + PATIENCE
     for process in running.values():
+        process.join(max(0.0, end - monotonic()))
+        process.kill()  # one that has not ended, such as one that was interrupted with a lock held
         process.join()
 
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import replace
 from pathlib import Path
+from time import monotonic, sleep
 
 import numpy as np
 import pytest
@@ -135,14 +137,34 @@ def test_sources_have_names_that_tell_them_apart():
                                             "out/data", "x/y.json", "x/y.onnx"]
 
 
+def ended(word: str) -> bool:
+    """Whether soon no process has this in its command line."""
+    end = monotonic() + 60.0
+    while monotonic() < end:
+        if not any(word in line for line in map(command_line, Path("/proc").glob("[0-9]*"))):
+            return True
+        sleep(0.02)
+    return False
+
+
+def command_line(process: Path) -> str:
+    try:
+        return (process / "cmdline").read_text(errors="replace")
+    except OSError:  # it has ended
+        return ""
+
+
 def test_result_files_that_are_not_there_are_named(tmp_path):
     with pytest.raises(InputError, match="there is no folder"):
         by_files(tmp_path / "none")
 
 
 @pytest.mark.skipif(browser_here() is None, reason="chromium is not installed")
-def test_a_screenshot_is_a_picture_of_the_page(drive_bag, tmp_path):
+def test_a_screenshot_is_a_picture_of_the_page_and_leaves_no_browser_behind(drive_bag, tmp_path,
+                                                                            monkeypatch):
     import matplotlib.image
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "profiles"))
+    (tmp_path / "profiles").mkdir()
     picture = tmp_path / "page.png"
     result = CliRunner().invoke(cli, ["view", str(drive_bag), "--frame", "1", "--theme", "light",
                                       "--screenshot", str(picture)])
@@ -151,6 +173,7 @@ def test_a_screenshot_is_a_picture_of_the_page(drive_bag, tmp_path):
     assert pixels.shape[:2] == (720, 1280)
     middle = pixels[100:500, 300:900, :3].reshape(-1, 3)
     assert len(np.unique((middle * 255).astype(int), axis=0)) > 50  # points, in colours
+    assert ended(str(tmp_path / "profiles"))
 
 
 def test_a_frame_that_is_not_there_is_said(drive_bag):
