@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import sys
@@ -30,9 +31,12 @@ def pytest_itemcollected(item):
 def pytest_collection_finish():
     """Autograd counts its devices at the first backward. After an ONNX export a torch that is built
     for CUDA counts one that is not there, and then works in no process that is forked, as runs are
-    that tests kill. So the first backward comes before all tests."""
+    that tests kill. So the first backward comes before all tests.
+
+    What has been imported by then stays: to look through it for garbage takes a while each time."""
     if (torch := sys.modules.get("torch")) is not None:
         torch.ones((), requires_grad=True).backward()
+    gc.freeze()
 
 
 @pytest.hookimpl(wrapper=True)

@@ -18,6 +18,8 @@ from lidar_perception.reproduction.figures import draw
 from lidar_perception.reproduction.report import parts, skipped_groups, to_csv, write_report
 from lidar_perception.reproduction.studies import STUDIES
 
+pytestmark = pytest.mark.no_cover  # others run these lines
+
 # The report
 
 

@@ -21,7 +21,8 @@ from lidar_perception.training.params import PAPER_SHARE, DataParams, PointPilla
 from lidar_perception.training.sources import training_scenes
 from lidar_perception.types import InputError
 
-pytestmark = pytest.mark.usefixtures("one_thread", "streets")
+pytestmark = [pytest.mark.no_cover,  # others run these lines
+              pytest.mark.usefixtures("one_thread", "streets")]
 SENSOR = "generic:16,-20,5,2,10"
 
 

@@ -19,7 +19,8 @@ from lidar_perception.training.params import LoopParams
 from lidar_perception.training.run import Progress, Run
 from lidar_perception.training.schedule import Average, one_cycle
 
-pytestmark = pytest.mark.usefixtures("one_thread_for_all")
+pytestmark = [pytest.mark.no_cover,  # others run these lines
+              pytest.mark.usefixtures("one_thread_for_all")]
 PLANNED = LoopParams(**{**vars(PARAMS), "steps": 300, "validate_steps": 60, "save_steps": 300})
 
 
