@@ -54,7 +54,10 @@ def one_at_a_time():
 def run(name: str, arguments: list[str]) -> int:
     """Run a node until SIGINT or SIGTERM (exit code 0), or until it is done. 2: it cannot start."""
     if {"-h", "--help"} & set(arguments[1:]):
-        print(help_text(name))
+        try:
+            print(help_text(name), flush=True)
+        except BrokenPipeError:  # `| head`: Python shall not try again at its end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     begin = perf_counter()
     # Threads inherit the mask, so this comes before any library starts one; what arrives from now

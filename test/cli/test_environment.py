@@ -27,6 +27,15 @@ def test_each_executable_of_the_package_is_its_node(name, monkeypatch, capsys):
     assert capsys.readouterr().out.startswith(f"Usage: {name} --ros-args")
 
 
+def test_a_reader_of_the_help_may_stop_reading():
+    command = [sys.executable, "-m", "lidar_perception.nodes.main", "perception", "--help"]
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": str(ROOT)}, text=True,
+                          stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 0
+
+
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
 def test_of_two_first_calls_one_makes_the_environment_and_the_other_waits(tmp_path):
     venv = tmp_path / "venv"
