@@ -29,7 +29,7 @@ def holding() -> Callable[[int], bytes]:
     return lambda item: bytes(300_000)
 
 
-def stubborn() -> Callable[[int], int]:
+def stubborn() -> Callable[[int], int | None]:
     """Work that says who does it, and then takes long, whatever it is told."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     return lambda item: os.getpid() if item < 2 else sleep(600)
