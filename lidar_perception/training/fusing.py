@@ -23,6 +23,7 @@ from lidar_perception.detectors.params import ScoreParams
 from lidar_perception.geometry import bev_iou, centre_distances
 from lidar_perception.runs.processes import in_processes
 from lidar_perception.runs.terminal import errors, track
+from lidar_perception.scoring.kitti.protocol import NEIGHBOURS
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.curves import fit
@@ -113,7 +114,8 @@ def fuse(weights: Path | None, classifier: Path | None, out: Path, params: Fused
 
 def samples_of(frame: Frame, look: Look, scan: int) -> Samples:
     """The proposals in the image, or all where there is no camera; of those that are right about
-    one object the one with the best score, as only one is kept."""
+    one object the one with the best score, as only one is kept. Those of what only looks like the
+    class, a van for a car, are left out, as they count neither way where detections are scored."""
     truth, camera, found = frame.truth(), frame.camera(), look.proposed
     assert truth is not None  # as of all simulated scans
     centres = found.boxes[:, :3] - np.array([0, 0, frame.sensor_height - SENSOR_HEIGHT], np.float32)
@@ -122,21 +124,29 @@ def samples_of(frame: Frame, look: Look, scan: int) -> Samples:
     for class_id in np.unique(found.class_ids):
         own = np.flatnonzero((found.class_ids == class_id) & seen)
         own = own[np.argsort(-found.scores[own], kind="stable")]
-        boxes = truth.of_class(class_id)
-        hits = bev_iou(found.boxes[own], boxes) > DETECTED[CLASSES[class_id]].relaxed
-        if class_id != CAR:
-            hits |= centre_distances(found.boxes[own], boxes) < NEAR
-        taken = np.zeros(len(boxes), bool)
-        for i, hit in zip(own, hits):
+        name, boxes = CLASSES[class_id], found.boxes[own]
+        hits = _right_about(boxes, truth.of_class(class_id), name)
+        alike = truth.of_class(CLASSES.index(NEIGHBOURS.get(name, name)))
+        taken = np.zeros(hits.shape[1], bool)
+        for i, hit, other in zip(own, hits, _right_about(boxes, alike, name)):
             free = np.flatnonzero(hit & ~taken)
-            if hit.any() and not len(free):
-                continue  # of an object that is found already
+            if not len(free) and (hit.any() or other.any()):
+                continue  # of an object that is found already, or of what looks like one
             taken[free[:1]] = True
             kept.append(i)
             right.append(len(free) > 0)
     chosen = np.array(kept, np.int64)
     return Samples(found.class_ids[chosen], np.array(right, bool), np.full(len(chosen), scan),
                    {name: odds[chosen] for name, odds in look.evidence.items()})
+
+
+def _right_about(boxes: np.ndarray, objects: np.ndarray, name: str) -> np.ndarray:
+    """(K, M) bool: which of boxes (K, 7) proposed as a class are right about which of its objects
+    (M, 7)."""
+    hits = bev_iou(boxes, objects) > DETECTED[name].relaxed
+    if name != CLASSES[CAR]:
+        hits |= centre_distances(boxes, objects) < NEAR
+    return hits
 
 
 def looked_at(params: FusedDetectorParams, scenes: SimulatedScenes, jobs: int) -> Samples:

@@ -91,14 +91,17 @@ def test_curves_are_not_fitted_to_too_little():
 
 
 @pytest.mark.parametrize("camera", [None, FORWARD_CAMERA], ids=["all around", "in an image"])
-def test_an_object_is_found_once_and_only_where_all_is_labelled(camera: Camera | None):
+def test_an_object_counts_once_where_all_is_labelled_and_a_van_neither_way(camera: Camera | None):
     car, person = [10, 0, -0.9, 4, 1.7, 1.5, 0], [12, 4, -0.8, 0.6, 0.6, 1.8, 0]
-    behind = [-10, 0, -0.9, 4, 1.7, 1.5, 0]
-    boxes = np.array([car, car, behind, person, np.add(person, [0.3, 0.2, 0, 0, 0, 0, 0]), car])
-    found = Detections.of(boxes, [CAR] * 3 + [PEDESTRIAN] * 3, [0.3, 0.8, 0.9, 0.2, 0.5, 0.7])
-    truth = GroundTruth.of(np.array([car, behind, person]), [CAR, CAR, PEDESTRIAN])
+    behind, van = [-10, 0, -0.9, 4, 1.7, 1.5, 0], [10, 5, -0.7, 4.7, 1.9, 2.0, 0]
+    nearly = np.add(person, [0.3, 0.2, 0, 0, 0, 0, 0])
+    found = Detections.of(np.array([car, car, behind, person, nearly, car, van]),
+                          [CAR] * 3 + [PEDESTRIAN] * 3 + [CAR],
+                          [0.3, 0.8, 0.9, 0.2, 0.5, 0.7, 0.9])
+    truth = GroundTruth.of(np.array([car, behind, person, van]),
+                           [CAR, CAR, PEDESTRIAN, CLASSES.index("Van")])
     scan = frame()
-    look = Look(found, {"network": np.arange(6.0)}, scan.xyz, scan.xyz[:0], None, {})
+    look = Look(found, {"network": np.arange(7.0)}, scan.xyz, scan.xyz[:0], None, {})
     own = samples_of(Frame.of("street", scan, truth, camera), look, 7)
     expected = {1.0: True, 2.0: True, 4.0: True, 5.0: False}
     if camera is not None:
