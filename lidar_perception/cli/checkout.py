@@ -43,9 +43,10 @@ def test(arguments: tuple[str, ...]) -> None:
 
     Without ARGUMENTS ruff, mypy, and all tests: those of the core on all cores, and beside them
     those with processes that talk to each other, two at a time. What Numba compiles is compiled
-    before them, once, while ruff and mypy run. The lines that the tests run are measured, in all
-    processes, but for long tests that run the lines of others, such as those of Hypothesis, as
-    they would take twice as long; at least as many as setup.cfg says must be.
+    before them, once, while ruff and mypy run. The lines that the tests run are measured, but not
+    those of nodes in processes of their own, nor of long tests that run the lines of others, such
+    as those of Hypothesis, as they would take twice as long; at least as many as setup.cfg says
+    must be.
 
     \b
     Examples:
