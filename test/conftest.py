@@ -66,17 +66,6 @@ def pytest_sessionfinish():
 
 
 @pytest.fixture(scope="session")
-def domain(domain) -> int:
-    """The nodes of tests are forked from a process whose lines are not measured: tests with a node
-    in their own process run nearly all of them."""
-    from lidar_perception.testing import forking  # noqa: F401  it says what that process loads
-    with pytest.MonkeyPatch.context() as patch:
-        patch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)
-        forkserver.ensure_running()
-    return domain
-
-
-@pytest.fixture(scope="session")
 def data() -> Path:
     """Real scans that lie beside the checkout, never in it."""
     from samples import DATA

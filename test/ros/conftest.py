@@ -1,6 +1,19 @@
 """What tests of nodes share: a cloud as a message, nodes in this process."""
 
+from multiprocessing import forkserver
+
 import pytest
+
+
+@pytest.fixture(scope="session")
+def domain(domain) -> int:
+    """The nodes of these tests are forked from a process whose lines are not measured: tests with a
+    node in their own process run nearly all of them."""
+    from lidar_perception.testing import forking  # noqa: F401  it says what that process loads
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("COVERAGE_PROCESS_CONFIG", raising=False)
+        forkserver.ensure_running()
+    return domain
 
 
 @pytest.fixture(scope="session")
