@@ -44,8 +44,9 @@ class DetectorUnderTest:
 
     def values(self, weights: Path, **changes: Any) -> dict[str, Any]:
         """Parameters of the node, as flat as a launch file has them; unchanged ones are left
-        out."""
+        out. On the CPU, as `offline`, also where there is a GPU, which rounds in another way."""
         params = with_values(self.params, {f"{self.network}.weights": str(weights),
+                                           f"{self.network}.device": "cpu",
                                            f"{self.network}.threads": 1, **changes})
         defaults = flatten(type(self.params)())
         return {k: v for k, v in flatten(params).items() if v != defaults[k]}
