@@ -61,8 +61,9 @@ def replay(drive: Path, clouds: int, out: Path, params: Any, *, detector: str = 
     with Bag(drive) as bag:
         poses = recorded_source(ODOMETRY in bag.topics)
     scores = out / "logs" / "scores.json"
+    settings = {**flatten(params), **({} if real_time else {"input.queue": AHEAD})}
     nodes: dict[str, tuple[Mapping[str, str], dict[str, Any]]] = {
-        node: (remap, {**flatten(params), "input.queue": AHEAD}) for node, remap in graph.items()}
+        node: (remap, settings) for node, remap in graph.items()}
     nodes[TRACKER] = graph[TRACKER], {
         "ego.source": "odometry" if poses == "recording" else poses,
         **({} if real_time else {"ego.max_wait": SILENCE_TIMEOUT})}
