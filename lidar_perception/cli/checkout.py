@@ -18,7 +18,9 @@ from lidar_perception.types import InputError
 ROOT = Path(__file__).resolve().parents[2]
 MAX_WORKERS = 4  # each holds torch and compiles what it runs
 NODE_WORKERS = 2  # of tests that mostly wait
-WITH_PROCESSES = ("test/ros", "test/launch", "test/testing")
+# Folders and files of them; those with the longest tests come first.
+WITH_PROCESSES = ("test/testing", "test/labeling/test_label_server.py", "test/labeling/test_page.py",
+                  "test/labeling/test_page_saves.py", "test/launch", "test/ros")
 # What Numba compiles for all of this is cached beside the source, for each process after this one.
 COMPILE = ("""
 from lidar_perception.candidates.warm_up import warm_up
@@ -87,7 +89,7 @@ def _everything(folder: Path) -> list[str]:
     if sys.version_info >= (3, 12):
         environment["COVERAGE_CORE"] = "sysmon"  # lines are noticed once, and then cost nothing
     pytest = ("-m", "pytest", "--cov", "--cov-report=", "--cov-fail-under=0")
-    nodes = [name for name in WITH_PROCESSES if (ROOT / name).is_dir()]
+    nodes = [name for name in WITH_PROCESSES if (ROOT / name).exists()]
     workers = min(os.cpu_count() or 1, MAX_WORKERS)
     running = {"ruff": Beside("-m", "ruff", "check"), "mypy": Beside("-m", "mypy")}
     *parts, last = COMPILE  # tests say what is wrong, if something is

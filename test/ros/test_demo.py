@@ -15,9 +15,11 @@ from bag_samples import message_bytes
 from click.testing import CliRunner
 from detector_node import assert_equal
 
+from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.cli.demo import RECORD, demo
 from lidar_perception.data.open import open_recording
 from lidar_perception.detectors.open import open_detector
+from lidar_perception.nodes import replay
 from lidar_perception.nodes.graph import FINAL, result_topics
 from lidar_perception.scoring.recorded import answered
 
@@ -41,6 +43,21 @@ def test_the_demo_scores_what_fused_finds_offline(drive_bag, make_bag, tmp_path)
     assert people["hits"] > 0 and people["hits"] + people["missed"] == people["labels"]
     assert scores["tracks"]["scores"]["Pedestrian"]["hits"] > 0
     assert (tmp_path / "birdseye.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(("real_time", "waiting"), [(False, replay.AHEAD), (True, None)])
+def test_in_real_time_as_many_clouds_wait_as_on_a_robot(
+        drive_bag, tmp_path, monkeypatch, real_time, waiting):
+    class Enough(Exception):
+        pass
+
+    def start(processes, node, remap, values):
+        assert values.get("input.queue") == waiting  # None: the node's own
+        raise Enough
+
+    monkeypatch.setattr(replay.Processes, "start", start)
+    with pytest.raises(Enough):
+        replay.replay(drive_bag, 1, tmp_path, PAPER, real_time=real_time)
 
 
 def test_what_demo_did_not_make_stays(drive_bag, make_bag, tmp_path):
