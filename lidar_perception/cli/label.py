@@ -19,7 +19,7 @@ from lidar_perception.cli.data import (
     weights_option,
     write_json,
 )
-from lidar_perception.runs.terminal import console, errors, progress
+from lidar_perception.runs.terminal import console, errors, looking_through, progress
 from lidar_perception.types import InputError
 
 if TYPE_CHECKING:
@@ -73,7 +73,8 @@ def label(data: Path, sequence: str | None, out: Path | None, weights: Path | No
     if simulate_annotator:
         write_json(json_file, _simulated(recording, sequence, detector))
         return
-    drive = one_drive(recording, sequence)
+    with looking_through(data):
+        drive = one_drive(recording, sequence)
     folder = out or Path("out/label") / drive.name
     if exports is not None and not imports and not (folder / JOURNAL).is_file():
         raise InputError(f"there is no journal in {folder}; give its folder with --out")

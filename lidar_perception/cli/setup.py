@@ -13,7 +13,7 @@ from rich.text import Text
 
 from lidar_perception.cli.data import a_path
 from lidar_perception.runs.files import make_folder, write_text
-from lidar_perception.runs.terminal import console, errors, progress
+from lidar_perception.runs.terminal import console, errors, looking_through, progress
 from lidar_perception.types import InputError
 
 FILES = ("sensor.yaml", "robot.param.yaml", "report.html", "lidar_perception.rviz",
@@ -60,7 +60,8 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
     from lidar_perception.sensor_setup.scans import scan_of
     from lidar_perception.sensor_setup.told import told_by
 
-    clouds = open_clouds(data, topic)
+    with looking_through(data):
+        clouds = open_clouds(data, topic)
     count = f"{clouds.count} cloud{'s' * (clouds.count != 1)}"
     errors.print(f"{data}: {clouds.layout}, {count}", style="dim")
     numbers, found, skipped = [], [], []

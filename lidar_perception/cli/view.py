@@ -17,7 +17,7 @@ from lidar_perception.cli.data import (
     port_option,
     range_option,
 )
-from lidar_perception.runs.terminal import console
+from lidar_perception.runs.terminal import console, looking_through
 from lidar_perception.types import InputError
 
 if TYPE_CHECKING:
@@ -137,7 +137,8 @@ def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], poi
     a_bag = path.exists() and recognises(path)
     recording = (opened(path, points=points or named or shown.points_topic(path)) if a_bag
                  else opened(path))
-    drive = one_drive(recording, sequence)
+    with looking_through(path):
+        drive = one_drive(recording, sequence)
     found = shown.Results()
     if a_bag:
         drive = shown.with_recorded_scans(drive)

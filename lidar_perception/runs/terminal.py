@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -17,6 +18,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
+from rich.status import Status
 from rich.text import Text
 
 
@@ -76,6 +78,12 @@ class _Lines(Progress):
         left = task.time_remaining
         errors.print(f"{task.description}: {task.completed:.0f}{of}"
                      + ("" if left is None else f", {duration(left)} left"))
+
+
+def looking_through(path: Path) -> Status:
+    """Shown in a terminal while all frames of a recording are found, for the times of all: of a bag
+    of hours that takes minutes."""
+    return errors.status(Text(f"looking through {path}"))
 
 
 @contextmanager
