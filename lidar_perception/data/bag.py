@@ -180,8 +180,8 @@ class Bag:
             self.connections = list(self.reader.connections)
             self.topics = {c.topic: c.msgtype for c in self.connections}
             self.counts = dict.fromkeys(self.topics, 0)
-            for connection in self.connections:  # of a damaged metadata.yaml they may be texts
-                self.counts[connection.topic] += connection.msgcount
+            for connection in self.connections:
+                self.counts[connection.topic] += _count(connection)
         except Exception as error:
             self.reader.close()
             raise InputError(_unreadable(source, error)) from None
@@ -260,6 +260,15 @@ class KeptOpen:
             self.here.bag, self.here.process = Bag(self.path), os.getpid()
         bag: Bag = self.here.bag
         return bag
+
+
+def _count(connection: Connection) -> int:
+    """Messages of a topic; of a damaged metadata.yaml it may be anything. ValueError if it is no
+    number of messages."""
+    count = connection.msgcount
+    if not isinstance(count, int) or count < 0:
+        raise ValueError(f"it says {count!r} messages on {connection.topic}")
+    return count
 
 
 def _parts(reader: Reader | Ros1Reader) -> list[Any]:

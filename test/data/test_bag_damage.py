@@ -168,11 +168,12 @@ def test_what_is_no_bag_is_named_in_one_line(tmp_path, name, make, words):
     assert "\n" not in str(error.value)
 
 
-def test_a_count_that_is_no_number_is_damage(written, tmp_path):
+@pytest.mark.parametrize("count", ["'1,5'", "2.5", "-1"])
+def test_a_count_that_is_no_number_of_messages_is_damage(written, tmp_path, count):
     shutil.copytree(written, tmp_path / "bag")
     text = (written / "metadata.yaml").read_text()
     (tmp_path / "bag/metadata.yaml").write_text(re.sub(r"    message_count: \d+",
-                                                       "    message_count: '1,5'", text))
+                                                       f"    message_count: {count}", text))
     with pytest.raises(InputError, match="truncated or damaged"):
         Bag(tmp_path / "bag")
 
