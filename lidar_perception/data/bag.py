@@ -178,10 +178,11 @@ class Bag:
             # They are read one after the other as metadata.yaml names them, in whatever order.
             _parts(self.reader).sort(key=lambda part: part.metadata.start_time)
             self.connections = list(self.reader.connections)
+            _check(self.reader, self.connections)
             self.topics = {c.topic: c.msgtype for c in self.connections}
             self.counts = dict.fromkeys(self.topics, 0)
             for connection in self.connections:
-                self.counts[connection.topic] += _count(connection)
+                self.counts[connection.topic] += connection.msgcount
         except Exception as error:
             self.reader.close()
             raise InputError(_unreadable(source, error)) from None
@@ -262,13 +263,17 @@ class KeptOpen:
         return bag
 
 
-def _count(connection: Connection) -> int:
-    """Messages of a topic; of a damaged metadata.yaml it may be anything. ValueError if it is no
-    number of messages."""
-    count = connection.msgcount
-    if not isinstance(count, int) or count < 0:
-        raise ValueError(f"it says {count!r} messages on {connection.topic}")
-    return count
+def _check(reader: Reader | Ros1Reader, connections: list[Connection]) -> None:
+    """ValueError where metadata.yaml, which may say anything, has no names, numbers or times."""
+    for connection in connections:
+        topic, kind, count = connection.topic, connection.msgtype, connection.msgcount
+        if not isinstance(topic, str) or not isinstance(kind, str):
+            raise ValueError(f"it names a topic {topic!r} of type {kind!r}")
+        if not isinstance(count, int) or count < 0:
+            raise ValueError(f"it says {count!r} messages on {topic}")
+    for time in reader.start_time, reader.end_time:
+        if not isinstance(time, int) or abs(time) > 2**63:
+            raise ValueError(f"it has {time!r} for a time in nanoseconds")
 
 
 def _parts(reader: Reader | Ros1Reader) -> list[Any]:

@@ -168,13 +168,21 @@ def test_what_is_no_bag_is_named_in_one_line(tmp_path, name, make, words):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("count", ["'1,5'", "2.5", "-1"])
-def test_a_count_that_is_no_number_of_messages_is_damage(written, tmp_path, count):
+@pytest.mark.parametrize("line, instead, words", [
+    *(("    message_count: .+", f"    message_count: {count}", "messages on /")
+      for count in ("'1,5'", "2.5", "-1")),
+    ("      name: .+", "      name: 3", "a topic 3 of type"),
+    ("      type: .+", "      type: [1]", r"of type \[1\]"),
+    ("    nanoseconds: .+", f"    nanoseconds: {'9' * 30}", "for a time in nanoseconds"),
+])
+def test_metadata_with_other_things_than_names_numbers_and_times_is_damage(
+        written, tmp_path, line, instead, words):
     shutil.copytree(written, tmp_path / "bag")
     text = (written / "metadata.yaml").read_text()
-    (tmp_path / "bag/metadata.yaml").write_text(re.sub(r"    message_count: \d+",
-                                                       f"    message_count: {count}", text))
-    with pytest.raises(InputError, match="truncated or damaged"):
+    changed = re.sub(f"^{line}$", instead, text, flags=re.M)
+    assert changed != text
+    (tmp_path / "bag/metadata.yaml").write_text(changed)
+    with pytest.raises(InputError, match=f"truncated or damaged .*{words}"):
         Bag(tmp_path / "bag")
 
 
