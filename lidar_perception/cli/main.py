@@ -89,6 +89,11 @@ def main() -> None:
     except InputError as error:
         click.echo(f"Error: {error}", err=True)
         sys.exit(2)
+    except OSError as error:
+        if error.filename is None:
+            raise
+        click.echo(f"Error: {error.filename}: {error.strerror}", err=True)  # no permission, say
+        sys.exit(2)
 
 
 if __name__ == "__main__":

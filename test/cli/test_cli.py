@@ -282,6 +282,7 @@ def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
 
 BAD_INPUTS = {
     "missing bag": (["info", "{tmp}/none"], "there is no bag {tmp}/none"),
+    "too long a name": (["info", f"{{tmp}}/{300 * 'a'}"], "File name too long"),
     "no bag": (["info", "{tmp}"], "{tmp} has no metadata.yaml"),
     "missing data": (["convert", "{tmp}/none", "--out", "{tmp}/o"], "there is no {tmp}/none"),
     "no data": (["convert", "{tmp}", "--out", "{tmp}/o"], "{tmp} is no recording that can be read"),
