@@ -79,20 +79,17 @@ def cli() -> None:
 
 
 def main() -> None:
+    from lidar_perception.runs.files import refusals_named
     from lidar_perception.runs.memory import keep_freed
     from lidar_perception.runs.threads import wait_asleep
     from lidar_perception.types import InputError
     wait_asleep()
     keep_freed()
     try:
-        cli(prog_name="lidar-perception")
+        with refusals_named():
+            cli(prog_name="lidar-perception")
     except InputError as error:
         click.echo(f"Error: {error}", err=True)
-        sys.exit(2)
-    except OSError as error:
-        if error.filename is None:
-            raise
-        click.echo(f"Error: {error.filename}: {error.strerror}", err=True)  # no permission, say
         sys.exit(2)
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from lidar_perception.nodes import NODES, require_rclpy
 from lidar_perception.nodes.known import misspelt, node_parameters
 from lidar_perception.nodes.shared_memory import fed_by_a_driver, use_large_shared_memory
+from lidar_perception.runs.files import refusals_named
 from lidar_perception.runs.memory import keep_freed
 from lidar_perception.runs.threads import one_thread_each
 
@@ -96,7 +97,8 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
     kept: BaseException | None = None  # and with it what a refused node has made
     try:
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-        node = node_class()
+        with refusals_named():
+            node = node_class()
         for line in misspelt(n for n in node._parameter_overrides if not node.has_parameter(n)):
             node.get_logger().warning(line)  # before anything that takes long
         node.start()

@@ -44,6 +44,17 @@ def read_text(path: str | Path, max_bytes: int) -> str:
                          f"{error.start})") from None
 
 
+@contextmanager
+def refusals_named() -> Iterator[None]:
+    """A file that the system refuses (no permission, too long a name) is an InputError."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            raise
+        raise InputError(f"{error.filename}: {error.strerror}") from error
+
+
 def short(error: BaseException, length: int = 200) -> str:
     """What an error says, in one line of at most so many characters; its type if it is silent."""
     line = (str(error).strip().splitlines() or [type(error).__name__])[0]

@@ -282,7 +282,7 @@ def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
 
 BAD_INPUTS = {
     "missing bag": (["info", "{tmp}/none"], "there is no bag {tmp}/none"),
-    "too long a name": (["info", f"{{tmp}}/{300 * 'a'}"], "File name too long"),
+    "too long a name": (["info", f"{{tmp}}/{300 * 'a'}"], "a: File name too long"),
     "no bag": (["info", "{tmp}"], "{tmp} has no metadata.yaml"),
     "missing data": (["convert", "{tmp}/none", "--out", "{tmp}/o"], "there is no {tmp}/none"),
     "no data": (["convert", "{tmp}", "--out", "{tmp}/o"], "{tmp} is no recording that can be read"),
@@ -378,9 +378,7 @@ def test_real_scans_are_scored_alike_from_folder_and_bag(data, tmp_path):
 
 @pytest.mark.parametrize("command", [["demo"], ["run", "perception"]])
 def test_without_rclpy_the_remedy_is_said_before_any_work(command, tmp_path):
-    blocked = tmp_path / "rclpy"
-    blocked.mkdir()
-    (blocked / "__init__.py").write_text("raise ImportError('not for this Python')")
+    write(tmp_path / "rclpy/__init__.py", "raise ImportError('not for this Python')")
     end = subprocess.run([sys.executable, "-m", "lidar_perception.cli.main", *command],
                          capture_output=True, text=True, cwd=tmp_path,
                          env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(

@@ -138,7 +138,7 @@ def test_a_problem_whose_numbers_change_with_every_cloud_is_logged_once(start, m
 
 ARGUMENTS = {"-p foo": "-p foo", "--params-file /nope.yaml": "/nope.yaml",
              "-r __node:=1bad": "1bad", "--nonsense": "--nonsense", "-p stm.threshold:=7.0":
-             "stm.threshold", "-p bag:=7": "bag"}
+             "stm.threshold", "-p bag:=7": "bag", f"-p bag:={300 * 'a'}": "a: File name too long"}
 
 
 def test_arguments_that_ros_does_not_take_are_one_line_and_exit_code_2(domain):
