@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import struct
+import time
 from pathlib import Path
 
 import numpy as np
@@ -173,3 +175,15 @@ def crowd_folder(root: Path, count: int = 6) -> Path:
         cloud, truth = crowd(i, people=4 if i < count - 1 else 0)
         write_object(root, i, cloud, truth, CALIBRATION)
     return root
+
+
+def wait_for_the_end(group):
+    """Until no process of the group is left."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        try:
+            os.killpg(group, 0)
+        except ProcessLookupError:
+            return
+        time.sleep(0.02)
+    pytest.fail("a process is still there")

@@ -30,7 +30,7 @@ PARTS: dict[str, tuple[float, Limits, str]] = {
 }
 NEEDS_ROS = {"messages", "live", "faults", "load", "leaks"}
 FOREVER = 2**62
-INTERRUPTED = "interrupted"  # by ctrl-C
+INTERRUPTED = "interrupted"  # by ctrl-C or SIGTERM
 SAME = 5  # files that are kept of failures that give the same reason
 
 

@@ -14,8 +14,9 @@ import traceback
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from multiprocessing.connection import Connection
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from threading import Thread
 from time import monotonic
 from typing import Any
 
@@ -131,6 +132,7 @@ class Worker:
 
 def _serve(part: str, limits: Limits, folder: Path, quiet: bool, connection: Connection) -> None:
     os.setsid()
+    Thread(target=_leave_with_parent, daemon=True).start()
     keep_freed()  # as nodes do
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_BYTES, ADDRESS_BYTES))
     if quiet:
@@ -170,6 +172,14 @@ def _serve(part: str, limits: Limits, folder: Path, quiet: bool, connection: Con
                     connection.send(("outcome", number, outcome,
                                      case if outcome.verdict == FAILED else None))
                 connection.send(("end",))
+
+
+def _leave_with_parent() -> None:
+    """A campaign that is killed leaves nothing of this session behind."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None  # this process is spawned
+    wait([parent.sentinel])
+    os.killpg(0, signal.SIGKILL)
 
 
 def _measured(attempt: Any, case: Case, limits: Limits) -> Outcome:

@@ -15,6 +15,7 @@ from rich.text import Text
 from lidar_perception.campaign.case import FAILED, REFUSED, SKIPPED, SURVIVED
 from lidar_perception.campaign.run import INTERRUPTED, PARTS, Tally, replay, run_campaign
 from lidar_perception.runs.files import write_text
+from lidar_perception.runs.stopping import terminated_as_interrupted
 from lidar_perception.runs.terminal import console, progress
 
 WIDTH = max(map(len, PARTS))
@@ -34,7 +35,7 @@ WIDTH = max(map(len, PARTS))
                "  lidar-perception campaign --replay out/campaign/failures/files-1-17.json")
 @click.option("--minutes", type=click.FloatRange(0.01), default=20.0, show_default=True,
               help="Of all parts together. A part that has tried all of its cases leaves its time "
-              "to the next.")
+              "to the next; a case that has begun is tried to its end.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
               help="The same seed gives the same cases.")
 @click.option("--only", type=click.Choice(list(PARTS)), multiple=True,
@@ -52,7 +53,7 @@ def campaign(minutes: float, seed: int, only: tuple[str, ...], cases: int | None
         console.print(f"{case.part}, {case.name}: {outcome.verdict}"
                       f"{f': {outcome.reason}' if outcome.reason else ''}")
         raise SystemExit(1 if outcome.verdict == FAILED else 0)
-    with progress() as bar:
+    with terminated_as_interrupted(), progress() as bar:
         tasks: dict[str, TaskID] = {}
 
         def watch(tally: Tally, share: float) -> None:

@@ -101,11 +101,7 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
 
 def _bag(out: Path, plan: Plan, force: bool) -> None:
     scans = simulated_scans(plan.seed, plan.frames, plan.sensor, plan.streets_of, plan.scenes)
-    try:
-        count = write_bag(out, track(scans, "simulating", plan.frames), force=force)
-    except OSError as error:
-        raise click.ClickException(f"cannot write {out}: {error.strerror}; finished scans are in "
-                                   f"{out}.incomplete") from None
+    count = write_bag(out, track(scans, "simulating", plan.frames), force=force)
     console.print(f"{out}: {count} scans")
 
 
@@ -132,8 +128,7 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, mount_height: float, jobs
     except InputError as error:
         if not begun:
             raise
-        raise click.ClickException(f"{error}; finished frames are kept, resume with "
-                                   "--resume") from None
+        raise InputError(f"{error}; finished frames are kept, resume with --resume") from None
     console.print(f"{out} is complete: there is nothing to do" if complete else
                   f"{out}: {plan.frames} scans" + (f", {plan.frames - len(missing)} of them from "
                                                    "before" if resume else ""))

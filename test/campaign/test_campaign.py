@@ -5,11 +5,14 @@ from __future__ import annotations
 
 import json
 import os
+import signal
+import subprocess
 import sys
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from samples import wait_for_the_end
 
 from lidar_perception.campaign import files, mutation, shapes
 from lidar_perception.campaign.case import FAILED, REFUSED, SURVIVED, Case, Outcome, generator
@@ -42,7 +45,7 @@ class Attempt:
         if case.settings["how"] == 6:
             os.kill(os.getpid(), 9)
         if case.settings["how"] == 9:
-            time.sleep(60)
+            time.sleep(600)
         if case.settings["how"] == 12:
             self.held = bytearray(300 * 2**20)
             del self.held
@@ -50,6 +53,18 @@ class Attempt:
             sys.exit("gone")
         return Outcome(SURVIVED)
 '''
+
+LONG_CASE = """
+import sys, time
+from pathlib import Path
+from lidar_perception.campaign.case import Case
+from lidar_perception.campaign.worker import Limits, Worker
+worker = Worker("planted", Limits(600, 0), Path(sys.argv[1]))
+worker.start()
+worker.connection.send(("case", Case("planted", "long", 0, 9, {"how": 9})))
+print(worker.process.pid, flush=True)
+time.sleep(600)
+"""
 
 
 @pytest.fixture
@@ -97,10 +112,20 @@ def test_the_command_ends_with_1_if_anything_failed(planted, tmp_path, monkeypat
     assert content["planted"]["tried"] == 4 and content["planted"][FAILED] == 1
 
     def stopped(*_):
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGTERM)
     monkeypatch.setattr(Tally, "add", stopped)
     result = run("--only", "planted", "--cases", "3")
     assert result.exit_code == 130 and "interrupted" in result.output
+
+
+def test_a_part_ends_when_its_campaign_is_killed(planted, tmp_path):
+    command = subprocess.Popen([sys.executable, "-c", LONG_CASE, str(tmp_path)], text=True,
+                               stdout=subprocess.PIPE)
+    assert command.stdout is not None
+    part = int(command.stdout.readline())
+    command.kill()
+    command.wait()
+    wait_for_the_end(part)
 
 
 def test_a_part_that_cannot_start_is_a_failure_with_a_reason(tmp_path, monkeypatch):

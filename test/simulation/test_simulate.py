@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
+from samples import wait_for_the_end
 from simulate_samples import arguments, content, run
 
 from lidar_perception.cli.simulate import simulate
@@ -97,18 +98,6 @@ def start():
             os.killpg(group, signal.SIGKILL)
 
 
-def wait_for_the_end(group):
-    """Until no process of the group is left."""
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
-        try:
-            os.killpg(group, 0)
-        except ProcessLookupError:
-            return
-        time.sleep(0.02)
-    pytest.fail("a process is still there")
-
-
 def test_after_a_kill_nothing_runs_on_and_it_goes_on_where_it_was(start, tmp_path):
     out, frames = tmp_path / "set", 40
     process = start(out, frames, "--streets-of", 30)  # in two processes; the rest in one
@@ -141,7 +130,7 @@ def test_two_writers_do_not_meet_and_ctrl_c_ends_all_processes(start, tmp_path):
 
 
 @pytest.mark.parametrize("call", ["fsync", "replace"])
-def test_a_full_disk_is_one_line_and_exit_code_1(made, tmp_path, monkeypatch, call):
+def test_a_full_disk_is_one_line_and_bad_input(made, tmp_path, monkeypatch, call):
     out, calls, real = tmp_path / "set", itertools.count(), getattr(os, call)
 
     def full(*args, **others):
@@ -151,10 +140,8 @@ def test_a_full_disk_is_one_line_and_exit_code_1(made, tmp_path, monkeypatch, ca
 
     with monkeypatch.context() as patch:
         patch.setattr(os, call, full)
-        result = run(out, "kitti", 5, 1, "--streets-of", 2)
-    assert result.exit_code == 1
-    assert "No space left on device" in result.output and "--resume" in result.output
-    assert len(result.output.strip().splitlines()) == 1
+        with pytest.raises(InputError, match=r"No space left on device.*--resume$"):
+            run(out, "kitti", 5, 1, "--streets-of", 2)
     assert (out / "INCOMPLETE").exists() and not list(out.rglob(".*.tmp"))
     assert run(out, "kitti", 5, 1, "--streets-of", 2, "--resume").exit_code == 0
     assert content(out) == content(made / "kitti")
@@ -166,9 +153,9 @@ def test_what_cannot_be_written_ends_the_work(tmp_path):
     (tmp_path / "set/dataset.json").rename(tmp_path / "set/INCOMPLETE")  # .parts is gone already
     blocked.unlink()
     blocked.mkdir()
-    result = run(tmp_path / "set", "kitti", 5, 1, "--streets-of", 5, "--resume")
-    assert result.exit_code == 1 and "cannot write" in result.output
-    assert "000003.bin" in result.output and (tmp_path / "set/INCOMPLETE").exists()
+    with pytest.raises(InputError, match=r"cannot write .*000003\.bin"):
+        run(tmp_path / "set", "kitti", 5, 1, "--streets-of", 5, "--resume")
+    assert (tmp_path / "set/INCOMPLETE").exists()
 
 
 def test_what_is_there_is_not_touched_without_a_word(made, tmp_path):
