@@ -128,7 +128,8 @@ def _simulated(recording: Recording, sequence: str | None, weights: str) -> dict
 
     recording.require(BOXES, "label --simulate-annotator")
     found: dict[str, Any] = {}
-    names = dict.fromkeys(frame.sequence for frame in recording)
+    with looking_through(recording.path):
+        names = dict.fromkeys(frame.sequence for frame in recording)
     for name in names if sequence is None else [sequence]:
         drive = one_drive(recording, name)
         with tempfile.TemporaryDirectory() as folder, session(drive, Path(folder), weights) as made:

@@ -15,6 +15,7 @@ from rclpy.node import Node
 
 from lidar_perception.nodes.runtime import ERROR, OK, WAITING, WARN, LidarNode
 from lidar_perception.nodes.transforms import Transforms
+from lidar_perception.runs.files import refusals_named
 from lidar_perception.types import InputError
 
 SUCCESS, FAILURE = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -169,7 +170,8 @@ class ManagedNode(LifecycleNodeMixin, LidarNode):
     def _problem_of(self, step: Callable[[], Any]) -> str | None:
         """What step() fails for; what is no InputError is logged in full, once."""
         try:
-            step()
+            with refusals_named():
+                step()
         except InputError as error:
             return str(error)
         except Exception as error:  # of torch and its drivers, say: the node lives to tell

@@ -134,6 +134,7 @@ def pointpillars_weights(folder):
 
 UNUSABLE = {  # weights made in a folder; words of the diagnostic
     "nowhere": (missing_weights, "there is no checkpoint /nowhere.safetensors"),
+    "too long a name": (lambda folder: folder / (300 * "a"), "File name too long"),
     "PointPillars": (pointpillars_weights, "holds a PointPillars, which is for"),
 }
 
