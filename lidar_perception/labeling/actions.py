@@ -6,7 +6,6 @@ gives the same state, and needs no detector.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
@@ -120,8 +119,8 @@ def numbers(action: Action, name: str, count: int) -> tuple[float, ...]:
     """So many finite numbers of an action. InputError where they are not."""
     values = action.get(name)
     if not isinstance(values, list | tuple) or len(values) != count or not all(
-            isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v)
-            and abs(v) <= MAX_RANGE for v in values):
+            isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= MAX_RANGE
+            for v in values):
         raise InputError(f"{name} must be {count} finite numbers within {MAX_RANGE:g}, not "
                          f"{str(values)[:80]}")
     return tuple(map(float, values))

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from lidar_perception.data.bag_frames import recognises as is_bag
 from lidar_perception.data.frame import Frame
 from lidar_perception.labeling.formats import (
@@ -62,7 +64,8 @@ class Written:
 def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabels:
     """The labels at a path, of each of the frames of a drive in their order. InputError in one line
     where they cannot be read, or are of frames that the drive has not."""
-    return _of(format)[0](path, frames[:])  # of a bag, frames that do not hold their clouds
+    with np.errstate(all="ignore"):  # what is too large for a float is no label, see FrameLabels.of
+        return _of(format)[0](path, frames[:])  # of a bag, frames that do not hold their clouds
 
 
 def export_labels(labels: DriveLabels, format: str, out: Path, frames: Sequence[Frame],

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from lidar_perception.data.frame import Frame
 from lidar_perception.geometry import wrap_angle
-from lidar_perception.types import CLASSES, GroundTruth, InputError, class_ids
+from lidar_perception.types import CLASSES, MAX_RANGE, GroundTruth, InputError, class_ids
 
 NO_TRACK = -1
 OTHER = "Misc"  # of CLASSES, for those that it does not have
@@ -43,7 +43,8 @@ class FrameLabels:
            extra: Iterable[dict[str, Any]] | None = None,
            notes: Iterable[tuple[str, dict[str, Any]]] = (), where: object = None) -> FrameLabels:
         """Labels with dtypes and shapes put right. InputError, naming `where`, for a box that is
-        not finite or has a side that is not above 0, and for numbers of columns that differ."""
+        not finite, lies beyond MAX_RANGE or has a side that is not above 0, for a track id that is
+        no whole number, and for numbers of columns that differ."""
         where = where or f"the labels of frame {name}"
         try:
             boxes = np.array(boxes, np.float64).reshape(-1, 7)
@@ -51,7 +52,7 @@ class FrameLabels:
             ids = np.full(count, NO_TRACK) if track_ids is None else np.array(track_ids)
             given = np.full(count, np.nan) if scores is None else np.array(scores, np.float64)
             labels = FrameLabels(name, int(stamp_ns), boxes, [str(c) for c in class_names],
-                                 ids.astype(np.int64).reshape(count), given.reshape(count),
+                                 _whole(ids).reshape(count), given.reshape(count),
                                  [{} for _ in boxes] if extra is None else list(extra),
                                  list(notes))
         except (ValueError, TypeError, OverflowError) as error:
@@ -60,10 +61,12 @@ class FrameLabels:
         if not len(labels.class_names) == len(labels.extra) == count:
             raise InputError(f"{where}: {count} boxes, {len(labels.class_names)} classes and "
                              f"{len(labels.extra)} notes; each box needs one")
-        wrong = ~np.isfinite(boxes).all(axis=1) | ~(boxes[:, 3:6] > 0).all(axis=1)
+        wrong = ~((np.abs(boxes[:, :6]) <= MAX_RANGE).all(axis=1) & np.isfinite(boxes[:, 6])
+                  & (boxes[:, 3:6] > 0).all(axis=1))
         if wrong.any():
             raise InputError(f"{where}, box {np.flatnonzero(wrong)[0] + 1} of {count}: its numbers "
-                             "must be finite and its sides above 0; correct or remove it")
+                             f"must be finite and within {MAX_RANGE:g} m, its sides above 0; "
+                             "correct or remove it")
         if np.isinf(labels.scores).any():
             raise InputError(f"{where}: a score is not finite; correct or remove it")
         return labels
@@ -117,6 +120,15 @@ def of_truth(name: str, stamp_ns: int, truth: GroundTruth | None) -> FrameLabels
         e.get("detection_name") or e.get("category"))) or label)
         for e, label in zip(extra, truth.labels)]
     return FrameLabels.of(name, stamp_ns, truth.boxes, classes, ids, scores, extra, truth.notes)
+
+
+def _whole(ids: np.ndarray) -> np.ndarray:
+    """ids as int64. ValueError where one is something else."""
+    with np.errstate(invalid="ignore"):
+        whole = ids.astype(np.int64)
+    if (whole != ids).any():
+        raise ValueError("a track id is no whole number, or too large")
+    return whole
 
 
 def to_truth(labels: FrameLabels) -> GroundTruth:

@@ -36,6 +36,8 @@ GOOD = {"labelcloud": ("000005.json", CLOUD), "sustech": ("000005.json", PSR),
         "kitti_tracking": ("0000.txt", "5 1 Car 0 0 0 0 0 9 9 1.5 1.6 3.9 0 1.7 15 0\n")}
 WRONG = [  # format, what is put in place of what, what is said
     ("labelcloud", '"x": 1', '"x": NaN', "box 1 of 1: its numbers must be finite"),
+    ("labelcloud", '"x": 1', '"x": 1e308', "within 100000 m"),
+    ("labelcloud", '"name"', '"track_id": 10000000000000000000, "name"', "no whole number"),
     ("labelcloud", '"length": 4', '"length": 0', "its sides above 0"),
     ("labelcloud", '"centroid"', '"centre"', "has no 'centroid'"),
     ("labelcloud", '"name": "Car",', '"name": "Car"', ":1 is no JSON: Expecting ',' delimiter"),
@@ -46,6 +48,7 @@ WRONG = [  # format, what is put in place of what, what is said
     ("openlabel", "[1, 2", "[NaN, 2", "frame 5, box 1 of 1"),
     ("openlabel", "[1, 2, 3, 0, 0", "[1, 2, 3", "a cuboid of 8 numbers"),
     ("openlabel", '"5"', '"50"', "has the frame '50' (1 such), and the drive has 5 to 7"),
+    ("openlabel", '"5": {', '"5": {"frame_properties": 7, ', "cannot be read"),
     ("openlabel", '"openlabel"', '"vcd"', "has no 'openlabel'"),
     ("nuscenes_detection", "[1, 2, 3]", "[1, 2, NaN]", "sample 0000/000005, box 1 of 1"),
     ("nuscenes_detection", "[1, 0, 0, 0]", "[0, 0, 0, 0]", "cannot be read"),
@@ -113,13 +116,31 @@ def test_the_command_knows_every_format_and_layout():
 
 
 def test_numbers_that_are_none_never_become_labels():
-    for box in ([np.nan, *[1] * 6], [*[1] * 6, np.inf], [1, 1, 1, 1, 1, -1, 0]):
+    for box in ([np.nan, *[1] * 6], [*[1] * 6, np.inf], [1, 1, 1, 1, 1, -1, 0], [1e6, *[1] * 6]):
         with pytest.raises(InputError, match="frame 7, box 1 of 1"):
             FrameLabels.of("7", 0, [box], ["Car"])
     with pytest.raises(InputError, match="seven numbers"):
         FrameLabels.of("7", 0, [[1, 2]], ["Car"])
+    for track in 2.5, np.nan, 2**63, 10**30:
+        with pytest.raises(InputError, match="a whole number as track id"):
+            FrameLabels.of("7", 0, [[1] * 7], ["Car"], [track])
     with pytest.raises(InputError, match="each box needs one"):
         FrameLabels.of("7", 0, [[1] * 7], [])
+
+
+def test_numbers_that_no_float_holds_go_through_every_format(tmp_path):
+    """Beside a box, where nobody computes with them."""
+    frames = drive("one")
+    path = put(tmp_path / "in", "labelcloud", '"name"', f'"n": {10**400}, "name"')
+    labels = import_labels(path, "labelcloud", frames)
+    for format in set(FORMATS) - {"kitti_object", "kitti_tracking"}:  # which have no place for it
+        export_labels(labels, format, tmp_path / format, frames)
+        back, = import_labels(tmp_path / format, format, frames).frames[0].extra
+        assert back["n"] == 10**400
+    far = put(tmp_path / "far", "kitti_object", "Car 0 0", "Car 1e308 0")
+    labels = import_labels(far, "kitti_object", frames)
+    export_labels(labels, "kitti_tracking", tmp_path / "t", frames)
+    assert (tmp_path / "t/0000.txt").read_text().split()[3] == "2"  # as far as levels go
 
 
 @pytest.mark.parametrize("format", FORMATS)

@@ -44,6 +44,7 @@ SUFFIX, ROOT = ".json", "openlabel"
 # its object; a cuboid that is kept as it is while nobody moves it.
 SCORE, TRACKED, TYPE = "confidence", "tracked", "type"
 UID, OTHER, OBJECT = "uid", "openlabel_attributes", "openlabel_data"
+PROPERTIES = "frame_properties"
 KEPT, DATA, CUBOIDS = "openlabel_cuboid", "object_data", "cuboid"
 
 
@@ -99,7 +100,8 @@ def _read_drive(path: Path, frames: list[Frame],
                                      **({} if values else {UID: uid})}))
         found.append(of_rows(frame, rows, notes, f"{where}, frame {frame.index}"))
     return found, {**content, "frames": {
-        number: {key: value for key, value in frame.items() if key != "objects"}
+        number: {**{key: value for key, value in frame.items() if key != "objects"},
+                 PROPERTIES: dict(frame.get(PROPERTIES, {}))}
         for number, frame in said.items()}}
 
 
@@ -156,9 +158,9 @@ def _content(labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[i
 
     for frame, each in own:
         before = kept.get("frames", {}).get(str(frame.index), {})
-        said[str(frame.index)] = {**before, "frame_properties": {
+        said[str(frame.index)] = {**before, PROPERTIES: {
             **({} if systems is kept else parts.transforms(frame)),
-            **before.get("frame_properties", {}), "name": frame.name,
+            **before.get(PROPERTIES, {}), "name": frame.name,
             "timestamp": f"{frame.stamp_ns / 1e9:.9f}"}}
         for k, (kind, extra) in enumerate(zip(each.class_names, each.extra)):
             track = int(each.track_ids[k])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -165,7 +166,9 @@ def from_named(lists: dict[str, Any]) -> tuple[dict[str, Any], dict[str, list[An
 
 
 def _number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """Whether other readers have a number for it, too: they have no integers of 400 digits."""
+    return (isinstance(value, int | float) and not isinstance(value, bool)
+            and abs(value) <= sys.float_info.max)
 
 
 KINDS = {"boolean": lambda v: isinstance(v, bool), "num": _number,
