@@ -248,6 +248,7 @@ BAD = {
     "columns": (f"{PERSON} 0.9\n\n{WHOLE} 0.8 7\n", "000000.txt:3 is no KITTI label"),
     "words": (PERSON.replace("1.80", "tall") + " 0.9", "000000.txt:1 is no KITTI label"),
     "score": (f"{PERSON} 0.9\n{WHOLE}", "000000.txt:2 is no result"),
+    "too large": (f"{PERSON} 1e308", "000000.txt:1 is no KITTI label"),
     "nan": (f"{PERSON} nan", "000000.txt:1 is no KITTI label"),
     "class": (f"{PERSON.lower()} 0.9", "000000.txt:1 has the unknown class 'pedestrian'"),
     "bytes": (b"\xff\xfe\x00", "cannot read the labels"),

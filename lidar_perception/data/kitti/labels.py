@@ -5,7 +5,6 @@ label_2 (object), label_02 (tracking) and tracklet_labels.xml (raw).
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -21,6 +20,7 @@ OTHER_NAMES = {"Person": "Person_sitting"}  # the tracking benchmark's name
 # A region that was not labelled: only its 2D box is known.
 DONT_CARE = {"track_id": -1, "truncated": -1.0, "occluded": -1, "alpha": -10.0,
              "dimensions": [-1.0] * 3, "location": [-1000.0] * 3, "rotation_y": -10.0}
+LARGEST = 1e9  # of the numbers of a label; what is larger is none
 RAW_NAMES = {"Person (sitting)": "Person_sitting"}
 
 
@@ -65,11 +65,11 @@ def parse(line: str, path: Path | str = "label", number: int = 0, known_only: bo
     words = line.split()
     try:
         numbers = [float(w) for w in words[1:]]
-        if len(numbers) not in (14, 15) or not all(map(math.isfinite, numbers)):
+        if len(numbers) not in (14, 15) or not all(abs(n) <= LARGEST for n in numbers):
             raise ValueError
     except ValueError:
         raise InputError(f"{path}:{number} is no KITTI label (a class and 14 or 15 numbers): "
-                         f"{line!r}") from None
+                         f"{line[:200]!r}") from None
     name = OTHER_NAMES.get(words[0], words[0])
     if name not in CLASSES and known_only:
         raise InputError(f"{path}:{number} has the unknown class {words[0]!r}; known are "

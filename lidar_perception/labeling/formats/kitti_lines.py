@@ -99,7 +99,7 @@ def lines_of(labels: FrameLabels, frame: Frame, levels: bool) -> list[dict[str, 
     for line, track in zip(lines + notes, [*labels.track_ids, *[0] * len(notes)]) if levels else ():
         value = line["truncated"]
         line["truncated"] = str(int(value) if _is_level(value, track)
-                                else max(-1, round(2 * min(value, 1))))
+                                else max(-1, round(2 * value)))
     return lines + notes
 
 
