@@ -17,6 +17,7 @@ from lidar_perception.campaign.mutation import mutate_bytes, mutate_text
 
 SECONDS, MEGABYTES = 60.0, 3000.0
 KITTI = ("--data", "kitti")
+LABELS = ("openlabel", "sustech", "labelcloud", "nuscenes_tracking")  # of the drive in bag/
 # Format -> how often it is drawn, the commands that read it; {} is the damaged file.
 COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
     "bag": (8, [("info", "bag/drive"), ("convert", "bag/drive", "--out", "made", "--force"),
@@ -28,6 +29,10 @@ COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
     "tracking": (2, [("convert", "tracking", "--out", "made", "--force")]),
     "semantickitti": (3, [("evaluate", "segmentation", "--data", "semantickitti")]),
     "nuscenes": (3, [("convert", "nuscenes", "--out", "made", "--force")]),
+    "pcd": (1, [("convert", "pcd", "--out", "made", "--force")]),
+    **{format: (1, [("convert", "{}" if format.startswith("nuscenes") else format, "--data",
+                     "bag/drive", "--to", "kitti_tracking", "--out", "made", "--force")])
+       for format in LABELS},
     "results": (2, [("evaluate", "detection", *KITTI, "--results", "results")]),
     "split": (1, [("convert", "kitti", "--out", "made", "--force", "--split", "{}")]),
     "template": (3, [("evaluate", "candidates", *KITTI, "--seed-source", "file",
@@ -39,7 +44,7 @@ COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
     "onnx": (1, [("evaluate", "detection", *KITTI, "--limit", "1", "--weights", "{}")]),
     "pth": (1, [("import-weights", "{}", "--out", "made.safetensors")]),
 }
-TEXT = (".txt", ".json", ".yaml")
+TEXT = (".txt", ".json", ".yaml", ".pcd")
 INSTEAD = ("nothing", "an empty file", "a folder", "a pipe", "a link to itself", "zeros")
 
 

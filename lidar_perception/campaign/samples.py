@@ -14,16 +14,20 @@ import numpy as np
 from rosbags.convert.converter import convert
 from rosbags.typesys import Stores, get_typestore
 
+from lidar_perception.campaign.files import LABELS
 from lidar_perception.campaign.good import PERSON, STAMP, street
 from lidar_perception.candidates.configurations import BEST_VALUES
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti import write as kitti
+from lidar_perception.data.open import open_recording
 from lidar_perception.data.semantickitti import calibration_text, pose_line, write_scan
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.detectors.pointpillars.onnx import export_onnx
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
+from lidar_perception.labeling.exchange import export_labels
+from lidar_perception.labeling.labels import DriveLabels, of_truth
 from lidar_perception.runs.files import write_bytes, write_text
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import PEDESTRIAN, GroundTruth, InputError, LidarFrame
@@ -67,6 +71,11 @@ def write_samples(root: Path) -> None:
     write_bag(root / "bag/drive", [Frame.of(str(i), LidarFrame(
         street(i), np.full(len(street(i)), 0.4, np.float32), STAMP + i * 10**8, "lidar"), TRUTH,
         FORWARD_CAMERA, pose=lambda: np.eye(4)) for i in range(FRAMES)])
+    _labels(root)
+    write_text(root / "pcd/0.pcd", "\n".join([
+        "VERSION 0.7", "FIELDS x y z intensity", "SIZE 4 4 4 4", "TYPE F F F F", "COUNT 1 1 1 1",
+        "WIDTH 20", "HEIGHT 1", "POINTS 20", "DATA ascii",
+        *(" ".join(map(str, point)) for point in scan(0)[:20].tolist())]))
     (root / "ros1").mkdir()
     as_ros1(root / "bag/drive", root / "ros1/drive.bag", "lz4")
     _nuscenes(root / "nuscenes")
@@ -88,6 +97,14 @@ def write_samples(root: Path) -> None:
             package / f"detectors/{name.partition('_')[0]}/weights/{name}.safetensors"
         ).read_bytes())
     write_bytes(root / "pth/weights.pth", _pth())
+
+
+def _labels(root: Path) -> None:
+    drive = open_recording(root / "bag/drive").frames
+    labels = DriveLabels([of_truth(frame.name, frame.stamp_ns, frame.truth()) for frame in drive])
+    for format in LABELS:
+        export_labels(labels, format, root / format / "labels.json" if format.startswith("nuscenes")
+                      else root / format, drive)
 
 
 def _yaml(values: dict[str, Any]) -> str:

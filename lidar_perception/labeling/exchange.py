@@ -115,20 +115,20 @@ def _by_text(file: Path) -> str:
 
 
 def _by_json(content: Any) -> str:
-    """By the keys; "" for a file without a box, such as of labelCloud and SUSTechPOINTS."""
-    if isinstance(content, list) or "objs" in content:
-        boxes = content if isinstance(content, list) else content["objs"]
-        return "sustech" if boxes and isinstance(boxes[0], dict) and "psr" in boxes[0] else ""
-    if not isinstance(content, dict):
-        return ""
-    if "openlabel" in content:
-        return "openlabel"
-    if isinstance(content.get("objects"), list):
-        boxes = content["objects"]
-        return "labelcloud" if boxes and ("centroid" in boxes[0] or "vertices" in boxes[0]) else ""
-    for boxes in content["results"].values() if isinstance(content.get("results"), dict) else ():
-        for row in boxes:
-            return "nuscenes_tracking" if "tracking_name" in row else "nuscenes_detection"
+    """By the keys; "" for a file without a box, such as of labelCloud and SUSTechPOINTS, and for
+    one of something else, whose values may be of any kind."""
+    with suppress(TypeError, LookupError, AttributeError):
+        if isinstance(content, list) or "objs" in content:
+            boxes = content if isinstance(content, list) else content["objs"]
+            return "sustech" if "psr" in boxes[0] else ""
+        if "openlabel" in content:
+            return "openlabel"
+        if "objects" in content:
+            box = content["objects"][0]
+            return "labelcloud" if "centroid" in box or "vertices" in box else ""
+        for boxes in content["results"].values():
+            for row in boxes:
+                return "nuscenes_tracking" if "tracking_name" in row else "nuscenes_detection"
     return ""
 
 

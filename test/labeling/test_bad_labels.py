@@ -87,6 +87,15 @@ def test_a_folder_of_kitti_is_told_by_its_folders(tmp_path):
         recognised(tmp_path / "set/training/calib")
 
 
+@pytest.mark.parametrize("content", [
+    5, None, [], [5], {"objs": 5}, {"objs": {}}, {"objects": 5}, {"objects": [5]}, {"results": 5},
+    {"results": {"a": 5}}, {"results": {"a": [5]}}])
+def test_a_file_of_something_else_is_not_recognised(content, tmp_path):
+    (tmp_path / "0.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="no labels that are recognised"):
+        recognised(tmp_path)
+
+
 @pytest.mark.parametrize(("format", "old", "new", "words"), WRONG)
 def test_what_is_wrong_is_named_with_its_file(format, old, new, words, tmp_path):
     path = put(tmp_path / "in", format, old, new)
