@@ -21,7 +21,7 @@ from lidar_perception.labeling.formats import (
     openlabel,
     sustech,
 )
-from lidar_perception.labeling.formats.files import MAX_BYTES, read_json
+from lidar_perception.labeling.formats.files import MAX_BYTES, in_file, read_json
 from lidar_perception.labeling.formats.kitti_lines import label_folder
 from lidar_perception.labeling.labels import NO_TRACK, DriveLabels
 from lidar_perception.runs.files import read_text
@@ -75,7 +75,8 @@ def export_labels(labels: DriveLabels, format: str, out: Path, frames: Sequence[
     if len(labels) != len(frames):
         raise InputError(f"labels of {len(labels)} frames for a drive of {len(frames)}; give those "
                          "of the same frames")
-    _of(format)[1](labels, out, frames[:], force)
+    in_file("what the labels keep of the file that they were read from",
+            lambda: _of(format)[1](labels, out, frames[:], force))
     notes = 0 if format in WITH_NOTES else sum(len(each.notes) for each in labels.frames)
     ids = format == "kitti_object" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
     return Written(out, labels.boxes, len(labels), (

@@ -20,7 +20,10 @@ _calls = itertools.count()
 
 def regular(path: Path) -> Path:
     """The path itself. InputError for what is neither file nor folder, such as a pipe or a device,
-    from which a read may wait for ever; what is not there passes."""
+    from which a read may wait for ever, and for a name that no file can have; what is not there
+    passes."""
+    if "\0" in str(path):
+        raise InputError(f"{str(path)!r} is no name of a file; correct it where it comes from")
     if path.exists() and not path.is_file() and not path.is_dir():
         raise InputError(f"{path} is no file; give the path of one")
     return path

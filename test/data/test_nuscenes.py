@@ -241,7 +241,10 @@ def put(table, **values):
     (drop("category", "c0"), "has no category"),
     (put("sample_annotation", prev="gone"), "the label gone is named"),
     (put("sample_annotation", rotation=[0, 0, 0, 0]), "a rotation is not a quaternion"),
-    (put("sample_annotation", size=[1, 2]), "a size is not 3 finite numbers"),
+    (put("sample_annotation", rotation=[1e308, 0, 0, 0]), "a rotation is not a quaternion"),
+    (put("ego_pose", rotation=[1e-200, 0, 0, 0]), "a rotation is not a quaternion"),
+    (put("sample_annotation", num_lidar_pts=1e308), "a count of points is not 3 finite numbers"),
+    (put("sample_annotation", attribute_tokens=[[]], size=[1, 2]), "a size is not 3 finite"),
     (put("sample_annotation", translation=[1, None, 2]), "a translation is not"),
     (put("ego_pose", translation="x"), "ego_pose.json: a translation is not 3 finite"),
     (put("ego_pose", rotation=[10**400, 0, 0, 0]), "ego_pose.json: a rotation is not"),
@@ -256,6 +259,13 @@ def test_tables_that_are_wrong_are_named(changed, change, words):
     with pytest.raises(InputError, match=words) as caught:
         open_nuscenes(changed(change))[0].truth()
     assert "\n" not in str(caught.value)
+
+
+def test_a_name_that_no_file_can_have_is_named(changed):
+    with pytest.raises(InputError, match=r"x00b' is no name of a file"):
+        for frame in open_nuscenes(changed(lambda tables: [
+                row.update(filename="a\0b") for row in tables["sample_data"]])):
+            frame.load()
 
 
 @pytest.mark.parametrize("damage", [

@@ -16,7 +16,7 @@ from lidar_perception.cli import convert
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labeling.datasets import LAYOUTS, write_dataset
 from lidar_perception.labeling.exchange import FORMATS, export_labels, import_labels, recognised
-from lidar_perception.labeling.labels import FrameLabels
+from lidar_perception.labeling.labels import DriveLabels, FrameLabels
 from lidar_perception.types import InputError
 
 CLOUD = {"folder": "", "filename": "", "path": "", "objects": [
@@ -136,6 +136,21 @@ def test_numbers_that_are_none_never_become_labels():
             FrameLabels.of("7", 0, [[1] * 7], ["Car"], [track])
     with pytest.raises(InputError, match="each box needs one"):
         FrameLabels.of("7", 0, [[1] * 7], [])
+
+
+@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("key", ["rotation", "tracking_id", "uid", "truncated", "openlabel_cuboid"])
+def test_fields_of_another_tool_are_kept_or_refused_in_one_line(key, format, tmp_path):
+    frames = drive("one")
+    for value in None, 5, "x", [], {}, [0] * 4, ["a"] * 4, [10**400] * 4, [1, 0, 0, 0]:
+        labels = DriveLabels([FrameLabels.of(frame.name, frame.stamp_ns, [[5, 1, 0, 4, 2, 1, 0.1]],
+                                             ["Car"], [3], [0.5], [{key: value}])
+                              for frame in frames])
+        try:
+            export_labels(labels, format, tmp_path / "out", frames, force=True)
+            assert import_labels(tmp_path / "out", format, frames).boxes == len(frames)
+        except InputError as error:
+            assert "\n" not in str(error) and key not in ("rotation", "tracking_id", "uid")
 
 
 def test_numbers_that_no_float_holds_go_through_every_format(tmp_path):

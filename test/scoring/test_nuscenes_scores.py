@@ -268,6 +268,8 @@ def spoil(**values):
     (spoil(translation=[1, 2, math.nan]), "must be finite"), (spoil(size=[1]), "cannot be read"),
     (spoil(velocity=[math.inf, 0]), "velocity finite or NaN"), (spoil(velocity=[0]), "cannot be"),
     (spoil(detection_score="high"), "cannot be read"),
+    (spoil(translation=[10**400, 0, 0]), "cannot be read"),
+    (spoil(rotation=[1e308, 0, 0, 0]), "a quaternion"),
 ])
 def test_results_that_are_wrong_are_named(tmp_path, change, words):
     results = folder.made_results(TABLES, CATEGORIES)

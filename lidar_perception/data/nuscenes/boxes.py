@@ -27,6 +27,7 @@ ATTRIBUTES = ("pedestrian.moving", "pedestrian.sitting_lying_down", "pedestrian.
               "cycle.with_rider", "cycle.without_rider", "vehicle.moving", "vehicle.parked",
               "vehicle.stopped")
 WITH_RIDER = ATTRIBUTES.index("cycle.with_rider")
+LARGEST = 1e9  # of all numbers of boxes; what is larger is damaged
 
 
 @dataclass(frozen=True)
@@ -88,6 +89,13 @@ class GlobalBoxes:
         """(K,) radians: where the boxes' lengths point, seen from above."""
         forward = matrices(self.rotations)[:, :, 0]
         return np.arctan2(forward[:, 1], forward[:, 0])
+
+
+def usable(rotations: np.ndarray) -> np.ndarray:
+    """(K,) bool: which quaternions (K, 4) matrices() takes."""
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(rotations, axis=1)
+    return (length > 0) & (length <= LARGEST)
 
 
 def matrices(rotations: np.ndarray) -> np.ndarray:

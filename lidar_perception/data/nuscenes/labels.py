@@ -105,7 +105,7 @@ def read_labels(tables: Tables, times: dict[str, int]) -> list[NuscenesLabels] |
         in_frames.append(frame_of[sample])
         of_objects.append(number)
         of_categories.append(category)
-        block.append((*box, (lidar, radar, attributes.get(labels[0], -1) if labels else -1)))
+        block.append((*box, (lidar, radar, attributes.get(str(labels[0]), -1) if labels else -1)))
         if len(block) == BLOCK:
             blocks.append(_columns(tables, block))
             block.clear()

@@ -10,7 +10,14 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.nuscenes.boxes import ATTRIBUTES, NAMES, GlobalBoxes, in_global
+from lidar_perception.data.nuscenes.boxes import (
+    ATTRIBUTES,
+    LARGEST,
+    NAMES,
+    GlobalBoxes,
+    in_global,
+    usable,
+)
 from lidar_perception.runs.files import regular, short, write_text
 from lidar_perception.types import CLASSES, Detections, InputError
 
@@ -104,14 +111,15 @@ def _boxes(where: str, rows: list) -> GlobalBoxes:
         raise InputError(f"{where}: a box has no {error}; boxes need sample_token, translation, "
                          "size, rotation, velocity, detection_name, detection_score and "
                          "attribute_name") from None
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{where}: a box that cannot be read ({error}); write the results "
                          "again") from None
-    finite = np.column_stack([boxes.centres, boxes.sizes, boxes.rotations, boxes.scores])
-    wrong = ~(np.isfinite(finite).all(axis=1) & (boxes.sizes > 0).all(axis=1)
-              & boxes.rotations.any(axis=1) & ~np.isinf(boxes.velocities).any(axis=1))
+    numbers = np.column_stack([boxes.centres, boxes.sizes, boxes.scores,
+                               np.nan_to_num(boxes.velocities, posinf=np.inf, neginf=np.inf)])
+    wrong = ~((np.abs(numbers) <= LARGEST).all(axis=1) & (boxes.sizes > 0).all(axis=1)
+              & usable(boxes.rotations))
     if wrong.any():
         raise InputError(f"{where}, box {np.flatnonzero(wrong)[0]}: translation, size, rotation "
-                         "and score must be finite, sizes above 0, the rotation a quaternion, and "
-                         "the velocity finite or NaN")
+                         f"and score must be finite and within {LARGEST:g}, sizes above 0, the "
+                         "rotation a quaternion, and the velocity finite or NaN")
     return boxes

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.data.nuscenes.boxes import LARGEST, usable
 from lidar_perception.runs.files import regular, short
 from lidar_perception.types import InputError
 
@@ -103,8 +104,9 @@ class Tables:
             column = np.zeros((len(values), 0))
         if len(values) == 0:
             return np.zeros((0, width))
-        if column.shape[1] != width or not np.isfinite(column).all() or (
-                field == "rotation" and not np.any(column, axis=1).all()):
-            wanted = "a quaternion" if field == "rotation" else f"{width} finite numbers"
+        if column.shape[1] != width or not (np.abs(column) <= LARGEST).all() or (
+                field == "rotation" and not usable(column).all()):
+            wanted = ("a quaternion" if field == "rotation" else
+                      f"{width} finite numbers within {LARGEST:g}")
             raise InputError(f"{self.path(table)}: a {field} is not {wanted}; download it again")
         return column

@@ -120,9 +120,10 @@ def track_names(frames: Iterable[FrameLabels], key: str) -> dict[int, str]:
     for each in frames:
         for track, extra in zip(each.track_ids.tolist(), each.extra):
             name = extra.get(key)
-            if track != NO_TRACK and track not in found and name is not None and name not in taken:
+            if (track != NO_TRACK and track not in found and name is not None
+                    and str(name) not in taken):
                 found[track] = str(name)
-                taken.add(name)
+                taken.add(str(name))
     return found
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import numpy as np
 
 from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.nuscenes.boxes import GlobalBoxes, in_frame, in_global, leaning
+from lidar_perception.data.nuscenes.boxes import GlobalBoxes, in_frame, in_global, leaning, usable
 from lidar_perception.data.nuscenes.labels import CLASS_OF
 from lidar_perception.data.nuscenes.results import DETECTED, META, places
 from lidar_perception.labeling.formats.files import (
@@ -117,6 +118,8 @@ def _in_frame(row: dict[str, Any], pose: np.ndarray) -> tuple[list[float], bool]
     """The box, and whether it leans there."""
     width, length, height = row["size"]
     one = GlobalBoxes.of([row["translation"]], [[length, width, height]], [row["rotation"]], 0)
+    if not usable(one.rotations).all():
+        raise ValueError("a rotation is no quaternion")
     return in_frame(one, pose)[0].tolist(), bool(leaning(one, pose)[0])
 
 
@@ -127,7 +130,9 @@ def rotation_read(labels: FrameLabels, k: int, pose: np.ndarray) -> list[float] 
         return None
     centre, size, _ = in_global(box[None], pose)
     place = {"translation": centre[0], "size": size[0][[1, 0, 2]], "rotation": rotation}
-    return rotation if unchanged(box, _in_frame(place, pose)[0]) else None
+    with suppress(ValueError, TypeError, OverflowError):  # another tool's field of this name
+        return rotation if unchanged(box, _in_frame(place, pose)[0]) else None
+    return None
 
 
 def _write(task: str, labels: DriveLabels, out: Path, frames: Sequence[Frame],
