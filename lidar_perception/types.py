@@ -19,6 +19,7 @@ __all__ = ["CLASSES", "PEDESTRIAN", "Detections", "GroundTruth", "InputError", "
            "usable_returns"]
 
 MAX_RANGE = 1e5  # metres; what is farther is a broken return, not a point
+LARGEST = 1e9  # of the numbers of a label; what is larger is damaged
 SENSOR_HEIGHT = 1.73  # metres: KITTI's sensor above the road. Defaults, anchors and simulation
 
 

@@ -17,7 +17,9 @@ from lidar_perception.campaign.mutation import mutate_bytes, mutate_text
 
 SECONDS, MEGABYTES = 60.0, 3000.0
 KITTI = ("--data", "kitti")
-LABELS = ("openlabel", "sustech", "labelcloud", "nuscenes_tracking")  # of the drive in bag/
+# Format of labels -> their place, a folder or a file; they are of the drive in bag/.
+LABELS = {"openlabel": "openlabel", "sustech": "sustech", "labelcloud": "labelcloud",
+          "nuscenes_tracking": "nuscenes_tracking/labels.json"}
 # Format -> how often it is drawn, the commands that read it; {} is the damaged file.
 COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
     "bag": (8, [("info", "bag/drive"), ("convert", "bag/drive", "--out", "made", "--force"),
@@ -30,9 +32,8 @@ COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
     "semantickitti": (3, [("evaluate", "segmentation", "--data", "semantickitti")]),
     "nuscenes": (3, [("convert", "nuscenes", "--out", "made", "--force")]),
     "pcd": (1, [("convert", "pcd", "--out", "made", "--force")]),
-    **{format: (1, [("convert", "{}" if format.startswith("nuscenes") else format, "--data",
-                     "bag/drive", "--to", "kitti_tracking", "--out", "made", "--force")])
-       for format in LABELS},
+    **{format: (1, [("convert", place, "--data", "bag/drive", "--to", "kitti_tracking",
+                     "--out", "made", "--force")]) for format, place in LABELS.items()},
     "results": (2, [("evaluate", "detection", *KITTI, "--results", "results")]),
     "split": (1, [("convert", "kitti", "--out", "made", "--force", "--split", "{}")]),
     "template": (3, [("evaluate", "candidates", *KITTI, "--seed-source", "file",

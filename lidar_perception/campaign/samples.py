@@ -101,10 +101,9 @@ def write_samples(root: Path) -> None:
 
 def _labels(root: Path) -> None:
     drive = open_recording(root / "bag/drive").frames
-    labels = DriveLabels([of_truth(frame.name, frame.stamp_ns, frame.truth()) for frame in drive])
-    for format in LABELS:
-        export_labels(labels, format, root / format / "labels.json" if format.startswith("nuscenes")
-                      else root / format, drive)
+    labels = DriveLabels(list(map(of_truth, drive)))
+    for format, place in LABELS.items():
+        export_labels(labels, format, root / place, drive)
 
 
 def _yaml(values: dict[str, Any]) -> str:

@@ -188,8 +188,7 @@ def _labels(source: Path, recording: Any, format: str, out: Path, given: str | N
     elif elsewhere:
         labels = import_labels(source, given or recognised(source), recording.frames)
     else:
-        labels = DriveLabels([of_truth(frame.name, frame.stamp_ns, frame.truth())
-                              for frame in recording.frames[:]])
+        labels = DriveLabels(list(map(of_truth, recording.frames[:])))
     written = export_labels(labels.first(count), format, out, recording.frames[:count], force)
     console.print(f"{out}: {written.boxes} boxes of {written.frames} frames, "
                   f"as {format}")

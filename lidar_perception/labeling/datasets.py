@@ -91,8 +91,7 @@ def _placed(frames: Iterable[Frame], labels: DriveLabels | None) -> Iterator[Pla
         steps = round((frame.stamp_ns - start) / PERIOD_NS)
         in_time = abs(frame.stamp_ns - start - steps * PERIOD_NS) < PERIOD_NS // 4
         index = steps if in_time and steps > index else index + 1
-        own = (labels.frames[number] if labels is not None
-               else of_truth(frame.name, frame.stamp_ns, frame.truth()))
+        own = labels.frames[number] if labels is not None else of_truth(frame)
         before = frame
         yield Placed(frame, own, drive, index, number)
 

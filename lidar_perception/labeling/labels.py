@@ -108,18 +108,20 @@ def of_rows(frame: Frame, rows: Iterable[Row], notes: Iterable[tuple[str, dict[s
                           where)
 
 
-def of_truth(name: str, stamp_ns: int, truth: GroundTruth | None) -> FrameLabels:
+def of_truth(frame: Frame) -> FrameLabels:
     """The labels that a recording gives for a frame; none where it gives none. A class that
     CLASSES does not have has the name that the recording gave it."""
+    truth = frame.truth()
     if truth is None:
-        return FrameLabels.of(name, stamp_ns)
+        return FrameLabels.of(frame.name, frame.stamp_ns)
     extra = [dict(e) for e in truth.extras]
     ids = [e.pop("track_id", NO_TRACK) for e in extra]
     scores = [e.pop("score", np.nan) for e in extra]
     classes = [str(e.pop("class_name", None) or (label == OTHER and (
         e.get("detection_name") or e.get("category"))) or label)
         for e, label in zip(extra, truth.labels)]
-    return FrameLabels.of(name, stamp_ns, truth.boxes, classes, ids, scores, extra, truth.notes)
+    return FrameLabels.of(frame.name, frame.stamp_ns, truth.boxes, classes, ids, scores, extra,
+                          truth.notes)
 
 
 def _whole(ids: np.ndarray) -> np.ndarray:

@@ -111,7 +111,7 @@ def test_a_simulated_drive_comes_back_from_nuscenes_tables(simulated, tmp_path):
         np.testing.assert_allclose(again.intensity, scan.intensity[away], atol=1e-6)
         np.testing.assert_allclose(other.pose(), frame.pose(), atol=1e-6)
         assert other.sensor_height == frame.sensor_height
-        truth, labels = frame.truth(), of_truth("", 0, other.truth())
+        truth, labels = frame.truth(), of_truth(other)
         np.testing.assert_allclose(labels.boxes, truth.boxes, atol=1e-6)
         for name, found, extra, track in zip(truth.labels, labels.class_names, truth.extras,
                                              labels.track_ids.tolist()):
@@ -136,7 +136,7 @@ def test_labels_of_a_vehicle_that_leans_come_back_from_nuscenes_as_they_were(kin
         write_dataset("nuscenes", recording, tmp_path / "back")
         written = json.loads(next(tmp_path.glob("back/*/sample_annotation.json")).read_text())
     else:
-        labels = DriveLabels([of_truth(f.name, f.stamp_ns, f.truth()) for f in recording])
+        labels = DriveLabels(list(map(of_truth, recording)))
         export_labels(labels, "nuscenes_detection", tmp_path / "r.json", recording.frames)
         results = json.loads((tmp_path / "r.json").read_text())["results"]
         written = [row for rows in results.values() for row in rows]
@@ -161,7 +161,7 @@ def test_without_a_camera_one_is_assumed_and_numbers_follow_the_time(tmp_path):
     back = open_recording(tmp_path / "k")
     assert [frame.name for frame in back] == [
         *(f"0000/{i:06}" for i in (0, 1, 3, 4)), *(f"0001/{i:06}" for i in range(3))]
-    found = DriveLabels([replace(of_truth("", 0, frame.truth()), name=a.name, stamp_ns=a.stamp_ns)
+    found = DriveLabels([replace(of_truth(frame), name=a.name, stamp_ns=a.stamp_ns)
                          for a, frame in zip(frames, back)])
     same(labels, found, 2e-6)
 
@@ -267,7 +267,7 @@ def test_scans_of_one_stamp_are_all_there_and_labels_go_to_no_other_scan(tmp_pat
 
 def test_results_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch, capsys):
     recording = list(open_recording(simulated))
-    labels = DriveLabels([of_truth(f.name, f.stamp_ns, f.truth()) for f in recording])
+    labels = DriveLabels(list(map(of_truth, recording)))
     export = tmp_path / "labels"
     bag_format.write(labels, export, recording)
     for topic in ("/ground_truth/detections", "/ground_truth/detections_3d"):
@@ -275,7 +275,7 @@ def test_results_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch, ca
         assert exit_of(monkeypatch, "convert", export, "--to", "kitti_tracking", "--detections",
                        topic, "--out", out) == 0
         back = open_recording(out)
-        found = DriveLabels([replace(of_truth("", 0, f.truth()), name=a.name, stamp_ns=a.stamp_ns)
+        found = DriveLabels([replace(of_truth(f), name=a.name, stamp_ns=a.stamp_ns)
                              for a, f in zip(recording, back)])
         expected = labels
         if topic.endswith("3d"):  # which has a score for everything

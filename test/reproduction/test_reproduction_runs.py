@@ -27,7 +27,7 @@ from reproduction_samples import (
     small,
     untimed,
 )
-from samples import object_folder, write
+from samples import object_folder, wait_for_the_end, write
 
 from lidar_perception.data.open import open_recording
 from lidar_perception.reproduction import journal, runner
@@ -103,15 +103,7 @@ def test_a_killed_run_of_two_processes_goes_on_where_it_was(crowds, whole, tmp_p
         time.sleep(0.005)
     os.kill(process.pid, signal.SIGKILL)
     process.wait()
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:  # its children end by themselves
-        try:
-            os.killpg(process.pid, 0)
-        except ProcessLookupError:
-            break
-        time.sleep(0.02)
-    else:
-        pytest.fail("a process is still there")
+    wait_for_the_end(process.pid)  # its children end by themselves
     assert "Traceback" not in process.communicate()[1]
     kept = lines_of(out)
     assert 4 <= len(kept)  # on a busy machine all may be measured before the signal comes

@@ -140,8 +140,9 @@ def test_a_full_disk_is_one_line_and_bad_input(made, tmp_path, monkeypatch, call
 
     with monkeypatch.context() as patch:
         patch.setattr(os, call, full)
-        with pytest.raises(InputError, match=r"No space left on device.*--resume$"):
+        with pytest.raises(InputError, match=r"No space left on device.*--resume$") as error:
             run(out, "kitti", 5, 1, "--streets-of", 2)
+    assert "\n" not in str(error.value)
     assert (out / "INCOMPLETE").exists() and not list(out.rglob(".*.tmp"))
     assert run(out, "kitti", 5, 1, "--streets-of", 2, "--resume").exit_code == 0
     assert content(out) == content(made / "kitti")

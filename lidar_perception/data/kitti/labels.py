@@ -12,7 +12,7 @@ import numpy as np
 
 from lidar_perception.geometry import wrap_angle
 from lidar_perception.runs.files import regular
-from lidar_perception.types import CLASSES, GroundTruth, InputError, class_ids
+from lidar_perception.types import CLASSES, LARGEST, GroundTruth, InputError, class_ids
 
 # The label file's own names and numbers, in its order; they travel in GroundTruth.extras.
 COLUMNS = ("truncated", "occluded", "alpha", "bbox", "dimensions", "location", "rotation_y")
@@ -20,7 +20,6 @@ OTHER_NAMES = {"Person": "Person_sitting"}  # the tracking benchmark's name
 # A region that was not labelled: only its 2D box is known.
 DONT_CARE = {"track_id": -1, "truncated": -1.0, "occluded": -1, "alpha": -10.0,
              "dimensions": [-1.0] * 3, "location": [-1000.0] * 3, "rotation_y": -10.0}
-LARGEST = 1e9  # of the numbers of a label; what is larger is none
 RAW_NAMES = {"Person (sitting)": "Person_sitting"}
 
 

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from lidar_perception.types import LARGEST
+
 # The ten classes of the detection task.
 NAMES = ("car", "truck", "bus", "trailer", "construction_vehicle", "pedestrian", "motorcycle",
          "bicycle", "traffic_cone", "barrier")
@@ -27,7 +29,6 @@ ATTRIBUTES = ("pedestrian.moving", "pedestrian.sitting_lying_down", "pedestrian.
               "cycle.with_rider", "cycle.without_rider", "vehicle.moving", "vehicle.parked",
               "vehicle.stopped")
 WITH_RIDER = ATTRIBUTES.index("cycle.with_rider")
-LARGEST = 1e9  # of all numbers of boxes; what is larger is damaged
 
 
 @dataclass(frozen=True)

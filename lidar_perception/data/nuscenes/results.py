@@ -10,16 +10,9 @@ from typing import Any
 import numpy as np
 
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.nuscenes.boxes import (
-    ATTRIBUTES,
-    LARGEST,
-    NAMES,
-    GlobalBoxes,
-    in_global,
-    usable,
-)
+from lidar_perception.data.nuscenes.boxes import ATTRIBUTES, NAMES, GlobalBoxes, in_global, usable
 from lidar_perception.runs.files import regular, short, write_text
-from lidar_perception.types import CLASSES, Detections, InputError
+from lidar_perception.types import CLASSES, LARGEST, Detections, InputError
 
 MAX_BOXES = 500    # of a frame
 # The classes of our detectors in the words of nuScenes; its bicycles have their riders inside.
@@ -114,10 +107,9 @@ def _boxes(where: str, rows: list) -> GlobalBoxes:
     except (ValueError, TypeError, OverflowError) as error:
         raise InputError(f"{where}: a box that cannot be read ({error}); write the results "
                          "again") from None
-    numbers = np.column_stack([boxes.centres, boxes.sizes, boxes.scores,
-                               np.nan_to_num(boxes.velocities, posinf=np.inf, neginf=np.inf)])
+    numbers = np.column_stack([boxes.centres, boxes.sizes, boxes.scores])
     wrong = ~((np.abs(numbers) <= LARGEST).all(axis=1) & (boxes.sizes > 0).all(axis=1)
-              & usable(boxes.rotations))
+              & usable(boxes.rotations) & ~(np.abs(boxes.velocities) > LARGEST).any(axis=1))
     if wrong.any():
         raise InputError(f"{where}, box {np.flatnonzero(wrong)[0]}: translation, size, rotation "
                          f"and score must be finite and within {LARGEST:g}, sizes above 0, the "

@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.data.nuscenes.boxes import LARGEST, usable
+from lidar_perception.data.nuscenes.boxes import usable
 from lidar_perception.runs.files import regular, short
-from lidar_perception.types import InputError
+from lidar_perception.types import LARGEST, InputError
 
 CHUNK = 2**22        # characters read at a time; no row is longer
 SPACE = " \t\r\n,"
