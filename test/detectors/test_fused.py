@@ -21,6 +21,7 @@ from lidar_perception.detectors.boxes import (
     MARGIN,
     SIDE,
     cars_on_points,
+    moved_towards,
     on_ground,
     on_points,
 )
@@ -126,6 +127,22 @@ def test_boxes_stand_on_the_ground_where_it_is_known():
 
 
 @given(SEEDS)
+def test_a_box_moves_towards_another_of_the_same_object_and_keeps_its_front(seed):
+    rng = np.random.default_rng(seed)
+    boxes, others = random_boxes(rng, 20), random_boxes(rng, 20)
+    silent = rng.random(20) < 0.3
+    others[silent] = np.nan
+    there, half, none = (moved_towards(boxes, others, share) for share in (1.0, 0.5, 0.0))
+    np.testing.assert_array_equal(none, boxes)
+    np.testing.assert_array_equal(half[silent], boxes[silent])
+    np.testing.assert_allclose(there[~silent, :6], others[~silent, :6])
+    np.testing.assert_allclose(half, (boxes + there) / 2)
+    turned = there[~silent, 6] - others[~silent, 6]
+    np.testing.assert_allclose(np.sin(turned), 0, atol=1e-9)  # the same line, either way
+    assert (np.abs(there - boxes)[:, 6] <= np.pi / 2 + 1e-9).all()
+
+
+@given(SEEDS)
 def test_more_evidence_is_never_less_likely_and_silence_is_neither(seed):
     rng = np.random.default_rng(seed)
     class_ids = rng.choice([CLASSES.index(name) for name in package_models()], 50)
@@ -213,8 +230,10 @@ def test_an_intensity_that_is_left_out_is_as_one_that_is_not_there(detector):
 
 
 def test_as_many_boxes_are_looked_at_as_asked_for_the_likeliest_ones(detector):
-    every, other = detector.look(frame()).proposed, copy.copy(detector)
-    other.params = with_values(detector.params, {"fused.max_proposals": 9})
+    whole, other = copy.copy(detector), copy.copy(detector)
+    own = with_values(detector.params, {"fused.classifier_box": 0.0})
+    whole.params, other.params = own, with_values(own, {"fused.max_proposals": 9})
+    every = whole.look(frame()).proposed
     few = other.look(frame()).proposed  # but for what would carry the sensor
     assert len(every) > 100 and 0 < len(few) <= 9 and same(few, every[:len(few)])
 

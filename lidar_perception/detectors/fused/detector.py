@@ -15,7 +15,7 @@ import torch
 from lidar_perception.classes import CAR
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.detectors.base import NetworkDetector
-from lidar_perception.detectors.boxes import cars_on_points, on_ground
+from lidar_perception.detectors.boxes import cars_on_points, moved_towards, on_ground
 from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.fused.evidence import Evidence, clipped_logit, judged, silhouette_at
 from lidar_perception.detectors.fused.fusion import Models, fusion_of, package_models
@@ -42,8 +42,9 @@ from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, LidarFram
 
 
 class Look(NamedTuple):
-    """What is proposed in the network's range, and what speaks for it; xyz (N, 3) of obstacles and
-    ground (G, 3) there; why little can be detected, or None; ms of each step."""
+    """What is proposed in the network's range, in boxes that the classifier has put right where it
+    was asked, and what speaks for it; xyz (N, 3) of obstacles and ground (G, 3) there; why little
+    can be detected, or None; ms of each step."""
 
     proposed: Detections
     evidence: Evidence
@@ -123,8 +124,10 @@ class FusedDetector(NetworkDetector):
         open_ = scores.passed(replace(found, scores=at_most(self.models, found.class_ids,
                                                             evidence,
                                                             "classifier")))
-        evidence["classifier"] = clipped_logit(
-            judged(found, obstacles, floor, self._classifier(), open_))
+        said, boxes = judged(found, obstacles, floor, self._classifier(), open_)
+        evidence["classifier"] = clipped_logit(said)
+        found = replace(found, boxes=moved_towards(found.boxes, boxes,
+                                                   settings.classifier_box).astype(np.float32))
         times.append(perf_counter())
         return Look(found, evidence, obstacles.xyz, floor,
                     self.proposer.out_of_sight(frame, seen) or proposed.problem,

@@ -51,17 +51,19 @@ def silhouette_at(boxes: np.ndarray, xyz: np.ndarray, ground: np.ndarray,
 
 
 def judged(proposed: Detections, obstacles: LidarFrame, ground: np.ndarray,
-           classifier: PointNetDetector, open_: np.ndarray) -> np.ndarray:
-    """(K,) the probability of the class of each of K proposals, for the points in its box; NaN
-    where it is decided already, not open_ (K,), where the classifier does not know the class, and
-    where there are less than FEWEST points."""
+           classifier: PointNetDetector, open_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(K,) the probability of the class of each of K proposals, for the points in its box, and
+    (K, 7) the box that these points are of, if it is of that class; NaN where it is decided
+    already, not open_ (K,), where the classifier does not know the class, and where there are less
+    than FEWEST points."""
     clusters = points_of(proposed.boxes, obstacles, obstacles, MARGIN)
     asked = np.flatnonzero(open_ & (clusters.sizes >= FEWEST)
                            & known(classifier, proposed.class_ids))
     clusters = clusters.take(asked).on(ground)
-    probabilities = np.full(len(proposed), np.nan)
-    probabilities[asked] = rescored_by(classifier, proposed[asked], clusters, 1.0)[0].scores
-    return probabilities
+    probabilities, boxes = np.full(len(proposed), np.nan), np.full((len(proposed), 7), np.nan)
+    rescored, boxes[asked] = rescored_by(classifier, proposed[asked], clusters, 1.0)
+    probabilities[asked] = rescored.scores
+    return probabilities, boxes
 
 
 def clipped_logit(probabilities: np.ndarray) -> np.ndarray:

@@ -43,7 +43,10 @@ class FusedParams(NetworkParams):
                                    "one.", unit="m", low=0.0, high=10.0)
     same_car: float = param(0.02, "Cars that overlap by more than this, seen from above, are one.",
                             low=0.0, high=1.0)
-    on_ground: float = param(0.5, "How far boxes are moved to the ground that is seen around "
+    classifier_box: float = param(0.5, "How far boxes become those that the cluster network makes "
+                                       "out of the points in them; 0: PointPillars' own.", low=0.0,
+                                  high=1.0)
+    on_ground: float = param(0.25, "How far boxes are moved to the ground that is seen around "
                              "them; 0: not at all, 1: onto it.", low=0.0, high=1.0)
     on_points: float = share_on_points()
 
