@@ -34,7 +34,7 @@ from lidar_perception.detectors.fused.model import probabilities
 from lidar_perception.detectors.fused.params import STEPS, FusedDetectorParams, FusedParams
 from lidar_perception.detectors.pointnet import rescoring
 from lidar_perception.detectors.view import without_carrier
-from lidar_perception.geometry import bev_iou, points_in_box, points_in_boxes
+from lidar_perception.geometry import bev_iou, points_in_box, points_in_boxes, wrap_angle
 from lidar_perception.ground.surface import FEWEST, surface_under
 from lidar_perception.param_fields import with_values
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
@@ -134,13 +134,16 @@ def test_a_box_moves_towards_another_of_the_same_object_and_keeps_its_front(seed
     silent = rng.random(20) < 0.3
     others[silent] = np.nan
     there, half, none = (moved_towards(boxes, others, share) for share in (1.0, 0.5, 0.0))
-    np.testing.assert_array_equal(none, boxes)
-    np.testing.assert_array_equal(half[silent], boxes[silent])
+    np.testing.assert_allclose(none[:, :6], boxes[:, :6])
+    np.testing.assert_allclose(wrap_angle(none[:, 6] - boxes[:, 6]), 0, atol=1e-9)
+    np.testing.assert_array_equal(half[silent], none[silent])
     np.testing.assert_allclose(there[~silent, :6], others[~silent, :6])
-    np.testing.assert_allclose(half, (boxes + there) / 2)
-    turned = there[~silent, 6] - others[~silent, 6]
-    np.testing.assert_allclose(np.sin(turned), 0, atol=1e-9)  # the same line, either way
-    assert (np.abs(there - boxes)[:, 6] <= np.pi / 2 + 1e-9).all()
+    np.testing.assert_allclose(half[:, :6], (none + there)[:, :6] / 2)
+    # Onto the same line, either way, by a quarter turn at most; halfway is half of that.
+    np.testing.assert_allclose(np.sin(there - others)[~silent, 6], 0, atol=1e-9)
+    turned, halfway = (wrap_angle(moved[:, 6] - none[:, 6]) for moved in (there, half))
+    assert (np.abs(turned) <= np.pi / 2 + 1e-9).all() and (np.abs(half[:, 6]) <= np.pi).all()
+    np.testing.assert_allclose(halfway, turned / 2, atol=1e-9)
 
 
 @given(SEEDS)
@@ -241,6 +244,18 @@ def test_as_many_boxes_are_looked_at_as_asked_for_the_likeliest_ones(detector):
     every = whole.look(frame()).proposed
     few = other.look(frame()).proposed  # but for what would carry the sensor
     assert len(every) > 100 and 0 < len(few) <= 9 and same(few, every[:len(few)])
+
+
+def test_boxes_are_halfway_between_both_networks(detector):
+    def looked(share: float) -> tuple[np.ndarray, np.ndarray]:
+        other = copy.copy(detector)
+        other.params = with_values(detector.params, {"fused.classifier_box": share})
+        look = other.look(frame())
+        return look.proposed.boxes, np.isfinite(look.evidence["classifier"])
+    (own, asked), (half, _), (judged, _) = (looked(share) for share in (0.0, 0.5, 1.0))
+    assert asked.any() and not asked.all()
+    np.testing.assert_array_equal((own != judged).any(axis=1), asked)
+    np.testing.assert_allclose(half[:, :6], (own + judged)[:, :6] / 2, atol=1e-4)
 
 
 @pytest.mark.parametrize("height, stays", [(0.4, True), (1.0, True), (1.73, False), (6.0, True)])
