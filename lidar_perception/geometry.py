@@ -15,6 +15,11 @@ def wrap_angle(angle: ArrayLike) -> np.ndarray:
     return np.where(wrapped >= np.pi, -np.pi, wrapped)[()]  # a hair below -pi rounds to pi
 
 
+def wrap_line(angle: ArrayLike) -> np.ndarray:
+    """The angle in [-pi/2, pi/2) of the same line, either way along it."""
+    return wrap_angle(2 * np.asarray(angle)) / 2
+
+
 def horizontal_range(xyz: np.ndarray) -> np.ndarray:
     """(N,) distance from the sensor in the x-y plane, dtype of xyz. xyz is (N, >=2)."""
     return np.sqrt(xyz[:, 0] * xyz[:, 0] + xyz[:, 1] * xyz[:, 1])

@@ -16,6 +16,7 @@ from lidar_perception.geometry import (
     to_box_frame,
     within,
     wrap_angle,
+    wrap_line,
 )
 from lidar_perception.types import MAX_RANGE, LidarFrame, usable_returns
 
@@ -119,6 +120,10 @@ def test_wrap_angle_is_the_same_angle_in_the_half_open_interval(angle):
     assert -np.pi <= wrapped < np.pi
     turns = (angle - wrapped) / (2 * np.pi)
     assert abs(turns - round(turns)) < 1e-9
+    line = wrap_line(angle)
+    assert -np.pi / 2 <= line < np.pi / 2
+    half_turns = (angle - line) / np.pi
+    assert abs(half_turns - round(half_turns)) < 1e-9
 
 
 def test_wrap_angle_at_its_ends():

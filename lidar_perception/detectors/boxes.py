@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from lidar_perception.classes import CAR
-from lidar_perception.geometry import points_in_boxes, wrap_angle
+from lidar_perception.geometry import points_in_boxes, wrap_angle, wrap_line
 
 MARGIN = 0.4   # metres around a box in which its points are looked for
 ABOVE = 0.2    # metres above its bottom from which on points count
@@ -26,7 +26,7 @@ def moved_towards(boxes: np.ndarray, others: np.ndarray, share: float) -> np.nda
     """Boxes (K, 7) moved, turned and resized by this share, 0..1, of what they differ from others
     (K, 7) of the same objects; those whose other one is NaN stay. Which end is the front stays."""
     way = np.where(np.isfinite(others), others - boxes, 0.0)
-    way[:, 6] = wrap_angle(2 * way[:, 6]) / 2  # of a box turned by half a circle only the line
+    way[:, 6] = wrap_line(way[:, 6])
     moved = boxes + share * way
     moved[:, 6] = wrap_angle(moved[:, 6])
     return moved

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.geometry import wrap_angle
+from lidar_perception.geometry import wrap_angle, wrap_line
 from lidar_perception.labeling.state import INTERPOLATED, KEY, PROPOSED, Box
 from lidar_perception.robot.poses import inverse, moved_boxes
 
@@ -111,7 +111,7 @@ def _ramp(found: dict[int, Box], stop: int, frame: int, new: Array, change: Arra
     """Move the boxes between the key boxes of stop and frame by their shares of a change; a
     heading comes to the side of those of the key boxes."""
     fixed = motion.fixed(found[stop].values, stop)
-    turn = (change[6] + np.pi / 2) % np.pi - np.pi / 2
+    turn = wrap_line(change[6])
     for f in [f for f in found if min(stop, frame) < f < max(stop, frame)]:
         share = float((motion.times[f] - motion.times[stop])
                       / (motion.times[frame] - motion.times[stop]))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lidar_perception.geometry import wrap_angle
+from lidar_perception.geometry import wrap_angle, wrap_line
 
 X, Y, VX, VY, HEADING, TURN = range(6)
 MEASURED = np.array([X, Y, HEADING])
@@ -65,7 +65,7 @@ def update(means: np.ndarray, covariances: np.ndarray, measured: np.ndarray,
     and its opposite the one nearer to the state's is taken: detectors confuse front and rear, of
     which facing_forward() decides."""
     innovation = measured - means[:, MEASURED]
-    innovation[:, 2] = wrap_angle(2.0 * innovation[:, 2]) / 2.0
+    innovation[:, 2] = wrap_line(innovation[:, 2])
     against = covariances[:, :, MEASURED]
     spread = against[:, MEASURED]
     spread[:, range(3), range(3)] += noise * noise

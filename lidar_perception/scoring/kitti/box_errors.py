@@ -9,7 +9,7 @@ import numpy as np
 from rich.console import Console
 
 from lidar_perception.classes import DETECTED
-from lidar_perception.geometry import bev_and_3d_iou, horizontal_range, wrap_angle
+from lidar_perception.geometry import bev_and_3d_iou, horizontal_range, wrap_line
 from lidar_perception.scoring.kitti.matched_heights import matched_boxes
 from lidar_perception.scoring.kitti.protocol import ComparedFrame
 from lidar_perception.scoring.tables import narrow_table
@@ -46,10 +46,9 @@ def _differences(found: np.ndarray, true: np.ndarray) -> dict[str, np.ndarray]:
     """By ERRORS, (P,)."""
     azimuth = np.arctan2(true[:, 1], true[:, 0])
     x, y, z, *sizes, yaw = (found - true).T
-    half_turn = wrap_angle(2 * yaw) / 2
     return dict(zip(ERRORS, (np.cos(azimuth) * x + np.sin(azimuth) * y,
                              np.cos(azimuth) * y - np.sin(azimuth) * x, z - sizes[2] / 2, *sizes,
-                             half_turn)))
+                             wrap_line(yaw))))
 
 
 def _reached(found: np.ndarray, true: np.ndarray, columns: list[int],
