@@ -1,5 +1,8 @@
 """ament_python package, and an ordinary one for pip."""
 
+import os
+import re
+import subprocess
 import sys
 from glob import glob
 from pathlib import Path
@@ -8,8 +11,36 @@ from runpy import run_path
 from setuptools import find_packages, setup
 
 NAME = "lidar_perception"
+ROOT = Path(__file__).resolve().parent  # colcon links setup.py elsewhere
 NODES = list(run_path("lidar_perception/nodes/__init__.py")["NODES"])
-README = Path(__file__).resolve().with_name("README.md")  # colcon links setup.py elsewhere
+VERSION = run_path("lidar_perception/__init__.py")["__version__"]
+
+
+def repository_url() -> str:
+    """Return the https address of the repository, or "" where it has none.
+
+    LIDAR_REPOSITORY_URL or git's remote `origin` says it, so that a fork's wheel links to the fork.
+    """
+    url = os.environ.get("LIDAR_REPOSITORY_URL", "")
+    if not url and (ROOT / ".git").exists():
+        asked = subprocess.run(["git", "-C", str(ROOT), "config", "remote.origin.url"],
+                               capture_output=True, text=True, check=False)
+        url = re.sub(r"^git@([^:]+):", r"https://\1/", asked.stdout.strip())
+    return url.removesuffix(".git").rstrip("/") if url.startswith("https://") else ""
+
+
+def index_page(text: str, url: str) -> str:
+    """Return the README with absolute links, as a package index shows it without the repository."""
+    if not url:
+        return text
+    text = re.sub(r"(!\[[^\]]*\]\()(?!https?:)", rf"\1{url}/raw/main/", text)
+    return re.sub(r"((?<!\!)\[[^\]]*\]\()(?!https?:|#)", rf"\1{url}/blob/main/", text)
+
+
+def project_urls(url: str) -> dict[str, str]:
+    pages = {"Source": "", "Documentation": "/tree/main/docs", "Issues": "/issues",
+             "Changelog": "/blob/main/CHANGELOG.md"}
+    return {name: url + path for name, path in pages.items()} if url else {}
 
 
 def node_executables() -> list[str]:
@@ -31,19 +62,36 @@ def node_executables() -> list[str]:
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version=VERSION,
     description="LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned "
                 "detectors, tracks, a simulator and training",
-    long_description=README.read_text(),
+    long_description=index_page((ROOT / "README.md").read_text(), repository_url()),
     long_description_content_type="text/markdown",
     license="Apache-2.0",
+    url=repository_url() or None,
+    project_urls=project_urls(repository_url()),
     maintainer="lidar_perception maintainers",
-    maintainer_email="maintainers@lidar-perception.invalid",
+    keywords=["lidar", "point cloud", "3D object detection", "ROS 2", "PointPillars", "tracking",
+              "KITTI", "ground segmentation", "clustering", "pedestrian detection"],
+    classifiers=[
+        "Development Status :: 4 - Beta",
+        "Intended Audience :: Developers",
+        "Intended Audience :: Science/Research",
+        "Operating System :: POSIX :: Linux",
+        "Programming Language :: Python :: 3.11",
+        "Programming Language :: Python :: 3.12",
+        "Topic :: Scientific/Engineering :: Artificial Intelligence",
+        "Topic :: Scientific/Engineering :: Image Recognition",
+        "Typing :: Typed",
+    ],
     python_requires=">=3.11,<3.13",
     packages=find_packages(include=["lidar_perception*", "msg_utils*"]),
-    package_data={NAME: ["nodes/*.xml", "candidates/*.json", "*/*.html",
-                         "simulation/sensors/*.yaml", "labeling/page/*", "detectors/*/weights/*",
-                         "detectors/fused/*.json"]},
+    package_data={
+        NAME: ["py.typed", "nodes/*.xml", "candidates/*.json", "*/*.html",
+               "simulation/sensors/*.yaml", "labeling/page/*", "detectors/*/weights/*",
+               "detectors/fused/*.json"],
+        "msg_utils": ["py.typed"],
+    },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -1,0 +1,57 @@
+"""The metadata that setup.py gives to pip, colcon and a package index."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from runpy import run_path
+from xml.etree import ElementTree
+
+import pytest
+import setuptools
+
+import lidar_perception
+
+ROOT = Path(__file__).resolve().parents[1]
+URL = "https://example.org/robots/lidar_perception"
+
+pytestmark = pytest.mark.skipif(not (ROOT / "setup.py").exists(), reason="needs the checkout")
+
+
+@pytest.fixture
+def metadata(monkeypatch):
+    """Return what setup.py hands to setuptools, built from a repository at `url`."""
+    def read(url):
+        given = {}
+        monkeypatch.chdir(ROOT)
+        monkeypatch.setenv("LIDAR_REPOSITORY_URL", url)
+        monkeypatch.setattr(setuptools, "setup", given.update)
+        run_path(str(ROOT / "setup.py"))
+        return given
+    return read
+
+
+def test_version_is_the_same_everywhere(metadata):
+    package = ElementTree.parse(ROOT / "package.xml").getroot()
+    assert metadata(URL)["version"] == lidar_perception.__version__ == package.findtext("version")
+
+
+def test_readme_on_a_package_index_has_no_relative_link(metadata):
+    links = re.findall(r"\]\(([^)]*)\)", metadata(URL + ".git")["long_description"])
+    assert len(links) > 5
+    assert [link for link in links if not link.startswith(("https://", "#"))] == []
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", metadata(URL)["long_description"])
+    assert all(link.startswith(f"{URL}/raw/main/") for link in pictures)
+    assert all((ROOT / link.removeprefix(f"{URL}/raw/main/")).is_file() for link in pictures)
+
+
+def test_project_urls_follow_the_repository(metadata):
+    given = metadata(URL)
+    assert given["url"] == URL and set(given["project_urls"]) >= {"Source", "Issues", "Changelog"}
+    assert all(page.startswith(URL) for page in given["project_urls"].values())
+
+
+def test_both_packages_ship_their_types(metadata):
+    for name in ("lidar_perception", "msg_utils"):
+        assert "py.typed" in metadata(URL)["package_data"][name]
+        assert (ROOT / name / "py.typed").is_file()
