@@ -19,7 +19,7 @@ ROOT = Path(__file__).resolve().parents[2]
 MAX_WORKERS = 4  # each holds torch and compiles what it runs
 NODE_WORKERS = 2  # of tests that mostly wait
 # Folders and files of them; those with the longest tests come first.
-WITH_PROCESSES = ("test/testing", "test/adapting", "test/campaign",
+WITH_PROCESSES = ("test/testing", "test/campaign",
                   "test/labeling/test_label_server.py", "test/labeling/test_page.py",
                   "test/labeling/test_page_saves.py", "test/launch", "test/ros")
 # What Numba compiles for all of this is cached beside the source, for each process after this one.

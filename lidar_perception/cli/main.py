@@ -18,7 +18,6 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
     "view": ("view.view", "Look at a recording and its results on a page in the browser."),
     "reproduce": ("reproduce.reproduce", "Reproduce every table of the STM-CPA paper."),
     "setup": ("setup.setup", "Measure a sensor and its mounting from unlabelled clouds."),
-    "adapt": ("adapt.adapt", "Adapt a detector to drives without labels."),
     "label": ("label.label", "Label a drive on a page in the browser."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),
     "simulate": ("simulate.simulate", "Write simulated, labelled scans as a bag or a data set."),

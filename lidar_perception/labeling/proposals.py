@@ -20,8 +20,8 @@ from lidar_perception.labeling.interpolation import Motion, filled
 from lidar_perception.labeling.snap import completed, usual_size
 from lidar_perception.labeling.state import PROPOSED, Box, Track
 from lidar_perception.labeling.survey import Look
-from lidar_perception.tracking.follow import NONE, WHOLE, hits
-from lidar_perception.tracking.params import KIND_OF_CLASS
+from lidar_perception.tracking.params import KIND_OF_CLASS, TrackingParams
+from lidar_perception.tracking.state import Tracks
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import CLASSES, PEDESTRIAN, Detections
 
@@ -34,6 +34,10 @@ FEWEST_HITS = 2        # of a track that is proposed, in a drive of several fram
 LEAST_SCORE = 0.3      # of one
 SURE = 0.95            # score of a box that a person placed
 CANDIDATES = "candidates"  # source of a track that no detector sees
+MAX_HIT_DISTANCE_M = 1.0   # between a track and the detection that updated it
+NONE = -1
+# Every track is reported: which ones are certain is decided when they are complete.
+WHOLE = TrackingParams(report=0.0, report_unseen=0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +141,7 @@ def proposed(looks: Sequence[Look], wanted: Wanted, stamps_ns: Sequence[int], mo
         found, candidates = found_in(looks[i], wanted, wanted.placed.get(i, ()))
         pose = None if motion.poses is None else motion.poses[i]
         tracks = tracker(found, stamps_ns[i], pose)
-        by = hits(tracks, found)
+        by = _hits(tracks, found)
         for k in np.flatnonzero(by != NONE):
             box = tracks.detections.boxes[k].astype(np.float64)
             box[:3] = found.boxes[by[k], :3]
@@ -147,6 +151,16 @@ def proposed(looks: Sequence[Look], wanted: Wanted, stamps_ns: Sequence[int], mo
     fewest = min(FEWEST_HITS, len(frames))
     made = [_track(each, motion) for each in seen.values() if len(each) >= fewest]
     return sorted((t for t in made if t.score >= LEAST_SCORE), key=lambda t: -t.score)
+
+
+def _hits(tracks: Tracks, found: Detections) -> np.ndarray:
+    """Return the detection that updated each track, (K,) int64: the nearest one within
+    MAX_HIT_DISTANCE_M, NONE for a track that was not updated."""
+    if len(found) == 0:
+        return np.full(len(tracks), NONE)
+    distances = centre_distances(tracks.detections.boxes, found.boxes)
+    nearest = distances.argmin(axis=1)
+    return np.where(tracks.seen & (distances.min(axis=1) <= MAX_HIT_DISTANCE_M), nearest, NONE)
 
 
 def _track(seen: list[tuple[int, Array, int, float, bool]], motion: Motion) -> Track:

@@ -7,7 +7,7 @@ from typing import Any
 
 
 def render(template: str, **values: Any) -> str:
-    """The page of a template inside the package, such as "adapting/report.html", which extends
+    """The page of a template inside the package, such as "sensor_setup/report.html", which extends
     runs/page.html. It escapes values, and a name without a value is an error."""
     import jinja2
 

@@ -58,7 +58,7 @@ def scan_of(msg: Any, name: str = "the cloud") -> Scan:
                          "record while it turns, in a place with walls or ground in sight")
     xyz = frame.xyz.astype(np.float64)
     ranges = np.linalg.norm(xyz, axis=1)
-    require_metres(xyz, name)
+    _require_metres(xyz, name)
     points = to_array(msg)
     columns = points.dtype.names or ()
     seconds, problem = None, ""
@@ -75,7 +75,7 @@ def scan_of(msg: Any, name: str = "the cloud") -> Scan:
                 columns, problem)
 
 
-def require_metres(xyz: np.ndarray, name: str) -> None:
+def _require_metres(xyz: np.ndarray, name: str) -> None:
     """InputError where the points (N, 3) of a cloud, N > 0, cannot be metres from its sensor."""
     middle = float(np.median(np.linalg.norm(xyz, axis=1)))
     if middle <= FAR:

@@ -121,19 +121,15 @@ def check(asked: Asked, init: Path | None) -> None:
     may_hold(asked.out, asked.resume)
 
 
-def scenes_of(asked: Asked, params: Any, sensor: Sensor, own: tuple = ()) -> tuple[tuple, tuple]:
-    """Sources to train on, those of one's own last, and to validate on."""
+def _scenes_of(asked: Asked, params: Any, sensor: Sensor) -> tuple[tuple, tuple]:
+    """Return the sources to train on and those to validate on."""
     around = getattr(params, "range", "") == "around"
-    sources, held_out = training_scenes(asked.data, asked.val, asked.split, asked.val_split,
-                                        params.data, params.seed, sensor, around, params.scene,
-                                        params.mount_height)
-    return (*sources, *own), held_out
+    return training_scenes(asked.data, asked.val, asked.split, asked.val_split, params.data,
+                           params.seed, sensor, around, params.scene, params.mount_height)
 
 
-def start(network: Network, asked: Asked, params: Any, commit: str = "",
-          own: tuple = ()) -> Ended | None:
-    """Train a network; how it ended, None in all but the first of several processes. own: sources
-    of scenes, see training/scenes.py, besides those that are asked for.
+def start(network: Network, asked: Asked, params: Any, commit: str = "") -> Ended | None:
+    """Train a network; how it ended, None in all but the first of several processes.
 
     The first start measures this machine, plans and writes the plan to RUN; a resumed run keeps
     it. All that is prepared is kept in the cache, so that a run may be killed at any time.
@@ -149,16 +145,16 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "",
     with joined(chosen_device(asked.device)) as device, alone(asked.out):
         wait()  # until all have looked at what rank 0 is going to write
         sensor = sensor_named(params.sensor, params.mount_height)
-        settings = settings_of(asked, params, sensor, init, own)
-        given, params = params, planned(network, asked, params, settings, sensor, device, own)
-        sources, held_out = scenes_of(asked, params, sensor, own)
+        settings = settings_of(asked, params, sensor, init)
+        given, params = params, planned(network, asked, params, settings, sensor, device)
+        sources, held_out = _scenes_of(asked, params, sensor)
         cut = network.cut(params, sources, held_out, Path(params.data.cache))
         if rank() == 0:
             with _said_when_stopped():
                 _prepare(network, asked, sources, held_out, cut)
                 network.gather(params, cut, asked.out)
                 if not decided:
-                    _refit(network, asked, given, sensor, device, own, begun, hours or BUDGET)
+                    _refit(network, asked, given, sensor, device, begun, hours or BUDGET)
         wait()
         params = _settled(network, asked, given, settings)
         stream, to_validate = network.scenes(params, sources, held_out, cut, asked.out)
@@ -183,26 +179,26 @@ def _said_when_stopped() -> Iterator[None]:
 
 
 def planned(network: Planning, asked: Asked, params: Any, settings: dict[str, Any],
-            sensor: Sensor, device: torch.device, own: tuple = ()) -> Any:
+            sensor: Sensor, device: torch.device) -> Any:
     """params with the plan of the first start, which may be this one. InputError where that had
     other settings."""
     if rank() == 0:
         make_folder(Path(params.data.cache))
         with _said_when_stopped():
-            _settle(network, asked, params, settings, sensor, device, own)
+            _settle(network, asked, params, settings, sensor, device)
     wait()
     return _settled(network, asked, params, settings)
 
 
 def _settle(network: Planning, asked: Asked, params: Any, settings: dict[str, Any], sensor: Sensor,
-            device: torch.device, own: tuple) -> None:
+            device: torch.device) -> None:
     """Plan, say so and write it, unless that was done by an earlier start."""
     path = asked.out / RUN
     if path.is_file():
         errors.print(f"resuming {asked.out}")
         return
     errors.print("measuring this machine with a few scenes ...")
-    speed, sources, held_out = _measured(network, asked, params, sensor, device, own)
+    speed, sources, held_out = _measured(network, asked, params, sensor, device)
     data = Data(_simulated(sources), _simulated(held_out), _recorded(sources), _recorded(held_out),
                 params.batch * world(), network.most_cuts(params))
     given = Plan(params.data.scans, params.data.val_scans, 0, params.steps, params.validate_steps,
@@ -219,10 +215,10 @@ def _settle(network: Planning, asked: Asked, params: Any, settings: dict[str, An
 
 
 def _measured(network: Planning, asked: Asked, params: Any, sensor: Sensor,
-              device: torch.device, own: tuple) -> tuple[Speed, Sequence[Any], Sequence[Any]]:
+              device: torch.device) -> tuple[Speed, Sequence[Any], Sequence[Any]]:
     """What the machine does now, and the sources of scenes to train with and to validate on."""
     few = _few(params)
-    sources, held_out = scenes_of(asked, few, sensor, own)
+    sources, held_out = _scenes_of(asked, few, sensor)
     scenes, scan, scan_mb = _some_scenes((*sources, *held_out))
     cut, step, whole, frame = network.measured(few, scenes, held_out, device)
     return Speed(scan, cut, step, whole, frame, scan_mb), sources, held_out
@@ -233,7 +229,7 @@ def _few(params: Any) -> Any:
 
 
 def _refit(network: Network, asked: Asked, params: Any, sensor: Sensor, device: torch.device,
-           own: tuple, begun: float, hours: float) -> None:
+           begun: float, hours: float) -> None:
     """Plan fewer steps, before the first, where the preparation took longer than planned. How much
     slower steps are than planned is measured, as other work slows them in another way."""
     if (asked.out / STATE).exists():
@@ -246,7 +242,7 @@ def _refit(network: Network, asked: Asked, params: Any, sensor: Sensor, device: 
     slower = max(1.0, (passed - STARTING) / preparing(made, cores(), speed))
     if refitted(made, left(), slower, speed, data) == made:
         return
-    now = _measured(network, asked, params, sensor, device, own)[0]
+    now = _measured(network, asked, params, sensor, device)[0]
     steps = now.step / speed.step if made.part else now.whole / speed.whole
     refit = refitted(made, left(), max(1.0, steps), speed, data)
     if refit != made:
@@ -281,15 +277,14 @@ def _settled(network: Planning, asked: Asked, params: Any, settings: dict[str, A
     return with_values(params, values)
 
 
-def settings_of(asked: Asked, params: Any, sensor: Sensor, init: Path | None, own: tuple = (),
+def settings_of(asked: Asked, params: Any, sensor: Sensor, init: Path | None,
                 compared: int = 0) -> dict[str, Any]:
     """What a resumed run must have in common, of files what is in them: a split may name other
     frames now, and weights be others. compared: networks that share the plan. InputError for scenes
     that are not there."""
-    sources, held_out = scenes_of(asked, _few(params), sensor, own)
-    others = {"own": [[source.key(0), len(source)] for source in own]} if own else {}
+    sources, held_out = _scenes_of(asked, _few(params), sensor)
     weights = sha256(init.read_bytes()).hexdigest()[:12] if init else ""
-    return {**others, **params.decisive(), "data": list(asked.data), "val": list(asked.val),
+    return {**params.decisive(), "data": list(asked.data), "val": list(asked.val),
             "split": str(asked.split or ""), "val_split": str(asked.val_split or ""),
             "frame_names": _names(sources), "val_frame_names": _names(held_out),
             "init": str(asked.init or ""), "init_weights": weights, "sensor": asdict(sensor),

@@ -347,8 +347,6 @@ def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch,
     (["evaluate", "candidates", "--data", "b", "--seed-source", "luck"], "'luck'"),
     (["convert", "a", "--out", "b", "--limit", "0"], "0 is not in the range"),
     (["convert", "a"], "--out"),
-    (["adapt", "--data", "a", "--out", "b", "--weights", "pointnet", "--resume", "--force"],
-     "give one of them"),
     (["simulate", "--frames", "1", "--out", "."], "no name for something new"),
     (["run", "bogus"], "'bogus'"),
 ])

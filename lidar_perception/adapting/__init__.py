@@ -1,1 +1,0 @@
-"""Self-training: what the detectors agree on in drives without labels, and what is learned."""
