@@ -19,22 +19,6 @@ SHOWN = reprlib.Repr()  # of a value that is refused, as much as fits into a lin
 SHOWN.maxstring = SHOWN.maxother = SHOWN.maxlong = 80
 SHOWN.maxlevel = 2
 
-# Old names, or old groups of them, and what they are called now.
-RENAMED = {
-    "detection.": "pointpillars.",
-    "seed.least_confidence": "seed.min_confidence",
-    "pointnet.least_points": "pointnet.min_points",
-    "data.least_points": "data.min_points",
-    "data.sensor": "sensor",
-    "most_skipped": "max_skipped",
-}
-
-
-def new_name(name: str) -> str | None:
-    """What a parameter of an older version is called now; None where it was not renamed."""
-    return next((new + name[len(old):] for old, new in RENAMED.items() if name.startswith(old)),
-                None)
-
 
 def param(default: Any, doc: str, *, unit: str = "", low: float | None = None,
           high: float | None = None, choices: tuple[str, ...] = (), fixed: bool = False) -> Any:
@@ -128,9 +112,7 @@ def with_values(params: Any, values: dict[str, Any]) -> Any:
     or wrong."""
     known = parameter_fields(params)
     if unknown := [name for name in values if name not in known]:
-        remedy = (f"it is {new} now" if (new := new_name(unknown[0])) in known
-                  else f"known are {', '.join(known)}")
-        raise ValueError(f"unknown parameter {unknown[0]!r}; {remedy}")
+        raise ValueError(f"unknown parameter {unknown[0]!r}; known are {', '.join(known)}")
     return _replaced(params, values, "")
 
 

@@ -13,7 +13,7 @@ import yaml
 
 from lidar_perception.candidates.configurations import CONFIGURATIONS
 from lidar_perception.nodes.known import misspelt
-from lidar_perception.param_fields import flatten, new_name, parameter_fields, with_values
+from lidar_perception.param_fields import flatten, parameter_fields, with_values
 from lidar_perception.runs.files import read_text, short
 from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
@@ -107,8 +107,6 @@ def read_config(path: Path, params: Any) -> dict[str, Any]:
                 raise InputError(f"{path}: {name!r} is no name of a parameter; put it into quotes")
             if name in known:
                 values[name] = value
-            elif (new := new_name(name)) in known:
-                raise InputError(f"{path}: '{name}' is called '{new}' now; rename it")
             elif any(k.startswith(f"{name}.") or name.startswith(f"{k}.") for k in known):
                 raise InputError(f"{path}: '{name}' is {_wrong_level(name, known)}")
             else:

@@ -8,8 +8,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from lidar_perception.param_fields import new_name, parameter_fields, with_values
-from lidar_perception.types import InputError
+from lidar_perception.param_fields import parameter_fields, with_values
 
 TYPES = {bool: Parameter.Type.BOOL, int: Parameter.Type.INTEGER, float: Parameter.Type.DOUBLE,
          str: Parameter.Type.STRING}
@@ -23,12 +22,11 @@ AS_FLOATS: dict[tuple[Any, Any], Any] = {
 
 
 def declare(node: Node, params: Any) -> Any:
-    """Declare the fields of params, a dataclass; return params with what the node was given.
-    InputError names what is out of range, or has another name by now."""
+    """Declare the fields of params, a dataclass, and return params with the values that the node
+    was given.
+
+    Raises: ValueError for a value out of range."""
     declared = {}
-    for name in node._parameter_overrides:
-        if (new := new_name(name)) in parameter_fields(params):
-            raise InputError(f"parameter '{name}' is called '{new}' now; rename it")
     for name, f in parameter_fields(params).items():
         kind = _kind(f)
         value = list(f.default) if isinstance(f.default, tuple) else f.default
