@@ -55,3 +55,32 @@ def test_both_packages_ship_their_types(metadata):
     for name in ("lidar_perception", "msg_utils"):
         assert "py.typed" in metadata(URL)["package_data"][name]
         assert (ROOT / name / "py.typed").is_file()
+
+
+def test_release_moves_unreleased_changes_under_the_version():
+    release = run_path(str(ROOT / "scripts/release.py"))
+    text = ("# Changes\n\n## Unreleased\n\n### Added\n\n### Fixed\n\n- A bug.\n\n"
+            "## 0.1.0\n\n- Old.\n")
+    dated = release["dated_changelog"](text, "0.2.0", "2026-12-01")
+    assert dated == ("# Changes\n\n" + release["EMPTY"] + "## 0.2.0 - 2026-12-01\n\n### Fixed\n\n"
+                     "- A bug.\n\n## 0.1.0\n\n- Old.\n")
+    with pytest.raises(SystemExit, match="no unreleased change"):
+        release["dated_changelog"](text.replace("- A bug.\n", ""), "0.2.0", "2026-12-01")
+
+
+def test_release_sets_the_version_in_both_files(tmp_path):
+    release = run_path(str(ROOT / "scripts/release.py"))
+    for name in ("lidar_perception/__init__.py", "package.xml"):
+        copy = tmp_path / name
+        copy.parent.mkdir(exist_ok=True)
+        copy.write_text((ROOT / name).read_text())
+    release["set_version"](tmp_path, "7.8.9")
+    assert '__version__ = "7.8.9"' in (tmp_path / "lidar_perception/__init__.py").read_text()
+    assert "<version>7.8.9</version>" in (tmp_path / "package.xml").read_text()
+
+
+def test_citation_names_the_three_papers():
+    import yaml
+    cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert len(cited["references"]) == 3
+    assert all(paper["doi"].startswith("10.") for paper in cited["references"])
