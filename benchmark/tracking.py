@@ -16,7 +16,8 @@ from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.params import MIN_SCORE, ScoreParams
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.scoring.tracking.pairs import tracked_labels
-from lidar_perception.scoring.tracking.report import TrackingReport, ego_of, observe
+from lidar_perception.scoring.tracking.report import TrackingReport, observe
+from lidar_perception.tracking.drive_tracker import ego_of
 from lidar_perception.tracking.ego import recorded_poses
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.tracker import Tracker
@@ -49,12 +50,12 @@ def measure_recording(recording: Recording) -> dict:
     drives: dict[str, list[Seen]] = {}
     source = ego_of(recording)
     for frame in track(recording, "detecting", len(recording)):
-        truth, scan = frame.truth(), frame.load()
+        truth, frame = frame.truth(), frame.loaded_once()
         if truth is not None and all("track_id" in extra for extra in truth.extras):
             if frame.sequence not in drives:
                 pose_of = recorded_poses(source)
             drives.setdefault(frame.sequence, []).append(
-                Seen(detector(scan).detections, truth, frame.stamp_ns, pose_of(frame, scan.xyz),
+                Seen(detector(frame.load()).detections, truth, frame.stamp_ns, pose_of(frame),
                      frame.calibration()))
     return measure_tracking(drives) if drives else {}
 

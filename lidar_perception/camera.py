@@ -104,3 +104,9 @@ class Calibration:
         return Camera.of(self.intrinsics, rotation, translation, self.width, self.height)
 
 
+# A nominal camera, of the simulator and where a recording has none: KITTI's field of view, level,
+# 0.27 m ahead of the LiDAR and 0.08 m below it.
+FORWARD_CAMERA = Calibration(
+    intrinsics=np.array([[720.0, 0, 621, 0], [0, 720, 187.5, 0], [0, 0, 1, 0]]),
+    lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]),
+    width=1242, height=375)

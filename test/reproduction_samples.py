@@ -7,7 +7,7 @@ import json
 from click.testing import CliRunner
 
 from lidar_perception.cli.main import cli
-from lidar_perception.reproduction import journal
+from lidar_perception.runs import journal
 from lidar_perception.reproduction.experiment import (
     Cell,
     Experiment,

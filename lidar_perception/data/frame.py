@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +64,10 @@ class Frame:
         """The camera that sees the frame; None without a calibration."""
         calibration = self.calibration()
         return None if calibration is None else calibration.camera()
+
+    def loaded_once(self) -> Frame:
+        """The same frame, whose scan is read once and kept as long as the frame is."""
+        return replace(self, load=cache(self.load))
 
     @staticmethod
     def of(name: str, scan: LidarFrame, truth: GroundTruth | None = None,

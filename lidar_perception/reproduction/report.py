@@ -18,7 +18,7 @@ from rich.text import Text
 
 from lidar_perception.reproduction.experiment import Cell, Experiment, Figure, Section, Table
 from lidar_perception.reproduction.figures import draw
-from lidar_perception.reproduction.journal import REPORT
+from lidar_perception.reproduction.report_files import REPORT
 from lidar_perception.runs.files import write_bytes, write_text
 from lidar_perception.runs.page import data_url, render
 

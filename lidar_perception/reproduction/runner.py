@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,10 @@ from lidar_perception import __version__
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.reproduction.experiment import Experiment
-from lidar_perception.reproduction.journal import journal
+from lidar_perception.reproduction.report_files import written
+from lidar_perception.runs.journal import journal
 from lidar_perception.runs.resuming import digest
-from lidar_perception.runs.terminal import track
-from lidar_perception.scoring.run import Skipped, results
+from lidar_perception.scoring.run import complete
 
 
 def run(experiment: Experiment, recording: Recording, out: Path, *, jobs: int = 1,
@@ -38,15 +37,9 @@ def run(experiment: Experiment, recording: Recording, out: Path, *, jobs: int = 
             "data": str(recording.path.resolve()), "frames": len(names),
             "frame_names": digest(names),
             "settings": experiment.settings}
-    with journal(out, plan, force=force) as done:
-        missing = [i for i, name in enumerate(names[:limit]) if name not in done.lines]
-        found = results(recording, functools.partial(_measurer, experiment), missing, jobs=jobs,
-                        dask=dask)
-        with threadpool_limits(1), closing(found):
-            for i, line in track(found, experiment.name, len(missing)):
-                if isinstance(line, Skipped):
-                    line = json.dumps({"frame": names[i], "skipped": str(line)})
-                done.add(line)
+    with journal(out, plan, force=force, written=written) as done, threadpool_limits(1):
+        complete(done, recording, functools.partial(_measurer, experiment), names[:limit],
+                 jobs=jobs, dask=dask, title=experiment.name)
         done.sort(names)
         records = [json.loads(done.lines[name]) for name in names[:limit]]
     lost = recording.lost if limit is None else ()

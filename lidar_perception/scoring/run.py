@@ -12,6 +12,7 @@ from reading the frame in it, skips the frame.
 from __future__ import annotations
 
 import functools
+import json
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError
@@ -23,6 +24,7 @@ from uuid import uuid4
 from threadpoolctl import threadpool_limits
 
 from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.runs.journal import Journal
 from lidar_perception.runs.processes import in_processes
 from lidar_perception.runs.terminal import track
 from lidar_perception.types import InputError
@@ -68,6 +70,20 @@ def fill(report: Report, recording: Recording, start: Start, *, limit: int | Non
                 report.update(result)
     if limit is None:
         report.skipped.extend(reason for _, reason in recording.lost)
+
+
+def complete(journal: Journal, recording: Recording, start: Start, names: Sequence[str], *,
+             jobs: int = 1, dask: str | None = None, title: str) -> None:
+    """Measure the first frames of a recording, which have these names, and add each to the journal
+    as soon as it is done, unless it is there already. measure() gives a JSON object with the
+    frame's name under "frame"; of a frame that was skipped the journal has {"frame": name,
+    "skipped": reason}. InputError if a process or a cluster fails."""
+    missing = [i for i, name in enumerate(names) if name not in journal.lines]
+    found = results(recording, start, missing, jobs=jobs, dask=dask)
+    with closing(found):
+        for i, line in track(found, title, len(missing)):
+            journal.add(json.dumps({"frame": names[i], "skipped": str(line)})
+                        if isinstance(line, Skipped) else line)
 
 
 def results(recording: Recording, start: Start, numbers: Sequence[int] | None = None, *,

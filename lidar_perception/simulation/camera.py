@@ -6,16 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from lidar_perception.camera import Calibration
+from lidar_perception.camera import FORWARD_CAMERA, Calibration
 from lidar_perception.data.kitti.labels import DONT_CARE
 from lidar_perception.data.kitti.write import seen_by_camera
 from lidar_perception.types import GroundTruth
-
-# A camera of KITTI's field of view, level, 0.27 m ahead of the LiDAR and 0.08 m below it.
-FORWARD_CAMERA = Calibration(
-    intrinsics=np.array([[720.0, 0, 621, 0], [0, 720, 187.5, 0], [0, 0, 1, 0]]),
-    lidar_to_camera=np.array([[0.0, -1, 0, 0], [0, 0, -1, -0.08], [1, 0, 0, -0.27], [0, 0, 0, 1]]),
-    width=1242, height=375)
 
 # People who label leave out what they can hardly see. The least of the 20 pedestrians of the real
 # frames at hand has 16 points; of KITTI's they are few that have less than 5.

@@ -95,13 +95,13 @@ def recorded_source(poses: bool, wanted: str = "auto") -> str:
     return best_source(wanted, {wanted, *["recording"] * poses, *["kiss_icp"] * has_odometry()})
 
 
-def recorded_poses(source: str) -> Callable[[Frame, np.ndarray], np.ndarray | None]:
-    """pose_of(frame, xyz (N, 3)) -> pose (4, 4) or None, for the frames of one drive in their
-    order; source as of recorded_source. InputError where KISS-ICP is not installed."""
+def recorded_poses(source: str) -> Callable[[Frame], np.ndarray | None]:
+    """pose_of(frame) -> pose (4, 4) or None, for the frames of one drive in their order; source as
+    of recorded_source. InputError where KISS-ICP, which loads each frame, is not installed."""
     if source == "kiss_icp":
         odometry = Odometry()
-        return lambda frame, xyz: odometry(xyz)
-    return lambda frame, xyz: frame.pose() if source == "recording" else None
+        return lambda frame: odometry(frame.load().xyz)
+    return lambda frame: frame.pose() if source == "recording" else None
 
 
 def has_odometry() -> bool:

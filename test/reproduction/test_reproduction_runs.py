@@ -30,10 +30,11 @@ from reproduction_samples import (
 from samples import object_folder, wait_for_the_end, write
 
 from lidar_perception.data.open import open_recording
-from lidar_perception.reproduction import journal, runner
+from lidar_perception.reproduction import report_files, runner
 from lidar_perception.reproduction.experiment import Cell
 from lidar_perception.reproduction.report import parts, write_report
 from lidar_perception.reproduction.stm_cpa import STM_CPA
+from lidar_perception.runs import journal
 from lidar_perception.scoring import run as scoring_run
 from lidar_perception.types import InputError
 
@@ -334,7 +335,7 @@ def test_every_table_and_figure_is_in_every_format(whole):
         picture = whole / f"figures/{figure['name']}.png"
         assert picture.read_bytes().startswith(b"\x89PNG")
         assert figure["title"] in page and f"(figures/{figure['name']}.png)" in markdown
-    assert {p for p in whole.rglob("*") if p.is_file()} == {*journal.written(whole)}
+    assert {p for p in whole.rglob("*") if p.is_file()} == {whole / journal.NAME, *report_files.written(whole)}
 
 
 def test_the_page_needs_no_other_file_and_says_what_was_run(whole, crowds):

@@ -12,10 +12,9 @@ import pytest
 from tracking_samples import pose
 
 from lidar_perception.data.frame import POSES, Frame, Recording
-from lidar_perception.scoring.tracking import report
-from lidar_perception.scoring.tracking.report import LOOKED_AT, ego_of
 from lidar_perception.simulation.drive import scans
-from lidar_perception.tracking import ego
+from lidar_perception.tracking import drive_tracker, ego
+from lidar_perception.tracking.drive_tracker import LOOKED_AT, ego_of
 from lidar_perception.tracking.ego import (
     NO_SOURCE,
     SOURCES,
@@ -65,7 +64,7 @@ def test_recorded_poses_come_before_the_scans_and_what_is_asked_for_is_not_repla
 @pytest.mark.parametrize("first", [0, LOOKED_AT - 1, LOOKED_AT, 200])
 def test_poses_that_the_first_frames_have_not_give_way_to_the_scans(monkeypatch, installed, first):
     """And no frame after these is read to see it: a bag can be an hour long."""
-    for module in ego, report:
+    for module in ego, drive_tracker:
         monkeypatch.setattr(module, "has_odometry", lambda: installed)
     read = []
 

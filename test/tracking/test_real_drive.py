@@ -29,7 +29,8 @@ def test_no_identity_switches_on_a_real_drive(data, detector, ego):
     from lidar_perception.data.frame import POSES
     from lidar_perception.data.open import open_recording
     from lidar_perception.scoring.run import fill
-    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, ego_of
+    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
+    from lidar_perception.tracking.drive_tracker import ego_of
     from lidar_perception.tracking.ego import has_odometry
 
     report, drive = TrackingReport(), open_recording(data / "kitti_tracking")

@@ -53,8 +53,9 @@ def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, d
     from lidar_perception.data.frame import BOXES, POSES
     from lidar_perception.detectors.open import open_detector
     from lidar_perception.scoring.run import fill
-    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, ego_of
+    from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
     from lidar_perception.scoring.tracking.tables import print_tracking_report
+    from lidar_perception.tracking.drive_tracker import ego_of
 
     recording = opened(data, split=split)
     recording.require(BOXES, "evaluate tracking")

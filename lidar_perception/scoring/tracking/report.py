@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import islice
 
 from lidar_perception.camera import Calibration
 from lidar_perception.classes import DETECTED
-from lidar_perception.data.drives import goes_on
-from lidar_perception.data.frame import POSES, Frame, Recording
+from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.scoring.run import Start
 from lidar_perception.scoring.tracking.clear import ClearCounts, clear_counts
@@ -23,18 +21,9 @@ from lidar_perception.scoring.tracking.pairs import (
     tracked_labels,
     without_ignored,
 )
-from lidar_perception.tracking.ego import (
-    NO_SOURCE,
-    has_odometry,
-    recorded_poses,
-    recorded_source,
-    usable,
-)
+from lidar_perception.tracking.drive_tracker import DriveTracker
 from lidar_perception.tracking.params import TrackingParams
-from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import GroundTruth, InputError
-
-LOOKED_AT = 50  # frames, the first ones, whether one of them has a pose
 
 
 @dataclass(frozen=True)
@@ -57,57 +46,29 @@ def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
         raise InputError(f"{sequence}/{index}: {error}") from None
 
 
-def ego_of(recording: Recording, wanted: str = "auto") -> str:
-    """Whence the sensor's motion comes, of RECORDED_EGO all but auto, which is: the poses of the
-    recording, where one of its first LOOKED_AT frames has one, else KISS-ICP, where that is
-    installed, else those poses that there are, else none."""
-    if wanted != "auto":
-        return wanted
-    return recorded_source(POSES in recording.has and (
-        not has_odometry() or any(map(has_pose, islice(recording.frames, LOOKED_AT)))))
-
-
-def has_pose(frame: Frame) -> bool:
-    """Whether a frame has a pose that can be used: odometry with another clock than the clouds'
-    gives none."""
-    try:
-        return usable(frame.pose())
-    except InputError:  # said where the frame is measured
-        return False
-
-
 def by_tracker(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
                ego: str = "auto") -> Start:
-    """Track what the detector of open_() finds, one tracker a sequence, whose frames must come in
-    their order in one process; without sequences, as in a bag, one a drive, see drives.goes_on.
-    ego, one of RECORDED_EGO, says whence the poses are, see ego_of."""
+    """Track what the detector of open_() finds, see DriveTracker. The frames must come in their
+    order, in one process."""
     return partial(_by_tracker, open_, params, ego)
 
 
 def _by_tracker(open_: Callable[[], Detector], params: TrackingParams, ego: str,
                 recording: Recording) -> Callable[[Frame], Observation | None]:
-    ego = ego_of(recording, ego)
+    tracker = DriveTracker(recording, params, ego)
     detector = open_()
-    last, number = ("", -1), 0  # sequence and stamp of the frame before; of the drive
-    tracker, pose_of = Tracker(params), recorded_poses(ego)
 
     def measure(frame: Frame) -> Observation | None:
-        nonlocal last, number, tracker, pose_of
-        if frame.sequence != last[0] or not (frame.sequence or goes_on(last[1], frame.stamp_ns)):
-            tracker, pose_of, number = Tracker(params), recorded_poses(ego), number + 1
-        last = frame.sequence, frame.stamp_ns
         truth = frame.truth()
         if truth is not None:
             ids_of(truth, "label")  # before the detector's work
-        scan = frame.load()
-        pose = pose_of(frame, scan.xyz)
-        tracks = tracker(detector(scan).detections, frame.stamp_ns, pose)
+        frame = frame.loaded_once()
+        tracks = tracker(frame, detector(frame.load()).detections)
         if truth is None:
             return None
-        return replace(observe(
-            frame.sequence or f"drive {number}", frame.index, truth,
-            tracked_labels(tracks.ids, tracks.detections), frame.calibration()),
-            posed=pose is not None or ego == NO_SOURCE)
+        return replace(observe(tracker.drive, frame.index, truth,
+                               tracked_labels(tracks.ids, tracks.detections), frame.calibration()),
+                       posed=tracker.posed)
     return measure
 
 

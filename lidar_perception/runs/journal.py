@@ -1,11 +1,11 @@
-"""The folder of a run: frames.jsonl holds its settings and then one record a line, so that a run
-that was stopped at any moment resumes where it stopped."""
+"""The folder of a run over frames: frames.jsonl holds its settings and then one record a line, so
+that a run that was stopped at any moment resumes where it stopped."""
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedWriter
 from pathlib import Path
@@ -17,9 +17,6 @@ from lidar_perception.runs.resuming import differences, locked
 from lidar_perception.types import InputError
 
 NAME = "frames.jsonl"
-REPORT = "report.json"  # written before the tables and figures that it names
-PAGES = ("report.html", "report.md", REPORT)
-FOLDERS = {"tables": ".csv", "figures": ".png"}
 SYNC_S = 1.0  # at most this much is lost when the machine stops
 
 
@@ -44,6 +41,7 @@ class Journal:
                              "kept, the same command resumes the run") from None
 
     def sync(self) -> None:
+        """Bring what was written to the disk."""
         os.fsync(self._stream.fileno())
         self._synced = monotonic()
 
@@ -54,9 +52,11 @@ class Journal:
 
 
 @contextmanager
-def journal(folder: Path, plan: dict[str, Any], *, force: bool = False) -> Iterator[Journal]:
-    """The journal of a run in a folder, which is made if need be. Frames that were skipped before
-    are not in it, so that they are tried again.
+def journal(folder: Path, plan: dict[str, Any], *, force: bool = False,
+            written: Callable[[Path], Iterable[Path]] = lambda folder: ()) -> Iterator[Journal]:
+    """Open the journal of a run in a folder, which is made if need be. Frames that were skipped
+    before are not in it, so that they are tried again. written(folder) lists what else an earlier
+    run wrote there, which force removes.
 
     InputError if the folder holds a run of another plan, or something else, unless force, which
     starts over; or if another process writes there.
@@ -65,7 +65,7 @@ def journal(folder: Path, plan: dict[str, Any], *, force: bool = False) -> Itera
         path = folder / NAME
         lines = {} if force else _begun(folder, plan)
         if force and path.exists():  # or what has our names there is somebody else's
-            for old in written(folder):
+            for old in (*written(folder), path):
                 old.unlink(missing_ok=True)
         for old in folder.glob(f".{NAME}.*.tmp"):  # of a process that was killed while it wrote
             old.unlink()
@@ -78,17 +78,6 @@ def journal(folder: Path, plan: dict[str, Any], *, force: bool = False) -> Itera
             for last in (opened.sync, stream.close):
                 with suppress(OSError):  # of a disk that is full; add() has said so
                     last()
-
-
-def written(folder: Path) -> list[Path]:
-    """All that a run and its report have written: tables and figures are those that the report
-    names, so that others in their folders stay."""
-    names = []
-    with suppress(OSError, ValueError, KeyError, TypeError):  # no report, or not ours
-        report = json.loads((folder / REPORT).read_text())
-        names = [f"{kind}/{Path(each['name']).name}{ending}" for section in report["sections"]
-                 for kind, ending in FOLDERS.items() for each in section[kind]]
-    return [folder / name for name in (*names, *PAGES, NAME)]
 
 
 def _head(plan: dict[str, Any]) -> str:
