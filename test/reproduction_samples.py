@@ -7,7 +7,6 @@ import json
 from click.testing import CliRunner
 
 from lidar_perception.cli.main import cli
-from lidar_perception.runs import journal
 from lidar_perception.reproduction.experiment import (
     Cell,
     Experiment,
@@ -17,6 +16,7 @@ from lidar_perception.reproduction.experiment import (
     Section,
     Table,
 )
+from lidar_perception.runs import journal
 from lidar_perception.types import InputError
 
 COUNT = 12

@@ -41,7 +41,7 @@ class Journal:
                              "kept, the same command resumes the run") from None
 
     def sync(self) -> None:
-        """Bring what was written to the disk."""
+        """Flush the file to disk."""
         os.fsync(self._stream.fileno())
         self._synced = monotonic()
 
@@ -55,8 +55,8 @@ class Journal:
 def journal(folder: Path, plan: dict[str, Any], *, force: bool = False,
             written: Callable[[Path], Iterable[Path]] = lambda folder: ()) -> Iterator[Journal]:
     """Open the journal of a run in a folder, which is made if need be. Frames that were skipped
-    before are not in it, so that they are tried again. written(folder) lists what else an earlier
-    run wrote there, which force removes.
+    before are not in it, so that they are tried again. written(folder) lists the other files
+    of an earlier run, which force removes.
 
     InputError if the folder holds a run of another plan, or something else, unless force, which
     starts over; or if another process writes there.

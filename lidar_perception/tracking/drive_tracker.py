@@ -24,7 +24,7 @@ LOOKED_AT = 50  # frames, the first ones, whether one of them has a pose
 class DriveTracker:
     """Track the detections of a recording: tracker(frame, detections) -> Tracks.
 
-    Frames come in their order, in one process. All tracks end where another drive begins: with
+    Call it for each frame in order of time. All tracks end where another drive begins: with
     another sequence, or in a recording without sequences, such as a bag, where the stamps jump (see
     data.drives). Ids go on, so no two tracks of a recording share one. ego, one of RECORDED_EGO,
     says where poses come from, see ego_of; kiss_icp loads every frame.

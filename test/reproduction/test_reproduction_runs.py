@@ -335,7 +335,8 @@ def test_every_table_and_figure_is_in_every_format(whole):
         picture = whole / f"figures/{figure['name']}.png"
         assert picture.read_bytes().startswith(b"\x89PNG")
         assert figure["title"] in page and f"(figures/{figure['name']}.png)" in markdown
-    assert {p for p in whole.rglob("*") if p.is_file()} == {whole / journal.NAME, *report_files.written(whole)}
+    assert {p for p in whole.rglob("*") if p.is_file()} == {whole / journal.NAME,
+                                                             *report_files.written(whole)}
 
 
 def test_the_page_needs_no_other_file_and_says_what_was_run(whole, crowds):

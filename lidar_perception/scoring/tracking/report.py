@@ -48,8 +48,8 @@ def observe(sequence: str, index: int, truth: GroundTruth, tracks: GroundTruth,
 
 def by_tracker(open_: Callable[[], Detector], params: TrackingParams = TrackingParams(),
                ego: str = "auto") -> Start:
-    """Track what the detector of open_() finds, see DriveTracker. The frames must come in their
-    order, in one process."""
+    """Track what the detector of open_() finds, see DriveTracker. Frames must be measured in order
+    of time, in one process."""
     return partial(_by_tracker, open_, params, ego)
 
 
