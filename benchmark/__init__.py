@@ -1,1 +1,5 @@
 """Our algorithms timed beside others in one run: python -m benchmark, or ./lidar benchmark."""
+
+from lidar_perception.runs.threads import wait_asleep
+
+wait_asleep()  # before __main__ loads torch, as OpenMP reads its environment once

@@ -155,4 +155,5 @@ if __name__ == "__main__":
     try:
         main(prog_name="lidar benchmark")
     except InputError as error:
-        raise SystemExit(f"Error: {error}") from None
+        click.echo(f"Error: {error}", err=True)
+        raise SystemExit(2) from None

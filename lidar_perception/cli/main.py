@@ -27,9 +27,7 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
     "export": ("weights.export", "Export a network for another runtime."),
     "info": ("info.info", "List what is in a bag."),
     "run": ("run.run_node", "Start one ROS node."),
-    "benchmark": ("checkout.benchmark", "Time the algorithms next to their peers."),
     "campaign": ("campaign.campaign", "Try to break the package, and say what came of it."),
-    "test": ("checkout.test", "Run the tests of this checkout."),
 }
 
 

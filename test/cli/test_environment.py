@@ -17,6 +17,13 @@ from lidar_perception.nodes import NODES
 ROOT = Path(__file__).resolve().parents[2]
 
 
+def wanted():
+    """Return the checksum by which ./lidar knows that its environment is up to date."""
+    return subprocess.run(["cksum"], input=b"".join(
+        (ROOT / name).read_bytes() for name in ("constraints.txt", "setup.py", "setup.cfg")),
+        capture_output=True, check=True).stdout.decode()
+
+
 @pytest.mark.parametrize("name", NODES)
 def test_each_executable_of_the_package_is_its_node(name, monkeypatch, capsys):
     """As ros2 run and ros2 launch start them."""
@@ -39,9 +46,6 @@ def test_a_reader_of_the_help_may_stop_reading():
 @pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
 def test_of_two_first_calls_one_makes_the_environment_and_the_other_waits(tmp_path):
     venv = tmp_path / "venv"
-    wanted = subprocess.run(["cksum"], input=b"".join(
-        (ROOT / name).read_bytes() for name in ("constraints.txt", "setup.py", "setup.cfg")),
-        capture_output=True, check=True).stdout.decode()
     write(venv / "bin/lidar-perception", "#!/bin/sh\necho ran $1\n").chmod(0o755)
     with open(venv / "lidar-lock", "w") as lock:  # the one
         fcntl.flock(lock, fcntl.LOCK_EX)
@@ -49,7 +53,7 @@ def test_of_two_first_calls_one_makes_the_environment_and_the_other_waits(tmp_pa
                                  stderr=subprocess.PIPE, env={
             **os.environ, "LIDAR_VENV": str(venv), "LIDAR_PYTHON": "/bin/false"})
         assert "another call is making" in other.stderr.readline()
-        write(venv / "lidar-setup", wanted)
+        write(venv / "lidar-setup", wanted())
     assert other.communicate() == ("ran info\n", "") and other.returncode == 0
 
 
@@ -64,3 +68,29 @@ def test_a_sourced_ros_is_not_seen_while_the_environment_is_made(tmp_path):
         "LIDAR_PYTHON": str(python)})
     assert done.returncode == 1 and "pip failed" in done.stderr  # this python makes none
     assert seen.read_text().split() == ["unset", "unset"]
+
+
+@pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
+@pytest.mark.parametrize("words, ran", [
+    ("test -k tracker -x", f"python {ROOT}/scripts/run_tests.py -k tracker -x\n"),
+    ("benchmark --help", "python -m benchmark --help\n"),
+    ("info drive.bag", "lidar-perception info drive.bag\n")])
+def test_lidar_runs_tests_and_benchmark_from_the_checkout(words, ran, environment):
+    assert environment(words) == ran
+
+
+@pytest.mark.skipif(not (ROOT / "lidar").exists(), reason="needs the checkout")
+def test_help_of_lidar_mentions_test_and_benchmark(environment):
+    first, *_, last = environment("--help").splitlines()
+    assert first == "lidar-perception --help" and "test" in last and "benchmark" in last
+
+
+@pytest.fixture
+def environment(tmp_path):
+    """Return what ./lidar WORDS prints in an environment whose programs print their arguments."""
+    for name in ("python", "lidar-perception"):
+        write(tmp_path / "bin" / name, f"#!/bin/sh\necho {name} $*\n").chmod(0o755)
+    write(tmp_path / "lidar-setup", wanted())
+    return lambda words: subprocess.run(
+        [ROOT / "lidar", *words.split()], text=True, capture_output=True, check=True,
+        env={**os.environ, "LIDAR_VENV": str(tmp_path)}).stdout

@@ -1,0 +1,115 @@
+"""Run the tests of this checkout: ./lidar test [ARGUMENTS of pytest].
+
+Without arguments: ruff, mypy and all tests. The tests of the core run on all cores, and two more
+processes run the tests that mostly wait for other processes. Numba compiles once before them, while
+ruff and mypy run. Coverage is measured and must reach the limit in setup.cfg; it leaves out nodes in
+processes of their own and long tests that repeat lines of others, such as those of Hypothesis,
+because measuring doubles their time.
+
+    ./lidar test
+    ./lidar test -k clustering -x
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from rich.text import Text
+
+from lidar_perception.runs.terminal import errors
+from lidar_perception.runs.threads import one_thread_each, wait_asleep
+
+ROOT = Path(__file__).resolve().parents[1]
+MAX_WORKERS = 4  # each holds torch and compiles what it runs
+NODE_WORKERS = 2  # for tests that mostly wait
+# Their folders and files, those with the slowest tests first.
+WITH_PROCESSES = ("test/testing", "test/campaign",
+                  "test/labeling/test_label_server.py", "test/labeling/test_page.py",
+                  "test/labeling/test_page_saves.py", "test/launch", "test/ros")
+# Numba caches what these compile, so that each test process loads it.
+COMPILE = ("""
+from lidar_perception.candidates.warm_up import warm_up
+warm_up()
+""", """
+from lidar_perception.simulation.to_bag import simulated_scans
+next(iter(simulated_scans(1, 1))).load()
+""", """
+from lidar_perception.detectors.open import LOAD, open_detector
+from lidar_perception.simulation.to_bag import simulated_scans
+for frame in simulated_scans(1, 1):
+    for name in LOAD:
+        open_detector(name)(frame.load())
+""")
+
+
+def main(arguments: list[str]) -> int:
+    """Run everything, or pytest alone with the arguments; return the exit code."""
+    wait_asleep()
+    if arguments:
+        return subprocess.run([sys.executable, "-m", "pytest", *arguments], cwd=ROOT).returncode
+    with tempfile.TemporaryDirectory() as folder:
+        failed = run_everything(Path(folder))
+    if failed:
+        errors.print(Text("failed:", "red") + f" {', '.join(failed)}")
+    return int(bool(failed))
+
+
+class BackgroundCommand:
+    """A Python command in the background, whose output is printed when it has ended."""
+
+    def __init__(self, *words: str, environment: dict[str, str] | None = None):
+        self.output = tempfile.TemporaryFile("w+")
+        self.process = subprocess.Popen([sys.executable, *words], cwd=ROOT, env=environment,
+                                        stdout=self.output, stderr=subprocess.STDOUT)
+
+    def failed(self) -> bool:
+        """Wait for its end; return True if it failed."""
+        code = self.process.wait()
+        self.output.seek(0)
+        print(self.output.read(), end="", flush=True)
+        return bool(code)
+
+
+def run_everything(folder: Path) -> list[str]:
+    """Run all checks and tests and return the names of those that failed. folder: for the files of
+    the coverage measurement."""
+    one_thread_each()  # as many processes as cores
+    environment = {**os.environ, "COVERAGE_FILE": str(folder / "coverage")}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # compiled once, not in each process
+    if sys.version_info >= (3, 12):
+        environment["COVERAGE_CORE"] = "sysmon"  # lines are noticed once, and then cost nothing
+    pytest = ("-m", "pytest", "--cov", "--cov-report=", "--cov-fail-under=0")
+    nodes = [name for name in WITH_PROCESSES if (ROOT / name).exists()]
+    workers = min(os.cpu_count() or 1, MAX_WORKERS)
+    running = {"ruff": BackgroundCommand("-m", "ruff", "check"),
+               "mypy": BackgroundCommand("-m", "mypy")}
+    *parts, last = COMPILE  # tests say what is wrong, if something is
+    for compiling in [BackgroundCommand("-c", part) for part in parts]:
+        compiling.failed()
+    BackgroundCommand("-c", last).failed()
+    running["tests of nodes"] = BackgroundCommand(
+        *pytest, *_distributed(NODE_WORKERS), *nodes,
+        environment={**environment, "COVERAGE_FILE": str(folder / "nodes")})
+    core = subprocess.run([sys.executable, *pytest, *_distributed(workers),
+                           *(f"--ignore={name}" for name in nodes)], cwd=ROOT, env=environment)
+    failed = ["tests"] * bool(core.returncode)
+    failed += [name for name, command in running.items() if command.failed()]
+    coverage, environment["COVERAGE_FILE"] = [sys.executable, "-m", "coverage"], str(folder / "all")
+    subprocess.run([*coverage, "combine", "--quiet", "--keep", str(folder / "coverage"),
+                    str(folder / "nodes")], cwd=ROOT, env=environment)
+    covered = subprocess.run([*coverage, "report"], cwd=ROOT, env=environment)
+    return [*failed, *["coverage"] * bool(covered.returncode)]
+
+
+def _distributed(workers: int) -> tuple[str, ...]:
+    """Return the options of pytest for this many processes. Whole files are distributed in their
+    order; sorted by their number of tests the slowest would come last."""
+    return "-n", str(workers), "--dist", "loadfile", "--no-loadscope-reorder"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
