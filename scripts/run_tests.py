@@ -2,9 +2,9 @@
 
 Without arguments: ruff, mypy and all tests. The tests of the core run on all cores, and two more
 processes run the tests that mostly wait for other processes. Numba compiles once before them, while
-ruff and mypy run. Coverage is measured and must reach the limit in setup.cfg; it leaves out nodes in
-processes of their own and long tests that repeat lines of others, such as those of Hypothesis,
-because measuring doubles their time.
+ruff and mypy run. Coverage must reach the limit in setup.cfg. It is not measured in nodes that run
+in their own processes, nor in long tests that repeat the lines of others, such as those of
+Hypothesis, because measuring doubles their time.
 
     ./lidar test
     ./lidar test -k clustering -x
@@ -24,7 +24,7 @@ from lidar_perception.runs.terminal import errors
 from lidar_perception.runs.threads import one_thread_each, wait_asleep
 
 ROOT = Path(__file__).resolve().parents[1]
-MAX_WORKERS = 4  # each holds torch and compiles what it runs
+MAX_WORKERS = 4  # each loads torch and compiles
 NODE_WORKERS = 2  # for tests that mostly wait
 # Their folders and files, those with the slowest tests first.
 WITH_PROCESSES = ("test/testing", "test/campaign",
@@ -87,7 +87,7 @@ def run_everything(folder: Path) -> list[str]:
     workers = min(os.cpu_count() or 1, MAX_WORKERS)
     running = {"ruff": BackgroundCommand("-m", "ruff", "check"),
                "mypy": BackgroundCommand("-m", "mypy")}
-    *parts, last = COMPILE  # tests say what is wrong, if something is
+    *parts, last = COMPILE  # their failures show up in the tests
     for compiling in [BackgroundCommand("-c", part) for part in parts]:
         compiling.failed()
     BackgroundCommand("-c", last).failed()
