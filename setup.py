@@ -85,11 +85,11 @@ setup(
         "Typing :: Typed",
     ],
     python_requires=">=3.11,<3.13",
-    packages=find_packages(include=["lidar_perception*", "msg_utils*"]),
+    packages=find_packages(include=["lidar_perception*", "lidar_studio*", "msg_utils*"]),
     package_data={
         NAME: ["py.typed", "nodes/*.xml", "candidates/*.json", "*/*.html",
-               "simulation/sensors/*.yaml", "labeling/page/*", "detectors/*/weights/*",
-               "detectors/fused/*.json"],
+               "simulation/sensors/*.yaml", "detectors/*/weights/*", "detectors/fused/*.json"],
+        "lidar_studio": ["py.typed", "page/*"],
         "msg_utils": ["py.typed"],
     },
     data_files=[
@@ -101,7 +101,7 @@ setup(
         (f"lib/{NAME}", node_executables()),
     ],
     install_requires=[
-        "aiohttp>=3.9", "click>=8.1", "jinja2>=3.1", "matplotlib>=3.7", "lz4>=4.0", "mcap>=1.2",
+        "click>=8.1", "jinja2>=3.1", "matplotlib>=3.7", "lz4>=4.0", "mcap>=1.2",
         "numba>=0.59", "numpy>=1.26", "pypatchworkpp>=1.0", "pyyaml>=6", "rich>=13",
         "rosbags>=0.11.6", "ruamel.yaml.clib>=0.2.12", "safetensors>=0.4", "scikit-learn>=1.3",
         "scipy>=1.11", "threadpoolctl>=3.1", "torch>=2.2", "zstandard>=0.21",
@@ -111,6 +111,7 @@ setup(
         "test": ["pytest>=7.4", "hypothesis>=6.90", "mypy>=1.15", "opencv-python-headless>=4.8",
                  "playwright>=1.50", "pytest-cov>=7.0", "pytest-xdist>=3.7", "ruff>=0.9",
                  "setuptools>=70.1", "shapely>=2.0"],
+        "studio": ["aiohttp>=3.9"],
         "distributed": ["distributed>=2024.1"],
         "odometry": ["kiss-icp>=1.2"],
         "onnx": ["onnx>=1.16", "onnxruntime>=1.18", "onnxscript>=0.2", "torch>=2.6"],

@@ -28,8 +28,8 @@ MAX_WORKERS = 4  # each loads torch and compiles
 NODE_WORKERS = 2  # for tests that mostly wait
 # Their folders and files, those with the slowest tests first.
 WITH_PROCESSES = ("test/testing", "test/campaign",
-                  "test/labeling/test_label_server.py", "test/labeling/test_page.py",
-                  "test/labeling/test_page_saves.py", "test/launch", "test/ros")
+                  "test/studio/test_label_server.py", "test/studio/test_page.py",
+                  "test/studio/test_page_saves.py", "test/launch", "test/ros")
 # Numba caches what these compile, so that each test process loads it.
 COMPILE = ("""
 from lidar_perception.candidates.warm_up import warm_up

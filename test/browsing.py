@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from lidar_perception.labeling.picture import browser_here
+from lidar_studio.picture import browser_here
 
 FLAGS = ("--no-sandbox --disable-gpu --enable-unsafe-swiftshader --disable-quic --no-first-run "
          "--disable-background-networking --disable-component-update --disable-sync").split()

@@ -9,7 +9,7 @@ from samples import INTRINSICS, LIDAR_TO_CAMERA
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame
-from lidar_perception.labeling.labels import DriveLabels, FrameLabels
+from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
 from lidar_perception.types import LidarFrame
 
 CALIBRATION = Calibration(INTRINSICS, LIDAR_TO_CAMERA, 1242, 375)

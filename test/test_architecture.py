@@ -14,7 +14,8 @@ from samples import for_all
 
 pytestmark = pytest.mark.no_cover  # it reads sources
 ROOT = Path(__file__).resolve().parents[1]
-SOURCES = [p.relative_to(ROOT).as_posix() for package in ("lidar_perception", "msg_utils")
+PACKAGES = "lidar_perception", "lidar_studio", "msg_utils"
+SOURCES = [p.relative_to(ROOT).as_posix() for package in PACKAGES
            for p in sorted((ROOT / package).rglob("*.py"))]
 ROS = {"rclpy", "ament_index_python", "launch", "launch_ros", "launch_testing", "sensor_msgs",
        "std_msgs", "geometry_msgs", "visualization_msgs", "vision_msgs", "builtin_interfaces",
@@ -24,7 +25,7 @@ MAX_LINES = 400
 # From the ground up: a room imports only those before it, and itself.
 ROOMS = ("classes", "types", "param_fields", "geometry", "camera", "groups", "robot", "runs",
          "wire", "data", "ground", "clustering", "candidates", "detectors", "tracking", "scoring",
-         "simulation", "sensor_setup", "training", "reproduction", "labeling", "params",
+         "simulation", "sensor_setup", "training", "reproduction", "labels", "params",
          "nodes", "campaign", "cli", "testing")
 # What the files of a room may import besides the rooms below and the standard library.
 NUMBERS = ["numpy", "scipy", "numba"]
@@ -38,7 +39,7 @@ STRANGERS = {
     "detectors": [*NUMBERS, "torch", "safetensors", "onnx", "onnxruntime", "onnxscript"],
     "tracking": ["numpy", "scipy", "kiss_icp"],
     "sensor_setup": ["numpy", "scipy", "matplotlib", "msg_utils"],
-    "labeling": ["numpy", "aiohttp", "msg_utils"], "params": [],
+    "labels": ["numpy", "msg_utils"], "params": [],
 }
 
 
@@ -118,7 +119,8 @@ def test_only_messages_of_msg_utils_imports_by_name():
 
 
 OUTSIDE = [name for name in SOURCES
-           if not name.startswith(tuple(f"lidar_perception/{room}/" for room in ROOMS[-4:]))]
+           if not name.startswith((*(f"lidar_perception/{room}/" for room in ROOMS[-4:]),
+                                   "lidar_studio/cli/", "lidar_studio/live_view.py"))]
 
 
 @for_all(OUTSIDE)
@@ -128,6 +130,11 @@ def test_the_core_imports_no_ros_no_nodes_and_no_command_line(name):
     above = [m for m in imports(name)
              if within(m, ["lidar_perception.nodes", "lidar_perception.cli"])]
     assert above == []
+
+
+@for_all(files_in("lidar_perception", "msg_utils"))
+def test_library_never_imports_the_studio(name):
+    assert [m for m in imports(name) if within(m, ["lidar_studio"])] == []
 
 
 @for_all([name for name in SOURCES if not name.startswith("lidar_perception/nodes/")])
@@ -156,7 +163,13 @@ def test_no_arrow_points_up(name):
     assert above == []
 
 
-@for_all([n for n in SOURCES if room(n.removesuffix(".py")) in STRANGERS])
+@for_all([n for n in files_in("lidar_studio") if n in OUTSIDE])
+def test_the_studio_needs_few_other_libraries(name):
+    assert strangers(name, ["numpy", "aiohttp", "msg_utils", "lidar_perception",
+                            "lidar_studio"]) == []
+
+
+@for_all([n for n in files_in("lidar_perception") if room(n.removesuffix(".py")) in STRANGERS])
 def test_a_room_of_the_core_needs_no_other_library(name):
     allowed = [*STRANGERS[room(name.removesuffix(".py"))], "lidar_perception"]
     assert strangers(name, allowed) == []
@@ -226,8 +239,8 @@ def test_every_public_function_has_a_docstring(name):
 
 
 STRICT = tuple(f"lidar_perception/{room}" for room in ROOMS[:ROOMS.index("data")] + (
-    "ground", "clustering", "candidates", "tracking", "sensor_setup", "labeling")
-    if room != "runs") + ("msg_utils",)
+    "ground", "clustering", "candidates", "tracking", "sensor_setup", "labels")
+    if room != "runs") + ("lidar_studio", "msg_utils")
 
 
 @for_all([n for n in SOURCES if n.startswith(STRICT)])
@@ -247,7 +260,7 @@ def test_mypy_ignores_no_module():
     settings = ConfigParser()
     settings.read(ROOT / "setup.cfg")
     asked = {name: dict(settings[name]) for name in settings if name.startswith("mypy")}
-    assert asked["mypy"]["files"] == "lidar_perception, msg_utils, scripts, benchmark"
+    assert asked["mypy"]["files"] == "lidar_perception, lidar_studio, msg_utils, scripts, benchmark"
     assert {name for name, options in asked.items()
             if {"ignore_errors", "exclude", "follow_imports"} & set(options)} == {"mypy-launch"}
     assert [name for name in SOURCES if "# mypy:" in (ROOT / name).read_text()] == []

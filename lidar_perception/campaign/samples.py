@@ -26,8 +26,8 @@ from lidar_perception.detectors.pointpillars.network import load_network
 from lidar_perception.detectors.pointpillars.onnx import export_onnx
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
-from lidar_perception.labeling.exchange import export_labels
-from lidar_perception.labeling.labels import DriveLabels, of_truth
+from lidar_perception.labels.drive_labels import DriveLabels, of_truth
+from lidar_perception.labels.exchange import export_labels
 from lidar_perception.runs.files import write_bytes, write_text
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import PEDESTRIAN, GroundTruth, InputError, LidarFrame

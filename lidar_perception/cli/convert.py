@@ -156,14 +156,14 @@ def _bag(source: Path, recording: Any, seen: Callable[[Any], Any], out: Path, im
 def _on_topic(source: Path, recording: Any, topic: str) -> Any:
     """DriveLabels of the boxes on a topic of a bag."""
     from lidar_perception.data.open import with_topic
-    from lidar_perception.labeling.formats import bag
+    from lidar_perception.labels.formats import bag
     return bag.read(with_topic(source)[0], recording.frames[:], topic)
 
 
 def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: str, out: Path,
              detections: str | None, limit: int | None, force: bool) -> None:
-    from lidar_perception.labeling.datasets import write_dataset
-    from lidar_perception.labeling.exchange import export_labels
+    from lidar_perception.labels.datasets import write_dataset
+    from lidar_perception.labels.exchange import export_labels
     labels = None if detections is None else _on_topic(source, recording, detections)
     count = min(len(recording), limit or len(recording))
     if labels is not None and format == BAG:
@@ -180,8 +180,8 @@ def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: s
 
 def _labels(source: Path, recording: Any, format: str, out: Path, given: str | None,
             elsewhere: bool, detections: str | None, limit: int | None, force: bool) -> None:
-    from lidar_perception.labeling.exchange import export_labels, import_labels, recognised
-    from lidar_perception.labeling.labels import DriveLabels, of_truth
+    from lidar_perception.labels.drive_labels import DriveLabels, of_truth
+    from lidar_perception.labels.exchange import export_labels, import_labels, recognised
     count = min(len(recording), limit or len(recording))
     if detections is not None:
         labels = _on_topic(source, recording, detections)

@@ -15,10 +15,11 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
     "convert": ("convert.convert", "Turn recordings and labels into bags and other formats."),
     "evaluate": ("evaluate.group.evaluate", "Score the algorithms without ROS."),
     "compare": ("compare.compare", "Run every detector on the same frames, side by side."),
-    "view": ("view.view", "Look at a recording and its results on a page in the browser."),
+    "view": ("lidar_studio.cli.view.view", "Look at a recording and its results on a page in "
+                                         "the browser."),
     "reproduce": ("reproduce.reproduce", "Reproduce every table of the STM-CPA paper."),
     "setup": ("setup.setup", "Measure a sensor and its mounting from unlabelled clouds."),
-    "label": ("label.label", "Label a drive on a page in the browser."),
+    "label": ("lidar_studio.cli.label.label", "Label a drive on a page in the browser."),
     "seed": ("seed.seed", "Make a template of a seed pedestrian."),
     "simulate": ("simulate.simulate", "Write simulated, labelled scans as a bag or a data set."),
     "train": ("train.train", "Train a detector on recordings or simulated streets."),
@@ -41,7 +42,9 @@ class LazyGroup(click.Group):
         if name not in COMMANDS:
             return None
         module, _, function = COMMANDS[name][0].rpartition(".")
-        return getattr(importlib.import_module(f"lidar_perception.cli.{module}"), function)
+        if not module.startswith("lidar_studio."):
+            module = f"lidar_perception.cli.{module}"
+        return getattr(importlib.import_module(module), function)
 
     def invoke(self, ctx: click.Context) -> Any:
         """A command that is stopped ends with 130, as everywhere; click would say 1, an error."""

@@ -1,0 +1,140 @@
+"""Labels in and out: which format lies there, and one way to read and to write each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from lidar_perception.data.bag_frames import recognises as is_bag
+from lidar_perception.data.frame import Frame
+from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels
+from lidar_perception.labels.formats import (
+    bag,
+    kitti_object,
+    kitti_tracking,
+    labelcloud,
+    nuscenes,
+    openlabel,
+    sustech,
+)
+from lidar_perception.labels.formats.files import MAX_BYTES, in_file, read_json
+from lidar_perception.labels.formats.kitti_lines import label_folder
+from lidar_perception.runs.files import read_text
+from lidar_perception.types import InputError
+
+Read = Callable[[Path, Sequence[Frame]], DriveLabels]
+Write = Callable[..., None]  # labels, out, frames, force
+
+# Each reads the labels of a drive's frames at a path, and writes them to one, with force over what
+# is there. A new format is a file and a line here.
+FORMATS: dict[str, tuple[Read, Write]] = {
+    "kitti_object": (kitti_object.read, kitti_object.write),
+    "kitti_tracking": (kitti_tracking.read, kitti_tracking.write),
+    "nuscenes_detection": nuscenes.detection,
+    "nuscenes_tracking": nuscenes.tracking,
+    "labelcloud": labelcloud.absolute,
+    "labelcloud_rel": labelcloud.relative,
+    "labelcloud_vertices": labelcloud.vertices,
+    "sustech": (sustech.read, sustech.write),
+    "openlabel": (openlabel.read, openlabel.write),
+    "bag": (bag.read, bag.write),
+    "bag_labels": (bag.read, bag.write_labels),
+}
+
+
+WITH_NOTES = {"kitti_object", "kitti_tracking", "openlabel", "bag", "bag_labels"}
+
+
+@dataclass(frozen=True)
+class Written:
+    """What was written where: how many boxes of how many frames; and what was left out, as the
+    format has no place for it, in words."""
+
+    path: Path
+    boxes: int
+    frames: int
+    left_out: tuple[str, ...] = ()
+
+
+def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabels:
+    """The labels at a path, of each of the frames of a drive in their order. InputError in one line
+    where they cannot be read, or are of frames that the drive has not."""
+    with np.errstate(all="ignore"):  # what is too large for a float is no label, see FrameLabels.of
+        return _of(format)[0](path, frames[:])  # of a bag, frames that do not hold their clouds
+
+
+def export_labels(labels: DriveLabels, format: str, out: Path, frames: Sequence[Frame],
+                  force: bool = False) -> Written:
+    """Write the labels of the frames of a drive. InputError in one line where they cannot be
+    written; then nothing is half-written. What exists is replaced with force only."""
+    if len(labels) != len(frames):
+        raise InputError(f"labels of {len(labels)} frames for a drive of {len(frames)}; give those "
+                         "of the same frames")
+    in_file("what the labels keep of the file that they were read from",
+            lambda: _of(format)[1](labels, out, frames[:], force))
+    notes = 0 if format in WITH_NOTES else sum(len(each.notes) for each in labels.frames)
+    ids = format == "kitti_object" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
+    return Written(out, labels.boxes, len(labels), (
+        *((f"{notes} regions without a box",) if notes else ()), *(("track ids",) if ids else ())))
+
+
+def recognised(path: Path) -> str:
+    """The format of the labels at a path. InputError if it is none of them, or cannot be told."""
+    files = [path] if path.is_file() else sorted(
+        file for file in path.rglob("*") if file.suffix in (".txt", ".json")
+        and not file.name.startswith(("_", ".")))
+    if not path.exists():
+        raise InputError(f"there is no file or folder {path}; give one with labels: "
+                         f"{', '.join(FORMATS)}")
+    if path.suffix in (".mcap", ".db3") or (path.is_dir() and is_bag(path)):
+        return "bag"
+    for folder, format in ("label_02", "kitti_tracking"), ("label_2", "kitti_object"):
+        if label_folder(path, folder) != path:
+            return format
+    for file in files:
+        found = _by_text(file) if file.suffix == ".txt" else _by_json(read_json(file))
+        if found:
+            return found
+    raise InputError(f"{path} holds no labels that are recognised, or none at all; say with --from "
+                     f"which of {', '.join(FORMATS)} they are")
+
+
+def _by_text(file: Path) -> str:
+    """By the class's place in the first line."""
+    words = read_text(file, MAX_BYTES).split(maxsplit=3)
+    if words and words[0].endswith(":"):
+        return ""  # a calibration
+    with suppress(ValueError, IndexError):
+        float(words[0]), float(words[1])
+        return "kitti_tracking"
+    return "kitti_object" if len(words) > 3 else ""
+
+
+def _by_json(content: Any) -> str:
+    """By the keys; "" for a file without a box, such as of labelCloud and SUSTechPOINTS, and for
+    one of something else, whose values may be of any kind."""
+    with suppress(TypeError, LookupError, AttributeError):
+        if isinstance(content, list) or "objs" in content:
+            boxes = content if isinstance(content, list) else content["objs"]
+            return "sustech" if "psr" in boxes[0] else ""
+        if "openlabel" in content:
+            return "openlabel"
+        if "objects" in content:
+            box = content["objects"][0]
+            return "labelcloud" if "centroid" in box or "vertices" in box else ""
+        for boxes in content["results"].values():
+            for row in boxes:
+                return "nuscenes_tracking" if "tracking_name" in row else "nuscenes_detection"
+    return ""
+
+
+def _of(format: str) -> tuple[Read, Write]:
+    if format not in FORMATS:
+        raise InputError(f"there is no format {format!r} for labels; there are "
+                         f"{', '.join(FORMATS)}")
+    return FORMATS[format]

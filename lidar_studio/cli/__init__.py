@@ -1,0 +1,8 @@
+"""The verbs `label` and `view` of the lidar-perception command."""
+
+from importlib.util import find_spec
+
+from lidar_perception.types import InputError
+
+if find_spec("aiohttp") is None:
+    raise InputError("label and view need aiohttp; pip install 'lidar_perception[studio]'")

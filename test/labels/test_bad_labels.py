@@ -1,0 +1,259 @@
+"""Labels that cannot be used: one line says which and what to do, and nothing is half-written."""
+
+from __future__ import annotations
+
+import json
+import resource
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cli_samples import error_line, exit_of
+from format_samples import drive, labels_of
+from samples import object_folder, walker_truth
+
+from lidar_perception.cli import convert
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.labels.datasets import LAYOUTS, write_dataset
+from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
+from lidar_perception.labels.exchange import FORMATS, export_labels, import_labels, recognised
+from lidar_perception.types import InputError
+
+CLOUD = {"folder": "", "filename": "", "path": "", "objects": [
+    {"name": "Car", "centroid": {"x": 1, "y": 2, "z": 3},
+     "dimensions": {"length": 4, "width": 2, "height": 1}, "rotations": {"x": 0, "y": 0, "z": 5}}]}
+PSR = [{"psr": {part: {"x": 1, "y": 1, "z": 1} for part in ("position", "scale", "rotation")},
+        "obj_type": "Car", "obj_id": "1"}]
+CUBOID = {"openlabel": {"frames": {"5": {"objects": {"1": {"object_data": {"cuboid": [
+    {"name": "b", "val": [1, 2, 3, 0, 0, 0, 1, 4, 2, 1]}]}}}}}, "objects": {"1": {"type": "Car"}}}}
+RESULT = {"results": {"0000/000005": [{
+    "sample_token": "0000/000005", "translation": [1, 2, 3], "size": [1, 2, 1],
+    "rotation": [1, 0, 0, 0], "velocity": [0, 0], "detection_name": "car", "detection_score": 1.0,
+    "attribute_name": ""}]}}
+GOOD = {"labelcloud": ("000005.json", CLOUD), "sustech": ("000005.json", PSR),
+        "openlabel": ("0000.json", CUBOID), "nuscenes_detection": ("r.json", RESULT),
+        "kitti_object": ("000005.txt", "Car 0 0 0 0 0 9 9 1.5 1.6 3.9 0 1.7 15 0\n"),
+        "kitti_tracking": ("0000.txt", "5 1 Car 0 0 0 0 0 9 9 1.5 1.6 3.9 0 1.7 15 0\n")}
+WRONG = [  # format, what is put in place of what, what is said
+    ("labelcloud", '"x": 1', '"x": NaN', "box 1 of 1: its numbers must be finite"),
+    ("labelcloud", '"x": 1', '"x": 1e308', "within 100000 m"),
+    ("labelcloud", '"name"', '"track_id": 10000000000000000000, "name"', "no whole number"),
+    ("labelcloud", '"length": 4', '"length": 0', "its sides above 0"),
+    ("labelcloud", '"centroid"', '"centre"', "has no 'centroid'"),
+    ("labelcloud", '"name": "Car",', '"name": "Car"', ":1 is no JSON: Expecting ',' delimiter"),
+    ("labelcloud", '"objects"', '"boxes"', "has no 'objects'"),
+    ("sustech", '"x": 1', '"x": 1e999', "must be finite"),
+    ("sustech", '"psr"', '"p"', "has no 'psr'"),
+    ("sustech", "[", "{", ":1 is no JSON"),
+    ("openlabel", "[1, 2", "[NaN, 2", "frame 5, box 1 of 1"),
+    ("openlabel", "[1, 2, 3, 0, 0", "[1, 2, 3", "a cuboid of 8 numbers"),
+    ("openlabel", '"5"', '"50"', "has the frame '50' (1 such), and the drive has 5 to 7"),
+    ("openlabel", '"5": {', '"5": {"frame_properties": 7, ', "cannot be read"),
+    ("openlabel", '"openlabel"', '"vcd"', "has no 'openlabel'"),
+    ("nuscenes_detection", "[1, 2, 3]", "[1, 2, NaN]", "sample 0000/000005, box 1 of 1"),
+    ("nuscenes_detection", "[1, 0, 0, 0]", "[0, 0, 0, 0]", "cannot be read"),
+    ("nuscenes_detection", "0000/000005", "other", "has none of the drive's samples"),
+    ("kitti_object", "3.9", "nan", "000005.txt:1 is no KITTI label"),
+    ("kitti_object", "Car 0", "Car 1e308", "000005.txt:1 is no KITTI label"),
+    ("kitti_tracking", "5 1 Car", "51 1 Car", "0000.txt:1 is of frame 51, and the drive has 5"),
+]
+
+
+def text(content):
+    return content if isinstance(content, str) else json.dumps(content)
+
+
+def put(folder, format, old="", new=""):
+    name, content = GOOD[format]
+    folder.mkdir(exist_ok=True)
+    assert old in text(content)
+    (folder / name).write_text(text(content).replace(old, new, 1))
+    return folder / name if format == "nuscenes_detection" else folder
+
+
+@pytest.mark.parametrize("format", GOOD)
+def test_the_examples_are_good(format, tmp_path):
+    path = put(tmp_path / "in", format)
+    assert recognised(path) == format
+    assert import_labels(path, format, drive("one")).boxes == 1
+
+
+def test_a_folder_of_kitti_is_told_by_its_folders(tmp_path):
+    """Not by the first text file there, which is of the calibration."""
+    write_dataset("kitti_tracking", drive("one"), tmp_path / "set")
+    for path in tmp_path / "set", tmp_path / "set/training":
+        assert recognised(path) == "kitti_tracking"
+    with pytest.raises(InputError, match="no labels that are recognised"):
+        recognised(tmp_path / "set/training/calib")
+
+
+@pytest.mark.parametrize("content", [
+    5, None, [], [5], {"objs": 5}, {"objs": {}}, {"objects": 5}, {"objects": [5]}, {"results": 5},
+    {"results": {"a": 5}}, {"results": {"a": [5]}}])
+def test_a_file_of_something_else_is_not_recognised(content, tmp_path):
+    (tmp_path / "0.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="no labels that are recognised"):
+        recognised(tmp_path)
+
+
+@pytest.mark.parametrize(("format", "old", "new", "words"), WRONG)
+def test_what_is_wrong_is_named_with_its_file(format, old, new, words, tmp_path):
+    path = put(tmp_path / "in", format, old, new)
+    with pytest.raises(InputError) as error:
+        import_labels(path, format, drive("one"))
+    assert words in str(error.value) and str(tmp_path / "in") in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("format", ["labelcloud", "sustech", "kitti_object", "kitti_tracking",
+                                    "openlabel"])
+def test_labels_of_what_the_drive_has_not_and_no_labels_are_named(format, tmp_path):
+    path = put(tmp_path / "in", format)
+    suffix = GOOD[format][0][-5:].lstrip("0123456789")
+    stranger = path / f"000099{suffix}"
+    stranger.write_text(text(GOOD[format][1]))
+    with pytest.raises(InputError, match="is of no frame of the drive"):
+        import_labels(path, format, drive("one"))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="has no label file"):
+        import_labels(tmp_path / "empty", format, drive("one"))
+    with pytest.raises(InputError, match=r"there is no folder|cannot read"):
+        import_labels(tmp_path / "none", format, drive("one"))
+
+
+def test_the_command_knows_every_format_and_layout():
+    assert (convert.LABELS, convert.DATASETS) == (tuple(FORMATS), tuple(LAYOUTS))
+
+
+def test_numbers_that_are_none_never_become_labels():
+    for box in ([np.nan, *[1] * 6], [*[1] * 6, np.inf], [1, 1, 1, 1, 1, -1, 0], [1e6, *[1] * 6]):
+        with pytest.raises(InputError, match="frame 7, box 1 of 1"):
+            FrameLabels.of("7", 0, [box], ["Car"])
+    with pytest.raises(InputError, match="seven numbers"):
+        FrameLabels.of("7", 0, [[1, 2]], ["Car"])
+    for track in 2.5, np.nan, 2**63, 10**30:
+        with pytest.raises(InputError, match="a whole number as track id"):
+            FrameLabels.of("7", 0, [[1] * 7], ["Car"], [track])
+    with pytest.raises(InputError, match="each box needs one"):
+        FrameLabels.of("7", 0, [[1] * 7], [])
+
+
+@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("key", ["rotation", "tracking_id", "uid", "truncated", "openlabel_cuboid"])
+def test_fields_of_another_tool_are_kept_or_refused_in_one_line(key, format, tmp_path):
+    frames = drive("one")
+    for value in None, 5, "x", [], {}, [0] * 4, ["a"] * 4, [10**400] * 4, [1, 0, 0, 0]:
+        labels = DriveLabels([FrameLabels.of(frame.name, frame.stamp_ns, [[5, 1, 0, 4, 2, 1, 0.1]],
+                                             ["Car"], [3], [0.5], [{key: value}])
+                              for frame in frames])
+        try:
+            export_labels(labels, format, tmp_path / "out", frames, force=True)
+            assert import_labels(tmp_path / "out", format, frames).boxes == len(frames)
+        except InputError as error:
+            assert "\n" not in str(error) and key not in ("rotation", "tracking_id", "uid")
+
+
+def test_numbers_that_no_float_holds_go_through_every_format(tmp_path):
+    """Beside a box, where nobody computes with them."""
+    frames = drive("one")
+    path = put(tmp_path / "in", "labelcloud", '"name"', f'"n": {10**400}, "name"')
+    labels = import_labels(path, "labelcloud", frames)
+    for format in set(FORMATS) - {"kitti_object", "kitti_tracking"}:  # which have no place for it
+        export_labels(labels, format, tmp_path / format, frames)
+        back, = import_labels(tmp_path / format, format, frames).frames[0].extra
+        assert back["n"] == 10**400
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_what_is_there_is_replaced_by_force_only(format, tmp_path):
+    frames = drive("one")
+    labels, other = (labels_of(frames, format, seed) for seed in (0, 1))
+    export_labels(labels, format, tmp_path / "out", frames)
+    with pytest.raises(InputError, match="exists already"):
+        export_labels(other, format, tmp_path / "out", frames)
+    export_labels(other, format, tmp_path / "out", frames, force=True)
+    found = import_labels(tmp_path / "out", format, frames)
+    np.testing.assert_allclose(found.frames[0].boxes.sum(), other.frames[0].boxes.sum(), atol=1e-4)
+
+
+def test_force_removes_nothing_that_it_does_not_write(tmp_path):
+    frames = drive("one")
+    export_labels(labels_of(frames, "sustech"), "sustech", tmp_path / "out", frames)
+    (tmp_path / "out/notes.txt").write_text("mine")
+    with pytest.raises(InputError, match=r"would not be replaced \(1, such as notes.txt\)"):
+        export_labels(labels_of(frames, "sustech", 1), "sustech", tmp_path / "out", frames, True)
+    assert (tmp_path / "out/notes.txt").read_text() == "mine"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["out"]
+
+
+@pytest.fixture
+def room():
+    """room(bytes): no file may grow larger; a write beyond fails as it does on a full disk."""
+    _, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    yield lambda size: resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, hard))
+
+
+@pytest.mark.parametrize("format", sorted(FORMATS.keys() - {"bag", "bag_labels"}))
+def test_on_a_full_disk_nothing_is_half_written(format, tmp_path, room):
+    frames = drive("one")
+    export_labels(labels_of(frames, format), format, tmp_path / "old", frames)
+    before = {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+    for out, force in (("old", True), ("new", False)):
+        room(100)
+        with pytest.raises(InputError, match=f"cannot write .*{out}"):
+            export_labels(labels_of(frames, format, 1), format, tmp_path / out, frames, force)
+        room(resource.RLIM_INFINITY)
+        assert before == {p: p.read_bytes() for p in tmp_path.rglob("*") if p.is_file()}
+
+
+def test_a_data_set_is_whole_or_not_there(tmp_path, room):
+    frames = drive("one")
+    broken = replace(frames[2], load=lambda: (_ for _ in ()).throw(InputError("scan 2 is cut")))
+    with pytest.raises(InputError, match="scan 2 is cut"):
+        write_dataset("kitti_object", [*frames[:2], broken], tmp_path / "out")
+    assert list(tmp_path.iterdir()) == []
+    room(600)
+    with pytest.raises(InputError, match=r"cannot write .*out/training/velodyne/000000\.bin"):
+        write_dataset("kitti_object", frames, tmp_path / "out")
+    room(resource.RLIM_INFINITY)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_kitti_and_nuscenes_say_what_they_lack(tmp_path):
+    bare = [replace(f, pose=lambda: None) for f in drive("one", camera=False)]
+    with pytest.raises(InputError, match="no camera calibration"):
+        export_labels(labels_of(bare, "kitti_object"), "kitti_object", tmp_path / "k", bare)
+    with pytest.raises(InputError, match="has no pose"):
+        export_labels(labels_of(bare, "openlabel"), "nuscenes_tracking", tmp_path / "n", bare)
+    for format in ("openlabel", "sustech", "labelcloud", "bag"):
+        export_labels(labels_of(bare, format), format, tmp_path / format, bare)
+    assert not (tmp_path / "k").exists() and not (tmp_path / "n").exists()
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["{bag}", "--to", "kitti_object", "--out", "{bag}"], "exists already"),
+    (["{bag}", "--to", "nuscenes_tracking", "--out", "{out}"], "has no pose"),
+    (["{bag}", "--to", "kitti_object", "--detections", "/none", "--out", "{out}"],
+     "has no topic /none; it has /camera/camera_info"),
+    (["{bag}", "--to", "openlabel", "--detections", "/points", "--out", "{out}"],
+     "/points is sensor_msgs/msg/PointCloud2, and labels are"),
+    (["{bag}", "--points", "/lidar", "--to", "nuscenes", "--out", "{out}"], "has no topic /lidar"),
+    (["{bag}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
+     "/ground_truth/detections has labels of"),
+    (["{bag}", "--data", "{kitti}", "--detections", "/none", "--to", "openlabel", "--out", "{out}"],
+     "has no topic /none"),
+    (["{empty}", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"],
+     "holds no labels that are recognised"),
+    (["{kitti}/none", "--data", "{kitti}", "--to", "openlabel", "--out", "{out}"], "there is no"),
+])
+def test_convert_says_in_one_line_what_cannot_be(arguments, words, tmp_path, monkeypatch, capsys):
+    root = object_folder(tmp_path / "kitti")
+    write_bag(tmp_path / "bag", [replace(frame, pose=lambda: None, truth=walker_truth)
+                                 for frame in drive("one")])
+    (tmp_path / "empty").mkdir()
+    places = {"bag": tmp_path / "bag", "out": tmp_path / "out", "kitti": root,
+              "empty": tmp_path / "empty"}
+    assert exit_of(monkeypatch, "convert", *(a.format(**places) for a in arguments)) == 2
+    assert words in error_line(capsys)
+    assert not (tmp_path / "out").exists()

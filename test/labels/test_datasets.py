@@ -1,0 +1,297 @@
+"""Data set -> bag -> data set: the same frames, boxes, labels of points and poses."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cli_samples import error_line, exit_of
+from format_samples import CALIBRATION, drive, labels_of, pose, same
+from nuscenes_folder import made_tables, save
+from robot_bags import ON_BASE, base_at, mount, moving, moving_tf, recorded, stamps
+from samples import DATA, needs_data
+
+from lidar_perception.classes import CAR
+from lidar_perception.data.bag import BagWriter
+from lidar_perception.data.frame import Frame, PointTruth
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.labels.datasets import write_dataset
+from lidar_perception.labels.drive_labels import DriveLabels, of_truth
+from lidar_perception.labels.exchange import export_labels
+from lidar_perception.labels.formats import bag as bag_format
+from lidar_perception.robot.poses import inverse, moved_boxes
+from lidar_perception.simulation.sensor import generic
+from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.testing.clouds import cloud_message
+from lidar_perception.types import SENSOR_HEIGHT, Detections, GroundTruth, InputError, LidarFrame
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.messages import detection_markers
+from lidar_perception.wire.topics import ODOMETRY, POINTS
+from lidar_studio import results
+from msg_utils.detections import to_detection_array
+from msg_utils.markers import to_marker_array
+from msg_utils.stamps import header_message
+
+MARKERS = "visualization_msgs/msg/MarkerArray"
+SMALL = generic(32, -25.0, 5.0, 0.4, 10.0)
+LAYOUTS = {"kitti": "kitti_object", "kitti-tracking": "kitti_tracking",
+           "semantickitti": "semantickitti"}
+REAL = {"kitti_object": "kitti_object", "kitti_tracking": "kitti_tracking",
+        "semantickitti": "semantickitti"}
+
+
+def same_frames(recording, others, boxes=1e-5, points=0.0):
+    for frame, other in zip(recording, others, strict=True):
+        scan, again = frame.load(), other.load()
+        np.testing.assert_allclose(again.xyz, scan.xyz, atol=points)
+        np.testing.assert_allclose(again.intensity, scan.intensity, atol=1e-6 * (points > 0))
+        assert again.stamp_ns == scan.stamp_ns
+        labels, again = frame.point_truth(), other.point_truth()
+        assert (labels is None) == (again is None)
+        if labels is not None:
+            assert np.array_equal(again.classes, labels.classes)
+            assert np.array_equal(again.instances, labels.instances)
+        here, again = frame.pose(), other.pose()
+        if here is not None and again is not None:
+            np.testing.assert_allclose(again, here, atol=1e-6)
+        truth, again = frame.truth(), other.truth()
+        assert (truth is None) == (again is None)
+        if truth is not None:
+            np.testing.assert_allclose(again.boxes, truth.boxes, atol=boxes)
+            assert again.labels == truth.labels and again.notes == truth.notes
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_simulated_data_set_comes_back_from_its_bag(layout, made, tmp_path):
+    recording = open_recording(made / layout)
+    write_bag(tmp_path / "bag", recording)
+    bag = open_recording(tmp_path / "bag")
+    summary = write_dataset(LAYOUTS[layout], bag, tmp_path / "back")
+    assert summary.frames == len(recording)
+    back = open_recording(tmp_path / "back")
+    assert (back.layout, back.has) == (recording.layout, recording.has)
+    same_frames(recording, back)
+    if layout != "semantickitti":  # the labels are the same files
+        for file in (made / layout).glob("training/label_*/*.txt"):
+            other = tmp_path / "back" / file.relative_to(made / layout)
+            assert other.read_text().split() == file.read_text().split()
+
+
+@needs_data
+@pytest.mark.parametrize("folder", REAL)
+def test_a_real_data_set_comes_back_from_its_bag(folder, tmp_path):
+    recording = open_recording(DATA / folder)
+    recording = recording.chosen([frame.name for frame in recording.frames[:4]])
+    write_bag(tmp_path / "bag", recording)
+    write_dataset(REAL[folder], open_recording(tmp_path / "bag"), tmp_path / "back")
+    same_frames(recording, open_recording(tmp_path / "back"))
+
+
+@pytest.fixture(scope="module")
+def simulated(streets, tmp_path_factory):
+    """The bag of a simulated drive, as `simulate` writes it."""
+    path = tmp_path_factory.mktemp("bags") / "drive"
+    write_bag(path, simulated_scans(5, 4, SMALL))
+    return path
+
+
+def test_a_simulated_drive_comes_back_from_nuscenes_tables(simulated, tmp_path):
+    summary = write_dataset("nuscenes", open_recording(simulated), tmp_path / "n")
+    assert all(remark.startswith("written as another class: ") for remark in summary.remarks)
+    recording, back = list(open_recording(simulated)), list(open_recording(tmp_path / "n"))
+    assert sum(len(frame.truth()) for frame in recording) == summary.boxes > 0
+    tracks = {}
+    for frame, other in zip(recording, back, strict=True):
+        scan, again = frame.load(), other.load()
+        away = (np.abs(scan.xyz[:, :2]) >= 1.0).any(axis=1)  # what nuScenes takes for the vehicle
+        np.testing.assert_allclose(again.xyz, scan.xyz[away], atol=1e-5)
+        np.testing.assert_allclose(again.intensity, scan.intensity[away], atol=1e-6)
+        np.testing.assert_allclose(other.pose(), frame.pose(), atol=1e-6)
+        assert other.sensor_height == frame.sensor_height
+        truth, labels = frame.truth(), of_truth(other)
+        np.testing.assert_allclose(labels.boxes, truth.boxes, atol=1e-6)
+        for name, found, extra, track in zip(truth.labels, labels.class_names, truth.extras,
+                                             labels.track_ids.tolist()):
+            assert found == {"Van": "Car", "Person_sitting": "Pedestrian"}.get(name, name)
+            assert tracks.setdefault(extra["track_id"], track) == track
+    assert len(set(tracks.values())) == len(tracks)
+
+
+def frames_at(seconds, **more):
+    return [Frame.of(str(i), LidarFrame.of(np.full((3, 3), 5.0 + i), None,
+                                           1_700_000_000_000_000_000 + round(s * 1e9), "top"),
+                     **more) for i, s in enumerate(seconds)]
+
+
+@pytest.mark.parametrize("kind", ["tables", "results"])
+def test_labels_of_a_vehicle_that_leans_come_back_from_nuscenes_as_they_were(kind, tmp_path):
+    """Its boxes are upright in the global frame, ours in the vehicle's; what was not moved is
+    written as it was read."""
+    tables = made_tables(frames=2, objects=8, scenes=("scene-0001",))
+    recording = open_recording(save(tmp_path / "there", tables))
+    if kind == "tables":
+        write_dataset("nuscenes", recording, tmp_path / "back")
+        written = json.loads(next(tmp_path.glob("back/*/sample_annotation.json")).read_text())
+    else:
+        labels = DriveLabels(list(map(of_truth, recording)))
+        export_labels(labels, "nuscenes_detection", tmp_path / "r.json", recording.frames)
+        results = json.loads((tmp_path / "r.json").read_text())["results"]
+        written = [row for rows in results.values() for row in rows]
+    counts = ("num_lidar_pts", "num_radar_pts")
+    there = {tuple(np.round(row["translation"], 3)): row for row in tables["sample_annotation"]}
+    assert len(written) == len(there) > 8
+    for row in written:
+        like = there[tuple(np.round(row["translation"], 3))]
+        np.testing.assert_allclose(row["rotation"], like["rotation"], atol=1e-9)
+        np.testing.assert_allclose(row["size"], like["size"], atol=1e-6)
+        assert kind == "results" or [row[key] for key in counts] == [like[key] for key in counts]
+
+
+def test_without_a_camera_one_is_assumed_and_numbers_follow_the_time(tmp_path):
+    """A missing scan leaves its number free; after a gap the next drive begins."""
+    frames = frames_at([0, 0.1, 0.31, 0.4, 30, 30.07, 30.13], pose=np.eye(4).copy)
+    labels = labels_of(frames, "kitti_tracking")
+    summary = write_dataset("kitti_tracking", frames, tmp_path / "k", labels)
+    assert (summary.frames, summary.drives) == (7, 2)
+    assert {remark.split(":")[0]: n for remark, n in summary.remarks.items()} == {
+        "assumed": 7, "left out": 7, "without a track id, which tracking needs": 6}
+    back = open_recording(tmp_path / "k")
+    assert [frame.name for frame in back] == [
+        *(f"0000/{i:06}" for i in (0, 1, 3, 4)), *(f"0001/{i:06}" for i in range(3))]
+    found = DriveLabels([replace(of_truth(frame), name=a.name, stamp_ns=a.stamp_ns)
+                         for a, frame in zip(frames, back)])
+    same(labels, found, 2e-6)
+
+
+@pytest.mark.parametrize("layout", REAL)
+@pytest.mark.parametrize("height", [0.62, SENSOR_HEIGHT, 2.9])
+def test_the_sensor_is_as_high_in_the_folder_as_in_the_recording(tmp_path, layout, height):
+    points = PointTruth(np.zeros(3, np.uint16), np.zeros(3, np.uint16))
+    frames = frames_at([0, 0.1], point_truth=lambda: points, sensor_height=height)
+    write_dataset(layout, frames, tmp_path / "folder")
+    assert [f.sensor_height for f in open_recording(tmp_path / "folder")] == [height] * 2
+    assert (tmp_path / "folder/mount.json").exists() == (height != SENSOR_HEIGHT)
+    assert open_recording(tmp_path / "folder", sensor_height=1.0).frames[0].sensor_height == 1.0
+
+
+def test_point_labels_need_columns_and_go_only_where_they_fit(tmp_path, monkeypatch, capsys):
+    points = PointTruth(np.array([40, 252, 0], np.uint16), np.array([0, 7, 65535], np.uint16))
+    write_bag(tmp_path / "labelled", frames_at([0, 0.1], point_truth=lambda: points,
+                                               calibration=CALIBRATION))
+    write_bag(tmp_path / "bare", frames_at([0, 0.1]))
+    assert exit_of(monkeypatch, "convert", tmp_path / "labelled", "--to", "semantickitti", "--out",
+                   tmp_path / "s") == 0
+    for frame in open_recording(tmp_path / "s"):
+        assert frame.point_truth().instances.tolist() == [0, 7, 65535]
+    assert exit_of(monkeypatch, "convert", tmp_path / "labelled", "--to", "kitti_object", "--out",
+                   tmp_path / "k") == 0
+    assert "left out: points' labels" in capsys.readouterr().out
+    assert exit_of(monkeypatch, "convert", tmp_path / "bare", "--to", "semantickitti", "--out",
+                   tmp_path / "none") == 2
+    assert "has no labels of points" in error_line(capsys)
+    assert not (tmp_path / "none").exists() and not list(tmp_path.glob(".*"))
+
+
+def test_detections_on_a_topic_become_labels(tmp_path, monkeypatch):
+    """MarkerArray of this package's nodes, and Detection3DArray of any, of tracks too."""
+    frames, rng = drive("one"), np.random.default_rng(2)
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/found", "visualization_msgs/msg/MarkerArray")
+        bag.add_topic("/tracks", "vision_msgs/msg/Detection3DArray")
+        expected = []
+        for i, frame in enumerate(frames):
+            found = Detections.of(rng.uniform(1, 9, (i, 7)) / [1, 1, 1, 1, 1, 1, 3], 0, 0.5)
+            header = header_message(frame.stamp_ns, "velodyne", bag_message)
+            bag.write("/found", frame.stamp_ns, detection_markers(found, header, bag_message))
+            bag.write("/tracks", frame.stamp_ns, to_detection_array(
+                found.boxes, ["tree"] * i, found.scores.tolist(), header=header, make=bag_message,
+                ids=[100 + k for k in range(i)]))
+            expected.append(found.boxes.astype(float))
+    found = bag_format.read(tmp_path / "bag", frames, "/found")
+    tracks = bag_format.read(tmp_path / "bag", frames, "/tracks")
+    for boxes, one, other in zip(expected, found.frames, tracks.frames):
+        for each in (one, other):
+            np.testing.assert_allclose(each.boxes, boxes, atol=1e-9)
+            assert each.scores.tolist() == [0.5] * len(boxes)
+        assert one.track_ids.tolist() == [-1] * len(boxes)
+        assert other.track_ids.tolist() == [100 + k for k in range(len(boxes))]
+        assert other.class_names == ["tree"] * len(boxes)
+
+
+@pytest.mark.parametrize("parts", [[moving(ODOMETRY), mount()], [moving_tf(), mount()], []])
+def test_boxes_in_another_frame_are_brought_to_that_of_the_clouds(parts, tmp_path):
+    """As target_frame:=odom gives them. Where nothing connects the two, that is said."""
+    boxes = np.array([[10.0, 2, 0.5, 4, 2, 1.5, 0.3]])
+    rows = []
+    for stamp in stamps():
+        marked = to_marker_array(boxes, ["Car"], ids=[1], make=bag_message,
+                                 header=header_message(stamp, "odom", bag_message))
+        rows += [(topic, MARKERS, stamp, marked) for topic in ("/n/output/detections",
+                                                               "/n/output/tracks")]
+    recording = recorded(tmp_path / "bag", *map(list, parts), rows)
+    frames, poses = recording.frames[:], recording.frames.poses
+    if not parts:
+        with pytest.raises(InputError, match="in 'odom', the clouds in 'lidar'"):
+            bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
+        assert not results.recorded(poses, stamps()).sources
+        return
+    labels = bag_format.read(tmp_path / "bag", frames, "/n/output/detections")
+    shown = results.recorded(poses, stamps())
+    for i, (frame, each) in enumerate(zip(frames, labels.frames)):
+        near = moved_boxes(boxes, inverse(base_at(frame.stamp_ns) @ ON_BASE))
+        np.testing.assert_allclose(each.boxes, near, atol=1e-3)
+        np.testing.assert_allclose(shown.sources["n"].find(i, frame).boxes, near, atol=1e-3)
+        np.testing.assert_allclose(shown.tracks[0]["boxes"][i][1:8], near[0], atol=1e-3)
+
+
+def test_scans_of_one_stamp_are_all_there_and_labels_go_to_no_other_scan(tmp_path):
+    twice = frames_at([0.0, 0.1, 0.1])
+    write_dataset("nuscenes", twice, tmp_path / "nuscenes")
+    assert len({f.points for f in open_recording(tmp_path / "nuscenes")}) == 3
+    skipped = []
+    assert write_bag(tmp_path / "plain", twice) == 3
+    truth = GroundTruth.of(np.ones((1, 7)), [CAR])
+    assert write_bag(tmp_path / "bag", [replace(f, truth=lambda: truth) for f in twice],
+                     skipped=skipped) == 2
+    assert "another labelled scan has its stamp" in skipped[0]
+    unset = [replace(f, stamp_ns=0) for f in frames_at([0, 1])]
+    with BagWriter(tmp_path / "unset") as bag:  # a driver that sets no stamp
+        bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+        for i, frame in enumerate(unset, 5):
+            bag.write(POINTS, i * 10**9, cloud_message(frame.load().xyz, 0, "top"))
+    assert [f.stamp_ns for f in open_recording(tmp_path / "unset")] == [5 * 10**9, 6 * 10**9]
+
+
+def test_results_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch, capsys):
+    recording = list(open_recording(simulated))
+    labels = DriveLabels(list(map(of_truth, recording)))
+    export = tmp_path / "labels"
+    bag_format.write(labels, export, recording)
+    for topic in ("/ground_truth/detections", "/ground_truth/detections_3d"):
+        out = tmp_path / topic.replace("/", "_")
+        assert exit_of(monkeypatch, "convert", export, "--to", "kitti_tracking", "--detections",
+                       topic, "--out", out) == 0
+        back = open_recording(out)
+        found = DriveLabels([replace(of_truth(f), name=a.name, stamp_ns=a.stamp_ns)
+                             for a, f in zip(recording, back)])
+        expected = labels
+        if topic.endswith("3d"):  # which has a score for everything
+            expected = DriveLabels([replace(f, scores=np.ones(len(f))) for f in labels.frames])
+        same(expected, found, 2e-6)
+    assert exit_of(monkeypatch, "convert", export, "--detections", "/odom", "--out",
+                   tmp_path / "no", "--to", "nuscenes") == 2
+    capsys.readouterr()
+
+
+def test_poses_lead_to_the_same_world(tmp_path):
+    frames = [replace(f, point_truth=lambda: PointTruth(np.zeros(50, np.uint16),
+                                                        np.zeros(50, np.uint16)))
+              for f in drive("one", frames=3)]
+    write_bag(tmp_path / "bag", frames)
+    write_dataset("semantickitti", open_recording(tmp_path / "bag"), tmp_path / "s")
+    first = np.linalg.inv(pose(5))
+    for i, frame in enumerate(open_recording(tmp_path / "s")):
+        np.testing.assert_allclose(frame.pose(), first @ pose(5 + i), atol=1e-6)

@@ -1,0 +1,198 @@
+"""Files as other tools write them: headings and corners as those tools mean them, and what we do
+not know is kept."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from format_samples import CALIBRATION, drive
+from scipy.spatial.transform import Rotation
+
+from lidar_perception.data.kitti.labels import DONT_CARE
+from lidar_perception.geometry import box_corners
+from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
+from lidar_perception.labels.exchange import FORMATS, export_labels, import_labels, recognised
+
+BOX = np.array([10.0, 5.0, -1.0, 4.0, 1.8, 1.5, 2.0])  # length, width, height, and to the left
+HEADING = np.array([math.cos(2.0), math.sin(2.0), 0.0])
+
+
+def frames_one():
+    return drive("one", frames=1)
+
+
+def written(format, path, box=BOX, **more):
+    frame, = frames = frames_one()
+    labels = FrameLabels.of(frame.name, frame.stamp_ns, [box], ["Car"], [7], [0.5], **more)
+    export_labels(DriveLabels([labels]), format, path, frames)
+    return path
+
+
+def near(found, expected):
+    """The same points, in any order."""
+    np.testing.assert_allclose(np.sort(np.round(found, 5), axis=0),
+                               np.sort(np.round(expected, 5), axis=0), atol=1e-5)
+
+
+def test_sustech_points_front_is_where_scale_x_points(tmp_path):
+    (item,) = json.loads((written("sustech", tmp_path / "s") / "000005.json").read_text())
+    psr = {k: np.array([v["x"], v["y"], v["z"]]) for k, v in item["psr"].items()}
+    turn = Rotation.from_euler("XYZ", psr["rotation"]).as_matrix()
+    near([psr["position"] + turn @ (np.array([x, y, z]) * psr["scale"] / 2)
+          for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], box_corners(BOX[None])[0])
+    np.testing.assert_allclose(turn[:, 0], HEADING, atol=1e-12)
+    assert (item["obj_type"], item["obj_id"]) == ("Car", "7")
+
+
+@pytest.mark.parametrize(("format", "degrees"), [("labelcloud", True), ("labelcloud_rel", False)])
+def test_labelcloud_turns_the_length_from_x_counterclockwise(format, degrees, tmp_path):
+    content = json.loads((written(format, tmp_path / "l") / "000005.json").read_text())
+    (item,) = content["objects"]
+    turn = item["rotations"]["z"]
+    assert turn == pytest.approx(math.degrees(2.0) if degrees else 2.0)
+    assert list(item["rotations"]) == ["x", "y", "z"]  # labelCloud takes them in this order
+    assert list(item["dimensions"].values()) == [4.0, 1.8, 1.5]
+    backwards = {**item["rotations"], "z": 350.0 if degrees else -0.3}
+    (tmp_path / "l/000005.json").write_text(json.dumps(
+        {**content, "objects": [{**item, "rotations": backwards}]}))
+    read = import_labels(tmp_path / "l", format, frames_one())
+    assert read.frames[0].boxes[0, 6] == pytest.approx(-math.pi / 18 if degrees else -0.3)
+
+
+def test_labelcloud_reads_heading_and_sides_off_its_vertices(tmp_path):
+    content = json.loads((written("labelcloud_vertices", tmp_path / "l") / "000005.json")
+                         .read_text())
+    corners = np.array(content["objects"][0]["vertices"])
+    near(corners, box_corners(BOX[None])[0])
+    along, across, up = (corners[k] - corners[0] for k in (3, 1, 4))  # as its own reader has it
+    np.testing.assert_allclose(along, 4.0 * HEADING, atol=1e-6)
+    np.testing.assert_allclose(np.linalg.norm([across, up], axis=1), [1.8, 1.5], atol=1e-6)
+    assert np.cross(along, across)[2] > 0 and up[2] > 0
+    assert recognised(tmp_path / "l") == "labelcloud"  # which reads them too
+    read = import_labels(tmp_path / "l", "labelcloud", frames_one())
+    np.testing.assert_allclose(read.frames[0].boxes[0], BOX, atol=1e-7)
+
+
+def test_a_cuboid_of_openlabel_has_its_x_axis_to_the_front(tmp_path):
+    content = json.loads(written("openlabel", tmp_path / "o.json").read_text())["openlabel"]
+    element = content["frames"]["5"]["objects"]["7"]["object_data"]
+    val = element["cuboid"][0]["val"]
+    np.testing.assert_allclose(Rotation.from_quat(val[3:7]).as_matrix()[:, 0], HEADING, atol=1e-12)
+    np.testing.assert_allclose([*val[:3], *val[7:]], BOX[:6], atol=1e-12)
+    assert content["objects"]["7"]["type"] == "Car"
+    assert content["objects"]["7"]["frame_intervals"] == [{"frame_start": 5, "frame_end": 5}]
+    camera = np.array(content["coordinate_systems"]["camera"]["pose_wrt_parent"]["matrix4x4"])
+    lidar_to_camera = frames_one()[0].calibration().lidar_to_camera
+    np.testing.assert_allclose(camera.reshape(4, 4) @ lidar_to_camera, np.eye(4), atol=1e-9)
+
+
+FOREIGN = {"openlabel": {
+    "metadata": {"schema_version": "1.0.0", "annotator": "somebody"},
+    "ontologies": {"0": "https://example.org/things"},
+    "coordinate_systems": {
+        "map": {"type": "scene_cs", "parent": "", "children": ["vehicle"]},
+        "vehicle": {"type": "local_cs", "parent": "map", "children": ["velodyne_top", "front"]},
+        "velodyne_top": {"type": "sensor_cs", "parent": "vehicle", "children": [],
+                         "pose_wrt_parent": {"quaternion": [0, 0, math.sin(0.25), math.cos(0.25)],
+                                             "translation": [1.0, 0, 2.0]}},
+        "front": {"type": "sensor_cs", "parent": "vehicle", "children": []}},
+    "frames": {"5": {"frame_properties": {"transforms": {"vehicle_to_map": {
+        "src": "vehicle", "dst": "map", "transform_src_to_dst": {"matrix4x4": [
+            1, 0, 0, 100, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}}}}, "objects": {
+        "6bb5f9a6-6b0f-4b3c-8d1a-2f5c1d3e4f50": {"object_data": {"cuboid": [{
+            "name": "shape3D", "coordinate_system": "map",
+            "val": [111.0, 0, 2.5, 0.0, 0.0, 0.7, 4, 2, 1.5],
+            "attributes": {"text": [{"name": "wheels", "val": "four"}]}}],
+            "bbox": [{"name": "b", "val": [1, 2, 3, 4], "coordinate_system": "front"}]}},
+        "3": {"object_data": {"cuboid": [{"name": "shape3D", "coordinate_system": "velodyne_top",
+                                          "val": [5, 6, 7, 0.1, 0.0, 0.0, 0.995, 4, 2, 1.5]}]}},
+        "9": {"object_data": {"bbox": [{"name": "b", "val": [5, 6, 7, 8]}]}}}}},
+    "objects": {"6bb5f9a6-6b0f-4b3c-8d1a-2f5c1d3e4f50": {"name": "a", "type": "forklift"},
+                "3": {"name": "b", "type": "Car", "ontology_uid": "0"},
+                "9": {"name": "c", "type": "sign", "frame_intervals": [
+                    {"frame_start": 5, "frame_end": 5}]}}}}
+
+
+def test_openlabel_of_another_tool_is_placed_by_its_systems_and_kept(tmp_path):
+    (tmp_path / "f.json").write_text(json.dumps(FOREIGN))
+    frames = frames_one()
+    labels = import_labels(tmp_path / "f.json", recognised(tmp_path / "f.json"), frames)
+    each = labels.frames[0]
+    assert each.class_names == ["forklift", "Car"] and each.track_ids.tolist() == [10, 3]
+    # 11 m ahead of the vehicle, which is 10 m ahead of the LiDAR that looks 0.5 to the left of it.
+    np.testing.assert_allclose(each.boxes[0], [
+        10 * math.cos(0.5), -10 * math.sin(0.5), 0.5, 4, 2, 1.5, 0.2], atol=1e-9)
+    export_labels(labels, "openlabel", tmp_path / "again.json", frames)
+    again = json.loads((tmp_path / "again.json").read_text())["openlabel"]
+    old, new = (content["frames"]["5"]["objects"] for content in (FOREIGN["openlabel"], again))
+    assert new == old
+    for key in ("metadata", "ontologies", "coordinate_systems"):
+        assert again[key] == FOREIGN["openlabel"][key]
+    assert again["objects"]["3"]["ontology_uid"] == "0"
+    each.boxes[:, 0] += 1.0  # moved boxes are in the LiDAR's system
+    export_labels(labels, "openlabel", tmp_path / "moved.json", frames)
+    moved = import_labels(tmp_path / "moved.json", "openlabel", frames)
+    np.testing.assert_allclose(moved.frames[0].boxes, each.boxes, atol=1e-9)
+    assert [e["wheels"] for e in moved.frames[0].extra[:1]] == ["four"]
+    flat = [replace(each, notes=[("lane mark", {"bbox": [{"name": "seen"}]}), ("DontCare", {
+        **DONT_CARE, "bbox": [1.0, 2.0, 3.0, 4.0]})])]  # regions that only an image shows
+    frames = [replace(frames[0], calibration=lambda: CALIBRATION)]
+    for format in ("kitti_tracking", "kitti_object"):
+        export_labels(DriveLabels(flat), format, tmp_path / format, frames)
+        notes = import_labels(tmp_path / format, format, frames).frames[0].notes
+        assert [(name, extra["bbox"]) for name, extra in notes] == [
+            ("lane_mark", [0, 0, 0, 0]), ("DontCare", [1, 2, 3, 4])]
+
+
+TILTED = {
+    "sustech": [{"psr": {"position": {"x": 4.1, "y": -49.7, "z": 1.8},
+                         "scale": {"x": 4.5, "y": 1.7, "z": 1.6},
+                         "rotation": {"x": -0.05, "y": 0.003, "z": 1.45}},
+                 "obj_type": "ScooterRider", "obj_id": "front-left", "obj_attr": "umbrella",
+                 "annotator": "i"}],
+    "labelcloud": {"folder": "pointclouds", "filename": "000005.ply", "path": "p/000005.ply",
+                   "objects": [{"name": "cart", "centroid": {"x": -0.2, "y": -0.2, "z": 0.1},
+                                "dimensions": {"length": 0.75, "width": 0.55, "height": 0.15},
+                                "rotations": {"x": 10, "y": 350, "z": 235}}]}}
+
+
+@pytest.mark.parametrize("format", TILTED)
+def test_a_box_that_leans_is_kept_until_it_is_moved(format, tmp_path):
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in/000005.json").write_text(json.dumps(TILTED[format]))
+    frames = frames_one()
+    assert recognised(tmp_path / "in") == format
+    labels = import_labels(tmp_path / "in", format, frames)
+    box = labels.frames[0].boxes[0]
+    turn = (Rotation.from_euler("XYZ", [-0.05, 0.003, 1.45]) if format == "sustech"
+            else Rotation.from_euler("ZYX", [235, 350, 10], degrees=True)).as_matrix()
+    assert box[6] == pytest.approx(math.atan2(turn[1, 0], turn[0, 0]))
+    for other in sorted(FORMATS.keys() - {"kitti_object"}):  # which has no ids
+        export_labels(labels, other, tmp_path / f"{format}_{other}", frames)
+    export_labels(labels, format, tmp_path / "same", frames)
+    assert json.loads((tmp_path / "same/000005.json").read_text()) == TILTED[format] or (
+        format == "labelcloud")
+    again = import_labels(tmp_path / "same", format, frames)
+    assert again.frames[0].extra == labels.frames[0].extra and again.extra == labels.extra
+    box[0] += 1.0
+    export_labels(labels, format, tmp_path / "moved", frames)
+    moved = import_labels(tmp_path / "moved", format, frames).frames[0]
+    np.testing.assert_allclose(moved.boxes[0], box, atol=1e-8)
+    assert not any("tilted" in key for key in moved.extra[0])
+
+
+@pytest.mark.parametrize(("format", "key"), [
+    ("sustech", "obj_id"), ("openlabel", "uid"), ("nuscenes_tracking", "tracking_id")])
+def test_a_name_of_a_track_goes_to_one_of_the_parts_it_is_split_into(format, key, tmp_path):
+    name = "0b3f7a52-5a7e-4a9b-9a3e-0d2c6f1b8e11"
+    frame, = frames = frames_one()
+    before = FrameLabels.of(frame.name, frame.stamp_ns, [BOX, BOX + [5, 0, 0, 0, 0, 0, 0]],
+                            ["Car", "Car"], [4, 8], extra=[{key: name}, {key: name}])
+    export_labels(DriveLabels([before]), format, tmp_path / "out", frames)
+    after = import_labels(tmp_path / "out", format, frames).frames[0]
+    assert sorted(after.track_ids.tolist()) == [8, 9]  # the name has the number behind
+    assert [e.get(key) for e in after.extra if e] == [name]

@@ -1,0 +1,81 @@
+"""A drive to be labelled: its clouds, and which of several it is; sizes and headings of boxes."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_proposals import SEED
+
+from lidar_perception.data.frame import Recording
+from lidar_perception.geometry import box_corners
+from lidar_perception.simulation.to_bag import simulated_scans
+from lidar_perception.types import InputError
+from lidar_studio.drive import Clouds, Scan, one_drive
+from lidar_studio.snap import around_click, headed, to_size
+
+
+def test_clouds_keep_to_their_bound_and_are_made_once():
+    made = []
+
+    def make(i):
+        made.append(i)
+        return Scan(np.zeros((1000, 3), np.float32), np.zeros(1000, np.uint8),
+                    np.zeros(1000, bool), np.zeros(1000, np.int32))
+    clouds = Clouds(make, limit=5 * make(0).size)
+    made.clear()
+    threads = [threading.Thread(target=clouds, args=(3,)) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert made == [3]
+    for i in range(1000):
+        clouds(i)
+        assert sum(s.size for s in clouds._kept.values()) == clouds._size <= 5 * make(0).size
+    assert len(clouds._making) <= 6
+
+
+def test_a_recording_of_several_drives_wants_one_named():
+    frames = [*simulated_scans(SEED, 2, streets_of=1)]
+    recording = Recording(Path("two"), "simulated", frames)
+    with pytest.raises(InputError, match="--sequence"):
+        one_drive(recording)
+    assert [f.sequence for f in one_drive(recording, "0001").frames] == ["0001"]
+    with pytest.raises(InputError, match="no drive 7"):
+        one_drive(recording, "7")
+
+
+def test_another_size_leaves_the_corner_that_is_seen():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        box = np.array([*rng.uniform(8, 20, 2) * rng.choice([-1, 1], 2), 0, *rng.uniform(1, 4, 3),
+                        rng.uniform(-3, 3)])
+        other = to_size(box, rng.uniform(1, 4, 3))
+        corners, after = (box_corners(b[None])[0][:, :2] for b in (box, other))
+        nearest = int(np.hypot(*corners.T).argmin())
+        seen = np.array([np.cos(box[6]), np.sin(box[6])]) @ -box[:2]
+        if abs(seen) > box[3] / 2 and abs(np.array([-np.sin(box[6]), np.cos(box[6])])
+                                         @ -box[:2]) > box[4] / 2:
+            assert np.allclose(corners[nearest], after[nearest])
+        assert other[2] - other[5] / 2 == pytest.approx(box[2] - box[5] / 2)
+        assert to_size(other, box[3:6]) == pytest.approx(box) or abs(seen) <= 4
+
+
+def test_a_box_has_four_ways_to_say_it():
+    box = np.array([1.0, 2, 3, 4, 2, 1, 0.3])
+    for turn in range(-4, 5):
+        again = headed(headed(box, 0.3 + turn * np.pi / 2), 0.35)
+        assert again == pytest.approx(box)
+
+
+def test_a_click_beside_a_wall_gives_a_box_of_its_nearest_part():
+    """It is too long for a person, and farther from the click than a person is long."""
+    y, z = np.meshgrid(np.arange(-4, 4, 0.1), np.arange(-1.5, 0.5, 0.1))
+    xyz = np.stack([np.full(y.size, 9.0), y.ravel(), z.ravel()], 1).astype(np.float32)
+    scan = Scan(xyz, np.zeros(len(xyz), np.uint8), np.zeros(len(xyz), bool),
+                np.ones(len(xyz), np.int32))
+    box = around_click(scan, np.array([8.0, 0.0, -1.0]), "Pedestrian")
+    assert abs(box[0] - 9.0) < 0.5 and abs(box[1]) < 0.3 and box[3] < 1.5

@@ -1,0 +1,189 @@
+"""What is kept of labels from one day to the next: journals, imports and exports."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lidar_perception.cli.main import cli
+from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
+from lidar_perception.types import InputError, LidarFrame
+from lidar_studio.drive import Drive, one_drive
+from lidar_studio.journal import Journal, header
+from lidar_studio.labelled import from_labels, joined, to_labels
+from lidar_studio.session import ImportedAlready, session
+from lidar_studio.state import State, track_to_json
+
+COUNT = 6
+BOX = [8.0, 3.0, -0.9, 0.8, 0.6, 1.7, 0.3]
+
+
+def frames(x=5.0):
+    cloud = np.tile(np.array([[x, 0, -1]], np.float32), (50, 1))
+    return [replace(Frame.of(f"{i:06}", LidarFrame(cloud + np.float32(i), cloud[:, 0] * 0,
+                                                   (i + 1) * 10**8, "velodyne")), index=i)
+            for i in range(COUNT)]
+
+
+def drive(name="monday", x=5.0):
+    return Drive(name, Recording(Path(name), "made up", frames(x)))
+
+
+def labelled(made, frame=0, **more):
+    made.do({"do": "add", "frame": frame, "box": BOX, "class": "Pedestrian", **more})
+
+
+def test_a_journal_is_of_what_the_sensor_saw_and_not_of_the_name_of_a_folder(tmp_path):
+    with session(drive(), tmp_path) as made:
+        labelled(made)
+    with session(drive("renamed"), tmp_path) as made:
+        assert len(made.state.tracks) == 1
+    with pytest.raises(InputError, match="another drive"), session(drive(x=6.0), tmp_path):
+        pass
+
+
+def test_a_journal_of_before_is_of_the_drive_of_its_name(tmp_path):
+    old = {k: v for k, v in header("monday", [f.name for f in frames()],
+                                   [f.stamp_ns for f in frames()], "").items() if k != "clouds"}
+    Journal(tmp_path, old).close()
+    with session(drive(), tmp_path) as made:
+        labelled(made)
+    with pytest.raises(InputError, match="another drive"), session(drive("other"), tmp_path):
+        pass
+
+
+def test_a_journal_that_grew_meanwhile_is_not_written_over(tmp_path, monkeypatch):
+    """As on a file system without locks."""
+    def no_locks(*_):
+        raise OSError(9, "Bad file descriptor")
+    monkeypatch.setattr(fcntl, "flock", no_locks)
+    with session(drive(), tmp_path) as one, session(drive(), tmp_path) as two:
+        assert "cannot be locked" in one.journal.message
+        labelled(one)
+        content = one.journal.path.read_bytes()
+        with pytest.raises(InputError, match="another process"):
+            labelled(two)
+        assert one.journal.path.read_bytes() == content and not two.state.tracks
+        labelled(one)
+
+
+def test_the_same_labels_are_imported_once_and_others_leave_what_was_there(tmp_path):
+    with session(drive(), tmp_path / "one") as made:
+        labelled(made)
+        made.export("openlabel", "labels.json")
+        made.do({"do": "class", "track": 1, "class": "Cyclist"})
+        made.export("openlabel", "others.json")
+    with session(drive(), tmp_path / "two") as made:
+        for name in ("labels", "others"):
+            asked = {"do": "import", "path": str(tmp_path / f"one/{name}.json")}
+            made.do(asked)
+            with pytest.raises(ImportedAlready):
+                made.do(asked)
+        made.do({"do": "undo"})
+        made.do(asked)  # what was undone can be imported again
+        assert sorted(t.class_name for t in made.state.tracks.values()) == ["Cyclist", "Pedestrian"]
+    with session(drive(), tmp_path / "two") as made, pytest.raises(ImportedAlready):
+        made.do(asked)
+
+
+def test_what_imports_say_besides_boxes_is_kept_of_all_of_them():
+    one = {"notes": {"0": [["DontCare", {"left": 10}]]}, "extra": {"openlabel": {"": {}}}}
+    two = {"notes": {"0": [["DontCare", {"left": 20}]], "3": []}, "extra": {"kitti": {}}}
+    both = joined(joined({}, one), two)
+    assert both["notes"]["0"] == one["notes"]["0"] + two["notes"]["0"]
+    assert both["extra"].keys() == {"openlabel", "kitti"} and joined(both, one) == both
+
+
+def test_boxes_without_ids_that_were_joined_get_one(tmp_path):
+    with session(drive(), tmp_path / "one") as made:
+        for frame in range(COUNT):
+            labelled(made, frame)
+        made.export("sustech", "boxes")
+        for file in (tmp_path / "one/boxes").rglob("*.json"):
+            file.write_text(file.read_text().replace("obj_id", "nobody"))
+    with session(drive(), tmp_path / "two") as made:
+        made.do({"do": "import", "path": str(tmp_path / "one/boxes")})
+        first, *others = sorted(made.state.tracks)
+        for other in others:
+            made.do({"do": "merge", "tracks": [first, other]})
+        ids = {int(i) for f in to_labels(made.state, made.drive.frames).frames for i in f.track_ids}
+        assert len(ids) == 1 and min(ids) >= 0
+
+
+def test_two_exports_at_once_are_both_whole_or_refused(tmp_path):
+    with session(drive(), tmp_path) as made:
+        for frame in range(COUNT):
+            labelled(made, frame)
+
+        def export(_):
+            return made.export("labelcloud", "labels", force=True)["boxes"]
+
+        with ThreadPoolExecutor(4) as pool:
+            assert list(pool.map(export, range(12))) == [COUNT] * 12
+        names = sorted(path.name for path in (tmp_path / "labels").iterdir())
+        assert [n for n in names if n[:6].isdigit()] == [f"{f.name}.json" for f in frames()]
+        assert not [n for n in os.listdir(tmp_path) if n.endswith(".tmp")]
+
+
+def test_a_journal_is_not_replayed_with_poses_that_were_not_there(tmp_path):
+    """As of KITTI's oxts that came later: boxes between others would be elsewhere."""
+    bare, posed = drive(), Drive("monday", Recording(Path("monday"), "made up", [
+        replace(frame, pose=lambda: np.eye(4)) for frame in frames()]))
+    for k, (now, then) in enumerate(((bare, posed), (posed, bare))):
+        with session(now, tmp_path / str(k)) as made:
+            labelled(made)
+        with pytest.raises(InputError, match="poses"), session(then, tmp_path / str(k)):
+            pass
+        with session(now, tmp_path / str(k)) as made:
+            assert len(made.state.tracks) == 1
+
+
+@pytest.mark.parametrize("name", ["journal.jsonl", "./other/journal.jsonl"])
+def test_no_export_is_written_over_the_journal(tmp_path, name):
+    with session(drive(), tmp_path) as made:
+        labelled(made)
+        (tmp_path / "other").symlink_to(tmp_path)
+        with pytest.raises(InputError, match="is the journal"):
+            made.export("nuscenes_detection", name, force=True)
+
+
+def test_numbers_that_are_none_are_null_in_the_journal():
+    """As the velocity in nuScenes of what was labelled once."""
+    none, box = float("nan"), np.array([BOX])
+    labels = DriveLabels([FrameLabels.of("000000", 10**8, box, ["Car"], [1], [0.5],
+                                         [{"velocity": [none, 1.0]}], [("area", {"x": none})])])
+    tracks, kept = from_labels(labels, 1)
+    json.dumps([track_to_json(tracks[0]), kept], allow_nan=False)
+    back = to_labels(replace(State(), tracks={1: tracks[0]}, kept=kept), frames()[:1])
+    assert back.frames[0].extra[0] == {"velocity": [None, 1.0]}
+    assert back.frames[0].notes == [("area", {"x": None})]
+
+
+def test_the_command_imports_once_and_exports_no_journal_that_is_not_there(tmp_path):
+    write_bag(tmp_path / "bag", frames())
+
+    def run(*words):
+        return CliRunner().invoke(cli, ["label", "--data", str(tmp_path / "bag"), *map(str, words)])
+    to = ("--export", "openlabel", "--to", tmp_path / "made/../labels.json")
+    nowhere = run("--out", tmp_path / "empty", *to)
+    assert isinstance(nowhere.exception, InputError) and "no journal" in str(nowhere.exception)
+    assert not (tmp_path / "empty").exists()
+    with session(one_drive(open_recording(tmp_path / "bag")), tmp_path / "made") as made:
+        labelled(made)
+    assert run("--out", tmp_path / "made", *to).exit_code == 0
+    for _ in range(2):
+        again = run("--out", tmp_path / "two", "--import", f"openlabel:{tmp_path / 'labels.json'}",
+                    *to, "--force")
+        assert again.exit_code == 0 and ": 1 boxes" in again.output.replace("\n", "")
+    assert "already" in again.output.replace("\n", " ")

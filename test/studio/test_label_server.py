@@ -1,0 +1,353 @@
+"""The server of the label page, as a process of its own, asked by an HTTP client."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import resource
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import asynccontextmanager
+from types import SimpleNamespace
+
+import aiohttp
+import numpy as np
+import pytest
+from labeling_pages import serving
+from samples import WALKER
+from yarl import URL
+
+from lidar_studio.server import MAX_WAITING, Server, _in_loop, _send
+
+BOX = [*WALKER[:6].tolist(), 0.3]
+ADD = {"do": "add", "frame": 0, "class": "Pedestrian", "box": BOX}
+
+
+def label(data, out, *more):
+    """To label with a server that proposes nothing by itself."""
+    return ["label", "--data", str(data), "--out", str(out), "--no-open", "--no-propose", *more]
+
+
+def alone(*arguments):
+    """As a program of its own."""
+    return [sys.executable, "-m", "lidar_perception.cli.main", *arguments]
+
+
+def test_a_page_that_is_too_far_behind_is_disconnected_and_so_reloads():
+    async def behind():
+        queue, sent = asyncio.Queue(MAX_WAITING), []
+        page = SimpleNamespace(pages={queue}, closed=False)
+
+        async def send_json(event):
+            sent.append(event)
+
+        async def close():
+            page.closed = True
+        for event in range(MAX_WAITING + 5):
+            Server.tell(page, event)
+        assert not page.pages
+        page.send_json, page.close = send_json, close
+        await asyncio.wait_for(_send(page, queue), 10)
+        assert page.closed and sent == [*range(1, MAX_WAITING)]
+    asyncio.run(behind())
+
+
+class Page:
+    """What a page asks."""
+
+    def __init__(self, http, base):
+        self.http, self.base = http, base
+
+    async def get(self, path, **how):
+        """Status and body; the path goes out as it is."""
+        async with self.http.get(URL(self.base + path, encoded=True), **how) as answer:
+            return answer.status, await answer.read()
+
+    async def json(self, path):
+        """Of a good answer."""
+        status, body = await self.get(path)
+        assert status == 200, body
+        return json.loads(body)
+
+    async def do(self, expected=200, page="one", **action):
+        """An action; the answer."""
+        async with self.http.post(f"{self.base}/api/do", data=json.dumps(action),
+                                  headers={"X-Page": page}) as answer:
+            found = await answer.json()
+            assert answer.status == expected, found
+            assert expected == 200 or "\n" not in found["error"]
+            return found
+
+
+@asynccontextmanager
+async def opened(url):
+    """A page that was opened at the address, with its cookie."""
+    async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as http:
+        async with http.get(url) as answer:
+            assert answer.status == 200 and "text/html" in answer.headers["Content-Type"]
+        yield Page(http, url.partition("/?")[0])
+
+
+def asked(url, questions):
+    """What the coroutine questions(page) gives."""
+    async def run():
+        async with opened(url) as page:
+            return await asyncio.wait_for(questions(page), 600)
+    return asyncio.run(run())
+
+
+@pytest.fixture(scope="module")
+def served(written, tmp_path_factory):
+    """One server for the tests that leave its labels as they like."""
+    with serving(*label(written, tmp_path_factory.mktemp("labels"))) as server:
+        yield server.url
+
+
+def test_a_cloud_says_all_that_the_page_draws(served, written):
+    from lidar_perception.data.open import open_recording
+
+    async def questions(page):
+        drive = await page.json("/api/drive")
+        assert (drive["mode"], len(drive["frames"]), drive["live"]) == ("label", 3, False)
+        assert {c["name"] for c in drive["classes"]} >= {"Car", "Pedestrian", "Cyclist"}
+        assert all(re.fullmatch("#[0-9a-f]{6}", c["color"]) for c in drive["classes"])
+        assert {"kitti_object", "openlabel"} <= set(drive["can_export"])
+        one, again = [(await page.get("/api/cloud/1"))[1] for _ in range(2)]
+        assert one == again  # the order is always the same
+        return one
+    body = asked(served, questions)
+    frame = list(open_recording(written))[1].load()
+    n = int(np.frombuffer(body, np.uint32, 1, 4)[0])
+    assert body[:4] == b"LPC1" and n == len(frame)
+    xyz = np.frombuffer(body, np.float32, 3 * n, 8).reshape(-1, 3)
+    intensity, ground = (np.frombuffer(body, np.uint8, n, 8 + 12 * n + i * n) for i in (0, 1))
+    clusters = np.frombuffer(body, np.uint32, n, len(body) - 4 * n)
+    assert (len(body) - 4 * n) % 4 == 0 and len(body) - 4 * n - (8 + 14 * n) in (0, 2)
+    order = np.lexsort(xyz.T)
+    assert (xyz[order] == frame.xyz[np.lexsort(frame.xyz.T)]).all()
+    assert (intensity[order] == (frame.intensity[np.lexsort(frame.xyz.T)] * 255).astype(int)).all()
+    assert 0.5 < ground.mean() < 1 and not clusters[ground == 1].any() and clusters.max() >= 1
+    assert np.abs(xyz[: n // 4].mean(axis=0) - xyz.mean(axis=0)).max() < 1  # thinned evenly
+
+
+def test_a_click_becomes_a_track_and_a_seed_and_is_like_itself(served):
+    async def questions(page):
+        before = await page.json("/api/state")
+        await page.do(do="seed", frame=0, xyz=WALKER[:3].tolist(), **{"class": "Pedestrian"})
+        state = await page.json("/api/state")
+        track, = [t for t in state["tracks"] if t["id"] not in {u["id"] for u in before["tracks"]}]
+        (frame, *box, kind), = track["boxes"]
+        assert (frame, kind, track["state"]) == (0, "key", "accepted")
+        assert np.hypot(box[0] - WALKER[0], box[1] - WALKER[1]) < 0.3
+        assert state["seeds"][-1] == [0, track["id"]]
+        alike = await page.json(f"/api/silhouettes?frame=0&track={track['id']}")
+        assert alike["similarity"] == pytest.approx(1)
+        assert set(alike["seed"]["bits"]) == {"0", "1"} and alike["seed"] == alike["candidate"]
+        assert (await page.get(f"/api/silhouettes?frame=1&track={track['id']}"))[0] == 404
+        await page.do(do="snap", track=track["id"], frame=0, to="ground")
+        await page.do(do="snap", track=track["id"], frame=0, to="cluster")
+        after, = [t for t in (await page.json("/api/state"))["tracks"] if t["id"] == track["id"]]
+        assert np.hypot(*(np.array(after["boxes"][0][1:3]) - WALKER[:2])) < 0.1
+        nothing = await page.do(400, do="seed", frame=0, xyz=[80, 80, 80], **{"class": "Car"})
+        assert "cluster" in nothing["error"]
+        assert await page.json("/api/next?after=0") == {"track": None, "frame": 0}
+    asked(served, questions)
+
+
+def test_a_second_page_sees_what_the_first_does(served):
+    async def questions(page):
+        async with opened(served) as other, other.http.ws_connect(
+                f"{other.base}/api/events") as events:
+            seq = (await page.do(page="first", **ADD))["seq"]
+            event = await events.receive_json()
+            assert (event["seq"], event["by"], event["action"]["do"]) == (seq, "first", "add")
+            assert event["tracks"][0]["boxes"] == [[0, *BOX, "key"]]
+            assert event["can_undo"] and event["progress"]["actions"] == seq
+            await page.do(do="undo")
+            event = await events.receive_json()
+            assert event["removed"] and event["can_redo"]
+    asked(served, questions)
+
+
+@pytest.mark.parametrize("wrong", [
+    {"do": "fly"}, {}, {**ADD, "frame": 3}, {**ADD, "frame": "0"}, {**ADD, "box": BOX[:6]},
+    {**ADD, "box": [float("nan"), *BOX[1:]]}, {**ADD, "box": [1e9, *BOX[1:]]},
+    {"do": "snap", "track": 10**6, "frame": 0, "to": "ground"}, {"do": "poses", "poses": []},
+    {"do": "import", "path": "/nowhere", "format": "kitti_object"},
+    {"do": "import", "path": 5, "format": []},
+    {"do": "seed", "frame": 0, "xyz": [0, 0], "class": "Car"},
+], ids=str)
+def test_what_cannot_be_done_is_said_and_changes_nothing(served, wrong):
+    async def questions(page):
+        before = await page.json("/api/state")
+        await page.do(400, **wrong)
+        assert await page.json("/api/state") == before
+    asked(served, questions)
+
+
+def test_nobody_else_is_served(served):
+    base, _, token = served.partition("/?token=")
+    port = int(base.rpartition(":")[2])
+
+    async def strangers():
+        async with aiohttp.ClientSession() as http:
+            page = Page(http, base)
+            for path in ("/", "/api/drive", "/api/cloud/0", "/static/app.js", "/?token=",
+                         "/api/state?token=" + token[:-1], "/?token=" + "x" * len(token),
+                         "/?token=%C3%A4", "/api/events"):
+                status, body = await page.get(path)
+                assert status == 403 and body.count(b"\n") == 1, path
+            async with http.post(f"{base}/api/do", json=ADD) as answer:
+                assert answer.status == 403
+            for host in (f"evil.example:{port}", "evil.example", f"127.0.0.1.evil.example:{port}"):
+                status, _ = await page.get(f"/api/state?token={token}", headers={"Host": host})
+                assert status == 403, host
+            origin = {"Origin": "http://evil.example"}
+            assert (await page.get(f"/api/state?token={token}", headers=origin))[0] == 403
+            async with http.post(f"{base}/api/do?token={token}", json=ADD,
+                                 headers=origin) as answer:
+                assert answer.status == 403
+            assert (await page.get(f"/api/state?token={token}"))[0] == 200
+    asyncio.run(strangers())
+    with socket.socket() as outside:  # only the loopback address listens
+        outside.settimeout(5)
+        assert outside.connect_ex(("127.0.0.2", port)) != 0
+
+
+def test_only_files_of_the_page_are_served(served):
+    async def questions(page):
+        for path in ("/static/..%2fserver.py", "/static/%2e%2e%2fserver.py", "/static/../server.py",
+                     "/static//etc/passwd", "/static/..", "/static/", "/etc/passwd",
+                     "/static/%2fetc%2fpasswd", "/static/x%00", "/nothing"):
+            status, body = await page.get(path)
+            assert status in (400, 404) and b"import" not in body, path
+        for path in ("/api/cloud/3", "/api/cloud/-1", "/api/cloud/a", "/api/cloud/" + "9" * 50,
+                     "/api/labels/3"):
+            status, body = await page.get(path)
+            assert status == 400 and "frame" in json.loads(body)["error"], path
+        async with page.http.get(f"{page.base}/") as answer:
+            assert "default-src 'self'" in answer.headers["Content-Security-Policy"]
+        async with page.http.post(f"{page.base}/api/do", data=b"{no json") as answer:
+            assert answer.status == 400 and (await answer.json())["error"]
+        async with page.http.post(f"{page.base}/api/do", data=b"[]") as answer:
+            assert answer.status == 400
+    asked(served, questions)
+
+
+def test_what_is_told_to_a_server_that_has_ended_does_no_harm():
+    """As by the thread that listens to a running graph, which ends a little later."""
+    loop = asyncio.new_event_loop()
+    loop.close()
+    _in_loop(loop, SimpleNamespace(tell=None), {})
+
+
+@pytest.mark.no_cover
+def test_a_killed_server_has_lost_nothing_and_a_second_one_is_refused(written, tmp_path):
+    async def edit(page):
+        await page.do(**ADD)
+        await page.do(do="box", track=1, frame=2, box=BOX)
+        await page.do(do="undo")
+        return await page.json("/api/state")
+    with serving(*label(written, tmp_path)) as server:
+        before = asked(server.url, edit)
+        second = subprocess.run(alone(*label(written, tmp_path)), text=True, capture_output=True)
+        assert second.returncode == 2 and "another process" in second.stderr
+        server.process.kill()
+    with open(tmp_path / "journal.jsonl", "a") as journal:
+        journal.write('{"seq": 4, "do": "re')
+    with serving(*label(written, tmp_path)) as server:
+        assert asked(server.url, lambda page: page.json("/api/state")) == before
+        assert asked(server.url, lambda page: page.do(do="redo")) == {"seq": 4}
+        os.kill(server.process.pid, signal.SIGINT)
+        server.process.join(60)
+        assert server.process.exitcode == 0
+        assert "cut off" in re.sub(r"\s+", " ", server.errors.read())
+
+
+def limited():
+    """No file of this process grows beyond this."""
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+
+
+def test_a_full_disk_is_said_and_the_labels_stay_as_the_journal_has_them(written, tmp_path):
+    async def fill(page):
+        for _ in range(50):
+            before = await page.json("/api/state")
+            async with page.http.post(f"{page.base}/api/do", json=ADD) as answer:
+                if answer.status != 200:
+                    assert "nothing was done" in (await answer.json())["error"]
+                    assert await page.json("/api/state") == before
+                    return before
+        raise AssertionError("the disk was never full")
+    with serving(*label(written, tmp_path), before=limited) as server:
+        before = asked(server.url, fill)
+    assert len(before["tracks"]) > 3
+    with serving(*label(written, tmp_path)) as server:
+        assert asked(server.url, lambda page: page.json("/api/state")) == before
+
+
+@pytest.mark.no_cover
+def test_labels_go_out_and_come_back_as_they_were(written, tmp_path):
+    async def make(page):
+        await page.do(**ADD)
+        await page.do(do="box", track=1, frame=2, box=BOX)
+        await page.do(**{**ADD, "class": "Marsmobil"})
+        await page.do(do="accept", track=2)
+        asked_for = {"format": "openlabel", "out": "labels.json"}
+        async with page.http.post(f"{page.base}/api/export", json=asked_for) as answer:
+            first = await answer.json()
+        async with page.http.post(f"{page.base}/api/export", json=asked_for) as answer:
+            assert answer.status == 400, await answer.text()  # it exists
+        async with page.http.post(f"{page.base}/api/export",
+                                  json={**asked_for, "force": True}) as answer:
+            assert await answer.json() == first
+        for bad in ({"format": "x", "out": "y"}, {"format": "openlabel", "out": "../y"}, {}):
+            async with page.http.post(f"{page.base}/api/export", json=bad) as answer:
+                assert answer.status == 400 and (await answer.json())["error"]
+        return first, await page.json("/api/state")
+    with serving(*label(written, tmp_path / "one")) as server:
+        written_to, state = asked(server.url, make)
+    assert written_to["boxes"] == 4 and written_to["frames"] == 3
+    again = ["--import", f"openlabel:{written_to['path']}"]
+    with serving(*label(written, tmp_path / "two", *again)) as server:
+        back = asked(server.url, lambda page: page.json("/api/state"))
+        assert {(t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"]))))
+                for t in back["tracks"]} == {
+            (t["class"], tuple(map(tuple, (b[:8] for b in t["boxes"])))) for t in state["tracks"]}
+        asked(server.url, lambda page: page.do(do="undo"))
+        assert asked(server.url, lambda page: page.json("/api/state"))["tracks"] == []
+
+
+def test_labels_of_the_drive_are_shown_only_when_asked_for(served, written, tmp_path):
+    assert asked(served, lambda page: page.json("/api/labels/0"))["labels"] == []
+    with serving(*label(written, tmp_path, "--show-labels")) as server:
+        (*box, name, _), = asked(server.url, lambda page: page.json("/api/labels/0"))["labels"]
+        assert np.allclose(box, WALKER) and name == "Pedestrian"
+        assert asked(server.url, lambda page: page.json("/api/labels/1"))["labels"] == []
+
+
+def test_the_drive_is_looked_at_beside_the_page_and_only_once(written, tmp_path):
+    async def wait(page):
+        async with page.http.ws_connect(f"{page.base}/api/events") as events:
+            state = await page.json("/api/state")
+            while state["progress"]["busy"] is not None:
+                event = await events.receive_json()
+                assert "error" not in event, event
+                state["progress"] = event["progress"]
+        return await page.json("/api/state")
+    before = None
+    for _ in range(2):  # the second one finds the proposals in the journal
+        with subprocess.Popen(alone(*label(written, tmp_path, "--propose")), text=True,
+                              stdout=subprocess.PIPE) as process:
+            try:
+                state = asked(process.stdout.readline().strip(), wait)
+            finally:
+                process.kill()
+        assert before is None or state == before
+        before = state
+    lines = [json.loads(line) for line in (tmp_path / "journal.jsonl").read_text().splitlines()]
+    assert [line["do"] for line in lines[1:]].count("propose") == 1

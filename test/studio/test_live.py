@@ -1,0 +1,273 @@
+"""The newest frames of a running graph, without ROS: what is kept, what is late, what is chosen."""
+
+from __future__ import annotations
+
+import sys
+import threading
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidar_perception.robot.poses import moved_boxes, moved_points, pose_of
+from lidar_perception.types import Detections, InputError
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.topics import TRUTH
+from lidar_perception.wire.track_markers import track_markers
+from lidar_studio import live as rooms
+from lidar_studio.live import BOXES, LABELS, TRACKS, Live
+from lidar_studio.live_topics import box_topics, clouds_topic
+from msg_utils.markers import MarkedObjects, from_marker_array
+from msg_utils.point_cloud2 import from_array
+from msg_utils.stamps import header_message
+
+CLOUD, MARKERS = "sensor_msgs/msg/PointCloud2", "visualization_msgs/msg/MarkerArray"
+ARRAY = "vision_msgs/msg/Detection3DArray"
+FOUND, TRACKED = "/fused_detector/output/detections", "/tracker/output/tracks"
+
+
+def cloud(stamp, points=50):
+    found = np.zeros(points, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("ground", "u1"),
+                              ("cluster_id", "<u4")])
+    found["x"] = 1 + np.arange(points)
+    found["ground"], found["cluster_id"] = 1, 0
+    found["ground"][:10], found["cluster_id"][:10] = 0, 7_000_000
+    return from_array(found, header_message(stamp, "velodyne", bag_message), bag_message)
+
+
+def boxes(stamp, frame_id="velodyne", x=5.0, ids=(3,)):
+    count = len(ids)
+    return MarkedObjects(np.tile([x, 0, 0, 1, 1, 1, 0], (count, 1)), ["Car"] * count,
+                         np.full(count, 0.5), np.array(ids),
+                         [{"sources": {"pillars": 0.25}}] * count, [], stamp, frame_id)
+
+
+@pytest.fixture
+def live():
+    made = Live("test", most_frames=5)
+    made.hear(FOUND, BOXES)
+    made.told = []
+    made.listeners.append(made.told.append)
+    return made
+
+
+def frames_told(live):
+    return [event["live"]["frame"] for event in live.told if "live" in event]
+
+
+def test_a_frame_waits_for_its_boxes_and_late_ones_are_told_and_counted(live, monkeypatch):
+    live.cloud(cloud(10))
+    live.boxes(FOUND, boxes(10), None)       # the first: from now on clouds wait for this topic
+    live.cloud(cloud(20))
+    assert frames_told(live)[-1] == 0
+    live.boxes(FOUND, boxes(20), None)
+    assert frames_told(live)[-1] == 1
+    live.cloud(cloud(30))
+    monkeypatch.setattr(rooms, "PATIENCE", 0.0)
+    live.tick()
+    assert frames_told(live)[-1] == 2 and live.layers(2, 0.0)["detections"] == {}
+    live.boxes(FOUND, boxes(30), None)
+    assert frames_told(live)[-2:] == [2, 2]
+    row, = live.layers(2, 0.0)["detections"]["fused_detector"]
+    assert row[:9] == [5, 0, 0, 1, 1, 1, 0, "Car", 0.5] and row[9] == {"pillars": 0.25}
+    assert [t["late"] for t in live.status()["topics"]] == [1]
+
+
+def test_boxes_may_come_before_their_cloud_and_those_without_one_are_counted(live):
+    live.boxes(FOUND, boxes(10), None)
+    live.cloud(cloud(10))
+    assert len(live.layers(0, 0.0)["detections"]["fused_detector"]) == 1
+    for stamp in range(1000, 1000 + rooms.EARLY + 3):
+        live.boxes(FOUND, boxes(stamp), None)
+    topic, = live.status()["topics"]
+    assert (topic["alone"], topic["late"]) == (3, 0)
+
+
+@given(st.lists(st.integers(1, 2000), min_size=1, max_size=60), st.integers(1, 12),
+       st.integers(1, 40_000))
+def test_memory_keeps_to_its_bounds_and_the_newest_frame_is_there(sizes, most, most_bytes):
+    live = Live("test", most_bytes, most)
+    for stamp, size in enumerate(sizes):
+        live.cloud(cloud(stamp, size))
+        kept = [f.cloud for f in live._frames.values()]
+        assert live._bytes == sum(len(c.data) for c in kept)
+        assert len(kept) == 1 or (len(kept) <= most and live._bytes <= most_bytes)
+        assert live.end == stamp + 1 == live.first + len(kept)
+        assert len(live.clouds(stamp).xyz) == size
+        assert len(live._by_stamp) == len(kept)
+    if live.first:
+        with pytest.raises(InputError, match="kept no more"):
+            live.clouds(live.first - 1)
+
+
+def test_while_a_page_has_paused_frames_stay_and_what_comes_is_counted(live):
+    for stamp in range(4):
+        live.cloud(cloud(stamp))
+    live.hold(1, True)
+    live.hold(2, True)
+    live.hold(1, False)
+    for stamp in range(4, 20):
+        live.cloud(cloud(stamp))
+    assert (live.first, live.end) == (0, 4) and live.status()["clouds"]["passed"] == 16
+    live.hold(2, False)
+    live.cloud(cloud(20))
+    assert live.end == 5
+
+
+def test_a_bag_that_begins_again_is_shown_again(live):
+    for stamp in (1, 2, 1, 2):
+        live.cloud(cloud(stamp))
+        live.boxes(FOUND, boxes(stamp), None)
+    assert frames_told(live) == [0, 0, 1, 2, 3]  # that of the first boxes again
+    assert all(live.layers(i, 0.0)["detections"] for i in range(4))
+
+
+def test_labels_that_come_before_their_cloud_do_so_when_a_bag_begins_again_too(live):
+    live.hear("/ground_truth/detections", LABELS)
+    for stamp in (1, 2, 1, 2):
+        live.boxes("/ground_truth/detections", boxes(stamp), None)
+        live.cloud(cloud(stamp))
+    assert all(len(live.layers(i, 0.0)["labels"]) == 1 for i in range(4))
+    assert live.status()["topics"][1]["alone"] == 0
+
+
+def test_boxes_that_tf_does_not_connect_are_said_and_broken_ones_left_out(live):
+    live.cloud(cloud(1))
+    live.boxes(FOUND, boxes(1, "base_link"), None)
+    line, = live.status()["lines"]
+    assert FOUND in line and "TF does not connect 'base_link' with 'velodyne'" in line
+    assert live.layers(0, 0.0)["detections"] == {}
+    wrong = boxes(1, ids=(1, 2, 3, 4))
+    wrong.boxes[0, 0], wrong.boxes[1, 4], wrong.scores[2] = np.nan, 0.0, np.inf
+    live.boxes(FOUND, wrong, None)
+    assert len(live.layers(0, 0.0)["detections"]["fused_detector"]) == 1
+    assert live.status()["lines"] == []
+
+
+def test_boxes_in_another_frame_are_those_of_the_clouds_once_tf_has_come(live, monkeypatch):
+    """What is fixed and what moves between them; with trails; each at its own stamp."""
+    live.hear(TRACKED, TRACKS)
+    second = 10**9
+    mounted, turned = [1.0, 0.5, 1.7], [0.0, 0.0, np.sin(0.2), np.cos(0.2)]  # by 0.4 rad
+    trail = np.array([[5.0, 0.0, 0.0], [6.0, 0.0, 0.0]])
+    live.tree.set("base", "velodyne", 0, mounted, turned, static=True)
+    live.tree.set("odom", "base", 10 * second, [0, 0, 0], [0, 0, 0, 1])
+    live.boxes(FOUND, boxes(10 * second), None)
+    for i, stamp in enumerate((10 * second, 10 * second + second // 2)):
+        live.cloud(cloud(stamp))
+        pose = pose_of(np.array([4.0 * i / 2, 0, 0]), [0, 0, 0, 1]) @ pose_of(mounted, turned)
+        found = Detections.of(moved_boxes(boxes(stamp).boxes, pose), [0], [0.5])
+        tracks = track_markers(np.array([3]), found, np.zeros((1, 2)), np.zeros(1),
+                               [moved_points(trail, pose)],
+                               header_message(stamp, "odom", bag_message), bag_message)
+        live.boxes(TRACKED, from_marker_array(tracks), tracks)
+        if i:
+            live.boxes(FOUND, boxes(stamp), None)
+    assert frames_told(live)[-1] == 0 and live.status()["lines"] == []  # the other waits for TF
+    live.tree.set("odom", "base", 11 * second, [4, 0, 0], [0, 0, 0, 1])
+    live.tick()
+    assert frames_told(live)[-1] == 1
+    track, = live.tracks()
+    for row, frame in zip(track["boxes"], (0, 1), strict=True):
+        np.testing.assert_allclose(row[1:8], boxes(0).boxes[0], atol=1e-6)
+        np.testing.assert_allclose(track["trails"][frame], trail, atol=1e-3)
+    monkeypatch.setattr(rooms, "PATIENCE", 0.0)
+    live.cloud(cloud(11 * second + second // 2))
+    live.boxes(TRACKED, boxes(11 * second + second // 2, "odom"), None)
+    assert any("the newest transform" in line for line in live.status()["lines"])
+    live.boxes(FOUND, boxes(11 * second + second // 2), None)
+    assert frames_told(live)[-1] == 2  # shown without
+
+
+def test_tracks_of_two_trackers_keep_apart_and_labels_say_what_is_missed(live):
+    live.hear(TRACKED, TRACKS)
+    live.hear("/b/tracker/output/tracks", TRACKS)
+    live.hear("/ground_truth/detections", LABELS)
+    live.cloud(cloud(1))
+    for topic in (TRACKED, "/b/tracker/output/tracks", "/ground_truth/detections"):
+        live.boxes(topic, boxes(1), None)
+    live.boxes(FOUND, boxes(1, x=50.0), None)
+    assert len({t["id"] for t in live.tracks()}) == 2
+    match = live.layers(0, 0.0)["matches"]["fused_detector"]
+    assert match == {"missed": [0], "false": None}
+    live.forget(TRACKED)  # another graph takes its place
+    live.hear("/c/tracker/output/tracks", TRACKS)
+    live.boxes("/c/tracker/output/tracks", boxes(1), None)
+    assert len({t["id"] for t in live.tracks()}) == 2
+
+
+def test_the_cloud_with_most_columns_is_chosen_and_the_boxes_of_its_namespace():
+    one = {"/points": CLOUD, "/ground_segmentation/output/points": CLOUD,
+           "/clustering/output/points": CLOUD, FOUND: MARKERS, FOUND + "_3d": ARRAY,
+           TRACKED: MARKERS, "/ground_truth/detections": MARKERS,
+           "/clustering/output/boxes": MARKERS}
+    assert clouds_topic(one) == "/clustering/output/points"
+    assert box_topics(one, "/clustering/output/points") == {
+        FOUND: BOXES, TRACKED: TRACKS, "/ground_truth/detections": LABELS}
+    assert box_topics({FOUND + "_3d": ARRAY}, "/points") == {FOUND + "_3d": BOXES}
+    assert box_topics(one, "/points", wanted=["clustering/output/boxes"]) == {
+        "/clustering/output/boxes": BOXES, TRACKED: TRACKS, "/ground_truth/detections": LABELS}
+    two = {f"/{ns}{topic}": kind for ns in ("front", "rear") for topic, kind in one.items()}
+    with pytest.raises(InputError, match="--namespace"):
+        clouds_topic(two)
+    chosen = clouds_topic(two, "rear")
+    assert chosen == "/rear/clustering/output/points"
+    assert all(topic.startswith("/rear/") for topic in box_topics(two, chosen))
+    assert clouds_topic(two, "front", "points") == "/front/points"
+    assert clouds_topic({"/velodyne_points": CLOUD, "/x": MARKERS}) == "/velodyne_points"
+    for types, wanted in (({}, ""), (one, "/no"), ({"/a": CLOUD, "/b": CLOUD}, "")):
+        with pytest.raises(InputError) as said:
+            clouds_topic(types, wanted=wanted)
+        assert "\n" not in str(said.value)
+
+
+def test_boxes_of_another_robot_are_not_shown_with_the_clouds_of_this_one():
+    one = dict.fromkeys([FOUND, TRACKED, TRUTH], MARKERS) | {"/clustering/output/points": CLOUD}
+    both = one | {f"/b{topic}": kind for topic, kind in one.items()}
+    for robot in ("", "/b"):
+        clouds, expected = robot + "/clustering/output/points", {
+            robot + FOUND, robot + TRACKED, robot + TRUTH}
+        assert clouds_topic(both, robot or "/") == clouds
+        assert set(box_topics(both, clouds, robot or "/")) == expected
+        for name in ("clustering/output/points", "a_clustering/output/points", "points",
+                     "velodyne_points", "ouster/points"):
+            assert set(box_topics(both, f"{robot}/{name}")) == expected
+    for clouds, theirs in (("/clustering/output/points", False), ("/a/points", False),
+                           ("/points", True), ("/livox/lidar", True)):
+        alone = {"/b" + FOUND: MARKERS}  # of another robot, or the only one
+        assert bool(box_topics(alone, clouds)) == theirs
+        assert not box_topics(alone | {"/c" + FOUND: MARKERS}, clouds)
+    assert set(box_topics(one, "/ouster/points")) == {FOUND, TRACKED, TRUTH}
+
+
+def test_pages_may_ask_while_topics_come_and_go(live):
+    """In another thread, as the server does; threads take turns as often as they can."""
+    before, wrong = sys.getswitchinterval(), []
+    sys.setswitchinterval(1e-6)
+    over = threading.Event()
+
+    def ask():
+        while not over.is_set():
+            try:
+                live.status(), live.frames(), live.tracks(), live.first
+                live.layers(live.end - 1, 0.0)
+            except InputError:
+                pass  # kept no more
+            except Exception as error:
+                wrong.append(error)
+                return
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    try:
+        for i in range(1500):
+            topic = f"/{i % 40}/output/detections"
+            (live.forget if i % 3 == 2 else live.hear)(*([topic] if i % 3 == 2 else [topic, BOXES]))
+            live.boxes(topic, boxes(i), None)
+            live.cloud(cloud(i))
+    finally:
+        over.set()
+        asking.join()
+        sys.setswitchinterval(before)
+    assert wrong == []

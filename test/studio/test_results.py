@@ -1,0 +1,181 @@
+"""Results to be looked at: what is missed and false, what a bag holds, pictures."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from time import monotonic, sleep
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidar_perception.classes import CAR, CLASSES, PEDESTRIAN
+from lidar_perception.cli.main import cli
+from lidar_perception.data.bag import BagWriter, KeptOpen
+from lidar_perception.data.bag_poses import BagPoses
+from lidar_perception.data.open import open_recording
+from lidar_perception.types import Detections, GroundTruth, InputError
+from lidar_perception.wire.codec import bag_message
+from lidar_studio.cli.view import short_names
+from lidar_studio.drive import one_drive, scanned
+from lidar_studio.picture import browser_here
+from lidar_studio.results import (
+    Results,
+    Source,
+    by_files,
+    compared,
+    points_topic,
+    recorded,
+    recorded_scan,
+    tracks_of,
+    with_recorded_scans,
+)
+from msg_utils.markers import MarkedObjects, to_marker_array
+from msg_utils.stamps import header_message
+
+VAN = CLASSES.index("Van")
+CARS = np.array([[10.0, 0, -1, 4, 1.6, 1.5, 0.3], [20.0, 4, -1, 4, 1.6, 1.5, 2.0]])
+
+
+def truth(boxes, class_ids):
+    return GroundTruth.of(boxes, class_ids)
+
+
+def test_labels_found_as_they_are_leave_nothing_missed_or_false():
+    ids = [CAR, CAR, PEDESTRIAN]
+    boxes = np.vstack([CARS, [[8.0, -3, -1, 0.6, 0.6, 1.7, 0]]])
+    found = Detections.of(boxes, ids, [0.9, 0.4, 0.7])
+    for order in ([0, 1, 2], [2, 0, 1]):
+        assert compared(truth(boxes[order], np.array(ids)[order]), found, 0.0) == {
+            "missed": [], "false": []}
+
+
+def test_a_score_below_the_least_is_as_if_it_were_not_there():
+    found = Detections.of(CARS, CAR, [0.9, 0.4])
+    assert compared(truth(CARS, [CAR, CAR]), found, 0.5) == {"missed": [1], "false": []}
+    assert compared(truth(CARS[:1], [CAR]), found, 0.0) == {"missed": [], "false": [1]}
+
+
+def test_two_boxes_on_one_car_are_one_too_many_and_classes_do_not_mix():
+    found = Detections.of(np.vstack([CARS[:1], CARS[:1]]), CAR, [0.9, 0.8])
+    assert compared(truth(CARS[:1], [CAR]), found, 0.0)["false"] in ([0], [1])
+    other = Detections.of(CARS[:1], PEDESTRIAN, 0.9)
+    assert compared(truth(CARS[:1], [CAR]), other, 0.0) == {"missed": [0], "false": [0]}
+
+
+def test_a_van_is_neither_missed_nor_makes_a_car_there_false():
+    assert compared(truth(CARS[:1], [VAN]), Detections.none(), 0.0) == {"missed": [], "false": []}
+    found = Detections.of(CARS[:1], CAR, 0.9)
+    assert compared(truth(CARS[:1], [VAN]), found, 0.0) == {"missed": [], "false": []}
+
+
+def test_what_a_source_cannot_detect_it_does_not_miss(drive_bag):
+    frame = next(iter(open_recording(drive_bag)))
+    blind = Source(lambda i, frame: Detections.none(), frozenset(["Pedestrian"]))
+    layers = Results({"blind": blind}).layers(0, frame, 0.3)
+    names = {layers["labels"][k][7] for k in layers["matches"]["blind"]["missed"]}
+    assert names == {"Pedestrian"} and layers["detections"] == {"blind": []}
+
+
+def test_the_ground_and_clusters_of_a_bag_without_them_are_our_own(drive_bag):
+    assert points_topic(drive_bag) == "/points"
+    drive = one_drive(open_recording(drive_bag))
+    ours, theirs = scanned(drive.frames[1]), recorded_scan(drive.frames[1])
+    for name in ("xyz", "ground", "cluster_ids"):
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name))
+    assert with_recorded_scans(drive).clouds(1).encoded() == ours.encoded()
+
+
+NUMBERS = st.lists(st.integers(-2**31, 2**31 - 1), min_size=1, max_size=6, unique=True)
+
+
+@given(st.lists(NUMBERS, min_size=2, max_size=4), st.integers(1, 10**6))
+def test_no_two_trackers_have_a_track_of_the_same_id(trackers, far):
+    """Whatever they call them, also where one counts on from the other's numbers."""
+    trackers[1] = [*{*trackers[1], *(n + far for n in trackers[0] if n + far < 2**31)}]
+    made = [[t["id"] for t in tracks_of({0: marked(numbers)}, "/a/output/tracks", k)]
+            for k, numbers in enumerate(trackers)]
+    every = [number for each in made for number in each]
+    assert len(set(every)) == len(every) == sum(map(len, trackers))
+    assert all(0 <= number < 2**53 for number in every)  # what a page can count
+    assert set(made[0]) >= {n for n in trackers[0] if n >= 0}
+
+
+def test_a_track_is_what_its_tracker_called_it_last():
+    first, then = marked([7]), replace(marked([7]), labels=["Cyclist"])
+    track, = tracks_of({0: first, 1: then}, "/a/output/tracks", 0)
+    assert track["class"] == "Cyclist" and len(track["boxes"]) == 2
+
+
+def marked(numbers):
+    count = len(numbers)
+    return MarkedObjects(np.tile([5.0, 0, 0, 1, 1, 1, 0], (count, 1)), ["Car"] * count,
+                         np.full(count, 0.5), np.array(numbers), [{}] * count)
+
+
+def test_tracks_of_all_trackers_in_a_bag_keep_apart(tmp_path):
+    numbers = {"/a/tracker/output/tracks": [1, 7], "/b/tracker/output/tracks": [1, 5]}
+    with BagWriter(tmp_path / "bag") as made:
+        for topic, ids in numbers.items():
+            made.add_topic(topic, "visualization_msgs/msg/MarkerArray")
+            made.write(topic, 10, to_marker_array(
+                np.tile([5.0, 0, 0, 1, 1, 1, 0], (2, 1)), ["Car"] * 2, ids=ids,
+                header=header_message(10, "velodyne", bag_message), make=bag_message))
+    found = recorded(BagPoses(KeptOpen(tmp_path / "bag"), ""), [10]).tracks
+    assert len({t["id"] for t in found}) == len(found) == 4
+    assert {t["source"] for t in found} == {"a", "b"}
+
+
+def test_sources_have_names_that_tell_them_apart():
+    paths = [Path(name) for name in ("fused", "robot/fused.json", "a/v4/best.safetensors",
+                                     "b/v4/best.safetensors", "/out/data", "x/y.json", "x/y.onnx")]
+    assert short_names(paths, ["data"]) == ["fused", "robot/fused", "a/v4/best", "b/v4/best",
+                                            "out/data", "x/y.json", "x/y.onnx"]
+
+
+def ended(word: str) -> bool:
+    """Whether soon no process has this in its command line."""
+    end = monotonic() + 60.0
+    while monotonic() < end:
+        if not any(word in line for line in map(command_line, Path("/proc").glob("[0-9]*"))):
+            return True
+        sleep(0.02)
+    return False
+
+
+def command_line(process: Path) -> str:
+    try:
+        return (process / "cmdline").read_text(errors="replace")
+    except OSError:  # it has ended
+        return ""
+
+
+def test_result_files_that_are_not_there_are_named(tmp_path):
+    with pytest.raises(InputError, match="there is no folder"):
+        by_files(tmp_path / "none")
+
+
+@pytest.mark.skipif(browser_here() is None, reason="chromium is not installed")
+def test_a_screenshot_is_a_picture_of_the_page_and_leaves_no_browser_behind(drive_bag, tmp_path,
+                                                                            monkeypatch):
+    import matplotlib.image
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "profiles"))
+    (tmp_path / "profiles").mkdir()
+    picture = tmp_path / "page.png"
+    result = CliRunner().invoke(cli, ["view", str(drive_bag), "--frame", "1", "--theme", "light",
+                                      "--screenshot", str(picture)])
+    assert result.exit_code == 0, result.output
+    pixels = matplotlib.image.imread(picture)
+    assert pixels.shape[:2] == (720, 1280)
+    middle = pixels[100:500, 300:900, :3].reshape(-1, 3)
+    assert len(np.unique((middle * 255).astype(int), axis=0)) > 50  # points, in colours
+    assert ended(str(tmp_path / "profiles"))
+
+
+def test_a_frame_that_is_not_there_is_said(drive_bag):
+    result = CliRunner().invoke(cli, ["view", str(drive_bag), "--frame", "99", "--no-open"])
+    assert isinstance(result.exception, InputError) and "no frame 99" in str(result.exception)
