@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidar_perception.classes import CLASSES, PEDESTRIAN
+from lidar_perception.intensity import to_unit
 
 __all__ = ["CLASSES", "PEDESTRIAN", "Detections", "GroundTruth", "InputError", "LidarFrame",
            "usable_returns"]
@@ -40,11 +41,33 @@ class LidarFrame:
     stamp_ns: int = 0
     frame_id: str = ""
 
+    def __post_init__(self) -> None:
+        shape = np.shape(self.xyz)
+        if len(shape) != 2 or shape[1] != 3:
+            raise InputError(f"xyz of a LidarFrame has shape {shape}, not (N, 3); LidarFrame.of "
+                             "takes points (N, 3) or (N, 4)")
+        if self.intensity is not None and np.shape(self.intensity) != shape[:1]:
+            raise InputError(f"intensity has shape {np.shape(self.intensity)} for {shape[0]} "
+                             f"points; give ({shape[0]},) or None")
+
     @staticmethod
-    def of(xyz: np.ndarray, intensity: np.ndarray | None = None, stamp_ns: int = 0,
-           frame_id: str = "") -> LidarFrame:
-        """The frame of the usable ones among returns (N, 3) as a sensor gives them."""
-        frame = LidarFrame(np.ascontiguousarray(xyz, np.float32), intensity, stamp_ns, frame_id)
+    def of(points: ArrayLike, intensity: ArrayLike | None = None, stamp_ns: int = 0,
+           frame_id: str = "", intensity_max: float | None = None) -> LidarFrame:
+        """Return the frame of the usable returns (see usable_returns) among the points of a sensor.
+
+        Args:
+            points: (N, 3) [x y z] or (N, 4) [x y z intensity] of any real type; metres, x forward,
+                y left, z up. An empty sequence is a cloud without points.
+            intensity: (N,) where points are (N, 3) and there is one. NaN, infinite and negative
+                ones are read as 0.
+            intensity_max: the value of a full reflection, by which intensities are divided. None:
+                255 for (N,) of type uint8, otherwise they are 0..1 already; a detector reports
+                those that are not.
+
+        Raises:
+            InputError: wrong shape or type. The message names the shape and the allowed ones.
+        """
+        frame = as_frame(points, intensity, stamp_ns, frame_id, intensity_max)
         usable = usable_returns(frame.xyz)
         return frame if usable.all() else frame.take(np.flatnonzero(usable))
 
@@ -60,6 +83,52 @@ class LidarFrame:
         """(N, 4) float32 [x y z intensity]; 0 without intensity."""
         intensity = np.zeros(len(self), np.float32) if self.intensity is None else self.intensity
         return np.column_stack([self.xyz, intensity])
+
+
+def as_frame(cloud: LidarFrame | ArrayLike, intensity: ArrayLike | None = None, stamp_ns: int = 0,
+             frame_id: str = "", intensity_max: float | None = None) -> LidarFrame:
+    """Return the frame of a cloud with all its points, also those that are not usable; a LidarFrame
+    is returned as it is. Arguments and errors as of LidarFrame.of."""
+    if isinstance(cloud, LidarFrame):
+        return cloud
+    points = _numbers(cloud, "a cloud", "a LidarFrame (frame.load() of a recorded frame, to_frame "
+                      "of a PointCloud2) or numbers (N, 3) [x y z] or (N, 4) [x y z intensity]")
+    if points.shape == (0,):
+        points = points.reshape(0, 3)
+    if points.ndim != 2 or points.shape[1] not in (3, 4):
+        shape, remedy = points.shape, ""
+        if points.ndim == 2:
+            remedy = ("; pass points[:, :4]" if shape[1] > 4 and shape[0] not in (3, 4) else
+                      "; pass points.T" if shape[0] in (3, 4) else "")
+        raise InputError(f"a cloud has shape {shape}; allowed are (N, 3) [x y z] and (N, 4) [x y z "
+                         f"intensity]{remedy}")
+    if points.shape[1] == 4 and intensity is not None:
+        raise InputError("the intensity is given twice, as a column of points (N, 4) and as "
+                         "intensity; pass points[:, :3]")
+    if intensity_max is not None and not 0 < intensity_max < np.inf:
+        raise InputError(f"intensity_max is {intensity_max:g}; it must be above 0: 1, 100 or 255 "
+                         "for most drivers")
+    values = points[:, 3] if points.shape[1] == 4 else (
+        None if intensity is None else _numbers(intensity, "intensity", "(N,) numbers"))
+    if values is not None:
+        full = intensity_max or (255.0 if values.dtype == np.uint8 else 1.0)
+        values = to_unit(values, full)
+    with np.errstate(over="ignore"):  # float64 beyond float32 becomes inf, which is not usable
+        xyz = np.ascontiguousarray(points[:, :3], np.float32)
+    return LidarFrame(xyz, values, stamp_ns, frame_id)
+
+
+def _numbers(given: Any, what: str, allowed: str) -> np.ndarray:
+    """An array of real numbers. InputError where it is none."""
+    try:
+        values = np.asarray(given)
+    except (TypeError, ValueError, RuntimeError) as error:  # ragged lists, tensors on a GPU
+        raise InputError(f"{what} cannot be read as an array "
+                         f"({str(error).splitlines()[0]}); allowed: {allowed}") from None
+    if values.dtype.kind not in "fiu":
+        kind = f" of {values.dtype.name}" if isinstance(given, np.ndarray) else ""
+        raise InputError(f"{what} is {type(given).__name__}{kind}; allowed: {allowed}")
+    return values
 
 
 def usable_returns(xyz: np.ndarray) -> np.ndarray:
@@ -84,11 +153,22 @@ class Detections:
     @staticmethod
     def of(boxes: ArrayLike, class_ids: ArrayLike = PEDESTRIAN,
            scores: ArrayLike = 1.0) -> Detections:
-        """Detections with dtypes and shapes put right; class_ids and scores may be scalars."""
-        boxes = np.ascontiguousarray(boxes, np.float32).reshape(-1, 7)
-        count = len(boxes)
-        return Detections(boxes, np.broadcast_to(np.asarray(class_ids, np.int32), count).copy(),
-                          np.broadcast_to(np.asarray(scores, np.float32), count).copy())
+        """Return detections of boxes (K, 7) [x y z l w h yaw], of any real type; one box may be
+        (7,). class_ids into CLASSES and scores are (K,), or one number for all. InputError for
+        other shapes."""
+        given = _numbers(boxes, "boxes", "numbers (K, 7) [x y z l w h yaw]")
+        if given.ndim > 2 or (given.size and given.shape[-1:] != (7,)):
+            raise InputError(f"boxes have shape {given.shape}; allowed is (K, 7) "
+                             "[x y z l w h yaw]")
+        boxes = np.ascontiguousarray(given, np.float32).reshape(-1, 7)
+        count, columns = len(boxes), []
+        for name, column in (("class_ids", np.asarray(class_ids, np.int32)),
+                             ("scores", np.asarray(scores, np.float32))):
+            if column.shape not in ((), (1,), (count,)):
+                raise InputError(f"{name} have shape {column.shape} for {count} boxes; give "
+                                 f"({count},) or one number")
+            columns.append(np.broadcast_to(column, count).copy())
+        return Detections(boxes, columns[0], columns[1])
 
     @staticmethod
     def none() -> Detections:

@@ -12,6 +12,7 @@ from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.params import PipelineParams
@@ -21,17 +22,18 @@ from lidar_perception.candidates.segmented import Segmented, grounded_boxes, poi
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.ground.segment import cropped_as_mounted, segment_ground
 from lidar_perception.groups import renumbered
-from lidar_perception.types import LidarFrame
+from lidar_perception.types import LidarFrame, as_frame
 
 
-def segment(frame: LidarFrame, camera: Camera | None = None,
+def segment(cloud: LidarFrame | ArrayLike, camera: Camera | None = None,
             params: PipelineParams = PipelineParams(), *, ground: np.ndarray | None = None,
             cluster_ids: np.ndarray | None = None) -> Segmented:
-    """Stages up to the boxes; ground (N,) bool and cluster_ids (N,) of the frame's points, from
-    whatever clustering, are computed where they are None. InputError if the view is on and there
-    is no camera."""
+    """Run the stages up to the boxes on a LidarFrame, or an array (N, 3) or (N, 4) as LidarFrame.of
+    takes it. ground (N,) bool and cluster_ids (N,) of its points, from any clustering, are computed
+    where they are None. InputError if the view is on and there is no camera, and for other
+    arrays."""
     t0 = perf_counter()
-    kept, frame = cropped_as_mounted(frame, params.crop, params.ground.sensor_pose)
+    kept, frame = cropped_as_mounted(as_frame(cloud), params.crop, params.ground.sensor_pose)
     indices, seen = points_in_view(frame, camera, params.view)
     indices = kept.take(indices)
     t1 = perf_counter()
@@ -50,12 +52,12 @@ def segment(frame: LidarFrame, camera: Camera | None = None,
                      ms={k: v * 1e3 for k, v in ms.items()})
 
 
-def find_candidates(frame: LidarFrame, seed: SeedSource, camera: Camera | None = None,
+def find_candidates(cloud: LidarFrame | ArrayLike, seed: SeedSource, camera: Camera | None = None,
                     params: PipelineParams = PipelineParams(),
                     **columns: np.ndarray | None) -> tuple[Segmented, Candidates]:
-    """The whole pipeline on one frame; ms of the result covers every step of params.STEPS;
-    columns as in segment(). InputError where the seed source has no seed for this frame."""
-    segmented = segment(frame, camera, params, **columns)
+    """Run the whole pipeline on one cloud; ms of the result covers every step of params.STEPS;
+    cloud and columns as in segment(). InputError where the seed source has no seed for it."""
+    segmented = segment(cloud, camera, params, **columns)
     return segmented, refined(segmented, seed, params)
 
 

@@ -14,11 +14,12 @@ import torch
 
 from lidar_perception.detectors.calibration import raw_score
 from lidar_perception.detectors.checkpoint import Header
-from lidar_perception.detectors.contract import Found, require_columns
+from lidar_perception.detectors.contract import Cloud, Found, accept, joined
 from lidar_perception.detectors.devices import CPU
 from lidar_perception.detectors.params import NetworkParams, ScoreParams
 from lidar_perception.ground.params import mounted
 from lidar_perception.ground.segment import cropped_as_mounted
+from lidar_perception.intensity import MIN_POINTS
 from lidar_perception.types import InputError, LidarFrame
 
 Result = TypeVar("Result")
@@ -41,17 +42,19 @@ class NetworkDetector:
         self.place = Place(device)
         self.doubt: str | None = None  # of its scores, or of its classes
 
-    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
+    def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
         """See contract.Detector. InputError also where CUDA is out of memory and the CPU may not
         take over."""
-        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
+        frame, ground, cluster_ids, problem = accept(cloud, ground, cluster_ids,
+                                                     self.settings.intensity_scale)
         if self.params.crop.enabled:
             kept, frame = cropped_as_mounted(frame, self.params.crop,
                                              self.params.ground.sensor_pose)
             ground, cluster_ids = (column if column is None else column.take(kept)
                                    for column in (ground, cluster_ids))
-        return self.detect(frame, ground, cluster_ids)
+        found = self.detect(frame, ground, cluster_ids)
+        return replace(found, problem=joined(problem, found.problem)) if problem else found
 
     def detect(self, frame: LidarFrame, ground: np.ndarray | None,
                cluster_ids: np.ndarray | None) -> Found:
@@ -155,6 +158,15 @@ class NetworkDetector:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
         return perf_counter()
+
+    def no_intensity(self, frame: LidarFrame) -> str | None:
+        """Say that the network misses the intensity of a frame; None where there is one, or it
+        shall not be read."""
+        if not self.settings.intensity_scale or (frame.intensity is not None and (
+                len(frame) < MIN_POINTS or frame.intensity.any())):
+            return None
+        lack = "has no intensity" if frame.intensity is None else "has the intensity 0 everywhere"
+        return f"the cloud {lack}, which the network was trained with; it reads zeros"
 
     def nothing_passed(self, highest: Iterable[float]) -> tuple[dict[str, float], str | None]:
         """The highest score of each class, where none reached its threshold, and what is wrong if

@@ -12,10 +12,10 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import explain_nothing
-from lidar_perception.detectors.contract import Found, require_columns
+from lidar_perception.detectors.contract import Cloud, Found, accept
 from lidar_perception.ground.params import mounted
 from lidar_perception.param_fields import with_values
-from lidar_perception.types import CLASSES, PEDESTRIAN, LidarFrame
+from lidar_perception.types import CLASSES, PEDESTRIAN
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,11 @@ class CandidateDetector:
         """The same detector for a sensor so many metres above the ground."""
         return CandidateDetector(self.seed, self.camera, mounted(self.params, height))
 
-    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
+    def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
         """See contract.Detector. InputError where there is no seed, and without a camera where
         params crop to its view."""
-        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
+        frame, ground, cluster_ids, _ = accept(cloud, ground, cluster_ids)
         segmented, candidates = find_candidates(frame, self.seed, self.camera, self.params,
                                                 ground=ground, cluster_ids=cluster_ids)
         return Found(candidates.final, candidates.ms,

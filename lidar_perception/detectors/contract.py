@@ -7,13 +7,16 @@ nodes, scores, training and scripts know nothing else of them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Protocol, Self
+from dataclasses import dataclass, field, replace
+from typing import NamedTuple, Protocol, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from lidar_perception.types import Detections, InputError, LidarFrame
+from lidar_perception.intensity import guessed_scale, scale_problem, to_unit
+from lidar_perception.types import Detections, InputError, LidarFrame, as_frame, usable_returns
 
+Cloud = LidarFrame | ArrayLike  # see LidarFrame.of
 FUSED = "fused"  # the default where one detector is wanted: all of them together
 
 
@@ -33,7 +36,7 @@ class Found:
 
 
 class Detector(Protocol):
-    """detector(frame) -> Found. classes: names of types.CLASSES that it can detect."""
+    """detector(cloud) -> Found. classes: names of types.CLASSES that it can detect."""
 
     @property
     def classes(self) -> tuple[str, ...]: ...
@@ -49,16 +52,61 @@ class Detector(Protocol):
         """The same detector for a sensor so many metres above the ground; this one stays as it
         is."""
 
-    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
+    def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
-        """The objects in a frame of N points, N may be 0. ground (N,) bool and cluster_ids (N,)
-        int, 0 and below = none, come from nodes before it; they are computed where they are None
-        and the detector needs them. InputError for columns of another length, and where the frame
-        cannot be used."""
+        """Return the objects in a cloud of N points, N may be 0.
+
+        Args:
+            cloud: a LidarFrame, or an array as LidarFrame.of takes it: (N, 3) [x y z] or (N, 4)
+                [x y z intensity], metres, x forward, y left, z up.
+            ground: (N,) bool from a stage before; computed where it is None and needed.
+            cluster_ids: (N,) int, 0 and below = none; computed where it is None and needed.
+
+        Raises:
+            InputError: columns of another length, and a cloud that cannot be used.
+        """
 
 
-def require_columns(frame: LidarFrame, **columns: np.ndarray | None) -> None:
-    """InputError naming a column, if there is one, that has not a value for each point."""
-    for name, column in columns.items():
-        if column is not None and len(column) != len(frame):
-            raise InputError(f"{name} has {len(column)} values for {len(frame)} points")
+class Accepted(NamedTuple):
+    """Checked arguments of a detector: the usable points of the cloud with the intensity in 0..1,
+    their columns, and the scale_problem() of the intensity."""
+
+    frame: LidarFrame
+    ground: np.ndarray | None
+    cluster_ids: np.ndarray | None
+    problem: str | None = None
+
+
+def accept(cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | None,
+           intensity_scale: float = 1.0) -> Accepted:
+    """Check and convert the arguments of a detector, see Detector.__call__. An intensity that is
+    not in 0..1 is divided by the scale that it seems to have, which is a guess from this cloud
+    alone, so that problem says it.
+
+    intensity_scale: the factor by which the detector multiplies the intensity; 0: it reads none.
+    """
+    frame = as_frame(cloud)
+    for name, column in (("ground", ground), ("cluster_ids", cluster_ids)):
+        if column is not None and np.shape(column) != (len(frame),):
+            size = np.size(column)
+            has = f"{size} values" if size != len(frame) else f"shape {np.shape(column)}"
+            raise InputError(f"{name} has {has} for {len(frame)} points")
+    if frame is not cloud and not (usable := usable_returns(frame.xyz)).all():
+        kept = np.flatnonzero(usable)
+        frame = frame.take(kept)
+        ground, cluster_ids = (column if column is None else np.asarray(column).take(kept)
+                               for column in (ground, cluster_ids))
+    problem = scale_problem(frame.intensity, intensity_scale)
+    if problem and frame.intensity is not None:
+        full = guessed_scale(frame.intensity, intensity_scale)
+        if full != 1.0:
+            frame = replace(frame, intensity=to_unit(frame.intensity, full))
+    return Accepted(frame, ground, cluster_ids, problem)
+
+
+def joined(*problems: str | None) -> str | None:
+    """Return the problems as one, in this order, without those that a later one repeats; None
+    without any."""
+    said = [problem for problem in problems if problem]
+    return "; ".join(problem for i, problem in enumerate(said)
+                     if not any(problem in later for later in said[i + 1:])) or None

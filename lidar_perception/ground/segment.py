@@ -6,16 +6,18 @@ from collections.abc import Sequence
 from itertools import islice
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from lidar_perception.data.frame import Recording
 from lidar_perception.ground.cloth import segment_by_cloth
 from lidar_perception.ground.params import GroundParams, SensorPoseParams, ThresholdParams
 from lidar_perception.ground.patchwork import segment_by_patchwork
 from lidar_perception.ground.threshold import ransac_plane, segment_by_threshold
+from lidar_perception.intensity import guessed_scale, to_unit
 from lidar_perception.robot.crop import cropped
 from lidar_perception.robot.params import CropParams
 from lidar_perception.robot.placing import levelling, tilted
-from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame, usable_returns
+from lidar_perception.types import SENSOR_HEIGHT, InputError, LidarFrame, as_frame, usable_returns
 
 METHODS = {  # xyz (M, 3) level, intensity (M,) or None, params -> (M,) bool
     "threshold": lambda xyz, intensity, p: segment_by_threshold(xyz, p.threshold,
@@ -35,10 +37,13 @@ HEIGHT_TOLERANCE = 0.25          # m between the parameter and the measured heig
 MAX_LEAN = 5.0                   # degrees; as much as roads slope
 
 
-def segment_ground(frame: LidarFrame, params: GroundParams = GroundParams()) -> np.ndarray:
-    """(N,) bool, True = ground, for the N points of the frame. Points that are not finite are not
-    ground; an empty frame has an empty mask. The points are levelled by sensor_pose for this; the
-    frame stays as it is."""
+def segment_ground(cloud: LidarFrame | ArrayLike,
+                   params: GroundParams = GroundParams()) -> np.ndarray:
+    """Return (N,) bool, True = ground, for the N points of a LidarFrame or of an array (N, 3) or
+    (N, 4) as LidarFrame.of takes it. Points that are not finite are not ground; an empty cloud has
+    an empty mask. The points are levelled by sensor_pose for this; the cloud stays as it is.
+    InputError for other arrays."""
+    frame = as_frame(cloud)
     usable = usable_returns(frame.xyz)
     if usable.all():
         return _segment(frame.xyz, frame.intensity, params)
@@ -49,6 +54,8 @@ def segment_ground(frame: LidarFrame, params: GroundParams = GroundParams()) -> 
 
 
 def _segment(xyz: np.ndarray, intensity: np.ndarray | None, params: GroundParams) -> np.ndarray:
+    if intensity is not None and (full := guessed_scale(intensity)) != 1.0:
+        intensity = to_unit(intensity, full)
     return METHODS[params.method](level(xyz, params.sensor_pose), intensity, params)
 
 

@@ -15,7 +15,7 @@ from lidar_perception.tracking.existence import probability
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.tracking.state import States, Tracks
 from lidar_perception.tracking.step import alive, born, matched, predicted, probabilities, updated
-from lidar_perception.types import CLASSES, MAX_RANGE, Detections
+from lidar_perception.types import CLASSES, MAX_RANGE, Detections, InputError
 
 
 class Tracker:
@@ -59,7 +59,13 @@ class Tracker:
         What cannot be used does no harm: boxes that are not finite, or without a size, are left
         out; a frame of the same stamp, or a little late, changes nothing; time that jumps, also
         back by a little and on from there, and a sensor that does, ends all tracks.
+
+        InputError for anything else than Detections.
         """
+        if not isinstance(detections, Detections):
+            raise InputError(f"a tracker takes Detections, not {type(detections).__name__}; give "
+                             "detector(cloud).detections, or Detections.of(boxes, class_ids, "
+                             "scores) with boxes (K, 7)")
         self.problem = None
         seconds = self._seconds(int(stamp_ns))
         self.taken = seconds is not None

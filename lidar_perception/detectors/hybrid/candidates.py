@@ -13,7 +13,7 @@ from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import SeedSource
 from lidar_perception.candidates.segmented import explain_nothing
-from lidar_perception.detectors.contract import Found, require_columns
+from lidar_perception.detectors.contract import Cloud, Found, accept, joined
 from lidar_perception.detectors.fused.evidence import clipped_logit
 from lidar_perception.detectors.fused.fusion import package_models
 from lidar_perception.detectors.fused.model import probabilities, sources
@@ -24,7 +24,7 @@ from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.rescoring import rescored_by, seen_by
 from lidar_perception.ground.params import mounted
 from lidar_perception.param_fields import with_values
-from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError, LidarFrame
+from lidar_perception.types import CLASSES, PEDESTRIAN, Detections, InputError
 
 PERSON = CLASSES[PEDESTRIAN]
 
@@ -66,11 +66,12 @@ class RescoredCandidates:
         return RescoredCandidates(self.classifier, self.seed, self.camera, self.params,
                                   mounted(self.pipeline, height))
 
-    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
+    def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
         """See contract.Detector: the candidates by their probability, best first. InputError
         where there is no seed, and without a camera where the pipeline crops to its view."""
-        require_columns(frame, ground=ground, cluster_ids=cluster_ids)
+        frame, ground, cluster_ids, problem = accept(cloud, ground, cluster_ids,
+                                                     self.classifier.settings.intensity_scale)
         params, pose = self.params, self.pipeline.ground.sensor_pose
         segmented, candidates = find_candidates(frame, self.seed, self.camera, self.pipeline,
                                                 ground=ground, cluster_ids=cluster_ids)
@@ -93,7 +94,8 @@ class RescoredCandidates:
             self._whole(result, whole))
         result = result[np.argsort(-result.scores, kind="stable")]
         return Found(result, {**candidates.ms, "network": (perf_counter() - t0) * 1e3},
-                     explain_nothing(len(frame), segmented.ground, segmented.cluster_ids))
+                     joined(problem, explain_nothing(len(frame), segmented.ground,
+                                                     segmented.cluster_ids)))
 
     def _whole(self, detections: Detections, boxes: np.ndarray) -> Detections:
         """The detections with these boxes; of those that overlap the best."""

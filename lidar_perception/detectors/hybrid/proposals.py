@@ -8,13 +8,12 @@ from time import perf_counter
 import numpy as np
 
 from lidar_perception.detectors.base import NetworkDetector
-from lidar_perception.detectors.contract import Detector, Found
+from lidar_perception.detectors.contract import Cloud, Detector, Found, accept, joined
 from lidar_perception.detectors.hybrid.params import ConfirmingParams
 from lidar_perception.detectors.pointnet.clusters import points_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.rescoring import known, rescored_by, seen_by
 from lidar_perception.detectors.view import levelled_ground
-from lidar_perception.types import LidarFrame
 
 
 class ConfirmedProposals:
@@ -51,10 +50,12 @@ class ConfirmedProposals:
         return ConfirmedProposals(self.proposer.mounted_at(height),
                                   self.classifier.mounted_at(height), self.params)
 
-    def __call__(self, frame: LidarFrame, *, ground: np.ndarray | None = None,
+    def __call__(self, cloud: Cloud, *, ground: np.ndarray | None = None,
                  cluster_ids: np.ndarray | None = None) -> Found:
         """See contract.Detector: the proposals by their combined score, best first."""
         params, t0 = self.params, perf_counter()
+        frame, ground, cluster_ids, problem = accept(cloud, ground, cluster_ids,
+                                                     self.classifier.settings.intensity_scale)
         proposed = self.proposer(frame, ground=ground, cluster_ids=cluster_ids)
         proposals = proposed.detections
         t1 = perf_counter()
@@ -82,4 +83,4 @@ class ConfirmedProposals:
         ms = {step: seconds * 1e3 for step, seconds in (
             ("proposals", t1 - t0), ("ground", t2 - t1), ("clusters", t3 - t2),
             ("network", perf_counter() - t3))}
-        return Found(proposals, ms, proposed.problem, proposed.best)
+        return Found(proposals, ms, joined(problem, proposed.problem), proposed.best)

@@ -112,9 +112,7 @@ class PointNetDetector(NetworkDetector):
         if left_out:
             return (f"{left_out} of {len(clusters) + left_out} clusters are left out, the "
                     "farthest; raise clustering's min_size or pointnet.max_clusters")
-        if frame.intensity is None and self.settings.intensity_scale:
-            return "the cloud has no intensity, which the network was trained with; it reads zeros"
-        return None
+        return self.no_intensity(frame)
 
     def bring_to(self, device: torch.device) -> None:
         """Bring the network to a device."""

@@ -217,9 +217,7 @@ class PointPillarsDetector(NetworkDetector):
         if not looks:
             return ("every point in the network's range is ground; is the sensor mounted at "
                     "another height or angle? set ground.sensor_pose")
-        if frame.intensity is None and self.settings.intensity_scale:
-            return "the cloud has no intensity, which the network was trained with; it reads zeros"
-        return None
+        return self.no_intensity(frame)
 
     def seeing(self, where: str) -> PointPillarsDetector:
         """See base. Around in two looks, where the network knows only what is ahead. InputError

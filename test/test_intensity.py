@@ -1,0 +1,179 @@
+"""The scale of intensities, and arrays in the place of a LidarFrame."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lidar_perception.clustering.cluster import cluster, cluster_obstacles
+from lidar_perception.ground.params import GroundParams
+from lidar_perception.ground.segment import segment_ground
+from lidar_perception.intensity import (
+    StreamScale,
+    full_scale,
+    guessed_scale,
+    scale_problem,
+    to_unit,
+)
+from lidar_perception.tracking.tracker import Tracker
+from lidar_perception.types import Detections, InputError, LidarFrame
+
+UNIT = np.random.default_rng(0).uniform(0, 1, 3000).astype(np.float32) ** 3
+UNIT[0] = 1.0
+WHOLE = {full: np.round(UNIT * full) for full in (100, 255, 1023, 4095, 65535)}
+
+
+@pytest.mark.parametrize("values, kind, full", [
+    (UNIT, "f4", 1), (UNIT * 1.4, "f4", 1), (UNIT * 100, "f4", 100), (UNIT * 255, "f8", 255),
+    (WHOLE[100], "f4", 255),  # Velodyne: diffuse surfaces up to 100, retroreflectors beyond
+    (WHOLE[255], "f4", 255), (WHOLE[1023], "f4", 1023), (WHOLE[4095], "f4", 4095),
+    (WHOLE[65535], "f8", 65535), (UNIT * 1e9, "f8", 65535),
+    (UNIT, "u1", 255), (WHOLE[255], "u1", 255), (WHOLE[100] // 2, "i1", 127),
+    (WHOLE[255], "u2", 255), (WHOLE[1023], "u2", 1023), (WHOLE[4095], "u2", 4095),
+    (WHOLE[65535], "u2", 65535), (WHOLE[65535], "u4", 65535), (UNIT, "i4", 255),
+    (UNIT * 0, "f4", 1), (UNIT * 0 + 7, "f4", 255), ([], "f4", 1), ([], "u1", 255),
+    ([np.nan, np.inf, -5, 0.5], "f4", 1), ([np.nan] * 3, "f4", 1), (-UNIT, "f4", 1)])
+def test_full_scale_follows_values_and_type(values, kind, full):
+    values = np.asarray(values)
+    assert full_scale(values.astype(kind)) == full
+    if np.isfinite(values).all():
+        assert full_scale(values.astype(kind).astype(np.float32), kind) == full
+
+
+def test_a_few_broken_values_do_not_change_the_scale():
+    many = np.tile(UNIT, 10)
+    many[:2] = 1e30, 40000.0
+    assert full_scale(many) == 1.0 and scale_problem(many) is None
+    many[:30] = 255.0
+    assert full_scale(many) == 255.0
+
+
+def test_to_unit_keeps_regular_values_bit_for_bit_and_reads_broken_ones_as_zero():
+    assert to_unit(UNIT, 1.0).tobytes() == UNIT.tobytes()
+    odd = to_unit(np.array([np.nan, np.inf, -np.inf, -3, 1e300, 0, 51, 510]), 255)
+    assert odd.dtype == np.float32 and np.allclose(odd, [0, 0, 0, 0, 0, 0, 0.2, 2])
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [2, 0, 1], [1, 2, 0]])
+def test_the_scale_of_a_stream_never_falls(order):
+    clouds = [UNIT, WHOLE[255], np.float32([0, 1, 1.2])]
+    scale = StreamScale()
+    found = [scale(clouds[i]) for i in order]
+    assert found == sorted(found) and scale.full == 255.0
+
+
+@pytest.mark.parametrize("full", [100, 255, 1023, 4095, 65535])
+def test_another_scale_is_said_with_the_remedy(full):
+    values = UNIT * np.float32(full)
+    assert guessed_scale(values) == full
+    problem = scale_problem(values)
+    assert "input.intensity_max" in problem and f"probably {full}" in problem
+    assert "LidarFrame.of" in problem and "\n" not in problem
+    for factor in (0.0, 1 / full):  # fused.intensity_scale leaves it out, or makes up for it
+        assert scale_problem(values, factor) is None and guessed_scale(values, factor) == 1.0
+    assert guessed_scale(values, 0.4) == full
+
+
+def test_dark_intensities_are_said_and_regular_ones_are_not():
+    assert "goes up to 0.02 " in scale_problem(UNIT * np.float32(0.02))
+    assert scale_problem(UNIT[:100] * np.float32(0.02)) is None
+    assert scale_problem(UNIT * np.float32(0.02), 40.0) is None
+    for fine in (None, UNIT, UNIT * 0, UNIT[:0], np.full(3000, 0.3)):
+        assert scale_problem(fine) is None
+
+
+# arrays
+
+CLOUD = np.random.default_rng(1).uniform([2, -9, -2, 0], [30, 9, 1, 1], (400, 4))
+
+
+@pytest.mark.parametrize("points, remedy", [
+    (np.ones((9, 5)), r"shape \(9, 5\).*points\[:, :4\]"), (np.ones((9, 2)), r"shape \(9, 2\)"),
+    (np.ones((4, 90)), r"points\.T"), (np.ones((3, 90)), r"points\.T"), (np.ones(9), r"\(9,\)"),
+    (np.ones((2, 9, 3)), r"\(2, 9, 3\)"), (np.ones((9, 3), object), "ndarray of object"),
+    (np.ones((9, 3), bool), "ndarray of bool"), (np.ones((9, 3), complex), "complex"),
+    (np.ones(9, [("x", "f4"), ("y", "f4")]), "ndarray of void"), ([[1, 2, 3], [1]], "as an array"),
+    ("drive.bag", "is str"), (None, "is NoneType"), (7.0, r"shape \(\)")])
+def test_what_is_no_cloud_is_refused_at_every_door(points, remedy):
+    for door in (LidarFrame.of, segment_ground, cluster,
+                 lambda cloud: cluster_obstacles(cloud, np.zeros(9, bool))):
+        with pytest.raises(InputError, match=f"a cloud .*{remedy}") as error:
+            door(points)
+        assert r"(N, 3) [x y z]" in str(error.value) and "\n" not in str(error.value)
+
+
+def test_clouds_of_three_and_four_columns_are_the_same_frame():
+    plain = LidarFrame.of(CLOUD[:, :3])
+    four = LidarFrame.of(CLOUD, stamp_ns=5, frame_id="velodyne")
+    assert plain.intensity is None and (four.stamp_ns, four.frame_id) == (5, "velodyne")
+    for same in (LidarFrame.of(CLOUD.tolist()), LidarFrame.of(CLOUD[:, :3], CLOUD[:, 3]),
+                 LidarFrame.of(CLOUD[:, :3], list(CLOUD[:, 3])),
+                 LidarFrame.of(CLOUD.copy("F"))):
+        assert np.array_equal(same.xyz, plain.xyz) and np.array_equal(same.intensity,
+                                                                      four.intensity)
+        assert same.xyz.flags.c_contiguous and same.intensity.dtype == np.float32
+    whole = LidarFrame.of(np.int64([[5, 0, -1], [0, 0, 0]]))
+    assert whole.xyz.tolist() == [[5, 0, -1]]
+    for empty in ([], np.zeros((0, 3)), np.zeros((0, 4)), np.full((5, 4), np.nan)):
+        assert len(LidarFrame.of(empty)) == 0
+
+
+def test_the_scale_of_an_intensity_is_declared_or_known_by_its_type():
+    raw = (CLOUD[:, 3] * 255).astype(np.uint8)
+    expected = raw / np.float32(255)
+    xyz = CLOUD[:, :3]
+    for frame in (LidarFrame.of(xyz, raw), LidarFrame.of(xyz, raw.astype(float), intensity_max=255),
+                  LidarFrame.of(np.column_stack([xyz, raw]), intensity_max=255)):
+        assert np.array_equal(frame.intensity, expected)
+    odd = LidarFrame.of(xyz[:3], [np.nan, -1, 0.5]).intensity
+    assert odd.tolist() == [0, 0, 0.5]
+    for wrong, said in ((dict(intensity=raw[:9]), r"\(9,\) for 400 points"),
+                        (dict(intensity=raw[:, None]), r"\(400, 1\) for 400"),
+                        (dict(intensity=["a"] * 400), "intensity is list"),
+                        (dict(intensity_max=0.0), "intensity_max is 0"),
+                        (dict(intensity_max=np.nan), "intensity_max is nan")):
+        with pytest.raises(InputError, match=said):
+            LidarFrame.of(xyz, **wrong)
+    with pytest.raises(InputError, match="given twice"):
+        LidarFrame.of(CLOUD, raw)
+    with pytest.raises(InputError, match=r"shape \(400, 4\), not \(N, 3\); LidarFrame.of"):
+        LidarFrame(CLOUD)
+
+
+@pytest.mark.parametrize("method", ["threshold", "patchwork", "cloth"])
+def test_ground_of_an_array_is_that_of_its_frame(method):
+    params = GroundParams(method=method)
+    xyz = np.random.default_rng(2).uniform([3, -9, -1.75], [30, 9, -1.7], (2000, 3))
+    cloud = np.column_stack([xyz, UNIT[:2000]]).astype(np.float32)
+    expected = segment_ground(LidarFrame.of(cloud), params)
+    assert expected.any() and np.array_equal(segment_ground(cloud, params), expected)
+    cloud[7] = np.nan
+    found = segment_ground(cloud, params)
+    assert found.shape == (2000,) and not found[7]
+    bright = segment_ground(np.column_stack([xyz, UNIT[:2000] * 255]), params)
+    assert np.array_equal(bright, segment_ground(LidarFrame.of(np.column_stack(
+        [xyz, UNIT[:2000] * 255]), intensity_max=255), params))
+
+
+def test_clusters_of_an_array_are_those_of_its_frame():
+    ids = cluster(LidarFrame.of(CLOUD))
+    assert np.array_equal(cluster(CLOUD), ids) and np.array_equal(cluster(CLOUD[:, :3]), ids)
+    with pytest.raises(InputError, match=r"ground has shape \(3,\) for 400 points"):
+        cluster_obstacles(CLOUD, np.zeros(3, bool))
+
+
+@pytest.mark.parametrize("boxes, said", [
+    (np.ones((7, 2)), r"\(7, 2\)"), (np.ones((2, 8)), r"\(2, 8\)"), (np.ones(14), r"\(14,\)"),
+    (np.ones((1, 2, 7)), r"\(1, 2, 7\)"), ("box", "is str")])
+def test_boxes_of_another_shape_are_refused(boxes, said):
+    with pytest.raises(InputError, match=f"boxes .*{said}"):
+        Detections.of(boxes)
+
+
+def test_a_tracker_names_what_it_takes():
+    for wrong in (np.ones((2, 7)), None):
+        with pytest.raises(InputError, match=rf"not {type(wrong).__name__}; give detector"):
+            Tracker()(wrong)
+    with pytest.raises(InputError, match=r"scores have shape \(3,\) for 2 boxes"):
+        Detections.of(np.ones((2, 7)), 1, [1, 1, 1])
+    assert len(Detections.of([])) == 0 and len(Detections.of(np.ones(7))) == 1
