@@ -94,10 +94,10 @@ def _seen(recording: Any, file: Path | None, deskew: bool) -> Callable[[Any], An
     """What makes of a frame what nodes with this parameter file see; nothing without one."""
     if file is None and not deskew:
         return lambda frame: frame
-    from lidar_perception.data import bag_frames, cloud_files
-    if not any(layout.recognises(recording.path) for layout in (bag_frames, cloud_files)):
+    from lidar_perception.data import bag_frames, cloud_folder
+    if not any(layout.recognises(recording.path) for layout in (bag_frames, cloud_folder)):
         raise InputError(f"{recording.path} ({recording.layout}) has level clouds; --robot and "
-                         "--deskew are for bags, .pcd and .bin files")
+                         "--deskew are for bags and files of clouds")
     from lidar_perception.data.levelled import Robot, levelled
     robot = Robot()
     if file is not None:

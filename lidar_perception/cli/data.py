@@ -17,9 +17,10 @@ from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
 
-WHAT = ("KITTI (object, tracking, raw), nuScenes or SemanticKITTI folder, bag (rosbag2, or .bag "
-        "of ROS 1), .pcd or .bin files, or what `simulate` wrote. BAG:/TOPIC names the clouds of a "
-        "bag that has several.")
+# docs/recordings.md has the complete list.
+WHAT = ("Bag (ROS 2 or ROS 1), KITTI, nuScenes or SemanticKITTI folder, .pcd, .ply, .npy or .bin "
+        "files, or the output of `simulate`. BAG:/TOPIC names the clouds of a bag that has "
+        "several.")
 MOST_JOBS = 16  # processes by default; as many feed a GPU
 
 

@@ -23,8 +23,8 @@ HINT_TOLERANCE = 0.1  # metres
 
 
 @click.command()
-@a_path("--data", "A bag, a .pcd or .bin file or a folder of them, or a KITTI, nuScenes or "
-        "SemanticKITTI folder. No label is needed.", "PATH", required=True)
+@a_path("--data", "A bag, a .pcd, .ply, .npy or .bin file or a folder of them, or the folder of a "
+        "data set. No label is needed.", "PATH", required=True)
 @a_path("--out", "Folder for the files.", "FOLDER", required=True)
 @click.option("--topic", metavar="TOPIC", help="Clouds of a bag that holds those of several "
               "sensors.")

@@ -18,7 +18,7 @@ import numpy as np
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import Bag, KeptOpen
 from lidar_perception.data.bag_poses import BagPoses
-from lidar_perception.data.cloud_files import SUFFIXES
+from lidar_perception.data.cloud_files import is_cloud
 from lidar_perception.data.frame import (
     BOXES,
     CAMERA,
@@ -44,7 +44,7 @@ BESIDE = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}}
 def recognises(path: Path) -> bool:
     """Whether a bag lies there: a file, or a folder with one."""
     if path.is_file():
-        return path.suffix not in SUFFIXES  # nothing else is one file
+        return not is_cloud(path)  # nothing else is one file
     return (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
 
 
@@ -80,7 +80,7 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
         labelled = frames.first is not None and frames.labelled(frames.first[1]) is not None
     has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | {
         *[POINT_LABELS] * labelled, *[POSES] * frames.poses.known}
-    return Recording(path, layout(path, points), frames, has, mounted=False)
+    return Recording(path, layout(path, points), frames, has, mounted=False, timed=True)
 
 
 def layout(path: Path, points: str) -> str:

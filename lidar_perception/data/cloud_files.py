@@ -1,111 +1,121 @@
-"""Clouds in files of their own, .pcd or .bin, as drivers and labelling tools write them."""
+"""The points of one file: .pcd, .ply, .npy or .bin, with the columns that it has."""
 
 from __future__ import annotations
 
-import re
-from functools import partial
-from itertools import pairwise
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS
 from lidar_perception.data.nuscenes.folder import SWEEP
 from lidar_perception.data.pcd import read_pcd
+from lidar_perception.data.ply import read_ply
 from lidar_perception.data.records import read_records
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.runs.files import regular
+from lidar_perception.types import MAX_RANGE, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import to_frame
-from msg_utils.point_cloud2 import from_array
+from msg_utils.point_cloud2 import from_array, xyz
 from msg_utils.stamps import header_message
 
-SUFFIXES = (".pcd", ".bin")
 KITTI = "x y z intensity"
+MAX_COLUMNS = 5  # of a .npy file whose fourth column is surely the intensity
 MAX_RING = 256
 SAMPLE = 2000  # points on which the columns of a .bin file are told
 NEGATIVE = 0.1  # of them; where more have a negative intensity the columns are others
-UNITS = {10: 10**9, 13: 10**6, 16: 10**3, 19: 1}  # digits of a Unix time of today: ns of its unit
+REFLECTANCE = ("reflectance", "remission")  # other names for the intensity
 
 
-def cloud_files(path: Path) -> list[Path]:
-    """The file at path, or those in the folder in order: of the times that their names are, else
-    of the numbers in them (2 before 10); none where there is no cloud."""
-    files = [path] if path.is_file() else [
-        file for file in path.glob("*") if file.suffix in SUFFIXES and file.is_file()]
-    times = {file: _named_time(file) for file in files if file.suffix in SUFFIXES}
-    if None not in times.values():
-        return sorted(times, key=lambda file: (times[file], file.name))
-    return sorted(times, key=lambda file: [
-        (int(part or -1), text) for text, part in re.findall(r"(\D*)(\d*)", file.name)])
+def is_cloud(path: Path) -> bool:
+    """Return True for a file whose suffix, in any case, is one of SUFFIXES."""
+    return path.suffix.lower() in SUFFIXES and path.is_file()
 
 
-def recognises(path: Path) -> bool:
-    """Whether such a file lies there, or a folder with some."""
-    return bool(cloud_files(path))
+def load_points(file: Path, stamp_ns: int, frame_id: str = "") -> LidarFrame:
+    """Read the usable points of a file of SUFFIXES.
+
+    Raises: InputError for a broken file, and for a cloud all of which is beyond MAX_RANGE, as one
+    in map coordinates (UTM) is.
+    """
+    try:
+        message = to_message(file, stamp_ns, frame_id)
+        frame = to_frame(message, 0.0)[0]
+    except InputError as error:
+        raise InputError(str(error) if str(file) in str(error) else f"{file}: {error}") from None
+    if len(frame) == 0:
+        check_near(read_points(file), file)
+    return frame
 
 
-def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
-    """The clouds as one drive without labels. Times are those that all names say (Unix times in
-    seconds, as 1700000000.1, or in ms, us or ns), else 10 Hz."""
-    files = cloud_files(path)
-    names = [file.stem for file in files]
-    if len(set(names)) < len(names):
-        names = [file.name for file in files]
-    said = named_times(files)
-    stamps = said or [START_NS + i * PERIOD_NS for i in range(len(files))]
-    kinds = " and ".join(sorted({file.suffix for file in files}))
-    return Recording(path, f"{kinds} clouds, {'times' if said else 'no times'} in their names",
-                     [Frame(name, stamp, partial(_load, file, stamp), index=i, points=file,
-                            native=partial(to_message, file, stamp))
-                      for i, (name, stamp, file) in enumerate(zip(names, stamps, files))],
-                     mounted=False)
+def check_near(points: np.ndarray, where: object) -> None:
+    """Raise InputError if every finite point of a structured array is beyond MAX_RANGE."""
+    coordinates = xyz(points)
+    far = np.abs(coordinates[np.isfinite(coordinates).all(axis=1)]).max(axis=1, initial=0)
+    if len(far) and far.min() > MAX_RANGE / 2:
+        x, y = (round(float(points[axis][0]), -3) for axis in "xy")
+        raise InputError(f"{where}: all points are beyond {MAX_RANGE / 1000:g} km, as map "
+                         f"coordinates (UTM) are; subtract an offset, such as {x:.0f} {y:.0f} from "
+                         "x y, and save it again")
 
 
-def named_times(files: list[Path]) -> list[int]:
-    """Nanoseconds that the names of the files are, in ascending order; none where one is not."""
-    stamps = [stamp for file in files if (stamp := _named_time(file)) is not None]
-    return stamps if len(stamps) == len(files) and all(
-        a < b for a, b in pairwise(stamps)) else []
-
-
-def _named_time(file: Path) -> int | None:
-    """Nanoseconds that the name of a file is; None where it is none: a frame of KITTI's raw data
-    has ten digits, too, the first of them 0."""
-    whole, _, fraction = file.name.removesuffix(file.suffix).partition(".")
-    if not whole.isdecimal() or whole[0] == "0" or len(whole) not in UNITS or (
-            fraction and (len(whole) != 10 or not fraction.isdecimal())):
-        return None
-    return int(whole) * UNITS[len(whole)] + int(f"{fraction:0<9}"[:9] or 0)
-
-
-def read_points(file: Path) -> np.ndarray:
-    """(N,) structured array with the columns of the file. InputError where it is no cloud."""
-    points = read_pcd(file) if file.suffix == ".pcd" else _of_records(file)
-    if missing := {"x", "y", "z"} - set(points.dtype.names or ()):
-        raise InputError(f"{file} has no field {min(missing)}; it is no cloud of points")
-    return points
-
-
-def to_message(file: Path, stamp_ns: int = 0) -> Any:
-    """A file as a PointCloud2 of rosbags' class."""
+def to_message(file: Path, stamp_ns: int = 0, frame_id: str = "") -> Any:
+    """Read a file as a PointCloud2 of rosbags' class, with all its columns."""
     points = read_points(file)
     # A PointCloud2 has no whole numbers of 64 bits: times as float64 keep their microseconds.
     kinds = [(name, points.dtype[name].base.str.replace("i8", "f8").replace("u8", "f8"),
               points.dtype[name].shape) for name in points.dtype.names or ()]
     try:
-        return from_array(points.astype(kinds), header_message(stamp_ns, "", bag_message),
+        return from_array(points.astype(kinds), header_message(stamp_ns, frame_id, bag_message),
                           bag_message)
     except ValueError as error:
         raise InputError(f"{file}: {error}") from None
 
 
-def _load(file: Path, stamp_ns: int) -> LidarFrame:
+def read_points(file: Path) -> np.ndarray:
+    """Read a file of SUFFIXES.
+
+    Returns: (N,) structured array with the columns of the file. Names are in lower case and without
+    the "scalar_" of CloudCompare, and REFLECTANCE is called intensity.
+    Raises: InputError for a file that cannot be read, or has no x, y or z.
+    """
+    points = _with_usual_names(READERS[file.suffix.lower()](file))
+    if missing := {"x", "y", "z"} - set(points.dtype.names or ()):
+        raise InputError(f"{file} has no field {min(missing)}; it is no cloud of points")
+    return points
+
+
+def _with_usual_names(points: np.ndarray) -> np.ndarray:
+    names = points.dtype.names or ()
+    new = [name.lower().removeprefix("scalar_") for name in names]
+    if "intensity" not in new and (other := next((n for n in REFLECTANCE if n in new), "")):
+        new[new.index(other)] = "intensity"
+    new = [name if new.count(name) == 1 else old for name, old in zip(new, names)]
+    fields = [points.dtype.fields[name] for name in names] if points.dtype.fields else []
+    return points.view(np.dtype({"names": new, "formats": [field[0] for field in fields],
+                                 "offsets": [field[1] for field in fields],
+                                 "itemsize": points.dtype.itemsize}))
+
+
+def read_npy(file: Path, max_columns: int = MAX_COLUMNS) -> np.ndarray:
+    """Read a .npy file of an array (N, 3) [x y z], or (N, 4) and more [x y z intensity ...], or of
+    a structured one.
+
+    Returns: (N,) structured array; of more than four columns the first four.
+    Raises: InputError for another shape or type, and for more than max_columns.
+    """
     try:
-        return to_frame(to_message(file, stamp_ns), 0.0)[0]
-    except InputError as error:
-        raise InputError(str(error) if str(file) in str(error) else f"{file}: {error}") from None
+        array = np.array(np.load(regular(file), mmap_mode="r", allow_pickle=False))
+    except (OSError, ValueError, EOFError, TypeError) as error:
+        raise InputError(f"{file} is no .npy file that can be read ({error}); save it again with "
+                         "numpy.save") from None
+    if array.dtype.names:
+        return array.reshape(-1)
+    if array.ndim != 2 or not 3 <= array.shape[1] <= max_columns or array.dtype.kind != "f":
+        raise InputError(f"{file} has an array {array.shape} of {array.dtype}; expected (N, 3) "
+                         "x y z or (N, 4) x y z intensity as float32")
+    kind = np.float64 if array.dtype.itemsize == 8 else np.float32
+    return _structured(array[:, :4].astype(kind), KITTI)
 
 
 def _of_records(file: Path) -> np.ndarray:
@@ -126,5 +136,11 @@ def _of_records(file: Path) -> np.ndarray:
 
 
 def _structured(cloud: np.ndarray, columns: str) -> np.ndarray:
-    names = columns.split()
-    return np.ascontiguousarray(cloud).view([(name, np.float32) for name in names]).reshape(-1)
+    """(N, C) as (N,) with these names for its columns, as many as it has."""
+    names = columns.split()[:cloud.shape[1]]
+    return np.ascontiguousarray(cloud).view([(name, cloud.dtype) for name in names]).reshape(-1)
+
+
+READERS: dict[str, Callable[[Path], np.ndarray]] = {
+    ".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy, ".bin": _of_records}
+SUFFIXES = tuple(READERS)

@@ -100,7 +100,8 @@ class Recording:
     some frames have. lost: labels whose scan is not there, name -> reason. reopen: opens the same
     recording again, in another process, too; takes what data.open.open_recording does. mounted:
     whether it says how high its sensor is; otherwise the sensor_height of its frames is KITTI's.
-    drives: whether frames follow each other in time; else they were drawn from anywhere.
+    drives: whether frames follow each other in time; else they were drawn from anywhere. timed:
+    whether the stamps were recorded; else 10 Hz is assumed.
     """
 
     path: Path
@@ -111,6 +112,7 @@ class Recording:
     reopen: Callable[..., Recording] | None = None
     mounted: bool = True
     drives: bool = True
+    timed: bool = False
 
     def __len__(self) -> int:
         return len(self.frames)

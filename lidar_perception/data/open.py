@@ -5,25 +5,48 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
+from types import ModuleType
 
-from lidar_perception.data import bag_frames, cloud_files, semantickitti
+from lidar_perception.data import bag_frames, cloud_folder, semantickitti
+from lidar_perception.data.cloud_files import SUFFIXES
 from lidar_perception.data.frame import Recording
 from lidar_perception.data.kitti import folder as kitti
 from lidar_perception.data.mounting import height_of
 from lidar_perception.data.nuscenes import folder as nuscenes
-from lidar_perception.runs.files import regular
+from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
-# Each has recognises(path) and open_recording(path, ...); a new data set is one line here.
-LAYOUTS = (bag_frames, nuscenes, semantickitti, kitti, cloud_files)
+# Modules with recognises(path) and open_recording(path, ...), the first that recognises a path
+# opens it; and how such a folder looks. A new format is one line here.
+LAYOUTS = {
+    bag_frames: "",
+    semantickitti: "KITTI odometry or SemanticKITTI (sequences/00/)",
+    kitti: "KITTI (velodyne/ or training/velodyne/, or raw drives)",
+    nuscenes: "nuScenes (v1.0-*/ and samples/)",
+    cloud_folder: "",
+}
+# Suffixes of other formats, and what makes one of the above of them.
+CONVERTERS = {
+    ".las": ("LAS", "convert it with PDAL: pdal translate IN.las OUT.pcd"),
+    ".laz": ("LAZ", "convert it with PDAL: pdal translate IN.laz OUT.pcd"),
+    ".e57": ("E57", "convert it with PDAL: pdal translate IN.e57 OUT.pcd"),
+    ".tfrecord": ("Waymo", "convert it to KITTI with waymo_kitti_converter or mmdetection3d"),
+    ".parquet": ("Waymo (version 2)", "convert it to KITTI with waymo_kitti_converter or "
+                 "mmdetection3d"),
+    ".feather": ("Argoverse 2", "read the sweeps with av2 (av2.utils.io.read_lidar_sweep) and save "
+                 "x y z intensity with numpy.save"),
+    ".pcap": ("sensor packets", "play it to the driver of the sensor and record its cloud topic in "
+              "a bag"),
+}
+MAX_FILES = 10_000  # of a folder that are looked at for these
 
 
 def open_recording(path: str | Path, *, split: str | Path | None = None, points: str = "",
                    scans: bool = True, sensor_height: float | None = None) -> Recording:
-    """The frames at a path: a rosbag2 bag, or a folder of KITTI (object, tracking, raw, or what
-    `simulate` wrote), nuScenes or SemanticKITTI, or one of its inner folders, or .pcd or .bin
-    files.
+    """Open the recording at a path: a bag (rosbag2 or ROS 1), a folder in one of LAYOUTS or one of
+    its inner folders, or a .pcd, .ply, .npy or .bin file or a folder of them.
 
     split: file that names frames or whole sequences, one a line; only these, in its order. points:
     topic of the clouds of a bag, where it is neither /points nor the only one; a path may name it,
@@ -35,12 +58,11 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
     points = points or named
     if not path.exists():
         raise InputError(f"there is no {path}; give a bag or the folder of a data set")
-    layout = next((layout for layout in LAYOUTS if layout.recognises(path)), None)
-    if layout is None:
-        raise InputError(f"{path} is no recording that can be read: expected a rosbag2 bag, or "
-                         "the folder of KITTI (velodyne/ or training/velodyne/, or raw drives), "
-                         "nuScenes (v1.0-*/ and samples/) or SemanticKITTI (sequences/00/), or "
-                         ".pcd or .bin files")
+    if (layout := layout_of(path)) is None:
+        *folders, last = filter(None, LAYOUTS.values())
+        raise InputError(f"{path} is no recording that can be read: expected a rosbag2 bag, or the "
+                         f"folder of {', '.join(folders)} or {last}, or {', '.join(SUFFIXES)} "
+                         "files")
     recording = layout.open_recording(path, points=points, scans=scans)
     if len(recording) == 0:
         raise InputError(f"{path} ({recording.layout}) has no frame; record or download it again")
@@ -57,6 +79,21 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
     return recording if split is None else _of_split(recording, Path(split))
 
 
+def layout_of(path: Path) -> ModuleType | None:
+    """Return the module of LAYOUTS that recognises a path; None where none does. InputError with a
+    converter for a known format that is not read."""
+    if not (path.is_file() and path.suffix.lower() in CONVERTERS):
+        for layout in LAYOUTS:
+            if layout.recognises(path):
+                return layout
+    for file in [path] if path.is_file() else islice(path.rglob("*"), MAX_FILES):
+        if file.suffix.lower() in CONVERTERS:
+            name, remedy = CONVERTERS[file.suffix.lower()]
+            raise InputError(f"{path} is in the format {name} ({file.name}), which is not read; "
+                             f"{remedy}")
+    return None
+
+
 def with_topic(path: str | Path) -> tuple[Path, str]:
     """The path of a bag, and the topic that is named behind it, as in drive.bag:/front/points; ""
     where there is none."""
@@ -66,10 +103,7 @@ def with_topic(path: str | Path) -> tuple[Path, str]:
 
 def _of_split(recording: Recording, split: Path) -> Recording:
     """The frames that a file names, by themselves or by their sequence, each once."""
-    try:
-        names = regular(split).read_text().split()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the split {split}: {error}") from None
+    names = read_text(split, what="the split").split()
     sequences: dict[str, list[str]] = {}
     frames: dict[str, None] = {}
     for frame in recording:

@@ -12,9 +12,10 @@ import numpy as np
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import KeptOpen
 from lidar_perception.data.bag_poses import BagPoses
-from lidar_perception.data.cloud_files import cloud_files, named_times, to_message
+from lidar_perception.data.cloud_files import to_message
+from lidar_perception.data.cloud_folder import cloud_files, named_times
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.open import open_recording, with_topic
+from lidar_perception.data.open import layout_of, open_recording, with_topic
 from lidar_perception.data.to_bag import points_of
 from lidar_perception.types import InputError
 from lidar_perception.wire.codec import bag_message
@@ -43,19 +44,18 @@ class RawClouds:
 
 def open_clouds(path: str | Path, topic: str | None = None) -> RawClouds:
     """The clouds at a path: a bag (topic: which, needed where several are recorded; see
-    data.open), a .pcd or .bin file or a folder of them, or the folder of a data set as data.open
+    data.open), a file of clouds or a folder of them, or the folder of a data set as data.open
     knows it. InputError says what is missing, and what can be opened."""
     path, on = with_topic(path)
     if not path.exists():
-        raise InputError(f"there is no {path}; give a bag, a data set, or .pcd or .bin files")
+        raise InputError(f"there is no {path}; give a bag, a data set, or files of clouds")
     if files := cloud_files(path):
         return _of_files(path, files)
-    if bag_frames.recognises(path):
+    if layout_of(path) is bag_frames:
         return _of_bag(path, topic or on)
     recording = open_recording(path)
     stamps = np.array([frame.stamp_ns for frame in recording])
-    named = "nuScenes" in recording.layout or "raw" in recording.layout
-    return RawClouds(path, recording.layout, len(recording), stamps if named else None,
+    return RawClouds(path, recording.layout, len(recording), stamps if recording.timed else None,
                      lambda i: _of_frame(recording.frames[i]))
 
 

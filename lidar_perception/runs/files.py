@@ -29,9 +29,14 @@ def regular(path: Path) -> Path:
     return path
 
 
-def read_text(path: str | Path, max_bytes: int) -> str:
-    """The UTF-8 text of a file of at most max_bytes. InputError where it cannot be read; also for
-    what is no file, such as a pipe, from which a read may wait for ever."""
+MAX_TEXT = 2**28  # bytes of a file of numbers or labels
+
+
+def read_text(path: str | Path, max_bytes: int = MAX_TEXT, what: str = "") -> str:
+    """Read the UTF-8 text of a file of at most max_bytes, without a byte order mark. InputError,
+    in which `what` describes the file, where it cannot be read; also for a pipe or a device, from
+    which a read may wait for ever."""
+    named = f"{what} {path}" if what else str(path)
     path = Path(path)
     try:
         with open(regular(path), "rb") as stream:
@@ -39,11 +44,11 @@ def read_text(path: str | Path, max_bytes: int) -> str:
         if len(content) > max_bytes:
             raise InputError(f"{path} has more than {max_bytes} bytes, which is no file of this "
                              "kind; give another one")
-        return content.decode()
+        return content.decode("utf-8-sig")  # as editors of Windows begin it
     except OSError as error:
-        raise InputError(f"cannot read {path}: {error.strerror or error}") from None
+        raise InputError(f"cannot read {named}: {error.strerror or error}") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"cannot read {path}: it is no UTF-8 text ({error.reason} at byte "
+        raise InputError(f"cannot read {named}: it is no UTF-8 text ({error.reason} at byte "
                          f"{error.start})") from None
 
 

@@ -151,6 +151,12 @@ def test_info_cuts_no_name_on_a_narrow_terminal(bag, monkeypatch):
         assert all(topic in topics and kind in kinds for topic, kind in opened.topics.items())
 
 
+def test_info_describes_a_recording_that_is_no_bag(kitti):
+    text = run("info", kitti)
+    assert f"{kitti}: KITTI object data, 2 frames, a camera, labelled boxes" in text
+    assert "10 Hz assumed" in text and "first cloud: 000000, " in text and "labels: " in text
+
+
 def test_info_shows_topics_types_counts_and_length(bag, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     text = run("info", bag)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from lidar_perception.camera import Calibration
-from lidar_perception.runs.files import regular
+from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
 # Size of the rectified images by focal length: it differs with the recording day, and the object
@@ -46,13 +46,8 @@ def read_raw_calibration(day: Path) -> Calibration:
 
 def matrices(path: Path) -> dict[str, np.ndarray]:
     """The numbers of each line "NAME: ..." of a file. InputError where it cannot be read."""
-    try:
-        lines = regular(path).read_text().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the calibration {path}: {error}; every frame needs "
-                         "one") from None
     values = {}
-    for line in lines:
+    for line in read_text(path, what="the calibration").splitlines():
         # the tracking benchmark writes some names without a colon
         name, _, rest = line.replace(":", " ", 1).strip().partition(" ")
         try:

@@ -83,7 +83,8 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     return Recording(path, f"KITTI {layout}", frames,
                      frozenset({CAMERA} | ({BOXES} if labelled else set())),
                      tuple((label.stem, f"{label} has no scan; download it again")
-                           for label in lost) if scans else (), drives=layout != OBJECT)
+                           for label in lost) if scans else (), drives=layout != OBJECT,
+                     timed=layout == "raw drives")
 
 
 def _object(folder: Path, scans: bool) -> list[Frame]:

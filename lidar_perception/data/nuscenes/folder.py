@@ -76,7 +76,7 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     frames = open_nuscenes(root, version)
     labelled = (root / version / "sample_annotation.json").is_file()
     return Recording(path, f"nuScenes {version}", frames,
-                     frozenset({POSES} | ({BOXES} if labelled else set())))
+                     frozenset({POSES} | ({BOXES} if labelled else set())), timed=True)
 
 
 def _versions(root: Path) -> list[str]:
