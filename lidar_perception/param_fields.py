@@ -10,7 +10,7 @@ import copy
 import dataclasses
 import math
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import field, fields
 from typing import Any
 
@@ -107,7 +107,17 @@ def _with_default(f: dataclasses.Field[Any], value: Any) -> dataclasses.Field[An
     return changed
 
 
-def with_values(params: Any, values: dict[str, Any]) -> Any:
+def described(fields: Mapping[str, dataclasses.Field[Any]]) -> list[str]:
+    """Return lines with name, default, unit and text of each field."""
+    lines = []
+    for name, f in fields.items():
+        default = list(f.default) if isinstance(f.default, tuple) else f.default
+        unit = f" {f.metadata['unit']}" if f.metadata["unit"] else ""
+        lines += [f"  {name} (default {default!r}{unit})", f"      {f.metadata['doc']}"]
+    return lines
+
+
+def with_values(params: Any, values: Mapping[str, Any]) -> Any:
     """params with {'clustering.dbscan.min_samples': 5, ...} set; ValueError names what is unknown
     or wrong."""
     known = parameter_fields(params)
@@ -116,7 +126,7 @@ def with_values(params: Any, values: dict[str, Any]) -> Any:
     return _replaced(params, values, "")
 
 
-def _replaced(params: Any, values: dict[str, Any], prefix: str) -> Any:
+def _replaced(params: Any, values: Mapping[str, Any], prefix: str) -> Any:
     """params with those of the dotted values set that lie under prefix."""
     changed = {}
     for f in fields(params):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
@@ -20,12 +21,39 @@ __all__ = ["CLASSES", "PEDESTRIAN", "Detections", "GroundTruth", "InputError", "
            "usable_returns"]
 
 MAX_RANGE = 1e5  # metres; what is farther is a broken return, not a point
+LIKELY = 0.6  # 0..1, see difflib: two names that are this similar may be the same one, misspelt
 LARGEST = 1e9  # of the numbers of a label; what is larger is damaged
 SENSOR_HEIGHT = 1.73  # metres: KITTI's sensor above the road. Defaults, anchors and simulation
 
 
 class InputError(ValueError):
     """Input that cannot be used. The message is one line: what is wrong, and the remedy."""
+
+
+def closest_name(name: object, known: Iterable[str]) -> str | None:
+    """Return the name of `known` that `name` is most likely meant to be, or None. A name that
+    begins with `name` comes before one that is spelt alike."""
+    wanted, plain = _plain(str(name)), {_plain(each): each for each in known}
+    longer = [each for each in plain if each.startswith(wanted)] if len(wanted) > 2 else []
+    found = longer or get_close_matches(wanted, plain, 1, LIKELY)
+    return plain[found[0]] if found else None
+
+
+def _plain(name: str) -> str:
+    return name.lower().replace("_", "-")
+
+
+def unknown_name(what: str, name: object, known: Iterable[str]) -> InputError:
+    """Return the error for a name that is not in `known`: the closest match and all valid names.
+
+    Args:
+        what: the kind of thing, such as "sensor".
+    """
+    known = list(known)
+    guess = closest_name(name, known)
+    return InputError(f"there is no {what} {str(name)[:80]!r}"
+                      + (f"; did you mean {guess!r}? Valid" if guess else "; valid")
+                      + f" names: {', '.join(known)}")
 
 
 @dataclass(frozen=True)

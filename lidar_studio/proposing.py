@@ -18,6 +18,7 @@ from lidar_perception.candidates.seeds import Seed, seed_from_points
 from lidar_perception.candidates.silhouette import similarity, to_pixels
 from lidar_perception.classes import Size
 from lidar_perception.detectors.contract import FUSED
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.geometry import centre_distances, points_in_box, to_box_frame
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
 from lidar_studio import survey_cache
@@ -37,12 +38,13 @@ ALONG = 0.4
 
 
 class Proposer:
-    """Proposals for a drive. weights: of a detector, as open_detector takes them; "": none. kept:
+    """Proposals for a drive. detector: the one that looks, None for none. kept:
     the folder that keeps the survey, None for none. problem: what is wrong with what is kept, or
     ""."""
 
-    def __init__(self, drive: Drive, weights: str = FUSED, kept: Path | None = None) -> None:
-        self.drive, self.weights, self.kept = drive, weights, kept
+    def __init__(self, drive: Drive, detector: DetectorChoice | None = DetectorChoice(),
+                 kept: Path | None = None) -> None:
+        self.drive, self.detector, self.kept = drive, detector, kept
         self.problem = ""
         self._seen: list[Look] = []  # of the first frames
         self._seeds: dict[tuple[int, tuple[float, ...]], Seed | None] = {}
@@ -54,10 +56,10 @@ class Proposer:
 
     @cached_property
     def _key(self) -> str:
-        return survey_cache.key_of(self.drive, self.weights)
+        return survey_cache.key_of(self.drive, self.detector)
 
     def remember(self) -> None:
-        """Take the looks that were kept, where they are of this drive and these weights."""
+        """Take the looks that were kept, where they are of this drive and this detector."""
         if self.kept is None or self._seen or not self.kept.is_dir():
             return
         try:
@@ -71,7 +73,7 @@ class Proposer:
         looks = self._seen
         if self.kept is not None and not looks:
             survey_cache.clear(self.kept)
-        with closing(surveyed(self.drive, self.weights, here, len(looks))) as survey:
+        with closing(surveyed(self.drive, self.detector, here, len(looks))) as survey:
             for look in survey:
                 if look is not None:
                     looks.append(look)
@@ -112,7 +114,7 @@ class Proposer:
                 if b.kind == KEY:
                     placed.setdefault(f, []).append((np.array(b.values), t.class_name))
         stamps = [frame.stamp_ns for frame in self.drive.frames]
-        wanted = Wanted(seeds, sizes, placed, self.weights != "")
+        wanted = Wanted(seeds, sizes, placed, self.detector is not None)
         return proposed(self.looks or [], wanted, stamps, motion,
                         range(len(self.looks or [])) if frames is None else frames, told)
 

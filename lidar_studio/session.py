@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.detectors.contract import FUSED
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.labels.exchange import export_labels, import_labels, recognised
 from lidar_perception.runs.files import short
 from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
@@ -62,9 +62,10 @@ class Session:
     """May be called from several threads. listeners: told of every action, as /api/events has
     it; busy: what goes on, as PROGRESS has it."""
 
-    def __init__(self, drive: Drive, journal: Journal, weights: str = FUSED) -> None:
+    def __init__(self, drive: Drive, journal: Journal,
+                 detector: DetectorChoice | None = DetectorChoice()) -> None:
         self.drive, self.journal, self.state = drive, journal, State()
-        self.proposer = Proposer(drive, weights, journal.path.with_name(survey_cache.FOLDER))
+        self.proposer = Proposer(drive, detector, journal.path.with_name(survey_cache.FOLDER))
         self.listeners: list[Listener] = []
         self.busy: dict[str, Any] | None = None
         self.was_proposed = any(line.get("do") == "propose" for line in journal.lines)
@@ -340,11 +341,12 @@ def _asked(action: Mapping[str, Any]) -> Action:
 
 
 @contextmanager
-def session(drive: Drive, folder: Path, weights: str = FUSED) -> Iterator[Session]:
+def session(drive: Drive, folder: Path,
+            detector: DetectorChoice | None = DetectorChoice()) -> Iterator[Session]:
     """The labels of a drive in a folder, gone on with from where they were left. InputError for the
     journal of another drive, and while another process has it."""
     with opened(folder, drive.known_by) as journal:
-        made = Session(drive, journal, weights)
+        made = Session(drive, journal, detector)
         made.proposer.remember()
         try:
             yield made

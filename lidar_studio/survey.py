@@ -19,6 +19,7 @@ from lidar_perception.candidates.silhouette import ROWS, silhouettes
 from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.detectors.contract import Detector
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.groups import group_points
 from lidar_perception.runs.processes import in_processes
 from lidar_perception.tracking.ego import Odometry, recorded_source
@@ -90,19 +91,25 @@ def _described(xyz: Array, cluster_ids: Array, boxes: Array, numbers: Array,
     return images, shape_features(points, start, boxes, params)
 
 
-def surveyed(drive: Drive, weights: str, here: bool = False,
+def surveyed(drive: Drive, choice: DetectorChoice | None, here: bool = False,
              first: int = 0) -> Generator[Look | None, None, None]:
-    """The looks of all frames from `first` on, in their order, with the detector of these weights,
-    "" for none; in a process of its own, which ends with the iterator, or with `here` in this one.
-    Before them None for each earlier frame that the poses by the scans need again. InputError where
-    a frame or the weights cannot be read."""
+    """Yield the looks of all frames from `first` on, in their order.
+
+    Args:
+        choice: the detector, or None.
+        here: look in this process, not in a separate one that ends with the iterator.
+        first: None is yielded for each earlier frame that the poses from the scans need again.
+
+    Raises:
+        InputError: a frame or the detector's weights cannot be read.
+    """
     reopen = drive.recording.reopen
     frames = list(range(0 if _by_scans(drive) else first, len(drive.frames)))
     if here or reopen is None:
-        yield from map(_here(drive, weights, first), frames)
+        yield from map(_here(drive, choice, first), frames)
         return
     sequence = drive.frames[0].sequence
-    yield from in_processes(partial(_elsewhere, reopen, weights, sequence, first), frames, 1,
+    yield from in_processes(partial(_elsewhere, reopen, choice, sequence, first), frames, 1,
                             "looked for proposals", apart=True)
 
 
@@ -110,10 +117,10 @@ def _by_scans(drive: Drive) -> bool:
     return recorded_source(drive.motion.poses is not None) == "kiss_icp"
 
 
-def _here(drive: Drive, weights: str, first: int) -> Callable[[int], Look | None]:
-    from lidar_perception.detectors.open import open_detector  # loads torch; a page need not
-    detector = None if weights == "" else open_detector(
-        weights, sensor_height=drive.frames[0].sensor_height, min_score=LEAST_SCORE)
+def _here(drive: Drive, choice: DetectorChoice | None,
+          first: int) -> Callable[[int], Look | None]:
+    detector = None if choice is None else choice.open(
+        sensor_height=drive.frames[0].sensor_height, min_score=LEAST_SCORE)
     odometry = Odometry() if _by_scans(drive) else None
 
     def look(i: int) -> Look | None:
@@ -125,7 +132,7 @@ def _here(drive: Drive, weights: str, first: int) -> Callable[[int], Look | None
     return look
 
 
-def _elsewhere(reopen: Callable[[], Recording], weights: str, sequence: str,
+def _elsewhere(reopen: Callable[[], Recording], choice: DetectorChoice | None, sequence: str,
                first: int) -> Callable[[int], Look | None]:
     os.nice(10)  # the page comes first
-    return _here(one_drive(reopen(), sequence), weights, first)
+    return _here(one_drive(reopen(), sequence), choice, first)

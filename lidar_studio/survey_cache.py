@@ -15,6 +15,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from lidar_perception import __version__
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.runs.files import short, write_bytes
 from lidar_perception.runs.resuming import differences
 from lidar_perception.types import Detections, InputError
@@ -28,12 +29,17 @@ MOST_BYTES = 300 * 10**6  # of all; the looks of 1,000 frames take a tenth of it
 PARTS = "detections", "classes", "scores", "boxes", "images", "features", "things"
 
 
-def key_of(drive: Drive, weights: str) -> str:
-    """What a survey depends on: the drive, the weights, the version of the package."""
+def key_of(drive: Drive, choice: DetectorChoice | None) -> str:
+    """Return what a survey depends on: the drive, the detector with its weights and parameters,
+    and the version of the package."""
+    weights = "" if choice is None else choice.weights
     file = Path(weights)
+    asked = {} if choice is None else {
+        **({} if choice.range == "auto" else {"range": choice.range}), **choice.settings}
     content = hashlib.sha256(file.read_bytes()).hexdigest() if file.is_file() else ""
     return json.dumps({**drive.known_by, "layout": LAYOUT,
                        "weights": weights, "content": content[:16], "version": __version__,
+                       **({"settings": asked} if asked else {}),
                        "posed": drive.motion.poses is not None})
 
 

@@ -99,7 +99,7 @@ def test_a_detector_is_one_folder_and_one_entry(copy, tmp_path):
 def test_a_ground_method_is_one_file_and_two_entries(copy, tmp_path):
     carry_out(copy, "lowest")
     said = run(copy, "evaluate", "segmentation", "--data", object_folder(tmp_path / "kitti"),
-               "--methods", "dbscan", "--ground-method", "lowest")
+               "--methods", "dbscan", "--set", "ground.method=lowest")
     assert "ground by lowest" in said
 
 

@@ -8,27 +8,44 @@ from pathlib import Path
 
 import click
 
+from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import (
     Walk,
     a_path,
-    device_option,
     intervals_option,
     no_labels,
     out_file,
     walk_options,
 )
+from lidar_perception.cli.options import (
+    Runs,
+    Settings,
+    candidates_run,
+    device_option,
+    range_option,
+    runs_of,
+    settings_options,
+)
+from lidar_perception.detectors.open import PARAMS
 from lidar_perception.runs.terminal import console, errors
 
 
-@click.command()
+def _runs() -> list[Runs]:
+    """Everything that is compared, with its parameters."""
+    return [candidates_run(), *map(runs_of, PARAMS)]
+
+
+@click.command(cls=Command)
 @walk_options()
-@a_path("--weights", "One more network, PointPillars or PointNet; may be given several times.",
+@a_path("--weights", "One more network, PointPillars or PointNet; may be repeated.",
         multiple=True)
 @out_file("--png", "Draw F1 and mean AP against time.")
 @intervals_option
+@range_option
 @device_option
-def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, device: str,
-            intervals: int) -> None:
+@settings_options(lambda given: _runs())
+def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, range: str, device: str,
+            settings: Settings, intervals: int) -> None:
     """Run all detectors on the same frames, in turns, and print scores and times side by side.
 
     STM-CPA (`paper` and `best`), PointPillars V0 to V4 in both sizes, PointNet, fused (the default
@@ -50,11 +67,14 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, device: str
     from lidar_perception.scoring.comparison.report import draw_comparison, print_comparison
     from lidar_perception.scoring.kitti.tables import CENTRE_F1
 
+    runs = _runs()
+    values = {each.name: own for each, own in zip(runs, settings.values(*runs))}
     recording = walk.opened(BOXES)
     with errors.status("loading detectors"):
         height = recording.frames[0].sensor_height
-        found, missing = contenders(weights, device, height)
-    open_ = (lambda: found) if walk.here else partial(opened_in_a_process, weights, device, height)
+        found, missing = contenders(weights, device, height, range, values)
+    open_ = (lambda: found) if walk.here else partial(opened_in_a_process, weights, device, height,
+                                                      range, values)
     report = ComparisonReport(found, intervals, recording.drives)
     walk.fill(report, recording, partial(by_contenders, open_), title="comparing")
     if not report.first.frames:

@@ -12,6 +12,7 @@ from typing import Any
 import click
 from rich.text import Text
 
+from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import a_path, limit_option, opened, split_option
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.types import InputError
@@ -22,14 +23,14 @@ LABELS = ("kitti_object", "kitti_tracking", "nuscenes_detection", "nuscenes_trac
           "labelcloud_rel", "labelcloud_vertices", "sustech", "openlabel", "bag", "bag_labels")
 
 
-@click.command()
+@click.command(cls=Command)
 @click.argument("source", type=click.Path(path_type=Path), metavar="PATH")
-@click.option("--to", "format", type=click.Choice(list(dict.fromkeys((BAG, *DATASETS, *LABELS)))),
+@click.option("--to", "format", type=Choice(list(dict.fromkeys((BAG, *DATASETS, *LABELS)))),
               default=BAG, show_default=True, help="What to make.")
 @click.option("--out", type=click.Path(path_type=Path), required=True,
               help="Bag, folder or file to make.")
 @a_path("--data", "PATH holds labels of this drive, a recording; convert the labels.", "DRIVE")
-@click.option("--from", "given", type=click.Choice(LABELS), help="Format of the labels at PATH. "
+@click.option("--from", "given", type=Choice(LABELS), help="Format of the labels at PATH. "
               "Default: recognised.")
 @click.option("--detections", metavar="TOPIC", help="Take the boxes on this topic of the bag at "
               "PATH (MarkerArray or Detection3DArray), instead of its labels.")

@@ -58,12 +58,6 @@ split_option = a_path("--split", "Only the frames, or whole sequences, named in 
                       "line.")
 limit_option = click.option("--limit", type=click.IntRange(1), metavar="N",
                             help="Only the first N frames.")
-device_option = click.option("--device", default="auto", show_default=True,
-                             help="Where networks run: auto, cpu, cuda or cuda:N.")
-range_option = click.option("--range", "where", type=click.Choice(["auto", "ahead", "around"]),
-                            default="auto", show_default=True, help="What --weights see: 69 m "
-                            "ahead, or 51 m to every side, which takes over twice as long. auto: "
-                            "what they were trained for; those that come with the package: ahead.")
 jobs_option = click.option("--jobs", type=click.IntRange(1), default=1, show_default=True,
                            metavar="N", help="Number of processes.")
 dask_option = click.option("--dask", metavar="ADDRESS", help="Run on the workers of the Dask "
@@ -74,11 +68,6 @@ intervals_option = click.option("--intervals", type=click.IntRange(0), default=0
                                 help="Also print bootstrap intervals from N resamples of the "
                                 "drives, or of runs of 10 frames where there are few drives. 200 "
                                 "are plenty.")
-weights_option = a_path("--weights", "Run the detector of this checkpoint, or of this file of "
-                        "`train fused`, or one by its name: fused, pointpillars or pointnet, with "
-                        "the weights that come with the package.",
-                        "FILE|NAME")
-
 port_option = click.option("--port", type=click.IntRange(0, 65535), default=0, show_default=True,
                            help="Port on 127.0.0.1; 0: any that is free.")
 browser_option = click.option("--open/--no-open", "browser", default=True,

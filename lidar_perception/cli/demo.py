@@ -13,17 +13,30 @@ import numpy as np
 from rich.text import Text
 
 from lidar_perception.candidates.configurations import PAPER
-from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.classes import DETECTED
+from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import WHAT, a_path, opened
 from lidar_perception.cli.evaluate.candidates import as_recorded
-from lidar_perception.cli.options import parameter_options
+from lidar_perception.cli.options import (
+    CANDIDATES,
+    Runs,
+    Settings,
+    candidates_run,
+    checked,
+    chosen_detector,
+    device_option,
+    range_option,
+    runs_of,
+    settings_options,
+)
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.bag_frames import BagFrames
 from lidar_perception.data.frame import BOXES, Recording
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
+from lidar_perception.detectors.contract import FUSED
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.groups import renumbered
 from lidar_perception.nodes import require_rclpy
 from lidar_perception.nodes.graph import ALONE, FINAL, cloud_topic, result_topics
@@ -39,16 +52,20 @@ from lidar_perception.wire.topics import POINTS
 from lidar_perception.wire.track_markers import drawn_trails
 from msg_utils.stamps import to_ns
 
-CANDIDATES = "candidates"
 RECORD = "demo.json"                      # in a folder that demo has made, what it replayed
 REPLACED = ("drive", "result", "logs")    # by the next demo
 
 
-@click.command()
+def _runs(detector: str) -> Runs:
+    """The detector that the nodes run, with its parameters."""
+    return candidates_run() if detector == CANDIDATES else runs_of(detector)
+
+
+@click.command(cls=Command)
 @a_path("--data", f"Replay this instead of the simulated drive; it needs labelled boxes: {WHAT}",
         "PATH")
-@click.option("--detector", type=click.Choice(list(ALONE)), help="What detects. Default: fused; "
-              f"{CANDIDATES} if one of their parameters, below, is given.")
+@click.option("--detector", type=Choice(ALONE), default=FUSED, show_default=True,
+              help="What detects.")
 @click.option("--out", type=click.Path(path_type=Path), default=Path("out/demo"),
               show_default=True, help="Folder for the results.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
@@ -62,9 +79,11 @@ REPLACED = ("drive", "result", "logs")    # by the next demo
 @click.option("--real-time", is_flag=True, help="Play at the speed of the sensor, even if the "
                                                 "machine cannot keep up. Without it each cloud is "
                                                 "sent once those before it have their results.")
-@parameter_options(PAPER)
-def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_seed: int,
-         rate: float, single: bool, real_time: bool, params: PipelineParams) -> None:
+@range_option
+@device_option
+@settings_options(lambda given: [_runs(given.get("detector") or FUSED)])
+def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: int, rate: float,
+         single: bool, real_time: bool, range: str, device: str, settings: Settings) -> None:
     """Replay a drive through the real nodes over DDS, and score the detections and their tracks.
 
     Without options: makes a simulated drive with traffic and walking pedestrians, writes it as a
@@ -82,9 +101,10 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
       lidar-perception demo --data drive.bag --rate 0.5 --single
       lidar-perception demo --detector candidates --config best
     """
-    detector = detector or ("fused" if params == PAPER else CANDIDATES)
-    if detector != CANDIDATES and params != PAPER:
-        raise click.UsageError(f"--config and the parameters are those of --detector {CANDIDATES}")
+    values, = settings.values(_runs(detector))
+    if detector == CANDIDATES and (range != "auto" or device != "auto"):
+        raise click.UsageError("--range and --device are for a detector with a network")
+    chosen = chosen_detector(detector, range, device, values, PAPER)
     require_rclpy()  # before the drive is made
     recording = None if data is None else opened(data)
     if recording is not None:
@@ -95,7 +115,7 @@ def demo(data: Path | None, detector: str | None, out: Path, frames: int, drive_
     clouds = len(played)
     from lidar_perception.nodes.replay import TRACKS, replay
     with errors.status("loading compiled code (the first time: compiling, half a minute or more)"):
-        own = _params_of(detector, played, params)
+        own = _params_of(chosen, played)
     content = replay(drive, clouds, out, own, detector=detector, rate=rate, single=single,
                      real_time=real_time)
     final = result_topics(single, detector)[FINAL]
@@ -139,13 +159,12 @@ def _as_replayed(drive: Path, recording: Recording | None) -> Recording:
                           recording.frames[0].sensor_height)
 
 
-def _params_of(detector: str, played: Recording, params: PipelineParams) -> Any:
+def _params_of(chosen: DetectorChoice, played: Recording) -> Any:
     """The parameters of the nodes; compiles what they share, once instead of in each of them."""
-    if detector == CANDIDATES:
+    if chosen.weights == CANDIDATES:
         warm_up()
-        return as_recorded(played, params)
-    from lidar_perception.detectors.open import open_detector
-    return open_detector(detector, sensor_height=played.frames[0].sensor_height).params
+        return as_recorded(played, checked(PAPER, chosen.settings))
+    return chosen.open(sensor_height=played.frames[0].sensor_height).params
 
 
 def _bag(path: Path, recording: Any, frames: int, drive_seed: int) -> Path:

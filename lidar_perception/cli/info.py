@@ -8,13 +8,14 @@ from typing import Any
 import click
 from rich.table import Table
 
+from lidar_perception.cli.command import Command
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import layout_of, open_recording
 from lidar_perception.runs.terminal import console
 
 
-@click.command()
+@click.command(cls=Command)
 @click.argument("data", type=click.Path(path_type=Path))
 def info(data: Path) -> None:
     """Print the topics, types, counts and length of a bag; of any other recording its layout,

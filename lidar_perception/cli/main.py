@@ -9,6 +9,7 @@ from typing import Any
 import click
 
 from lidar_perception import __version__
+from lidar_perception.cli.command import Group
 
 COMMANDS = {  # verb -> module.function, and its line in the overview
     "demo": ("demo.demo", "Replay a drive through the ROS 2 nodes and score the result."),
@@ -32,7 +33,7 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
 }
 
 
-class LazyGroup(click.Group):
+class LazyGroup(Group):
     """A group that imports a command's module on first use."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:

@@ -1,9 +1,15 @@
-"""Flags from the parameter dataclasses, and parameter files."""
+"""--config and --set: the parameters of what runs. --weights, --range, --device: the detector.
+
+    @click.command(cls=Command)
+    @detector_options()
+    def verb(detector: DetectorChoice): detector.open(sensor_height=1.73)
+"""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterable, Iterator
+import functools
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import Field, dataclass, fields
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -11,97 +17,322 @@ from typing import Any
 import click
 import yaml
 
-from lidar_perception.candidates.configurations import CONFIGURATIONS
-from lidar_perception.nodes.known import misspelt
-from lidar_perception.param_fields import flatten, parameter_fields, with_values
+from lidar_perception.candidates.configurations import CONFIGURATIONS, PAPER
+from lidar_perception.cli.command import Choice, HelpfulOption, guessed, meant
+from lidar_perception.detectors.contract import FUSED
+from lidar_perception.detectors.open import DetectorChoice, default_params
+from lidar_perception.detectors.params import RANGE_CHOICES
+from lidar_perception.nodes import NODES
+from lidar_perception.nodes.known import misspelt, node_parameters
+from lidar_perception.param_fields import described, parameter_fields, with_values
 from lidar_perception.runs.files import read_text, short
 from lidar_perception.runs.terminal import errors
-from lidar_perception.types import InputError
+from lidar_perception.tracking.params import TrackingParams
+from lidar_perception.types import InputError, closest_name
 
 MAX_BYTES, MAX_NAMES = 10**6, 10_000  # of a parameter file; aliases in YAML make many of few bytes
 MAX_DEPTH = 20  # groups in each other
+CANDIDATES = "candidates"
+CANDIDATE_NODES = "perception", "ground_segmentation", "clustering", "candidate_refinement"
+ON_OFF = {"true": True, "yes": True, "on": True, "1": True,
+          "false": False, "no": False, "off": False, "0": False}
+
+Fields = Mapping[str, Field[Any]]
 
 
-class NumberList(click.ParamType):
-    """Comma-separated numbers."""
+@dataclass(frozen=True)
+class Runs:
+    """Something that runs, with parameters: its name, their fields by dotted name, and the nodes
+    whose sections of a parameter file apply to it (None: all)."""
 
-    name = "numbers"
+    name: str
+    fields: Fields
+    nodes: Collection[str] | None
 
-    def convert(self, value: Any, param: Any, ctx: Any) -> tuple:
+
+@dataclass(frozen=True)
+class Settings:
+    """The values of --config and --set, not checked against a detector yet."""
+
+    config: Path | None
+    given: tuple[tuple[str, str], ...]
+
+    def values(self, *runs: Runs) -> list[dict[str, Any]]:
+        """Return {dotted name: value} for each of several things that run; --set wins.
+
+        Raises:
+            InputError: a parameter of --set is of none of them, or a file cannot be used.
+        """
+        known = {name: f for each in runs for name, f in each.fields.items()}
+        whose = " or ".join(dict.fromkeys(each.name for each in runs))
+        for name, _ in self.given:
+            if name not in known:
+                raise InputError(f"{whose} has no parameter {name[:80]!r}{_guess(name, known)} "
+                                 "(--set help lists them all)")
+        found = [{} if self.config is None else
+                 read_config(self.config, each.fields, each.nodes) for each in runs]
+        if self.config is not None and not any(found):
+            errors.print(f"{self.config} has no parameter of {whose}", style="yellow")
+        return [{**values, **{name: _value(name, each.fields[name], text)
+                              for name, text in self.given if name in each.fields}}
+                for each, values in zip(runs, found)]
+
+    def __bool__(self) -> bool:
+        return self.config is not None or bool(self.given)
+
+
+def _guess(name: str, known: Fields) -> str:
+    """The closest parameter, by its whole name or the end of it."""
+    inner = [each for each in known if each.startswith(f"{name}.")]
+    if inner:
+        return f", which is a group with {', '.join(inner)}"
+    ends = [each for each in known if each.endswith(f".{name}")]
+    return f"; did you mean {ends[0]!r}?" if len(ends) == 1 else guessed(name, known)
+
+
+def _value(name: str, f: Field[Any], text: str) -> Any:
+    """The value of a parameter that is given as text."""
+    kind = f.metadata["item"] or type(f.default)
+    try:
+        if not isinstance(f.default, tuple):
+            return _scalar(kind, text)
+        inner = text.strip().removeprefix("[").removesuffix("]")
+        return tuple(_scalar(kind, word.strip()) for word in inner.split(",") if word.strip())
+    except (ValueError, KeyError):
+        many = "a list of numbers such as 0.15,0.3" if isinstance(f.default, tuple) else {
+            bool: "true or false", int: "a whole number", float: "a number"}[kind]
+        raise InputError(f"--set {name}={text[:80]}: the value must be {many}") from None
+
+
+def _scalar(kind: type, text: str) -> Any:
+    return ON_OFF[text.lower()] if kind is bool else kind(text)
+
+
+class Assignment(click.ParamType):
+    """NAME=VALUE, or NAME:=VALUE as in ROS."""
+
+    name = "assignment"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, str]:
         if isinstance(value, tuple):
             return value
-        try:
-            return tuple(float(v) for v in str(value).split(","))
-        except ValueError:
-            self.fail(f"{value!r} is not a list of numbers like 0.15,0.3", param, ctx)
+        name, equals, text = str(value).partition("=")
+        if not equals and value != "help":
+            self.fail(f"{value!r} must be NAME=VALUE, such as fused.scores.car=0.7; --set help "
+                      "lists all names", param, ctx)
+        return name.removesuffix(":").strip(), text
 
 
-def parameter_options(defaults: Any) -> Callable:
-    """Decorator: one flag for each field, and --config. The function gets params=..."""
+class SetOption(HelpfulOption):
+    """--set. runs: of the options that were given, what runs."""
 
+    def __init__(self, *args: Any, runs: Callable[[Mapping[str, Any]], list[Runs]], **more: Any):
+        super().__init__(*args, **more)
+        self.runs = runs
+
+    def listing(self, given: Mapping[str, Any]) -> str:
+        return "\n".join(line for each in self.runs(given) for line in (
+            f"Parameters of {each.name}:", *described(each.fields)))
+
+    def instead_of(self, flag: str) -> str:
+        plain = flag.removeprefix("--").removeprefix("no-")
+        known = {name.replace(".", "-").replace("_", "-"): name for node in NODES
+                 for name in node_parameters(node)}
+        return f"; parameters are given as --set {known[plain]}=VALUE" if plain in known else ""
+
+
+def settings_options(runs: Callable[[Mapping[str, Any]], list[Runs]]) -> Callable:
+    """Decorator: --config and --set, which the function gets as settings=Settings(...).
+
+    runs: takes the options that were given, by name, and says what runs, for `--set help`.
+    """
     def decorate(function: Callable) -> Callable:
-        def wrapper(*args: Any, **kwargs: Any) -> Any:
-            given = {name: value for name in parameter_fields(defaults)
-                     if (value := kwargs.pop(_variable(name))) is not None}
-            config = kwargs.pop("config")
-            try:
-                params = with_values(defaults, {**(read_config(config, defaults) if config else {}),
-                                                **given})
-            except ValueError as error:
-                raise InputError(str(error)) from None
-            return function(*args, params=params, **kwargs)
+        @functools.wraps(function)
+        def wrapper(*args: Any, config: Path | None, given: tuple, **kwargs: Any) -> Any:
+            return function(*args, settings=Settings(config, given), **kwargs)
 
-        wrapper.__name__, wrapper.__doc__ = function.__name__, function.__doc__
-        setattr(wrapper, "__click_params__", getattr(function, "__click_params__", []))  # noqa: B010
-        for name, f in reversed(parameter_fields(defaults).items()):
-            wrapper = _option(name, f, defaults)(wrapper)
-        named = [name for name, values in CONFIGURATIONS.items()
-                 if values.keys() & parameter_fields(defaults).keys()]
-        return click.option("--config", type=click.Path(path_type=Path), metavar="YAML|NAME",
-                            help="ROS parameter file, as in config/"
-                            + (f", or one of {', '.join(named)}." if named else "."))(wrapper)
-
+        wrapper = click.option(
+            "--set", "given", cls=SetOption, runs=runs, multiple=True, type=Assignment(),
+            metavar="NAME=VALUE", help="Set a parameter, such as ground.method=patchwork; may be "
+            "repeated. `--set help` lists all, with units and defaults.")(wrapper)
+        return click.option(
+            "--config", type=click.Path(path_type=Path), metavar="FILE|NAME",
+            help="ROS parameter file, as in config/, or for candidates one of "
+            f"{', '.join(CONFIGURATIONS)}. --set takes precedence.")(wrapper)
     return decorate
 
 
-def _variable(name: str) -> str:
-    return name.replace(".", "_")
+def candidates_run(params: Any = PAPER) -> Runs:
+    """The pipeline of the STM-CPA paper, with these defaults."""
+    return Runs(CANDIDATES, parameter_fields(params), CANDIDATE_NODES)
 
 
-def _option(name: str, f: dataclasses.Field, defaults: Any) -> Callable:
-    flag = "--" + name.replace(".", "-").replace("_", "-")
-    meta, default = f.metadata, flatten(defaults)[name]
-    unit = f" [{meta['unit']}]" if meta["unit"] else ""
-    shown = (",".join(map(str, default)) if isinstance(default, tuple) else
-             f"{default:.4g}" if isinstance(default, float) else default)
-    kind: Any = NumberList() if isinstance(default, tuple) else type(default)
-    if meta["choices"]:
-        kind = click.Choice(meta["choices"])
-    if isinstance(default, bool):
-        return click.option(f"{flag}/--no-{flag[2:]}", _variable(name), default=None,
-                            help=f"{meta['doc']} Default: {'on' if default else 'off'}.")
-    return click.option(flag, _variable(name), type=kind, default=None,
-                        help=f"{meta['doc']}{unit} Default: {'none' if shown == '' else shown}.")
+def parameter_options(defaults: Any, name: str = CANDIDATES,
+                      nodes: Collection[str] | None = CANDIDATE_NODES) -> Callable:
+    """Decorator: --config and --set of one dataclass of parameters, which the function gets as
+    params=."""
+    runs = Runs(name, parameter_fields(defaults), nodes)
+
+    def decorate(function: Callable) -> Callable:
+        @functools.wraps(function)
+        def wrapper(*args: Any, settings: Settings, **kwargs: Any) -> Any:
+            return function(*args, params=checked(defaults, settings.values(runs)[0]), **kwargs)
+        return settings_options(lambda _: [runs])(wrapper)
+    return decorate
 
 
-def read_config(path: Path, params: Any) -> dict[str, Any]:
-    """Values of a ROS parameter file for params, or of a named configuration; other nodes'
-    parameters are left out."""
-    if str(path) in CONFIGURATIONS:
-        return {name: value for name, value in CONFIGURATIONS[str(path)].items()
-                if name in parameter_fields(params)}
+def checked(params: Any, values: Mapping[str, Any]) -> Any:
+    """params with these values. InputError where one is out of range."""
     try:
-        content = yaml.safe_load(read_text(path, MAX_BYTES))
-    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
-        raise InputError(f"cannot read the parameter file {path}: {short(error)}") from None
-    if not isinstance(content, dict | None):
-        raise InputError(f"{path} is no parameter file; see config/ for the form")
-    known, values, visited = parameter_fields(params), {}, count()
-    others = []
-    for node, section in (content or {}).items():
+        return with_values(params, dict(values))
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+def weights_of(given: Mapping[str, Any]) -> list[str]:
+    """The detectors that the options name."""
+    weights = given.get("weights") or ()
+    return [*map(str, weights)] if isinstance(weights, tuple) else [str(weights)]
+
+
+def runs_of(weights: str | Path) -> Runs:
+    """A detector that runs, by its name or its file of weights. InputError for an unknown one."""
+    params = default_params(weights)
+    name = str(weights)
+    node = next((f"{f.name}_detector" for f in fields(params)
+                 if f"{f.name}_detector" in NODES), name)
+    return Runs(name, parameter_fields(params), (node,))
+
+
+@dataclass(frozen=True)
+class Tracked:
+    """The parameters of the tracker, named as in its node."""
+
+    tracking: TrackingParams = TrackingParams()
+
+
+TRACKER = Runs("the tracker", parameter_fields(Tracked()), ("tracker",))
+
+range_option = click.option("--range", type=Choice(RANGE_CHOICES), default="auto",
+                            show_default=True, help="What the detector sees: 69 m ahead, or 51 m "
+                            "to every side, which takes over twice as long. auto: what its weights "
+                            "were trained for; those that come with the package: ahead.")
+device_option = click.option("--device", default="auto", show_default=True,
+                             help="Where networks run: auto, cpu, cuda or cuda:N.")
+
+
+def detector_options(*, default: str | None = FUSED, tracking: bool = False) -> Callable:
+    """Decorator: --weights, --range, --device, --config and --set, which the function gets as
+    detector=DetectorChoice(...).
+
+    Args:
+        default: the detector without --weights; None: the function gets detector=None. So it does
+            where the verb has an option --results, and that is given.
+        tracking: parameters of the tracker can be set too, and the function gets
+            tracking=TrackingParams(...).
+    """
+    others = [TRACKER] if tracking else []
+
+    def runs(given: Mapping[str, Any]) -> list[Runs]:
+        return [*map(runs_of, weights_of(given) or [FUSED]), *others]
+
+    def decorate(function: Callable) -> Callable:
+        @functools.wraps(function)
+        def wrapper(*args: Any, weights: Path | None, range: str, device: str, settings: Settings,
+                    **kwargs: Any) -> Any:
+            results = kwargs.get("results")
+            if results is not None and (weights is not None or settings or range != "auto"):
+                form = next(p.metavar for p in click.get_current_context().command.params
+                            if p.name == "results")
+                raise click.UsageError(f"give either --results {form} or --weights FILE, --range, "
+                                       "--config and --set, which are for a detector that runs")
+            name = str(weights) if weights else None if results else default
+            if name is None and settings:
+                raise click.UsageError("--config and --set are for a detector that runs; give "
+                                       "--weights")
+            values: list[dict[str, Any]] = [{}, {}]
+            if name is not None:
+                values = settings.values(runs_of(name), *others) if settings else values
+            if tracking:
+                kwargs["tracking"] = checked(Tracked(), values[1]).tracking
+            chosen = None if name is None else chosen_detector(name, range, device, values[0])
+            return function(*args, detector=chosen, **kwargs)
+
+        wrapper = settings_options(runs)(wrapper)
+        for option in device_option, range_option, weights_option(default):
+            wrapper = option(wrapper)
+        return wrapper
+    return decorate
+
+
+def detectors_options(function: Callable) -> Callable:
+    """Decorator: as detector_options, of none or several detectors, which the function gets as
+    detectors=(DetectorChoice(...), ...). A parameter must be of one of them at least."""
+    @functools.wraps(function)
+    def wrapper(*args: Any, weights: tuple[Path, ...], range: str, device: str,
+                settings: Settings, **kwargs: Any) -> Any:
+        if settings and not weights:
+            raise click.UsageError("--config and --set are for a detector that runs; give "
+                                   "--weights")
+        values = settings.values(*map(runs_of, weights)) if settings else [{} for _ in weights]
+        chosen = tuple(chosen_detector(name, range, device, own)
+                       for name, own in zip(weights, values))
+        return function(*args, detectors=chosen, **kwargs)
+
+    wrapper = settings_options(lambda given: [*map(runs_of, weights_of(given) or [FUSED])])(wrapper)
+    for option in device_option, range_option, weights_option(multiple=True):
+        wrapper = option(wrapper)
+    return wrapper
+
+
+def chosen_detector(weights: str | Path, range: str, device: str, values: Mapping[str, Any],
+                    params: Any = None) -> DetectorChoice:
+    """A detector with parameters that are checked now, before anything is read. params: its
+    defaults, where open_detector does not know it."""
+    if values:
+        checked(default_params(weights) if params is None else params, values)
+    return DetectorChoice(str(weights), range, device, dict(values))
+
+
+def weights_option(default: str | None = None, multiple: bool = False) -> Callable:
+    """--weights, of one detector or of several."""
+    more = " May be repeated." if multiple else f" Default: {default}." if default else ""
+    return click.option(
+        "--weights", type=click.Path(path_type=Path), metavar="FILE|NAME", multiple=multiple,
+        help="The detector: a checkpoint, a file of `train fused`, or one of fused, pointpillars "
+        f"and pointnet with the weights that come with the package.{more}")
+
+
+def read_config(path: Path, known: Any, nodes: Collection[str] | None = None) -> dict[str, Any]:
+    """Read the values of a ROS parameter file, or of a named configuration of the candidates.
+
+    Args:
+        path: file, or a name of CONFIGURATIONS.
+        known: a dataclass of parameters, or its fields; other parameters are left out.
+        nodes: names of the nodes whose sections apply, and those for all nodes; None: all
+            sections.
+
+    Returns:
+        {dotted name: value}, not checked yet.
+
+    Raises:
+        InputError: the file cannot be read, or a name in it is on the wrong level.
+    """
+    known = known if isinstance(known, Mapping) else parameter_fields(known)
+    if str(path) in CONFIGURATIONS:
+        values = CONFIGURATIONS[str(path)]
+        if others := sorted(values.keys() - known.keys()):
+            raise InputError(f"the configuration {path} is for candidates; there is no "
+                             f"{others[0]} here, give a parameter file")
+        return dict(values)
+    content = _loaded(path)
+    values, visited, others = {}, count(), []
+    for node, section in content.items():
         if not (isinstance(section, dict)
                 and isinstance(section.get("ros__parameters", ()), dict | None)):
             raise InputError(f"{path}: '{node}' has no ros__parameters; see config/ for the form")
+        if nodes is not None and not _applies(path, str(node), nodes):
+            continue
         for name, value in _dotted(path, section.get("ros__parameters") or {}, visited):
             if not isinstance(name, str):
                 raise InputError(f"{path}: {name!r} is no name of a parameter; put it into quotes")
@@ -114,6 +345,31 @@ def read_config(path: Path, params: Any) -> dict[str, Any]:
     for line in misspelt(others):
         errors.print(f"{path}: {line}")
     return values
+
+
+def _loaded(path: Path) -> dict[Any, Any]:
+    """The content of a parameter file. InputError where it cannot be read."""
+    if not path.exists():
+        raise InputError(f"cannot read the parameter file {path}: there is no such file"
+                         + meant(str(path), CONFIGURATIONS))
+    try:
+        content = yaml.safe_load(read_text(path, MAX_BYTES))
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        raise InputError(f"cannot read the parameter file {path}: {short(error)}") from None
+    if not isinstance(content, dict | None):
+        raise InputError(f"{path} is no parameter file; see config/ for the form")
+    return content or {}
+
+
+def _applies(path: Path, section: str, nodes: Collection[str]) -> bool:
+    """Return True for a section for one of these nodes, or for all nodes."""
+    name = section.rpartition("/")[2]
+    if name in ("*", "**") or name in nodes:
+        return True
+    if name not in NODES and (guess := closest_name(name, nodes)):
+        errors.print(f"{path}: no node is called {name[:80]!r}; did you mean {guess!r}?",
+                     style="yellow")
+    return False
 
 
 def _wrong_level(name: str, known: Iterable[str]) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 import click
 
 from lidar_perception import __version__
+from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import dask_option, data_option, limit_option, opened, split_option
 from lidar_perception.reproduction.studies import STUDIES
 from lidar_perception.runs.machine import cores, cpu_name
@@ -22,8 +23,8 @@ EXPERIMENTS = {"stm-cpa": "lidar_perception.reproduction.stm_cpa:STM_CPA"}
 NAMES = ", ".join(STUDIES) or "none yet"
 
 
-@click.command()
-@click.argument("experiment", type=click.Choice(list(EXPERIMENTS)), default="stm-cpa")
+@click.command(cls=Command)
+@click.argument("experiment", type=Choice(EXPERIMENTS), default="stm-cpa")
 @click.option("--study", metavar="NAME", help="Measure one of the paper's open questions instead "
               f"of its tables: {NAMES}.")
 @data_option

@@ -7,11 +7,13 @@ import sys
 
 import click
 
+from lidar_perception.cli.command import Choice, Command
 from lidar_perception.nodes import NODES
 
 
-@click.command(context_settings=dict(ignore_unknown_options=True, allow_interspersed_args=False))
-@click.argument("node", type=click.Choice(list(NODES)))
+@click.command(cls=Command, context_settings=dict(ignore_unknown_options=True,
+                                                   allow_interspersed_args=False))
+@click.argument("node", type=Choice(NODES), metavar="NODE")
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def run_node(node: str, arguments: tuple[str, ...]) -> None:
     """Start one ROS NODE; what follows goes to it, as with `ros2 run lidar_perception NODE`.

@@ -14,6 +14,7 @@ from lidar_perception.candidates.pipeline import segment
 from lidar_perception.candidates.seed_sources import clicked_seed, truth_seed
 from lidar_perception.candidates.seeds import save_seed
 from lidar_perception.candidates.silhouette import to_pixels
+from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import as_mounted, data_option, opened
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.frame import Frame, Recording
@@ -23,7 +24,7 @@ from lidar_perception.types import InputError
 from lidar_perception.wire.params import ViewParams
 
 
-@click.command()
+@click.command(cls=Command)
 @data_option
 @click.option("--frame", "number", type=click.IntRange(0), metavar="N",
               help="Number of the frame; default: the first with a Pedestrian label.")
@@ -35,8 +36,7 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
          params: PipelineParams) -> None:
     """Take the silhouette and height of one pedestrian as a template for later runs.
 
-    Use it with --seed-source file --seed-file OUT, or with the parameters seed.source and
-    seed.file of the nodes.
+    Use it with --set seed.source=file --set seed.file=OUT, or with these parameters of the nodes.
 
     \b
     Examples:

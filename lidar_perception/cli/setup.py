@@ -11,6 +11,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 from rich.text import Text
 
+from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import a_path
 from lidar_perception.runs.files import make_folder, write_text
 from lidar_perception.runs.terminal import console, errors, looking_through, progress
@@ -22,7 +23,7 @@ COLORS = {"sure": "green", "fair": "default", "doubtful": "yellow"}
 HINT_TOLERANCE = 0.1  # metres
 
 
-@click.command()
+@click.command(cls=Command)
 @a_path("--data", "A bag, a .pcd, .ply, .npy or .bin file or a folder of them, or the folder of a "
         "data set. No label is needed.", "PATH", required=True)
 @a_path("--out", "Folder for the files.", "FOLDER", required=True)

@@ -9,6 +9,7 @@ from pathlib import Path
 import click
 
 from lidar_perception import __version__
+from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import a_path, opened, out_file, write_json
 from lidar_perception.data.frame import BOXES
 from lidar_perception.data.to_bag import write_bag
@@ -24,9 +25,9 @@ from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.types import InputError
 
 
-@click.command()
+@click.command(cls=Command)
 @a_path("--out", "Folder to make.", "FOLDER")
-@click.option("--format", "layout", type=click.Choice(["mcap", *LAYOUTS]), default="mcap",
+@click.option("--format", "layout", type=Choice(["mcap", *LAYOUTS]), default="mcap",
               show_default=True, help="A rosbag2 bag, or the folders of one of these data sets.")
 @click.option("--sensor", "sensor_name", default="hdl64e", show_default=True,
               help=f"One of {', '.join(NAMES)}, in any spelling (hdl64e is hdl-64e), a .yaml "

@@ -6,15 +6,17 @@ import functools
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import Field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import click
 
 from lidar_perception import __version__
-from lidar_perception.cli.data import a_path, device_option, jobs_for_all_cores, out_file
-from lidar_perception.cli.options import parameter_options
+from lidar_perception.cli.command import Choice, Group
+from lidar_perception.cli.data import a_path, jobs_for_all_cores, out_file
+from lidar_perception.cli.options import checked, device_option, parameter_options
+from lidar_perception.param_fields import parameter_fields
 from lidar_perception.runs.terminal import console
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.params import FusedTraining, PointNetTraining, PointPillarsTraining
@@ -58,14 +60,45 @@ def shared_options(function: Callable) -> Callable:
     return wrapper
 
 
-@click.group()
+def training_options(defaults: Any) -> Callable:
+    """Decorator: one flag for each field of a training, --config and --set. The function gets
+    params=...; flags take precedence."""
+    named = parameter_fields(defaults)
+
+    def decorate(function: Callable) -> Callable:
+        @functools.wraps(function)
+        def wrapper(*args: Any, params: Any, **kwargs: Any) -> Any:
+            given = {name: value for name in named
+                     if (value := kwargs.pop(name.replace(".", "_"))) is not None}
+            return function(*args, params=checked(params, given), **kwargs)
+
+        for name, f in reversed(named.items()):
+            wrapper = _flag(name, f)(wrapper)
+        return parameter_options(defaults, "training", None)(wrapper)
+    return decorate
+
+
+def _flag(name: str, f: Field[Any]) -> Callable:
+    flag, variable = "--" + name.replace(".", "-").replace("_", "-"), name.replace(".", "_")
+    meta, default = f.metadata, f.default
+    if isinstance(default, bool):
+        return click.option(f"{flag}/--no-{flag[2:]}", variable, default=None,
+                            help=f"{meta['doc']} Default: {'on' if default else 'off'}.")
+    shown = f"{default:.4g}" if isinstance(default, float) else default
+    return click.option(
+        flag, variable, type=Choice(meta["choices"]) if meta["choices"] else type(default),
+        default=None, help=f"{meta['doc']}{f' [{unit}]' if (unit := meta['unit']) else ''} "
+        f"Default: {'none' if shown == '' else shown}.")
+
+
+@click.group(cls=Group)
 def train() -> None:
     """Train a network."""
 
 
 @train.command()
 @shared_options
-@parameter_options(PointPillarsTraining())
+@training_options(PointPillarsTraining())
 def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
     """PointPillars and EG-PointPillars, on labelled frames, simulated streets, or both.
 
@@ -94,7 +127,7 @@ def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
 @shared_options
 @click.option("--ablation", is_flag=True, help="Train every row of the paper's ablation, each into "
               "a folder in --out, and compare them.")
-@parameter_options(PointNetTraining())
+@training_options(PointNetTraining())
 def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
     """The cluster network (PointNet), on labelled frames, simulated streets, or both.
 
@@ -141,7 +174,7 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
           required=True)
 @click.option("--force", is_flag=True, help="Replace --out.")
 @jobs_for_all_cores("Processes that look at scans.", 1)
-@parameter_options(FusedTraining())
+@training_options(FusedTraining())
 def fused(weights: Path | None, classifier: Path | None, out: Path, force: bool, jobs: int,
           params: FusedTraining) -> None:
     """The fused detector of your own weights: fit how much each source counts.

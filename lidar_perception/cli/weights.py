@@ -6,10 +6,11 @@ from pathlib import Path
 
 import click
 
+from lidar_perception.cli.command import Command, Group
 from lidar_perception.runs.terminal import console
 
 
-@click.command("import-weights")
+@click.command("import-weights", cls=Command)
 @click.argument("source", type=click.Path(path_type=Path), metavar="FILE.pth")
 @click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FILE",
               help="Checkpoint to write (.safetensors).")
@@ -36,7 +37,7 @@ def import_weights(source: Path, out: Path, classes: str, half: bool) -> None:
     console.print(f"{out}: PointPillars of {project} for {', '.join(config.classes)}")
 
 
-@click.group()
+@click.group(cls=Group)
 def export() -> None:
     """Export a network for another runtime."""
 

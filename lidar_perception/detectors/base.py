@@ -102,11 +102,11 @@ class NetworkDetector:
         other.header = replace(self.header, calibration={})
         return other
 
-    def seeing(self, where: str) -> Self:
-        """The same detector, of the same network, that sees ahead or around, or what its weights
-        were trained for (auto). InputError where it cannot; without a range of its own it always
-        sees all around."""
-        if where == "ahead":
+    def with_range(self, range: str) -> Self:
+        """Return this detector, with the same network, for another range: ahead, around, or auto,
+        what its weights were trained for. A network without such a range always sees all
+        around. InputError where the network cannot see that range."""
+        if range == "ahead":
             raise InputError(f"{self.header.network} sees all around; crop.* leaves out what is "
                              "not wanted")
         return self

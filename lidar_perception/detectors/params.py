@@ -11,7 +11,7 @@ from lidar_perception.param_fields import Params, param
 from lidar_perception.types import CLASSES, Detections
 
 MIN_SCORE = 0.001  # of boxes that average precision is made of: more than a robot would act on
-SEEN = "auto", "ahead", "around"
+RANGE_CHOICES = "auto", "ahead", "around"
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def seen_range() -> Any:
     """The parameter of detectors with PointPillars that says what they see."""
     return param("auto", "What it sees. ahead: 69.12 m ahead and 39.68 m to each side; around: "
                  "51.2 m to every side, in two looks of a network that was trained ahead. auto: "
-                 "what the weights were trained for.", choices=SEEN,
+                 "what the weights were trained for.", choices=RANGE_CHOICES,
                  fixed=True)
 
 

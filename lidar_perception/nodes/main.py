@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from lidar_perception.nodes import NODES, require_rclpy
 from lidar_perception.nodes.known import misspelt, node_parameters
 from lidar_perception.nodes.shared_memory import fed_by_a_driver, use_large_shared_memory
+from lidar_perception.param_fields import described
 from lidar_perception.runs.files import refusals_named
 from lidar_perception.runs.memory import keep_freed
 from lidar_perception.runs.threads import one_thread_each
@@ -28,11 +29,7 @@ def help_text(name: str) -> str:
     """What --help prints: how to start the node, and its parameters."""
     lines = [f"Usage: {name} --ros-args [-p PARAMETER:=VALUE] [-r FROM:=TO] [--params-file YAML]",
              "", "Parameters:"]
-    for key, f in node_parameters(name).items():
-        default = list(f.default) if isinstance(f.default, tuple) else f.default
-        unit = f" {f.metadata['unit']}" if f.metadata["unit"] else ""
-        lines += [f"  {key} (default {default!r}{unit})", f"      {f.metadata['doc']}"]
-    return "\n".join(lines)
+    return "\n".join([*lines, *described(node_parameters(name))])
 
 
 def main() -> int:

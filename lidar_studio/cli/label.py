@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import (
     a_path,
     browser_option,
@@ -16,9 +17,10 @@ from lidar_perception.cli.data import (
     json_option,
     opened,
     port_option,
-    weights_option,
     write_json,
 )
+from lidar_perception.cli.options import detector_options
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.runs.terminal import console, errors, looking_through, progress
 from lidar_perception.types import InputError
 
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
     from lidar_studio.session import Session
 
 
-@click.command()
+@click.command(cls=Command)
 @data_option
 @click.option("--sequence", metavar="NAME", help="The drive of PATH to label, where it has "
               "several.")
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
         "out/label/NAME OF THE DRIVE.", "FOLDER")
 @port_option
 @browser_option
-@weights_option
+@detector_options()
 @click.option("--propose/--no-propose", default=True, help="Look for proposals in the whole drive "
               "at once, unless the journal has some.  [default: propose]")
 @click.option("--show-labels", is_flag=True, help="Show the labels that the drive has.")
@@ -49,7 +51,7 @@ if TYPE_CHECKING:
 @click.option("--simulate-annotator", is_flag=True, help="Let a script that knows the labels do "
               "the work, in each drive of PATH, and count its clicks, keys and drags.")
 @json_option
-def label(data: Path, sequence: str | None, out: Path | None, weights: Path | None,
+def label(data: Path, sequence: str | None, out: Path | None, detector: DetectorChoice,
           imports: tuple[str, ...], exports: str | None, to: Path | None, force: bool,
           simulate_annotator: bool, json_file: Path | None, **page: Any) -> None:
     """Label a drive on a page in the browser: click, accept, correct.
@@ -62,14 +64,13 @@ def label(data: Path, sequence: str | None, out: Path | None, weights: Path | No
       lidar-perception label --data drive --out labels --no-open --port 8080
       lidar-perception label --data drive --export kitti_tracking --to labels
     """
-    from lidar_perception.detectors.contract import FUSED
     from lidar_studio.drive import one_drive
     from lidar_studio.journal import NAME as JOURNAL
     from lidar_studio.session import ImportedAlready, session
 
     if (exports is None) != (to is None):
         raise click.UsageError("--export and --to go together")
-    recording, detector = opened(data), str(weights or FUSED)
+    recording = opened(data)
     if simulate_annotator:
         write_json(json_file, _simulated(recording, sequence, detector))
         return
@@ -120,7 +121,8 @@ def _serve(drive: Drive, made: Session, port: int, browser: bool, propose: bool,
     asyncio.run(serve(Served(drive, made, layers), port, started))
 
 
-def _simulated(recording: Recording, sequence: str | None, weights: str) -> dict[str, Any]:
+def _simulated(recording: Recording, sequence: str | None,
+               detector: DetectorChoice) -> dict[str, Any]:
     from lidar_perception.data.frame import BOXES
     from lidar_studio.annotator import Annotator, totals
     from lidar_studio.drive import one_drive
@@ -132,7 +134,8 @@ def _simulated(recording: Recording, sequence: str | None, weights: str) -> dict
         names = dict.fromkeys(frame.sequence for frame in recording)
     for name in names if sequence is None else [sequence]:
         drive = one_drive(recording, name)
-        with tempfile.TemporaryDirectory() as folder, session(drive, Path(folder), weights) as made:
+        with (tempfile.TemporaryDirectory() as folder,
+              session(drive, Path(folder), detector) as made):
             _propose(drive, made)
             found[drive.name] = done = Annotator(made).work()
         console.print(f"{drive.name}: {done['people']} pedestrians, {done['boxes']} boxes: "

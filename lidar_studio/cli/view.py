@@ -10,13 +10,10 @@ from typing import TYPE_CHECKING
 
 import click
 
-from lidar_perception.cli.data import (
-    browser_option,
-    device_option,
-    opened,
-    port_option,
-    range_option,
-)
+from lidar_perception.cli.command import Choice, Command
+from lidar_perception.cli.data import browser_option, opened, port_option
+from lidar_perception.cli.options import detectors_options
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.runs.terminal import console, looking_through
 from lidar_perception.types import InputError
 
@@ -26,12 +23,10 @@ if TYPE_CHECKING:
 WEIGHTS = (".safetensors", ".onnx", ".json")
 
 
-@click.command()
+@click.command(cls=Command)
 @click.argument("path", type=click.Path(path_type=Path), required=False)
 @click.option("--live", is_flag=True, help="Look at the running graph instead of a recording.")
-@click.option("--weights", multiple=True, metavar="FILE|NAME", help="Run the detector of this "
-              "checkpoint, or one by its name: fused, pointpillars or pointnet. May be given "
-              "several times.")
+@detectors_options
 @click.option("--results", multiple=True, type=click.Path(path_type=Path), metavar="FOLDER",
               help="KITTI result files, FOLDER/NAME.txt, such as `evaluate detection "
               "--write-results FOLDER` writes. May be given several times.")
@@ -45,20 +40,18 @@ WEIGHTS = (".safetensors", ".onnx", ".json")
               "this namespace, / for those in none, where several graphs run.")
 @click.option("--sequence", metavar="NAME", help="The drive of PATH to show, where it has "
               "several.")
-@range_option
-@device_option
 @port_option
 @browser_option
 @click.option("--screenshot", type=click.Path(path_type=Path), metavar="PNG", help="Write a "
               "picture of the page and end; needs chromium.")
 @click.option("--frame", type=click.IntRange(0), default=0, show_default=True, metavar="N",
               help="Frame to begin with.")
-@click.option("--theme", type=click.Choice(["auto", "light", "dark"]), default="auto",
+@click.option("--theme", type=Choice(["auto", "light", "dark"]), default="auto",
               show_default=True, help="Of the page.")
-def view(path: Path | None, live: bool, weights: tuple[str, ...], results: tuple[Path, ...],
-         points: str | None, detections: tuple[str, ...], namespace: str, sequence: str | None,
-         where: str, device: str, port: int, browser: bool, screenshot: Path | None, frame: int,
-         theme: str) -> None:
+def view(path: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
+         results: tuple[Path, ...], points: str | None, detections: tuple[str, ...],
+         namespace: str, sequence: str | None, port: int, browser: bool, screenshot: Path | None,
+         frame: int, theme: str) -> None:
     """Look at a recording and its results on a page in the browser: clouds with ground and
     clusters, labels, detections by source and score, what is missed and false, tracks. PATH is a
     bag, such as the result bag of the demo, or the folder of a data set; with --live the nodes
@@ -80,7 +73,7 @@ def view(path: Path | None, live: bool, weights: tuple[str, ...], results: tuple
 
     if (path is None) != live:
         raise click.UsageError("give the PATH of a recording, or --live")
-    only = {"--weights": weights, "--results": results, "--sequence": sequence,
+    only = {"--weights": detectors, "--results": results, "--sequence": sequence,
             "--screenshot": screenshot} if live else {"--detections": detections,
                                                       "--namespace": namespace}
     if given := [name for name, value in only.items() if value]:
@@ -95,7 +88,7 @@ def view(path: Path | None, live: bool, weights: tuple[str, ...], results: tuple
         with _listening(namespace, points or "", detections) as served:
             asyncio.run(serve(served, port, started))
         return
-    served = _served(path, weights, results, points, sequence, where, device)
+    served = _served(path, detectors, results, points, sequence)
     if frame >= served.drive.end:
         raise InputError(f"{path} has no frame {frame}; it has {served.drive.end}")
     if screenshot is None:
@@ -123,12 +116,11 @@ def _listening(namespace: str, points: str, detections: tuple[str, ...]) -> Iter
         yield Served(live, layers=live.layers, tracks=live.tracks)
 
 
-def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], points: str | None,
-            sequence: str | None, where: str, device: str) -> Served:
+def _served(path: Path, detectors: tuple[DetectorChoice, ...], results: tuple[Path, ...],
+            points: str | None, sequence: str | None) -> Served:
     """What the page shows of a path."""
     from lidar_perception.data.bag_frames import recognises
     from lidar_perception.data.open import with_topic
-    from lidar_perception.detectors.open import open_detector
     from lidar_studio import results as shown
     from lidar_studio.drive import one_drive
     from lidar_studio.served import Served
@@ -144,8 +136,8 @@ def _served(path: Path, weights: tuple[str, ...], results: tuple[Path, ...], poi
         drive = shown.with_recorded_scans(drive)
         found = shown.recorded(recording.frames.poses, [f.stamp_ns for f in drive.frames])
     height = drive.frames[0].sensor_height
-    made = {Path(name): shown.by_detector(
-        open_detector(name, device, sensor_height=height, where=where)) for name in weights}
+    made = {Path(each.weights): shown.by_detector(each.open(sensor_height=height))
+            for each in detectors}
     made |= {folder.absolute(): shown.by_files(folder) for folder in results}
     more = zip(short_names(list(made), found.sources), made.values())
     found = shown.Results({**found.sources, **dict(more)}, found.tracks)

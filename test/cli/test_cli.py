@@ -22,6 +22,7 @@ from lidar_perception.cli.main import COMMANDS, cli
 from lidar_perception.cli.options import read_config
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.to_bag import write_bag
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.param_fields import parameter_fields, with_values
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS, TRUTH
@@ -58,6 +59,10 @@ def evaluate(tmp_path, *arguments) -> dict:
     path = tmp_path / "made/by/evaluate/scores.json"
     run("evaluate", "candidates", "--json", path, *arguments)
     return json.loads(path.read_text())
+
+
+def given(*assignments) -> list[str]:
+    return [word for each in assignments for word in ("--set", each)]
 
 
 def scores(content: dict) -> dict:
@@ -97,15 +102,21 @@ def test_every_command_has_a_docstring(name):
     assert cli.get_command(click.Context(cli), name).help
 
 
-def test_every_parameter_has_a_flag_that_says_its_default():
-    command = dict(LEAVES)["evaluate", "candidates"]
-    helps = {option.name: option.help for option in command.params}
-    for name, f in parameter_fields(PAPER).items():
-        assert f.metadata["doc"] in helps[name.replace(".", "_")]
-    assert helps["seed_source"].endswith("Default: ground_truth.")
-    assert helps["ground_threshold_seed"].endswith("Default: 0.")
-    assert helps["view_enabled"].endswith("Default: on.")
-    assert helps["clustering_dbscan_eps"].endswith("Default: 0.15,0.3,0.5.")
+@pytest.mark.parametrize(("words", "names"), [
+    (("evaluate", "candidates"), ["stm.threshold (default 0.4)", "ground.method (default 'thr"]),
+    (("evaluate", "detection", "--weights", "pointnet"), ["pointnet.scores.car (default 0.4)"]),
+    (("evaluate", "tracking"), ["fused.same_place (default 0.6 m)", "tracking.min_score (defa"]),
+    (("demo", "--detector=candidates"), ["view.enabled (default True)"])], ids=str)
+def test_set_help_lists_the_parameters_of_what_runs(words, names):
+    for spelling in ["--set", "help"], ["--set=help"]:
+        text = run(*words, *spelling)
+        assert all(name in text for name in names), text
+
+
+def test_set_help_of_candidates_describes_every_parameter():
+    text = run("evaluate", "candidates", "--set", "help")
+    assert all(f"{name} (default" in text and f.metadata["doc"] in text
+               for name, f in parameter_fields(PAPER).items())
 
 
 def test_convert_makes_a_bag_of_every_scan(kitti, bag):
@@ -200,19 +211,18 @@ def test_evaluate_prints_what_it_writes(bag, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("flags", [
-    ("--clustering-dbscan-min-samples", 100_000),
-    ("--height-tolerance", 0, "--seed-source", "file"),
-    ("--clustering-dbscan-eps", "0.001,0.001,0.001"),
-    ("--no-view-enabled", "--ground-threshold-max-height", -10,
-     "--clustering-dbscan-range-limits", "5,7")])
-def test_flags_reach_the_pipeline(bag, tmp_path, flags):
-    changed = scores(evaluate(tmp_path, "--data", bag, *flags))
+    ("clustering.dbscan.min_samples=100000",), ("height.tolerance=0", "seed.source=file"),
+    ("clustering.dbscan.eps=0.001,0.001,0.001",),
+    ("view.enabled=false", "ground.threshold.max_height:=-10",
+     "clustering.dbscan.range_limits=[5, 7]")])
+def test_parameters_reach_the_pipeline(bag, tmp_path, flags):
+    changed = scores(evaluate(tmp_path, "--data", bag, *given(*flags)))
     assert changed["ground_truth"] == 2
     assert changed != scores(evaluate(tmp_path, "--data", bag))
 
 
 def test_without_core_points_there_are_no_candidates(bag, tmp_path):
-    content = evaluate(tmp_path, "--data", bag, "--clustering-dbscan-min-samples", 100_000)
+    content = evaluate(tmp_path, "--data", bag, *given("clustering.dbscan.min_samples=100000"))
     for stage in STAGES:
         row = content[stage]["all"]
         assert (row["tp"], row["fp"], row["fn"], row["f1"]) == (0, 0, 2, 0)
@@ -220,13 +230,13 @@ def test_without_core_points_there_are_no_candidates(bag, tmp_path):
 
 
 @pytest.mark.no_cover
-def test_a_config_says_the_same_as_flags_and_flags_win(bag, tmp_path):
-    flag = "--clustering-dbscan-min-samples"
+def test_a_config_says_the_same_as_set_and_set_wins(bag, tmp_path):
+    few, many = (given(f"clustering.dbscan.min_samples={n}") for n in (10, 100_000))
     file = write(tmp_path / "p.yaml",
                  "/**:\n  ros__parameters:\n    clustering.dbscan.min_samples: 100000\n")
-    no_clusters = scores(evaluate(tmp_path, "--data", bag, flag, 100_000))
+    no_clusters = scores(evaluate(tmp_path, "--data", bag, *many))
     assert scores(evaluate(tmp_path, "--data", bag, "--config", file)) == no_clusters
-    assert scores(evaluate(tmp_path, "--data", bag, "--config", file, flag, 10)) == scores(
+    assert scores(evaluate(tmp_path, "--data", bag, "--config", file, *few)) == scores(
         evaluate(tmp_path, "--data", bag))
 
 
@@ -297,18 +307,21 @@ BAD_INPUTS = {
                        "--force"], "is no bag"),
     "out under a file": (["convert", "{kitti}", "--out",
                           "{kitti}/training/calib/000000.txt/o"], "cannot make the folder"),
-    "out of range": (["evaluate", "candidates", "--data", "{bag}", "--ground-cloth-resolution",
-                      "99"], "ground.cloth.resolution = 99.0 is outside 0.1 .. 10.0"),
-    "lengths": (["evaluate", "candidates", "--data", "{bag}", "--clustering-dbscan-eps", "0.1"],
-                "one more eps than range_limits"),
+    "out of range": (["evaluate", "candidates", "--data", "{bag}", "--set",
+                      "ground.cloth.resolution=99"],
+                     "ground.cloth.resolution = 99.0 is outside 0.1 .. 10.0"),
+    "lengths": (["evaluate", "candidates", "--data", "{bag}", "--set",
+                 "clustering.dbscan.eps=0.1"], "one more eps than range_limits"),
     "missing config": (["evaluate", "candidates", "--data", "{bag}", "--config", "{tmp}/none"],
                        "{tmp}/none"),
-    "missing template": (["evaluate", "candidates", "--data", "{bag}", "--seed-source", "file",
-                          "--seed-file", "{tmp}/none"], "{tmp}/none"),
+    "missing template": (["evaluate", "candidates", "--data", "{bag}", "--set",
+                          "seed.source=file", "--set", "seed.file={tmp}/none"], "{tmp}/none"),
     "json under a file": (["evaluate", "candidates", "--data", "{bag}", "--json",
                            "{kitti}/training/calib/000000.txt/o"], "cannot be written"),
     "json is a folder": (["evaluate", "candidates", "--data", "{tmp}/none", "--json", "{tmp}"],
                          "{tmp} cannot be written"),
+    "detector": (["evaluate", "detection", "--data", "{kitti}", "--weights", "fussed"],
+                 "'fussed'; did you mean 'fused'? Valid names: pointpillars, pointnet, fused"),
     "no standard output": (["compare", "--data", "{tmp}/none", "--json", "-"],
                            "- cannot be written; give the name of a file"),
 }
@@ -330,7 +343,7 @@ def test_a_bag_without_a_cloud_is_bad_input(tmp_path, monkeypatch, capsys):
         made.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
     for command in "nuscenes", "detection":
         assert exit_of(monkeypatch, "evaluate", command, "--data", tmp_path / "bag", "--weights",
-                       "w", "--write-results", tmp_path / "out") == 2
+                       "fused", "--write-results", tmp_path / "out") == 2
         assert "has no frame" in error_line(capsys)
 
 
@@ -344,13 +357,27 @@ def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch,
 
 
 @pytest.mark.parametrize("arguments, words", [
-    (["bogus"], "No such command 'bogus'"),
+    (["bogus"], "there is no command 'bogus'; valid names: demo"),
     (["evaluate", "candidates"], "Missing option '--data'"),
     (["evaluate", "candidates", "--data", "a", "--jobs", "2", "--dask", "b"], "give one of them"),
-    (["evaluate", "candidates", "--data", "b", "--clustering-dbscan-min-samples", "few"], "'few'"),
-    (["evaluate", "candidates", "--data", "b", "--clustering-dbscan-eps", "0.1,wide"],
+    (["evaluate", "candidates", "--data", "b", "--set", "clustering.dbscan.min_samples=few"],
+     "must be a whole number"),
+    (["evaluate", "candidates", "--data", "b", "--set", "clustering.dbscan.eps=0.1,wide"],
      "list of numbers"),
-    (["evaluate", "candidates", "--data", "b", "--seed-source", "luck"], "'luck'"),
+    (["evaluate", "candidates", "--data", "b", "--set", "seed.source=luck"], "'luck'"),
+    (["evaluate", "candidates", "--data", "b", "--set", "stm.threshold"], "must be NAME=VALUE"),
+    (["evaluate", "detection", "--data", "b", "--set", "fused.score.car=1"],
+     "did you mean 'fused.scores.car'?"),
+    (["evaluate", "detection", "--data", "b", "--set", "scores=1"], "no parameter 'scores'"),
+    (["evaluate", "detection", "--data", "b", "--results", "r", "--set", "fused.amp=auto"],
+     "give either --results"),
+    (["evaluate", "detection", "--data", "b", "--wieghts", "fused"], "did you mean '--weights'?"),
+    (["evaluate", "candidates", "--data", "b", "--config", "bset"], "did you mean 'best'?"),
+    (["evaluate", "candidates", "--data", "b", "--stm-threshold", "0.5"],
+     "given as --set stm.threshold=VALUE"),
+    (["evaluate", "trakcing"], "did you mean 'tracking'? Valid names: candidates, clusters"),
+    (["evalute"], "did you mean 'evaluate'? Valid names: demo, convert"),
+    (["run", "fused"], "did you mean 'fused_detector'?"),
     (["convert", "a", "--out", "b", "--limit", "0"], "0 is not in the range"),
     (["convert", "a"], "--out"),
     (["simulate", "--frames", "1", "--out", "."], "no name for something new"),
@@ -399,5 +426,5 @@ def test_demo_tells_its_nodes_how_high_the_sensor_is(tmp_path):
     write_bag(tmp_path / "bag", [lowered_crowd(i, 1.0) for i in range(3)])
     recording = opened(tmp_path / "bag")
     played = _as_replayed(recording.path, recording)
-    assert _params_of("candidates", played, PAPER).ground.sensor_pose.height == pytest.approx(
-        0.7, abs=0.02)
+    pose = _params_of(DetectorChoice("candidates"), played).ground.sensor_pose
+    assert pose.height == pytest.approx(0.7, abs=0.02)

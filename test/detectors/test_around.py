@@ -29,9 +29,9 @@ from lidar_perception.types import InputError, LidarFrame
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def shipped(version="v4", where="auto"):
+def shipped(version="v4", range="auto"):
     return open_detector(WEIGHTS / f"pointpillars_{version}_compact.safetensors", "cpu",
-                         min_score=0.05, where=where)
+                         min_score=0.05, range=range)
 
 
 def columns_of(scan):
@@ -61,10 +61,10 @@ def test_cars_that_are_plain_to_see_are_found_behind_and_beside(street):
     angle = np.degrees(np.arctan2(truth.boxes[:, 1], truth.boxes[:, 0]))
     near = horizontal_range(truth.boxes) < 30
     cars = truth.boxes[(truth.class_ids == CAR) & plain & near & (np.abs(angle) > 60)]
-    found = open_detector("fused", "cpu", where="around")(street.frame).detections
+    found = open_detector("fused", "cpu", range="around")(street.frame).detections
     mine = found.boxes[found.class_ids == CAR]
-    with pytest.raises(InputError, match="'Around' must be one of auto, ahead, around"):
-        open_detector("fused", "cpu", where="Around")
+    with pytest.raises(InputError, match="'Around'; did you mean 'around'"):
+        open_detector("fused", "cpu", range="Around")
     assert len(cars) >= 4
     assert len(match_centres(mine[:, :3], cars[:, :3], 1.0)[0]) >= 0.8 * len(cars)
 
@@ -74,22 +74,22 @@ def test_away_from_the_border_it_says_what_one_look_says(street):
     half = replace(detector.header, config=replace(detector.config, **HALF))
     one = PointPillarsDetector(detector.network, half, CPU, detector.params)
     apart = [found[np.flatnonzero(found.boxes[:, 0] > 8)] for found in (
-        each(street.frame, **columns).detections for each in (one, detector.seeing("around")))]
+        each(street.frame, **columns).detections for each in (one, detector.with_range("around")))]
     assert len(apart[0]) > 3 and same(*apart)
 
 
 def test_there_and_back_it_is_the_same_detector(street):
     detector = shipped("v1")
-    around = detector.seeing("around")
-    assert detector.seeing("auto") is detector.seeing("ahead") is detector
-    assert around.seeing("around") is around and around.config.low == RANGES["around"]["low"]
-    assert same(around.seeing("ahead")(street.frame), detector(street.frame))
+    around = detector.with_range("around")
+    assert detector.with_range("auto") is detector.with_range("ahead") is detector
+    assert around.with_range("around") is around and around.config.low == RANGES["around"]["low"]
+    assert same(around.with_range("ahead")(street.frame), detector(street.frame))
     trained = random_detector(**RANGES["around"])  # one look of it is enough
-    assert trained.seeing("around") is trained and len(trained.turns) == 1
+    assert trained.with_range("around") is trained and len(trained.turns) == 1
 
 
 def test_nothing_behind_or_nothing_at_all_is_no_trouble(street):
-    detector = shipped(where="around")
+    detector = shipped(range="around")
     ahead = detector(street.frame.take(np.flatnonzero(street.frame.xyz[:, 0] > 6)))
     assert len(ahead.detections) and ahead.problem is None
     nothing = detector(LidarFrame.of(np.zeros((0, 3))))
@@ -99,11 +99,12 @@ def test_nothing_behind_or_nothing_at_all_is_no_trouble(street):
 def test_what_cannot_see_that_says_so():
     config = pointnet_samples.small()
     pointnet = PointNetDetector(pointnet_samples.lively(config), Header(config), CPU)
-    assert pointnet.seeing("around") is pointnet
+    assert pointnet.with_range("around") is pointnet
     with pytest.raises(InputError, match="pointnet sees all around; crop"):
-        pointnet.seeing("ahead")
+        pointnet.with_range("ahead")
     with pytest.raises(InputError, match="cannot see around: a grid of"):
-        random_detector(low=(0.0, -3.52, -3.0), high=(7.04, 3.52, 1.0), cell=0.22).seeing("around")
+        random_detector(low=(0.0, -3.52, -3.0), high=(7.04, 3.52, 1.0),
+                        cell=0.22).with_range("around")
     exported = PointPillarsDetector(lambda pillars, maps: None, Header(tiny()), CPU)
     with pytest.raises(InputError, match="take the checkpoint to see around"):
-        exported.seeing("around")
+        exported.with_range("around")

@@ -44,7 +44,7 @@ def test_a_detector_finds_on_cuda_what_it_finds_on_the_cpu(weights, scan):
 
 
 def test_all_around_too(scan):
-    here, there = (open_detector(device=device, where="around") for device in ("cpu", "cuda"))
+    here, there = (open_detector(device=device, range="around") for device in ("cpu", "cuda"))
     assert_alike(here(scan).detections, there(scan).detections)
 
 

@@ -82,7 +82,7 @@ def test_no_car_is_seen_where_the_recording_car_is(data):
     """All around, in whole scans of KITTI, whose roof returns some points."""
     frames = [frame for frame in open_recording(data / "kitti_object")
               if (frame.load().xyz[:, 0] < -5).any()][:3]
-    for detector in open_detector("fused", "cpu", where="around"), open_detector("pointnet", "cpu"):
+    for detector in open_detector("fused", "cpu", range="around"), open_detector("pointnet", "cpu"):
         for frame in frames:
             found = detector(frame.load()).detections
             cars = found.boxes[found.class_ids == CAR]

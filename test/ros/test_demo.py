@@ -12,6 +12,7 @@ import torch
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
 from bag_samples import message_bytes
+from cli_samples import exit_of
 from click.testing import CliRunner
 from detector_node import assert_equal
 
@@ -72,8 +73,12 @@ def test_what_demo_did_not_make_stays(drive_bag, make_bag, tmp_path):
     assert message_bytes(mine) == message_bytes(bag)
 
 
-def test_parameters_of_the_candidates_are_refused_for_another_detector(tmp_path):
-    outcome = CliRunner().invoke(demo, ["--detector", "pointnet", "--config", "best",
-                                        "--out", str(tmp_path / "out")])
-    assert outcome.exit_code == 2 and "--detector candidates" in outcome.output
-    assert not (tmp_path / "out").exists()
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["--config", "best"], "the configuration best is for candidates"),
+    (["--set", "stm.threshold=0.5"], "fused has no parameter 'stm.threshold'"),
+    (["--ground-method", "cloth"], "--set ground.method=VALUE"),
+    (["--detector", "candidates", "--set", "fused.proposals=0.1"], "candidates has no parameter")])
+def test_demo_refuses_parameters_of_another_detector(tmp_path, monkeypatch, capsys, arguments,
+                                                     words):
+    assert exit_of(monkeypatch, "demo", *arguments, "--out", tmp_path / "out") == 2
+    assert words in capsys.readouterr().err and not (tmp_path / "out").exists()

@@ -59,7 +59,8 @@ def detector(monkeypatch):
     was asked."""
     made = types.SimpleNamespace(asked=[], scans=[], find=lambda frame: Detections.none())
 
-    def open_detector(path, device="auto", *, min_score=None, sensor_height=None, where="auto"):
+    def open_detector(path, device="auto", *, min_score=None, sensor_height=None,
+                      range="auto", settings=None):
         made.asked.append((str(path), device, min_score, sensor_height))
 
         def detect(frame):

@@ -54,7 +54,7 @@ def detector(monkeypatch):
     """A stand-in for the detector of a checkpoint."""
     made = types.SimpleNamespace(asked=[], find=lambda scan: Detections.none())
 
-    def opened(path, device, *, min_score, sensor_height, where):
+    def opened(path, device, *, min_score, sensor_height, range, settings):
         made.asked.append((path, device, min_score, sensor_height))
         return lambda scan: Found(made.find(scan))
     monkeypatch.setattr("lidar_perception.detectors.open.open_detector", opened)

@@ -397,4 +397,4 @@ def test_a_bag_whose_sensor_is_lower_is_scored_alike(command, tmp_path):
 
     usual = scores("usual", 0.0)
     assert np.min(usual) > 0 and scores("lower", 1.0) == usual
-    assert scores("told", 1.0, "--ground-sensor-pose-height", "1.6") != usual
+    assert scores("told", 1.0, "--set", "ground.sensor_pose.height=1.6") != usual

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from lidar_perception.classes import CAR
 from lidar_perception.data.frame import BOXES, POSES, Recording
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.geometry import points_in_box
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.types import InputError
@@ -40,7 +41,7 @@ def drive(streets):
 @pytest.fixture
 def made(drive, tmp_path):
     """Labels of which there are none yet; no detector."""
-    with session(drive, tmp_path, weights="") as made:
+    with session(drive, tmp_path, detector=None) as made:
         yield made
 
 
@@ -83,7 +84,7 @@ def test_a_seed_in_a_long_drive_is_answered_at_once_and_in_the_end_in_full(
     made.propose(here=True)
     click(made)
     full = boxes_of(made)
-    with session(drive, tmp_path / "long", weights="") as long:
+    with session(drive, tmp_path / "long", detector=None) as long:
         long.propose(here=True)
         before = long.state
         monkeypatch.setattr("lidar_studio.session.NEARBY", 1)
@@ -134,7 +135,7 @@ def test_what_is_as_large_as_the_seed_is_most_alike(length, width, height, share
 def frames_looked_at(drive, folder, until=FRAMES):
     """Of a session that is ended once so many frames are looked at; what it says, its labels."""
     looked_at, said = [], []
-    with session(drive, folder, weights="") as made:
+    with session(drive, folder, detector=None) as made:
         made.listeners.append(lambda event: said.append(event.get("error", "")))
 
         def told(count):
@@ -181,7 +182,7 @@ def test_a_survey_of_something_else_is_begun_anew_and_that_is_said(drive, tmp_pa
     looked_at, said, _ = frames_looked_at(drive, tmp_path)
     assert looked_at == [1, 2, 3, 4, 5, 6] and "looked at again" in said
     found, why = survey_cache.read(tmp_path / survey_cache.FOLDER,
-                                   survey_cache.key_of(drive, "pointpillars"))
+                                   survey_cache.key_of(drive, DetectorChoice("pointpillars")))
     assert found == [] and "weights '', not 'pointpillars'" in why
 
 
@@ -199,7 +200,7 @@ def test_a_seed_that_is_corrected_before_it_was_followed_is_followed_all_the_sam
         drive, tmp_path, monkeypatch, restarted):
     """Also if the server was killed meanwhile, by the next one."""
     monkeypatch.setattr("lidar_studio.session.NEARBY", 1)
-    with session(drive, tmp_path, weights="") as made:
+    with session(drive, tmp_path, detector=None) as made:
         made.propose(here=True)
         monkeypatch.setattr(made, "_start", lambda *_: None)  # it had no time
         _, track = click(made)
@@ -210,7 +211,7 @@ def test_a_seed_that_is_corrected_before_it_was_followed_is_followed_all_the_sam
             made.propose(here=True, anew=False)
             found = made.state.tracks[track.id]
     if restarted:
-        with session(drive, tmp_path, weights="") as again:
+        with session(drive, tmp_path, detector=None) as again:
             again.prepare()
             again.wait()
             found = again.state.tracks[track.id]
@@ -275,9 +276,9 @@ def test_what_was_only_looked_at_by_the_server_is_nobodys_to_undo(made):
 
 
 def test_the_survey_is_kept_over_a_restart_and_made_again_where_it_is_damaged(drive, tmp_path):
-    with session(drive, tmp_path, weights="") as made:
+    with session(drive, tmp_path, detector=None) as made:
         made.propose(here=True)
-    folder, key = tmp_path / survey_cache.FOLDER, survey_cache.key_of(drive, "")
+    folder, key = tmp_path / survey_cache.FOLDER, survey_cache.key_of(drive, None)
     looks, _ = survey_cache.read(folder, key)
     for old, new in zip(made.proposer.looks, looks, strict=True):
         for name in ("boxes", "images", "things"):
@@ -292,13 +293,13 @@ def test_the_survey_is_kept_over_a_restart_and_made_again_where_it_is_damaged(dr
         kept.write_bytes(damaged)
         found, why = survey_cache.read(folder, key)
         assert found == [] and "damaged" in why
-    with session(drive, tmp_path, weights="") as again:
+    with session(drive, tmp_path, detector=None) as again:
         said = []
         again.listeners.append(lambda event: said.append(event.get("error", "")))
         assert again.was_proposed and again.proposer.looks is None
         again.propose(here=True, anew=False)
         assert any("damaged" in line for line in said) and again.proposer.looks is not None
-    with session(drive, tmp_path, weights="") as third:
+    with session(drive, tmp_path, detector=None) as third:
         assert third.proposer.looks is not None
         click(third)
         assert len(third.state.tracks) >= 1 and third.state.seeds
@@ -330,7 +331,7 @@ def test_the_journal_of_proposals_is_replayed_without_looking_at_the_drive(made,
     click(made)
     state = made.state
     made.journal.close()
-    again = type(made)(drive, type(made.journal)(tmp_path, made.journal._head), weights="")
+    again = type(made)(drive, type(made.journal)(tmp_path, made.journal._head), detector=None)
     assert again.state == state and again.was_proposed
 
 

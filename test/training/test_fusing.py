@@ -180,7 +180,7 @@ def test_a_detector_weighs_by_its_own_curves(others):
     scan = frame()
     odds = [detector.with_min_score(0.0)(scan).detections for detector in (mine, theirs)]
     assert len(odds[0]) and not same(*odds)
-    assert mine.seeing("around").models is models and loaded.seeing("around").doubt is None
+    assert mine.with_range("around").models is models and loaded.with_range("around").doubt is None
     half = with_values(loaded.params, {"fused.amp": "bf16", "fused.warm_up": False})
     assert load_fused_detector(path, "cpu", half).proposer.network.amp == "bf16"
 

@@ -10,6 +10,7 @@ import click
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import Walk, as_mounted, no_labels, out_file, walk_options
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.param_fields import with_values
@@ -27,20 +28,20 @@ def as_recorded(recording: Any, params: PipelineParams) -> PipelineParams:
     return params
 
 
-@click.command()
+@click.command(cls=Command)
 @walk_options()
 @out_file("--png", "Draw the frame with most pedestrians from above.")
 @parameter_options(PAPER)
 def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
     """Pedestrian candidates of the STM-CPA paper against the Pedestrian labels.
 
-    The paper's protocol unless flags say otherwise: frames with a pedestrian, points in the
+    The paper's protocol unless --config or --set change it: frames with a pedestrian, points in the
     camera's view, the nearest labelled pedestrian as seed, hits within 1.0 m of the 3D centre.
 
     \b
     Examples:
       lidar-perception evaluate candidates --data /data/kitti/object --json scores.json
-      lidar-perception evaluate candidates --data drive.bag --seed-source file
+      lidar-perception evaluate candidates --data drive.bag --config best --set seed.source=file
     """
     from lidar_perception.data.frame import BOXES
     from lidar_perception.scoring.centres.report import CandidateReport, by_pipeline
@@ -49,7 +50,7 @@ def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
     recording = walk.opened(BOXES)
     params = as_recorded(recording, params)
     if params.seed.source == "click":
-        raise click.UsageError("there is nobody to click here; use --seed-source file")
+        raise click.UsageError("there is nobody to click here; use --set seed.source=file")
     report = CandidateReport()
     walk.fill(report, recording, partial(by_pipeline, params))
     if report.frames == 0:

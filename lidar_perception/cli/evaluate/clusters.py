@@ -7,11 +7,12 @@ from pathlib import Path
 
 import click
 
+from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import Walk, a_path, no_labels, walk_options
 from lidar_perception.runs.terminal import console
 
 
-@click.command()
+@click.command(cls=Command)
 @walk_options()
 @a_path("--weights", "Checkpoint of a cluster network. Default: the one that comes with the "
         "package.")

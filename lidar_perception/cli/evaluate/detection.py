@@ -7,28 +7,20 @@ from pathlib import Path
 
 import click
 
-from lidar_perception.cli.data import (
-    Walk,
-    a_path,
-    device_option,
-    intervals_option,
-    no_labels,
-    range_option,
-    walk_options,
-    weights_option,
-)
+from lidar_perception.cli.command import Command
+from lidar_perception.cli.data import Walk, a_path, intervals_option, no_labels, walk_options
+from lidar_perception.cli.options import detector_options
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.runs.terminal import console
 from lidar_perception.runs.terminal import errors as terminal_errors
 from lidar_perception.types import InputError
 
 
-@click.command()
+@click.command(cls=Command)
 @walk_options()
 @a_path("--results", "Result files of any detector, in KITTI's format: DIR/000000.txt ...", "DIR")
-@weights_option
-@range_option
-@device_option
+@detector_options()
 @click.option("--min-score", type=click.FloatRange(0, 1), default=MIN_SCORE, show_default=True,
               help="Leave out boxes of --weights with a lower score. Average precision needs "
                    "precision at every recall, so keep this lower than a robot would.")
@@ -46,9 +38,9 @@ from lidar_perception.types import InputError
 @click.option("--errors-from", type=click.FloatRange(0, 1), default=0.2, show_default=True,
               metavar="SCORE", help="With --errors: of boxes from this score on.")
 @intervals_option
-def detection(walk: Walk, results: Path | None, weights: Path | None, where: str, device: str,
-              min_score: float, keep: float, mount_height: float, write_results: Path | None,
-              errors: bool, errors_from: float, intervals: int) -> None:
+def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None, min_score: float,
+              keep: float, mount_height: float, write_results: Path | None, errors: bool,
+              errors_from: float, intervals: int) -> None:
     """Boxes of Car, Pedestrian and Cyclist by the protocol of KITTI's object benchmark.
 
     Average precision in the image, from above and in space, and of orientation, at 40 and 11
@@ -64,7 +56,7 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
       lidar-perception evaluate detection --data drive --weights v4.safetensors --keep 0.1
     """
     from lidar_perception.data.frame import BOXES
-    from lidar_perception.detectors.open import doubts, open_detector
+    from lidar_perception.detectors.open import doubts
     from lidar_perception.scoring.detections import by_detector, by_files
     from lidar_perception.scoring.kitti.box_errors import box_errors, print_box_errors
     from lidar_perception.scoring.kitti.protocol import SCORED, Comparison
@@ -73,19 +65,15 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
     from lidar_perception.scoring.kitti.tables import print_detection_report, print_intervals
     from lidar_perception.scoring.run import Start
 
-    if results is None:
-        weights = weights or Path("fused")
-    elif weights is not None:
-        raise click.UsageError("give either --results DIR or --weights FILE")
-    if write_results is not None and weights is None:
+    if write_results is not None and detector is None:
         raise click.UsageError("--write-results writes the detections of a detector; --results DIR "
                                "has its files already")
     if write_results is not None and write_results.is_dir() and any(write_results.iterdir()):
         raise InputError(f"{write_results} has files already; give another name")
-    if keep != 1 and weights is None:
+    if keep != 1 and detector is None:
         raise click.UsageError("--keep thins the scans that a detector sees; --results DIR sees "
                                "none")
-    recording = walk.opened(BOXES if write_results is None else None, scans=weights is not None,
+    recording = walk.opened(BOXES if write_results is None else None, scans=detector is not None,
                             sensor_height=mount_height or None)
     start: Start
     if results is not None:
@@ -93,20 +81,20 @@ def detection(walk: Walk, results: Path | None, weights: Path | None, where: str
             raise InputError(f"{results} is not a folder; give the folder of the result files")
         start = partial(by_files, results)
     else:
-        assert weights is not None  # as there are no --results
+        assert detector is not None  # as there are no --results
         height = recording.frames[0].sensor_height
-        for doubt in doubts(weights, height):
+        for doubt in doubts(Path(detector.weights), height):
             terminal_errors.print(doubt)
-        open_ = partial(open_detector, weights, device, min_score=min_score, sensor_height=height,
-                        where=where)
-        start = by_detector(open_, keep, write_results)
+        start = by_detector(partial(detector.open, min_score=min_score, sensor_height=height), keep,
+                            write_results)
     report = DetectionReport(follow=recording.drives)
     walk.fill(report, recording, start)
     if write_results is not None:
         console.print(f"result files: {write_results}")
     if not report.frames and (write_results is None or report.skipped):
         raise no_labels(recording, report.skipped)
-    content = {"source": str(results or weights), "keep": keep, **report.compute()}
+    content = {"source": str(results if detector is None else detector.weights), "keep": keep,
+               **report.compute()}
     if errors and report.frames:
         together = Comparison.of(report.frames)
         content["errors"] = {name: box_errors(report.frames, name, errors_from) for name in SCORED}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import click
 
+from lidar_perception.cli.command import Group
 from lidar_perception.cli.evaluate.candidates import candidates
 from lidar_perception.cli.evaluate.clusters import clusters
 from lidar_perception.cli.evaluate.detection import detection
@@ -12,7 +13,7 @@ from lidar_perception.cli.evaluate.segmentation import segmentation
 from lidar_perception.cli.evaluate.tracking import tracking
 
 
-@click.group()
+@click.group(cls=Group)
 def evaluate() -> None:
     """Score the algorithms without ROS."""
 

@@ -7,31 +7,23 @@ from pathlib import Path
 
 import click
 
-from lidar_perception.cli.data import (
-    Walk,
-    a_path,
-    device_option,
-    no_labels,
-    out_file,
-    range_option,
-    walk_options,
-    weights_option,
-)
+from lidar_perception.cli.command import Command
+from lidar_perception.cli.data import Walk, a_path, no_labels, out_file, walk_options
+from lidar_perception.cli.options import detector_options
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.detectors.params import MIN_SCORE
 from lidar_perception.runs.terminal import console
 from lidar_perception.types import InputError
 
 
-@click.command()
+@click.command(cls=Command)
 @walk_options()
 @a_path("--results", "Result file of any detector, in the format of nuScenes' detection task.",
         "JSON")
-@weights_option
-@range_option
-@device_option
+@detector_options(default=None)
 @out_file("--write-results", "Write the detections of --weights as a result file, also for frames "
                              "without labels.")
-def nuscenes(walk: Walk, results: Path | None, weights: Path | None, where: str, device: str,
+def nuscenes(walk: Walk, results: Path | None, detector: DetectorChoice | None,
              write_results: Path | None) -> None:
     """Boxes by the protocol of nuScenes' detection task.
 
@@ -48,16 +40,14 @@ def nuscenes(walk: Walk, results: Path | None, weights: Path | None, where: str,
     """
     from lidar_perception.data.nuscenes.folder import KeyFrame
     from lidar_perception.data.nuscenes.results import write_results as write_result_file
-    from lidar_perception.detectors.open import open_detector
     from lidar_perception.scoring.nuscenes.report import NuscenesReport, by_detector, by_file
     from lidar_perception.scoring.nuscenes.tables import print_nuscenes_report
 
-    if (results is None) == (weights is None):
+    if (results is None) == (detector is None):
         raise click.UsageError("give either --results JSON or --weights FILE")
-    if write_results is not None and weights is None:
+    if write_results is not None and detector is None:
         raise click.UsageError("--write-results writes the detections of --weights; --results "
-                               "JSON is "
-                               "such a file already")
+                               "JSON is such a file already")
     recording = walk.opened(None)
     first = recording.frames[0]
     if not isinstance(first.native, KeyFrame):
@@ -66,9 +56,8 @@ def nuscenes(walk: Walk, results: Path | None, weights: Path | None, where: str,
     if results is not None:
         start = partial(by_file, results)
     else:
-        assert weights is not None  # as there are no --results
-        open_ = partial(open_detector, weights, device, min_score=MIN_SCORE,
-                        sensor_height=first.sensor_height, where=where)
+        assert detector is not None  # as there are no --results
+        open_ = partial(detector.open, min_score=MIN_SCORE, sensor_height=first.sensor_height)
         start = partial(by_detector, open_, write_results is not None)
     report = NuscenesReport()
     walk.fill(report, recording, start)
@@ -77,8 +66,8 @@ def nuscenes(walk: Walk, results: Path | None, weights: Path | None, where: str,
         console.print(f"result file: {write_results}")
     if not report.frames and (write_results is None or report.skipped):
         raise no_labels(recording, report.skipped)
-    content = {"source": str(results or weights), "version": recording.layout.split()[-1],
-               **report.compute()}
+    content = {"source": str(results if detector is None else detector.weights),
+               "version": recording.layout.split()[-1], **report.compute()}
     if report.frames:
         print_nuscenes_report(content, console)
     walk.write(content)

@@ -9,6 +9,7 @@ from typing import Any
 
 import click
 
+from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import (
     WHAT,
     Walk,
@@ -38,24 +39,26 @@ class MethodList(click.ParamType):
         return names
 
 
-@click.command()
+@click.command(cls=Command)
 @walk_options(a_path("--data", f"{WHAT} May be repeated.", "PATH", multiple=True, required=True))
 @click.option("--methods", type=MethodList(), default=GROUND_METHODS + CLUSTERING_METHODS,
               help="Methods to score, of ground and of clustering, with commas between. "
               "Default: all.")
 @out_file("--png", "Draw the ground of the first scan with labelled points from above.")
-@parameter_options(SegmentationParams())
+@parameter_options(SegmentationParams(), "segmentation",
+                   ("perception", "ground_segmentation", "clustering"))
 def segmentation(walk: Walk, methods: tuple, png: Path | None, params: SegmentationParams) -> None:
     """Ground and clusters against labels.
 
     Ground: each method against the classes of SemanticKITTI's points. Clusters: each method, on
-    what --ground-method leaves, against SemanticKITTI's instances or labelled boxes; with boxes,
+    what ground.method leaves, against SemanticKITTI's instances or labelled boxes; with boxes,
     only the points in the camera's view where there is a calibration.
 
     \b
     Examples:
       lidar-perception evaluate segmentation --data /data/semantickitti --png ground.png
-      lidar-perception evaluate segmentation --data /data/kitti/object --ground-method patchwork
+      lidar-perception evaluate segmentation --data /data/kitti/object \\
+          --set ground.method=patchwork
       lidar-perception evaluate segmentation --data drive.bag --methods dbscan --json scores.json
     """
     from lidar_perception.data.frame import BOXES, POINT_LABELS

@@ -8,10 +8,9 @@ from pathlib import Path
 import click
 from rich.text import Text
 
+from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import (
-    a_path,
     data_option,
-    device_option,
     json_option,
     limit_option,
     no_labels,
@@ -19,27 +18,24 @@ from lidar_perception.cli.data import (
     split_option,
     write_json,
 )
-from lidar_perception.cli.options import parameter_options
+from lidar_perception.cli.options import detector_options
+from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.runs.terminal import console
 from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
 
 
-@click.command()
+@click.command(cls=Command)
 @data_option
 @split_option
 @limit_option
-@a_path("--weights", "Track what the detector of this checkpoint finds, or one by its name: "
-        "fused, pointpillars or pointnet, with the weights that come with the package.",
-        "FILE|NAME", default="fused", show_default=True)
-@device_option
-@click.option("--ego", type=click.Choice(RECORDED_EGO), default="auto", show_default=True,
+@detector_options(tracking=True)
+@click.option("--ego", type=Choice(RECORDED_EGO), default="auto", show_default=True,
               help="The sensor's motion: from the recording's poses; from the scans, by KISS-ICP "
               "(the extra [odometry]); or none: tracks are relative to the sensor. auto: the first "
               "of these that is available, poses where one of the first frames has one.")
 @json_option
-@parameter_options(TrackingParams())
-def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, device: str,
-             ego: str, json_file: Path | None, params: TrackingParams) -> None:
+def tracking(data: Path, split: Path | None, limit: int | None, detector: DetectorChoice,
+             tracking: TrackingParams, ego: str, json_file: Path | None) -> None:
     """HOTA, CLEAR MOT and AB3DMOT's scores of Car, Pedestrian and Cyclist.
 
     The labels need track ids, and the frames of a drive come one after the other, so this runs in
@@ -51,7 +47,6 @@ def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, d
       lidar-perception evaluate tracking --data drive --ego kiss_icp --weights v4.safetensors
     """
     from lidar_perception.data.frame import BOXES, POSES
-    from lidar_perception.detectors.open import open_detector
     from lidar_perception.scoring.run import fill
     from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker
     from lidar_perception.scoring.tracking.tables import print_tracking_report
@@ -59,16 +54,16 @@ def tracking(data: Path, split: Path | None, limit: int | None, weights: Path, d
 
     recording = opened(data, split=split)
     recording.require(BOXES, "evaluate tracking")
-    open_ = partial(open_detector, weights, device, min_score=params.min_score,
+    open_ = partial(detector.open, min_score=tracking.min_score,
                     sensor_height=recording.frames[0].sensor_height)
     report, asked, ego = TrackingReport(), ego, ego_of(recording, ego)
     if (asked, ego) == ("auto", "kiss_icp") and POSES in recording.has:
         console.print(Text("no pose", "yellow") + ": the first frames have none, so poses are by "
                       "KISS-ICP; see whether the odometry or TF of the recording has the clock of "
                       "its clouds")
-    fill(report, recording, by_tracker(open_, params, ego), limit=limit)
+    fill(report, recording, by_tracker(open_, tracking, ego), limit=limit)
     if not report.frames:
         raise no_labels(recording, report.skipped)
-    content = {"source": str(weights), "ego": ego, **report.compute()}
+    content = {"source": detector.weights, "ego": ego, **report.compute()}
     print_tracking_report(content, console)
     write_json(json_file, content)

@@ -77,9 +77,9 @@ class FusedDetector(NetworkDetector):
         """Its own group of params."""
         return self.params.fused
 
-    def seeing(self, where: str) -> FusedDetector:
-        """See base; the range is PointPillars'."""
-        other = FusedDetector(self.proposer.seeing(where), self.classifier, self.params,
+    def with_range(self, range: str) -> FusedDetector:
+        """See base; the range is that of PointPillars."""
+        other = FusedDetector(self.proposer.with_range(range), self.classifier, self.params,
                               self.models)
         other.doubt = self.doubt
         return other

@@ -219,19 +219,19 @@ class PointPillarsDetector(NetworkDetector):
                     "another height or angle? set ground.sensor_pose")
         return self.no_intensity(frame)
 
-    def seeing(self, where: str) -> PointPillarsDetector:
-        """See base. Around in two looks, where the network knows only what is ahead. InputError
-        where its cells do not fit the range, and of an exported network, which has one range."""
-        if where == "auto" or (where == "around") == (self.config.low[0] < 0):
+    def with_range(self, range: str) -> PointPillarsDetector:
+        """See base. A network that was trained ahead sees around in two passes. InputError where
+        its cells do not fit the range, and for an exported network, which has one range."""
+        if range == "auto" or (range == "around") == (self.config.low[0] < 0):
             return self
         if not isinstance(self.network, TorchNetwork):
             raise InputError("an exported network sees what it was exported for; take the "
-                             f"checkpoint to see {where}")
+                             f"checkpoint to see {range}")
         try:
-            config = replace(self.config, **RANGES[where])
-            look = replace(self.config, **HALF) if where == "around" else None
+            config = replace(self.config, **RANGES[range])
+            look = replace(self.config, **HALF) if range == "around" else None
         except ValueError as error:
-            raise InputError(f"this network cannot see {where}: {error}") from None
+            raise InputError(f"this network cannot see {range}: {error}") from None
         other = PointPillarsDetector(self.network, replace(self.header, config=config),
                                      self.device, self.params, look)
         other.place = self.place
@@ -287,7 +287,8 @@ def load_detector(path: str | Path = "", device: str = "auto",
         if wanted not in ("auto", found):
             raise InputError(f"{path} holds {name} {found}, asked for was {wanted}; change "
                              f"pointpillars.{name} or pointpillars.weights")
-    detector = PointPillarsDetector(network, header, CPU, params).seeing(params.pointpillars.range)
+    detector = PointPillarsDetector(network, header, CPU, params)
+    detector = detector.with_range(params.pointpillars.range)
     detector.move(where)
     if params.pointpillars.warm_up:
         detector.warm_up()

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from lidar_perception.candidates.configurations import BEST, PAPER
 from lidar_perception.candidates.params import PipelineParams
@@ -16,14 +17,14 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.candidates import CandidateDetector
-from lidar_perception.detectors.checkpoint import NETWORKS, POINTPILLARS
+from lidar_perception.detectors.checkpoint import NETWORKS, POINTNET, POINTPILLARS
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.hybrid.candidates import RescoredCandidates
 from lidar_perception.detectors.hybrid.params import ConfirmingParams, RescoringParams
 from lidar_perception.detectors.hybrid.proposals import ConfirmedProposals
-from lidar_perception.detectors.open import FUSED, LOAD, open_detector
+from lidar_perception.detectors.open import FUSED, LOAD, Configured, kind_and_file, open_detector
 from lidar_perception.detectors.params import MIN_SCORE
-from lidar_perception.detectors.pointnet.detector import PointNetDetector, load_pointnet_detector
+from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.params import PointNetParams
 from lidar_perception.detectors.pointnet.weights_file import judge_file
 from lidar_perception.detectors.pointnet.weights_file import weights_file as pointnet_file
@@ -40,6 +41,10 @@ PROPOSER = "PointPillars v4 compact"  # whose proposals the hybrid confirms, if 
 PROPOSED = 0.05  # its least score, not calibrated
 NO_WEIGHTS = "no weights come with the package; give some with --weights"
 PERSON = CLASSES[PEDESTRIAN]
+CANDIDATES = "candidates"
+
+Settings = Mapping[str, Mapping[str, Any]]  # kind of a detector -> dotted name -> value
+NO_SETTINGS: Settings = {}
 
 
 @dataclass(frozen=True)
@@ -75,15 +80,34 @@ def always(name: str, detector: Detector, source: str) -> Contender:
 
 
 def contenders(weights: Sequence[Path] = (), device: str = "auto",
-               sensor_height: float = SENSOR_HEIGHT) -> tuple[list[Contender], list[Missing]]:
-    """Every detector of the package that has weights, those of more weights, and hybrids; and those
-    that are missing. All are for a sensor so many metres above the ground. InputError for weights
-    that cannot be used."""
+               sensor_height: float = SENSOR_HEIGHT, range: str = "auto",
+               settings: Settings = NO_SETTINGS) -> tuple[list[Contender], list[Missing]]:
+    """Open every detector of the package that has weights, and hybrids of them.
+
+    Args:
+        weights: files of more networks.
+        sensor_height: height of the sensor above the ground in metres.
+        range: of the detectors that have one, see open_detector.
+        settings: parameters by the kind of their detector: candidates, pointpillars, pointnet,
+            fused.
+
+    Returns:
+        The detectors, and those that are missing.
+
+    Raises:
+        InputError: weights or parameters cannot be used.
+    """
     warm_up()
+
+    def opened_as(path: str | Path) -> Configured:
+        kind = kind_and_file(path)[0]
+        return open_detector(path, device, sensor_height=sensor_height,
+                             range="auto" if kind == POINTNET else range,
+                             settings=settings.get(kind, {}))
     files, absent = _own_files()
     opened: list[Opened] = []
     for path in [*files, *weights]:
-        detector = open_detector(path, device, sensor_height=sensor_height)
+        detector = opened_as(path)
         if str(path) in LOAD or not isinstance(detector, NetworkDetector):
             raise InputError(f"{path} takes part anyway; give files of weights")
         opened.append(Opened(_name(detector, [FUSED, *(each.name for each in opened)]), detector,
@@ -92,18 +116,18 @@ def contenders(weights: Sequence[Path] = (), device: str = "auto",
     missing = [Missing(name, reason) for name, reason in absent.items()
                if name not in [each.name for each in opened]]
     try:
-        found.append(always(FUSED, open_detector(FUSED, device, sensor_height=sensor_height),
-                            "those of PointPillars and PointNet"))
+        found.append(always(FUSED, opened_as(FUSED), "those of PointPillars and PointNet"))
     except InputError as error:
         missing.append(Missing(FUSED, str(error)))
-    hybrids, lacking = _hybrids(opened, device, sensor_height)
-    return [*_candidates(sensor_height), *found, *hybrids], [*missing, *lacking]
+    paper, best = (with_values(mounted(params, sensor_height), settings.get(CANDIDATES, {}))
+                   for params in (PAPER, BEST))
+    hybrids, lacking = _hybrids(opened, best, opened_as)
+    return [*_candidates(paper, best), *found, *hybrids], [*missing, *lacking]
 
 
-def opened_in_a_process(weights: Sequence[Path], device: str,
-                        sensor_height: float) -> list[Contender]:
+def opened_in_a_process(*asked: Any) -> list[Contender]:
     """The contenders alone; a function that can be sent to another process."""
-    return contenders(weights, device, sensor_height)[0]
+    return contenders(*asked)[0]
 
 
 def _own_files() -> tuple[list[Path], dict[str, str]]:
@@ -133,16 +157,15 @@ def _name(detector: NetworkDetector, taken: Sequence[str]) -> str:
     return name
 
 
-def _candidates(sensor_height: float) -> list[Contender]:
+def _candidates(paper: PipelineParams, best: PipelineParams) -> list[Contender]:
     """STM-CPA of both configurations with the paper's seed, and the better one with its own."""
-    paper, best = (mounted(params, sensor_height) for params in (PAPER, BEST))
     return [_seeded("STM-CPA paper", CandidateDetector, paper, _labelled),
             _seeded("STM-CPA best", CandidateDetector, best, _labelled),
             _seeded("STM-CPA best, auto", CandidateDetector, best, _own_seed(best))]
 
 
-def _hybrids(opened: Sequence[Opened], device: str, sensor_height: float
-             ) -> tuple[list[Contender], list[Missing]]:
+def _hybrids(opened: Sequence[Opened], best: PipelineParams,
+             opened_as: Callable[[Path], Detector]) -> tuple[list[Contender], list[Missing]]:
     """STM-CPA and PointPillars, each with the judge of `fused`, or else the first PointNet."""
     proposers = {each.name: each for each in reversed(opened) if each.network == POINTPILLARS}
     proposer = proposers.get(PROPOSER, next(reversed(proposers.values()), None))
@@ -150,11 +173,12 @@ def _hybrids(opened: Sequence[Opened], device: str, sensor_height: float
     classifiers = [(each.detector, str(each.source)) for each in opened
                    if isinstance(each.detector, PointNetDetector)]
     with suppress(InputError):
-        judge = load_pointnet_detector(judge_file(), device).mounted_at(sensor_height)
+        judge = opened_as(judge_file())
+        assert isinstance(judge, PointNetDetector)
         classifiers.insert(0, (judge, str(judge_file())))
     if not classifiers:
         return [], [Missing(name, "no PointNet has weights") for name in names]
-    (classifier, source), best = classifiers[0], mounted(BEST, sensor_height)
+    classifier, source = classifiers[0]
 
     def rescored(seed, camera, pipeline):
         return RescoredCandidates(classifier, seed, camera, RescoringParams(), pipeline)

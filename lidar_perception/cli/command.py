@@ -1,0 +1,110 @@
+"""Commands, groups and choices that name the closest match for a misspelt word."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import click
+
+from lidar_perception.types import closest_name
+
+
+def guessed(name: str, known: Iterable[str]) -> str:
+    """Return "; did you mean 'X'?", or "" where no known name is close."""
+    guess = closest_name(name, known)
+    return f"; did you mean {guess!r}?" if guess else ""
+
+
+def meant(name: str, known: Iterable[str]) -> str:
+    """Return the closest match for an unknown name, and all valid ones."""
+    known = list(known)
+    guess = guessed(name, known)
+    return f"{guess} Valid" * bool(guess) + "; valid" * (not guess) + f" names: {', '.join(known)}"
+
+
+class Choice(click.ParamType):
+    """One of a fixed list of names. Case does not matter, and underscores count as hyphens.
+
+    aliases: other accepted spellings -> the name.
+    """
+
+    name = "choice"
+
+    def __init__(self, choices: Iterable[str], aliases: Mapping[str, str] = {}):
+        self.choices, self.aliases = tuple(choices), aliases
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> str:
+        known = {_plain(alias): name for alias, name in self.aliases.items()}
+        known |= {_plain(name): name for name in self.choices}
+        if (found := known.get(_plain(str(value)))) is not None:
+            return found
+        self.fail(f"{value!r} is unknown{meant(str(value), self.choices)}", param, ctx)
+
+    def get_metavar(self, param: Any, ctx: Any = None) -> str:
+        return f"[{'|'.join(self.choices)}]"
+
+    def shell_complete(self, ctx: Any, param: Any, incomplete: str) -> list[Any]:
+        from click.shell_completion import CompletionItem
+        return [CompletionItem(name) for name in self.choices if name.startswith(incomplete)]
+
+
+def _plain(name: str) -> str:
+    return name.strip().lower().replace("_", "-")
+
+
+class Command(click.Command):
+    """A command whose misspelt options get the closest match."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        for param in self.params:
+            if isinstance(param, HelpfulOption) and param.asks_for_help(args):
+                ctx.resilient_parsing = True  # required options may be missing
+                super().parse_args(ctx, [*args])
+                click.echo(param.listing(ctx.params))
+                ctx.exit()
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            flags = [flag for param in self.get_params(ctx) for flag in
+                     (*param.opts, *param.secondary_opts) if flag.startswith("-")]
+            remedy = self.remedy(error.option_name) or guessed(error.option_name, flags)
+            raise click.UsageError(f"no such option {error.option_name}"
+                                   + (remedy or f"; {ctx.command_path} --help lists them"),
+                                   ctx) from None
+
+    def remedy(self, flag: str) -> str:
+        """Return what to say of an unknown flag, before the closest match is looked for."""
+        return next((text for param in self.params if isinstance(param, HelpfulOption)
+                     and (text := param.instead_of(flag))), "")
+
+
+class HelpfulOption(click.Option):
+    """An option whose possible values are listed by `--NAME help`."""
+
+    def asks_for_help(self, args: list[str]) -> bool:
+        """Return whether the words of a command line ask for the listing."""
+        return any(f"{flag}=help" in args or [flag, "help"] in [args[i:i + 2] for i in
+                                                                range(len(args))]
+                   for flag in self.opts)
+
+    def listing(self, given: Mapping[str, Any]) -> str:
+        """Return the listing, with the options that were given."""
+        raise NotImplementedError
+
+    def instead_of(self, flag: str) -> str:
+        """Return what to say of an unknown flag that this option stands for, or ""."""
+        return ""
+
+
+class Group(click.Group):
+    """A group whose misspelt commands get the closest match."""
+
+    command_class = Command
+
+    def resolve_command(self, ctx: click.Context, args: list[str]) -> Any:
+        name = args[0]
+        if self.get_command(ctx, name) is None and not name.startswith("-"):
+            known = self.list_commands(ctx)
+            ctx.fail(f"there is no command {name!r}{meant(name, known)}")
+        return super().resolve_command(ctx, args)
