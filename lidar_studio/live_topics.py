@@ -6,11 +6,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from lidar_perception.data.bag_frames import CLOUD
+from lidar_perception.data.to_bag import MARKERS
 from lidar_perception.types import InputError
-from lidar_perception.wire.topics import POINTS, TRUTH
+from lidar_perception.wire.topics import FOUND, POINTS, TRUTH
+from lidar_perception.wire.topics import TRACKS as TRACKED
 from lidar_studio.live import BOXES, LABELS, TRACKS
-from lidar_studio.results import CLUSTERED, FOUND, MARKERS
-from lidar_studio.results import TRACKS as TRACKED
+from lidar_studio.results import CLUSTERED
 
 ARRAY = "vision_msgs/msg/Detection3DArray"
 # The ends of topics of clouds, those with the most columns first.

@@ -17,7 +17,8 @@ from lidar_perception.data.bag import Bag
 from lidar_perception.data.bag_frames import cloud_topic
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.frame import Frame
-from lidar_perception.data.kitti.results import read_results
+from lidar_perception.data.kitti.results import read_results, result_calibration, result_files
+from lidar_perception.data.to_bag import MARKERS
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.geometry import bev_iou
 from lidar_perception.runs.terminal import errors
@@ -25,14 +26,12 @@ from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_t
 from lidar_perception.scoring.recorded import by_stamp
 from lidar_perception.types import Detections, GroundTruth, InputError
 from lidar_perception.wire.messages import cluster_column, column, to_detections, to_frame
-from lidar_perception.wire.topics import TRUTH
+from lidar_perception.wire.topics import FOUND, TRACKS, TRUTH
 from lidar_studio.drive import Drive, Scan, scan_of, scanned
 from msg_utils.markers import MarkedObjects
 
 Array = np.ndarray[Any, Any]
 SIMILAR = {row.name: row.looks_like or row.name for row in TABLE}
-MARKERS = "visualization_msgs/msg/MarkerArray"
-FOUND, TRACKS = "/output/detections", "/output/tracks"  # the end of a topic, of whatever node
 CLUSTERED = ("/clustering/output/points", "/perception/output/points")
 MOST_SOURCES = 8                             # of one detection that are shown
 KEPT = 2000                                  # frames whose detections are kept
@@ -128,20 +127,18 @@ def by_detector(detector: Detector) -> Source:
 
 
 def by_files(folder: Path) -> Source:
-    """KITTI result files, folder/NAME.txt; a frame without one has no detections. InputError where
-    a file is no result, or the recording has no camera."""
+    """KITTI result files, folder/NAME.txt, or those of a run of `detect` in folder; a frame without
+    one has no detections. InputError where a file is no result."""
     if not folder.is_dir():
         raise InputError(f"there is no folder {folder} with result files")
+    files = result_files(folder)
 
     @lru_cache(maxsize=KEPT)
     def read(i: int, frame: Frame) -> Detections:
-        calibration, path = frame.calibration(), folder / f"{frame.name}.txt"
-        if calibration is None:
-            raise InputError(f"frame {frame.name} has no camera calibration, in whose frame "
-                             "KITTI's result files are")
+        path = files / f"{frame.name}.txt"
         if not path.exists():
             return Detections.none()
-        rows = read_results(path, calibration.lidar_to_camera)
+        rows = read_results(path, result_calibration(frame)[0].lidar_to_camera)
         return Detections.of(rows.boxes, rows.class_ids, [e["score"] for e in rows.extras])
     return Source(read)
 

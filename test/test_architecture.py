@@ -25,8 +25,8 @@ MAX_LINES = 400
 # From the ground up: a room imports only those before it, and itself.
 ROOMS = ("classes", "intensity", "types", "param_fields", "geometry", "camera", "groups", "robot",
          "runs", "wire", "data", "ground", "clustering", "candidates", "detectors", "tracking",
-         "scoring", "simulation", "sensor_setup", "training", "reproduction", "labels", "params",
-         "nodes", "campaign", "cli", "testing")
+         "scoring", "simulation", "sensor_setup", "training", "reproduction", "labels", "detecting",
+         "params", "nodes", "campaign", "cli", "testing")
 # What the files of a room may import besides the rooms below and the standard library.
 NUMBERS = ["numpy", "scipy", "numba"]
 STRANGERS = {

@@ -14,6 +14,7 @@ from lidar_perception.cli.command import Group
 COMMANDS = {  # verb -> module.function, and its line in the overview
     "demo": ("demo.demo", "Replay a drive through the ROS 2 nodes and score the result."),
     "convert": ("convert.convert", "Turn recordings and labels into bags and other formats."),
+    "detect": ("detect.detect", "Run a detector on a recording and write its results."),
     "evaluate": ("evaluate.group.evaluate", "Score the algorithms without ROS."),
     "compare": ("compare.compare", "Run every detector on the same frames, side by side."),
     "view": ("lidar_studio.cli.view.view", "Look at a recording and its results on a page in "

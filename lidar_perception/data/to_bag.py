@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import LATCHED_QOS, BagWriter
 from lidar_perception.data.frame import Frame, PointTruth
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import camera_info, extrinsics, odometry, truth_markers
 from lidar_perception.wire.topics import (
@@ -34,6 +34,8 @@ from msg_utils.markers import from_marker_array, marker_keys
 from msg_utils.point_cloud2 import from_array
 from msg_utils.stamps import header_message
 
+MARKERS = "visualization_msgs/msg/MarkerArray"
+DETECTIONS_3D = "vision_msgs/msg/Detection3DArray"
 POINT_LABELS = np.dtype([(SEMANTIC, "<u2"), (INSTANCE, "<u2")])  # as data.frame.PointTruth
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
 
@@ -51,52 +53,86 @@ def write_bag(path: str | Path, frames: Iterable[Frame], *, images: bool = False
     such a list, and where the bag cannot be written.
     """
     with BagWriter(path, force=force) as bag:
-        bag.add_topic(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", LATCHED_QOS)
-        bag.add_topic(EXTRINSICS, "geometry_msgs/msg/TransformStamped", LATCHED_QOS)
-        bag.add_topic(TF_STATIC, "tf2_msgs/msg/TFMessage", LATCHED_QOS)
-        bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")
-        if detections_3d:
-            bag.add_topic(TRUTH_3D, "vision_msgs/msg/Detection3DArray")
-        if clouds:
-            bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
-        shown: frozenset[tuple[str, int]] = frozenset()
-        labelled: set[int] = set()  # stamps, by which labels and clouds find each other
-        count, written = 0, None
+        writer = FrameWriter(bag, images=images, clouds=clouds, detections_3d=detections_3d)
+        count = 0
         for frame in frames:
             try:
-                scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
-                pose, columns = frame.pose(), frame.point_truth() if clouds else None
-                if frame.stamp_ns < 0:
-                    raise InputError(f"{frame.name}: a stamp before 1970, which no bag holds; "
-                                     "set the clock of the sensor")
-                if truth is not None and frame.stamp_ns in labelled:
-                    raise InputError(f"{frame.name}: another labelled scan has its stamp, so that "
-                                     "nothing would say whose the labels are")
+                content = writer.read(frame)
             except InputError as error:
                 if skipped is None:
                     raise
                 skipped.append(str(error))
                 continue
-            header = header_message(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
-            if calibration is not None and not calibration.equals(written):
-                written = calibration
-                _write_calibration(bag, calibration, frame.stamp_ns, header)
-            if pose is not None:
-                _write_pose(bag, pose, frame.stamp_ns, header.frame_id)
-            if truth is not None:
-                labelled.add(frame.stamp_ns)
-                markers = truth_markers(truth, header, bag_message, shown)
-                shown = marker_keys(markers)
-                bag.write(TRUTH, frame.stamp_ns, markers)
-                if detections_3d:
-                    bag.write(TRUTH_3D, frame.stamp_ns, _detections(markers, header))
-            if images and frame.image is not None and frame.image.exists():
-                _write_image(bag, frame.image, frame.stamp_ns)
-            if clouds:
-                bag.write(POINTS, frame.stamp_ns,
-                          from_array(points_of(scan, columns), header, bag_message))
+            writer.write(content)
             count += 1
     return count
+
+
+class Content(NamedTuple):
+    """The parts of a frame that go into a bag; None for those that it does not have."""
+
+    header: Any
+    stamp_ns: int
+    calibration: Calibration | None
+    pose: np.ndarray | None
+    truth: GroundTruth | None
+    image: Path | None
+    points: np.ndarray | None
+
+
+class FrameWriter:
+    """Write frames into an open bag, see write_bag."""
+
+    def __init__(self, bag: BagWriter, *, images: bool = False, clouds: bool = True,
+                 detections_3d: bool = False) -> None:
+        self.bag, self.images, self.clouds, self.detections_3d = bag, images, clouds, detections_3d
+        self._shown: frozenset[tuple[str, int]] = frozenset()
+        self._labelled: set[int] = set()  # stamps, by which labels and clouds find each other
+        self._calibration: Calibration | None = None  # the last one that was written
+        bag.add_topic(CAMERA_INFO, "sensor_msgs/msg/CameraInfo", LATCHED_QOS)
+        bag.add_topic(EXTRINSICS, "geometry_msgs/msg/TransformStamped", LATCHED_QOS)
+        bag.add_topic(TF_STATIC, "tf2_msgs/msg/TFMessage", LATCHED_QOS)
+        bag.add_topic(TRUTH, MARKERS)
+        if detections_3d:
+            bag.add_topic(TRUTH_3D, DETECTIONS_3D)
+        if clouds:
+            bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+
+    def read(self, frame: Frame) -> Content:
+        """Read the content of a frame. InputError for one that cannot be read, or that no bag can
+        hold."""
+        scan, truth, calibration = frame.load(), frame.truth(), frame.calibration()
+        pose, columns = frame.pose(), frame.point_truth() if self.clouds else None
+        if frame.stamp_ns < 0:
+            raise InputError(f"{frame.name}: a stamp before 1970, which no bag holds; set the "
+                             "clock of the sensor")
+        if truth is not None and frame.stamp_ns in self._labelled:
+            raise InputError(f"{frame.name}: another labelled scan has its stamp, so that nothing "
+                             "would say whose the labels are")
+        header = header_message(frame.stamp_ns, scan.frame_id or LIDAR_FRAME, bag_message)
+        image = frame.image if self.images and frame.image and frame.image.exists() else None
+        return Content(header, frame.stamp_ns, calibration, pose, truth, image,
+                       points_of(scan, columns) if self.clouds else None)
+
+    def write(self, content: Content) -> None:
+        """Write the content of a frame. InputError where the bag cannot be written."""
+        bag, (header, stamp_ns, calibration, pose, truth, image, points) = self.bag, content
+        if calibration is not None and not calibration.equals(self._calibration):
+            self._calibration = calibration
+            _write_calibration(bag, calibration, stamp_ns, header)
+        if pose is not None:
+            _write_pose(bag, pose, stamp_ns, header.frame_id)
+        if truth is not None:
+            self._labelled.add(stamp_ns)
+            markers = truth_markers(truth, header, bag_message, self._shown)
+            self._shown = marker_keys(markers)
+            bag.write(TRUTH, stamp_ns, markers)
+            if self.detections_3d:
+                bag.write(TRUTH_3D, stamp_ns, _detections(markers, header))
+        if image is not None:
+            _write_image(bag, image, stamp_ns)
+        if points is not None:
+            bag.write(POINTS, stamp_ns, from_array(points, header, bag_message))
 
 
 def points_of(scan: LidarFrame, labels: PointTruth | None = None) -> np.ndarray:

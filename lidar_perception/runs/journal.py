@@ -46,9 +46,12 @@ class Journal:
         self._synced = monotonic()
 
     def sort(self, names: list[str]) -> None:
-        """Put the records of a finished run into the order of these names of all frames."""
+        """Rewrite the file with the records in the order of these names, before those of other
+        frames."""
         ordered = [self.lines[name] for name in names if name in self.lines]
-        write_text(self.path, "\n".join([_head(self.plan), *ordered]))
+        known = set(names)
+        others = [line for name, line in self.lines.items() if name not in known]
+        write_text(self.path, "\n".join([_head(self.plan), *ordered, *others]))
 
 
 @contextmanager
@@ -78,6 +81,16 @@ def journal(folder: Path, plan: dict[str, Any], *, force: bool = False,
             for last in (opened.sync, stream.close):
                 with suppress(OSError):  # of a disk that is full; add() has said so
                     last()
+
+
+def skipped_frames(folder: Path) -> dict[str, str]:
+    """Return name -> reason of the frames that the run in a folder skipped; nothing where there is
+    no run."""
+    with suppress(OSError, ValueError, TypeError):
+        lines = (folder / NAME).read_text(errors="replace").splitlines()[1:]
+        records = [json.loads(line) for line in lines if '"skipped"' in line]
+        return {each["frame"]: each["skipped"] for each in records if "skipped" in each}
+    return {}
 
 
 def _head(plan: dict[str, Any]) -> str:

@@ -11,8 +11,14 @@ from typing import Generic, TypeVar
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.data.kitti.results import read_results, write_results
+from lidar_perception.data.kitti.results import (
+    read_results,
+    result_calibration,
+    result_files,
+    write_results,
+)
 from lidar_perception.detectors.contract import Detector
+from lidar_perception.runs import journal
 from lidar_perception.scoring.run import RunError, Start
 from lidar_perception.scoring.thinning import thinned
 from lidar_perception.types import Detections, GroundTruth, InputError
@@ -65,11 +71,9 @@ def _by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None
             return None
         result = detected(detector, frame, truth, calibration, keep)
         if folder is not None:
-            if calibration is None:
-                raise RunError(f"{recording.path} ({recording.layout}) has no camera calibration, "
-                               "which KITTI's result files need")
             try:
-                write_results(folder / f"{frame.name}.txt", result.detections, calibration)
+                write_results(folder / f"{frame.name}.txt", result.detections,
+                              result_calibration(frame)[0])
             except InputError as error:  # of the disk, or numbers that are not finite
                 raise RunError(str(error)) from None
         return result
@@ -78,17 +82,21 @@ def _by_detector(open_: Callable[[], Detector], keep: float, folder: Path | None
 
 def by_files(folder: Path, recording: Recording
              ) -> Callable[[Frame], Detected[GroundTruth] | None]:
-    """Reads KITTI result files, folder/NAME.txt, of every frame with labels. With a folder a Start
-    of scoring.run."""
+    """Read KITTI result files, folder/NAME.txt, of every frame with labels. folder may be that of a
+    run of `detect`; frames that the run skipped are skipped. With a folder a Start of
+    scoring.run."""
+    files = result_files(folder)
+    skipped = journal.skipped_frames(files.parent)
+
     def measure(frame: Frame) -> Detected[GroundTruth] | None:
         truth, calibration = frame.truth(), frame.calibration()
         if truth is None:
             return None
-        if calibration is None:
-            raise RunError(f"{recording.path} ({recording.layout}) has no camera calibration, in "
-                           "whose frame KITTI's result files are")
+        if frame.name in skipped:
+            raise InputError(skipped[frame.name])
         try:
-            found = read_results(folder / f"{frame.name}.txt", calibration.lidar_to_camera)
+            found = read_results(files / f"{frame.name}.txt",
+                                 result_calibration(frame)[0].lidar_to_camera)
         except InputError as error:
             raise RunError(str(error)) from None
         return Detected(frame.name, truth, found, calibration)

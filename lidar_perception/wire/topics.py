@@ -9,6 +9,7 @@ IMAGE = "/camera/image/compressed"
 TF, TF_STATIC = "/tf", "/tf_static"
 ODOMETRY = "/odom"                 # nav_msgs/Odometry, as drivers and navigation name it
 CLICK = "/clicked_point"           # what RViz and Foxglove publish
+FOUND, TRACKS = "/output/detections", "/output/tracks"  # at the end of a node's topic
 
 ODOMETRY_FRAME = "odom"            # fixed; REP-105
 LIDAR_FRAME = "velodyne"

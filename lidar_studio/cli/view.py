@@ -28,8 +28,8 @@ WEIGHTS = (".safetensors", ".onnx", ".json")
 @click.option("--live", is_flag=True, help="Look at the running graph instead of a recording.")
 @detectors_options
 @click.option("--results", multiple=True, type=click.Path(path_type=Path), metavar="FOLDER",
-              help="KITTI result files, FOLDER/NAME.txt, such as `evaluate detection "
-              "--write-results FOLDER` writes. May be given several times.")
+              help="KITTI result files, FOLDER/NAME.txt, such as `detect --format kitti "
+              "--out FOLDER` writes. May be given several times.")
 @click.option("--points", "--topic", "points", metavar="TOPIC", help="Topic of the clouds of a bag "
               "or of the running graph. Default: clustered ones, else /points, else the only one "
               "there.")

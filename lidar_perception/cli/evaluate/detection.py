@@ -55,7 +55,7 @@ def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None,
           --split val.txt --json scores.json --write-results out/data
       lidar-perception evaluate detection --data drive --weights v4.safetensors --keep 0.1
     """
-    from lidar_perception.data.frame import BOXES
+    from lidar_perception.data.frame import BOXES, CAMERA
     from lidar_perception.detectors.open import doubts
     from lidar_perception.scoring.detections import by_detector, by_files
     from lidar_perception.scoring.kitti.box_errors import box_errors, print_box_errors
@@ -87,6 +87,9 @@ def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None,
             terminal_errors.print(doubt)
         start = by_detector(partial(detector.open, min_score=min_score, sensor_height=height), keep,
                             write_results)
+    if CAMERA not in recording.has and (results is not None or write_results is not None):
+        terminal_errors.print(f"{recording.path} has no camera calibration: result files are in "
+                              "the frame of a nominal camera, as detect writes them", style="dim")
     report = DetectionReport(follow=recording.drives)
     walk.fill(report, recording, start)
     if write_results is not None:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.camera import Calibration
+from lidar_perception.camera import FORWARD_CAMERA, Calibration
+from lidar_perception.data.frame import Frame
 from lidar_perception.data.kitti.labels import (
     format_label,
     parsed_lines,
@@ -17,10 +18,29 @@ from lidar_perception.data.kitti.labels import (
     to_labels,
 )
 from lidar_perception.data.kitti.write import image_boxes, tracking_line
+from lidar_perception.runs import journal
 from lidar_perception.runs.files import write_text
 from lidar_perception.types import Detections, GroundTruth, InputError
 
+FOLDER = "kitti"  # of result files in the folder of a run
 DECIMALS = 4  # of a score, so that the order stays, and of metres, so that overlaps do
+
+
+def result_files(folder: Path) -> Path:
+    """Return the folder of result files: `folder`, or its kitti/ where it is that of a run of
+    `detect`."""
+    return folder / FOLDER if (folder / journal.NAME).is_file() and (
+        folder / FOLDER).is_dir() else folder
+
+
+def result_calibration(frame: Frame) -> tuple[Calibration, bool]:
+    """Return the calibration in whose camera's frame the result file of a frame is, and True where
+    that is a nominal camera, as the frame has none or its own cannot be read."""
+    try:
+        own = frame.calibration()
+    except InputError:
+        own = None
+    return (FORWARD_CAMERA, True) if own is None else (own, False)
 
 
 def read_results(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:

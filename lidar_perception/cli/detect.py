@@ -1,0 +1,153 @@
+"""detect: run a detector on a recording and write its results."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+from rich.text import Text
+
+from lidar_perception.cli.command import Choice, Command
+from lidar_perception.cli.data import (
+    a_path,
+    dask_option,
+    jobs_option,
+    limit_option,
+    opened,
+    split_option,
+)
+from lidar_perception.cli.options import detector_options
+from lidar_perception.detectors.open import DetectorChoice
+from lidar_perception.runs.terminal import console, errors
+from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
+from lidar_perception.types import InputError
+
+if TYPE_CHECKING:
+    from lidar_perception.detecting.formats import Run
+    from lidar_perception.detecting.run import Summary
+
+FORMATS = ("kitti", "json", "csv", "mcap", "openlabel")
+
+
+class Formats(click.ParamType):
+    """Names of formats, separated by commas."""
+
+    name = "formats"
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, ...]:
+        if isinstance(value, tuple):
+            return value
+        one = Choice(FORMATS, {"bag": "mcap"})
+        return tuple(one.convert(name, param, ctx) for name in str(value).split(","))
+
+
+@click.command(cls=Command)
+@click.argument("data", type=click.Path(path_type=Path))
+@a_path("--out", "Folder of the results.", "DIR", required=True)
+@click.option("--format", "formats", type=Formats(), multiple=True, metavar="FORMAT[,FORMAT...]",
+              help=f"What to write: {', '.join(FORMATS)}. May be given several times.  "
+              "[default: json]")
+@detector_options(tracking=True)
+@click.option("--min-score", type=click.FloatRange(0, 1), metavar="SCORE", help="Least score of a "
+              "box of any class. Default: the thresholds of the detector.")
+@click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
+              help="Height of the sensor above the ground. Default: what the recording says, or "
+              "else what its first clouds show.")
+@click.option("--track", is_flag=True, help="Write tracks, with ids and velocities, instead of the "
+              "boxes of each frame alone.")
+@click.option("--ego", type=Choice(RECORDED_EGO), default="auto", show_default=True,
+              help="With --track, the sensor's motion: from the recording's poses; from the scans, "
+              "by KISS-ICP (the extra [odometry]); or none: tracks are relative to the sensor.")
+@click.option("--clouds/--no-clouds", default=True, show_default=True, help="With --format mcap: "
+              "write the clouds into the bag too.")
+@split_option
+@limit_option
+@jobs_option
+@dask_option
+@click.option("--force", is_flag=True, help="Start over where DIR holds another run.")
+def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector: DetectorChoice,
+           tracking: TrackingParams, min_score: float | None, mount_height: float, track: bool,
+           ego: str, clouds: bool, split: Path | None, limit: int | None, jobs: int,
+           dask: str | None, force: bool) -> None:
+    """Run a detector on every frame of the recording at DATA, labels or not, and write its boxes,
+    classes and scores, with --track also ids and velocities, into DIR.
+
+    \b
+    kitti      kitti/FRAME.txt, as KITTI's object benchmark has results;
+               with --track kitti/SEQUENCE.txt, as its tracking benchmark has them
+    json, csv  detections.json, detections.csv: boxes in the LiDAR frame
+    mcap       bag/, a rosbag2 bag with the topics of the nodes, for RViz, Foxglove and view
+    openlabel  openlabel/SEQUENCE.json, ASAM OpenLABEL, for label and convert
+
+    Finished frames are kept at once: the same command resumes a run that was stopped, and makes
+    more formats of one that is complete. Frames that cannot be read are named and counted; the exit
+    code is then 1.
+
+    \b
+    Examples:
+      lidar-perception detect drive.bag --out results
+      lidar-perception detect /data/kitti/object --format kitti,csv --out results --jobs 4
+      lidar-perception detect drive.bag --track --range around --format mcap --out results
+    """
+    from lidar_perception.detecting.bag import Bag
+    from lidar_perception.detecting.formats import FORMATS as WRITERS
+    from lidar_perception.detecting.formats import Run
+    from lidar_perception.detecting.run import detect as run_detector
+    from lidar_perception.detecting.run import header_of
+    from lidar_perception.detectors.open import doubts
+    from lidar_perception.tracking.drive_tracker import ego_of
+
+    if dask and jobs > 1:
+        raise click.UsageError("--jobs is for this machine, --dask for others: give one of them")
+    if not track and (ego != "auto" or tracking != TrackingParams()):
+        raise click.UsageError("--ego and --set tracking.* are for --track")
+    recording = opened(data, split=split, sensor_height=mount_height or None)
+    if track and not recording.drives:
+        raise InputError(f"{data} ({recording.layout}) has frames that do not follow each other, "
+                         "so nothing can be tracked; leave out --track")
+    height = recording.frames[0].sensor_height
+    for doubt in doubts(Path(detector.weights), height):
+        errors.print(doubt)
+    open_ = partial(detector.open, sensor_height=height, min_score=min_score)
+    opened_detector = open_()
+    header = header_of(recording, detector.weights, opened_detector,
+                       tracking=tracking if track else None,
+                       ego=ego_of(recording, ego) if track else None,
+                       split=None if split is None else str(split), device=detector.device)
+    if track and min_score is None:  # the tracker is given weak ones too
+        open_ = partial(detector.open, sensor_height=height, min_score=tracking.min_score)
+        opened_detector = open_()
+    chosen = list(dict.fromkeys(name for names in formats for name in names)) or ["json"]
+    run = Run(recording, out, header, min(len(recording), limit or len(recording)))
+    summary = run_detector(
+        run, open_ if jobs > 1 or dask else lambda: opened_detector,
+        [partial(Bag, clouds=clouds, tracked=track) if name == "mcap" else WRITERS[name]
+         for name in chosen],
+        tracking=tracking if track else None, ego=header["ego"] or "none", jobs=jobs, dask=dask,
+        force=force)
+    print_summary(summary, run)
+    raise SystemExit(1 if summary.skipped else 0)
+
+
+def print_summary(summary: Summary, run: Run) -> None:
+    """Print counts of boxes, the paths of the results, and the problems of the run."""
+    from lidar_perception.scoring.tables import narrow_table, print_skipped, print_time
+    content = summary.compute()
+    table = narrow_table(f"{content['frames']} frames of {run.recording.path}", "class", "boxes",
+                         "a frame", width=7)
+    for name, count in sorted(content["boxes"].items(), key=lambda item: -item[1]):
+        table.add_row(name, str(count), f"{count / content['frames']:.1f}")
+    table.add_row("all", str(sum(content["boxes"].values())), "")
+    console.print(table)
+    if run.header["tracking"] is not None:
+        console.print(f"{content['tracks']} tracks, poses: {run.header['ego']}")
+    print_time(content["ms"], console)
+    for path in summary.paths:
+        console.print(f"written: {path}")
+    for remark in run.remarks:
+        console.print(Text("note", "yellow") + f": {remark}")
+    for problem, count in content["problems"].items():
+        console.print(Text("problem", "yellow") + f" in {count} frames: {problem}")
+    print_skipped(content["skipped"], console)

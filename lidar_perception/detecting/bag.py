@@ -1,0 +1,82 @@
+"""Results as a rosbag2 bag, with the topics of the nodes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Self
+
+import numpy as np
+
+from lidar_perception.data.bag import BagWriter
+from lidar_perception.data.frame import nothing
+from lidar_perception.data.to_bag import DETECTIONS_3D, MARKERS, FrameWriter
+from lidar_perception.detecting.formats import Run
+from lidar_perception.detecting.results import FrameResult
+from lidar_perception.types import CLASSES, Detections, InputError, LidarFrame
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.messages import detection_markers
+from lidar_perception.wire.topics import FOUND, TRACKS
+from lidar_perception.wire.track_markers import track_markers
+from msg_utils.detections import to_detection_array
+from msg_utils.markers import marker_keys
+
+
+class Bag:
+    """A bag, bag/: detections, and with tracks those, on the topics of the nodes that find them, as
+    MarkerArray and Detection3DArray; labels, camera and odometry, where there are any; and the
+    clouds, unless they are left out. All have the stamps of their clouds."""
+
+    def __init__(self, run: Run, clouds: bool, tracked: bool) -> None:
+        self.run, self.clouds = run, clouds
+        self.path = run.out / "bag"
+        self.found = f"/{run.header['detector']}_detector{FOUND}"
+        self.tracks = f"/tracker{TRACKS}" if tracked else None
+        self.bag = BagWriter(self.path, force=True)
+        self._shown: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        self.bag.__enter__()
+        self.writer = FrameWriter(self.bag, clouds=self.clouds)
+        for topic in filter(None, (self.found, self.tracks)):
+            self.bag.add_topic(topic, MARKERS)
+            self.bag.add_topic(f"{topic}_3d", DETECTIONS_3D)
+        return self
+
+    def __exit__(self, *error: Any) -> None:
+        self.bag.__exit__(*error)
+
+    def add(self, result: FrameResult) -> None:
+        """Write a frame. One that no bag can hold is added to the skipped ones instead."""
+        frame = result.frame
+        if not self.clouds:  # then nothing but its frame is needed of it
+            nobody = LidarFrame(np.zeros((0, 3), np.float32), frame_id=result.frame_id)
+            frame = replace(frame, load=lambda: nobody)
+        try:
+            content = self.writer.read(frame)
+        except InputError:
+            try:  # without labels that no bag can hold
+                content = self.writer.read(replace(frame, truth=nothing))
+            except InputError as error:
+                self.run.skipped.append(f"not in {self.path}: {error}")
+                return
+        header, stamp_ns = content.header, content.stamp_ns
+        self._write(self.found, stamp_ns, detection_markers(
+            result.detections, header, bag_message, self._shown.get(self.found, ())))
+        self._write_3d(self.found, stamp_ns, header, result.detections)
+        if self.tracks is not None and (tracks := result.tracks) is not None:
+            self._write(self.tracks, stamp_ns, track_markers(
+                tracks.ids, tracks.detections, tracks.velocities, tracks.moving, result.trails,
+                header, bag_message, previous=self._shown.get(self.tracks, ())))
+            self._write_3d(self.tracks, stamp_ns, header, tracks.detections, ids=tracks.ids,
+                           covariances=tracks.pose_covariances())
+        self.writer.write(content)
+
+    def _write(self, topic: str, stamp_ns: int, markers: Any) -> None:
+        self._shown[topic] = marker_keys(markers)
+        self.bag.write(topic, stamp_ns, markers)
+
+    def _write_3d(self, topic: str, stamp_ns: int, header: Any, found: Detections,
+                  **more: Any) -> None:
+        self.bag.write(f"{topic}_3d", stamp_ns, to_detection_array(
+            found.boxes, [CLASSES[i] for i in found.class_ids], found.scores, header=header,
+            make=bag_message, **more))

@@ -1,0 +1,90 @@
+"""A detector that needs no network, and runs of `detect` with it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+
+import numpy as np
+from cli_samples import error_line, exit_of
+
+from lidar_perception.detectors.contract import Found
+from lidar_perception.param_fields import Params, param
+from lidar_perception.types import CLASSES, Detections
+
+NAME = "made"  # under which it is opened
+CAR, PEDESTRIAN = CLASSES.index("Car"), CLASSES.index("Pedestrian")
+WEAK, STRONG = 0.15, 0.876543
+
+
+@dataclass(frozen=True)
+class MadeParams(Params):
+    """Its parameters."""
+
+    least: float = param(0.5, "Least score.", low=0.0, high=1.0)
+
+
+class MadeDetector:
+    """It finds a walker, and a weak car that differs from cloud to cloud. calls: the clouds that
+    any such detector has seen; fails(scan): called before it detects."""
+
+    classes = ("Car", "Pedestrian")
+    calls: list = []
+    problem = None
+
+    def __init__(self, params=MadeParams(), fails=lambda scan: None):
+        self.params, self.fails = params, fails
+
+    @property
+    def min_scores(self):
+        return dict.fromkeys(self.classes, self.params.least)
+
+    def with_min_score(self, min_score):
+        return MadeDetector(replace(self.params, least=min_score), self.fails)
+
+    def mounted_at(self, height):
+        return self
+
+    def with_range(self, range):
+        return self
+
+    def __call__(self, frame, **columns):
+        self.fails(frame)
+        self.calls.append(frame)
+        some = float(frame.xyz[:50].mean())
+        boxes = [[8.0, 0.5, -0.85, 0.5, 0.5, 1.7, 0.3], [14.0 + some, -3, -1, 4, 1.7, 1.5, -3.1]]
+        found = Detections.of(boxes, [PEDESTRIAN, CAR], [STRONG, WEAK + abs(some) / 1e3])
+        found = replace(found, sources={"a": np.array([0.5, np.nan], np.float32)})
+        problem = f"{len(frame)} points are few" if frame.xyz[0, 0] > 0 else None
+        return Found(found[found.scores >= self.params.least], problem=problem)
+
+
+def opened(path="", device="auto"):
+    """Load it, as a loader of detectors.open.LOAD."""
+    return MadeDetector()
+
+
+def detect(monkeypatch, *arguments):
+    """The exit code of `detect --weights made ARGUMENTS`."""
+    return exit_of(monkeypatch, "detect", "--weights", NAME, *arguments)
+
+
+def refused(monkeypatch, capsys, *arguments):
+    """The line of the error of a call that is refused."""
+    assert detect(monkeypatch, *arguments) == 2
+    return error_line(capsys)
+
+
+def read_json(out):
+    """detections.json, without the times."""
+    content = json.loads((out / "detections.json").read_text())
+    for frame in content["frames"]:
+        assert frame.pop("ms") >= 0
+    return content
+
+
+def objects(content):
+    """Frame -> rows of numbers of its objects."""
+    return {frame["name"]: [[CLASSES.index(row["class"]), row["score"], *(row[name] for name in (
+        "x", "y", "z", "length", "width", "height", "yaw"))] for row in frame["objects"]]
+        for frame in content["frames"]}

@@ -1,0 +1,339 @@
+"""detect: results of every frame, in every format, which read back as they were found."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from functools import partial
+
+import detect_samples
+import numpy as np
+import pytest
+from bag_samples import cloud_frame, scans
+from cli_samples import evaluate_detection
+from detect_samples import NAME, MadeDetector, detect, objects, read_json, refused
+from kitti_samples import tracking_folder
+from recording_samples import MADE
+from samples import STAMP, object_folder, scene, walker_label, write
+
+from lidar_perception.camera import FORWARD_CAMERA
+from lidar_perception.data.bag import Bag
+from lidar_perception.data.frame import Frame, Recording, nothing
+from lidar_perception.data.kitti.results import (
+    read_results,
+    read_tracking_results,
+    result_calibration,
+)
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.detecting.bag import Bag as BagFormat
+from lidar_perception.detecting.formats import Json, Run
+from lidar_perception.detecting.run import detect as run_detector
+from lidar_perception.detectors import open as opening
+from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.open import LOAD
+from lidar_perception.labels.exchange import import_labels
+from lidar_perception.scoring.recorded import by_stamp
+from lidar_perception.tracking.params import TrackingParams
+from lidar_perception.types import Detections
+from lidar_perception.wire.topics import POINTS, TRUTH
+from lidar_studio.results import points_topic, recorded
+from msg_utils.detections import from_detection_array
+
+ALL = "kitti,json,csv,mcap,openlabel"
+
+
+@pytest.fixture(autouse=True)
+def made(monkeypatch):
+    """The detector `made` is known; what any such one has seen."""
+    monkeypatch.setitem(LOAD, NAME, "")
+    monkeypatch.setattr(opening, "_loader", lambda kind: detect_samples.opened)
+    monkeypatch.setattr(MadeDetector, "calls", [])
+    return MadeDetector.calls
+
+
+@pytest.fixture
+def kitti(tmp_path):
+    """Four labelled frames."""
+    return object_folder(tmp_path / "kitti", walker_label() + "\n", 4)
+
+
+@pytest.fixture
+def drives(tmp_path):
+    """Two sequences, of three and of two frames."""
+    return tracking_folder(tmp_path / "drives")
+
+
+# What is written
+
+
+@pytest.mark.parametrize("kind", MADE)
+def test_any_recording_gives_a_result_of_every_frame(kind, tmp_path, monkeypatch, made):
+    data, out = MADE[kind][0](tmp_path / "in/bag"), tmp_path / "out"
+    assert detect(monkeypatch, data, "--out", out, "--format", "json,csv,kitti") == 0
+    names = [frame.name for frame in open_recording(data)]
+    content = read_json(out)
+    assert [frame["name"] for frame in content["frames"]] == names and len(made) == len(names)
+    assert content["detector"] == content["weights"] == NAME and content["skipped"] == []
+    assert content["parameters"]["least"] == 0.5
+    found = objects(content)
+    for frame, said in zip(open_recording(data), content["frames"]):
+        assert {k: said[k] for k in ("sequence", "index", "stamp_ns", "frame_id")} == {
+            "sequence": frame.sequence, "index": frame.index, "stamp_ns": frame.stamp_ns,
+            "frame_id": frame.load().frame_id}
+        expected = MadeDetector()(frame.load()).detections
+        np.testing.assert_array_equal(np.float32(found[frame.name]), np.column_stack([
+            expected.class_ids, expected.scores, expected.boxes]).astype(np.float32))
+        camera = result_calibration(frame)[0].lidar_to_camera
+        back = read_results(out / f"kitti/{frame.name}.txt", camera)
+        np.testing.assert_allclose(back.boxes[:, :6], expected.boxes[:, :6], atol=2e-4)
+        assert [e["score"] for e in back.extras] == pytest.approx(expected.scores, abs=1e-4)
+    table = [*csv.DictReader((out / "detections.csv").open())]
+    assert [(row["frame"], row["class"], row["id"]) for row in table] == [
+        (name, "Pedestrian", "") for name in names]
+    for row in table:
+        assert [float(row[k]) for k in ("score", "x", "yaw")] == [
+            found[row["frame"]][0][k] for k in (1, 2, 8)]
+
+
+def test_all_formats_of_one_run_hold_the_same_boxes(drives, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    assert detect(monkeypatch, drives, "--out", out, "--format", ALL, "--min-score", 0.1) == 0
+    found = objects(read_json(out))
+    assert {len(rows) for rows in found.values()} == {2}
+    frames = open_recording(drives).frames
+    labels = import_labels(out / "openlabel", "openlabel", frames)
+    for frame, each in zip(frames, labels.frames):
+        rows = np.array(found[frame.name])
+        np.testing.assert_allclose(each.boxes, rows[:, 2:], atol=1e-6)
+        assert each.scores.tolist() == rows[:, 1].tolist()
+    bag, shown = seen_by_view(out / "bag")
+    for i, frame in enumerate(bag.frames):
+        np.testing.assert_array_equal(frame.load().xyz, frames[i].load().xyz)
+        boxes = shown.layers(i, frame, 0.0)["detections"]["made_detector"]
+        np.testing.assert_allclose([row[:7] for row in boxes],
+                                   np.array(found[frames[i].name])[:, 2:], atol=1e-3)
+        assert [row[8] for row in boxes] == pytest.approx([
+            row[1] for row in found[frames[i].name]])
+        assert [row[9] for row in boxes] == [{"a": 0.5}, {}]
+
+
+def seen_by_view(path):
+    """A bag as `view` opens it: the recording and its results."""
+    recording = open_recording(path, points=points_topic(path))
+    return recording, recorded(recording.frames.poses,
+                               [frame.stamp_ns for frame in recording.frames[:]])
+
+
+@pytest.mark.parametrize("clouds", [True, False])
+def test_a_bag_holds_what_the_nodes_publish(drives, tmp_path, monkeypatch, clouds):
+    out = tmp_path / "out"
+    assert detect(monkeypatch, drives, "--out", out, "--format", "mcap", "--track",
+                  "--ego", "none", *["--no-clouds"] * (not clouds)) == 0
+    frames = open_recording(drives).frames
+    stamps = [frame.stamp_ns for frame in frames]
+    with Bag(out / "bag") as bag:
+        assert bag.counts.get(POINTS, 0) == clouds * len(frames)
+        for topic in "/made_detector/output/detections", "/tracker/output/tracks":
+            marked = by_stamp(bag, [topic])[topic]
+            arrays = [from_detection_array(message) for _, _, message
+                      in bag.messages([f"{topic}_3d"])]
+            assert sorted(marked) == stamps == [array.stamp_ns for array in arrays]
+            for array in arrays:
+                np.testing.assert_allclose(array.boxes, marked[array.stamp_ns].boxes, atol=1e-9)
+                assert array.labels == marked[array.stamp_ns].labels
+                assert array.ids.tolist() == marked[array.stamp_ns].ids.tolist()
+        assert sum(map(len, marked.values())) > 0
+
+
+def test_a_bag_of_a_cloud_that_has_its_stamp_twice_is_written_without_labels(tmp_path, monkeypatch,
+                                                                              capsys):
+    """Nothing would say whose the labels are."""
+    frames = [replace(frame, stamp_ns=STAMP) for frame in scans(3)]
+    recording = Recording(tmp_path, "", frames)
+    run = made_run(recording, tmp_path / "out")
+    run_detector(run, MadeDetector, [partial(BagFormat, clouds=True, tracked=False)])
+    with Bag(tmp_path / "out/bag") as bag:
+        assert bag.counts[POINTS] == 3 and bag.counts[TRUTH] == 1
+
+
+def made_run(recording, out, **header):
+    return Run(recording, out, {"detector": NAME, "min_scores": {}, **header}, len(recording))
+
+
+# Results are scored as the detector is
+
+
+@pytest.mark.parametrize("camera", [True, False], ids=["camera", "nominal"])
+def test_written_results_score_as_the_detector_itself(kitti, tmp_path, monkeypatch, camera, capsys):
+    write(kitti / "training/velodyne/000002.bin", b"123")  # which is skipped by both
+    if not camera:
+        frames = [replace(frame, calibration=nothing) for frame in open_recording(kitti)]
+        kitti = tmp_path / "bag"
+        write_bag(kitti, frames, skipped=[])
+    out, asked = tmp_path / "out", ("--min-score", 0.001)
+    assert detect(monkeypatch, kitti, "--out", out, "--format", "kitti", *asked) == camera
+    said = capsys.readouterr().out
+    assert ("nominal camera" in " ".join(said.split())) == (not camera)
+    direct, _ = evaluate_detection(tmp_path, "--data", kitti, "--weights", NAME, *asked)
+    assert direct["frames"] == 3 and direct["ap"]["Pedestrian"]["bev"]["easy"]["r40"] == 100
+    for folder in out, out / "kitti":
+        read, _ = evaluate_detection(tmp_path, "--data", kitti, "--results", folder)
+        assert numbers_in(read["ap"]) == pytest.approx(numbers_in(direct["ap"]), abs=1e-3)
+        assert read["skipped"] == direct["skipped"]
+
+
+def numbers_in(content):
+    """All numbers in nested dicts, in their order."""
+    inner = content.values() if isinstance(content, dict) else [content]
+    return [number for each in inner for number in (
+        numbers_in(each) if isinstance(each, dict) else [each] * (each is not None))]
+
+
+# Tracks
+
+
+def test_tracks_have_ids_and_velocities_that_never_mix(drives, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    assert detect(monkeypatch, drives, "--out", out, "--format", ALL, "--track",
+                  "--ego", "none") == 0
+    content = read_json(out)
+    assert content["ego"] == "none" and content["tracking"]["min_score"] == 0.05
+    ids = {}
+    for frame in content["frames"]:
+        for row in frame["objects"]:
+            ids.setdefault(frame["sequence"], set()).add(row["id"])
+            assert len(row["velocity"]) == 2 and all(map(np.isfinite, row["velocity"]))
+    assert ids["0000"] and ids["0007"] and not ids["0000"] & ids["0007"]
+    frames = open_recording(drives).frames
+    labels = import_labels(out / "openlabel", "openlabel", frames)
+    for frame, each, said in zip(frames, labels.frames, content["frames"]):
+        assert each.track_ids.tolist() == [row["id"] for row in said["objects"]]
+        assert [e["velocity"] for e in each.extra] == [row["velocity"] for row in said["objects"]]
+        camera = frame.calibration().lidar_to_camera
+        tracks = read_tracking_results(out / f"kitti/{frame.sequence}.txt", camera)[frame.index]
+        np.testing.assert_allclose(tracks.boxes[:, :3], np.array(
+            objects(content)[frame.name])[:, 2:5], atol=2e-4)
+        assert [e["track_id"] for e in tracks.extras] == each.track_ids.tolist()
+
+
+def test_drives_of_a_bag_are_tracked_apart(tmp_path, monkeypatch):
+    """They have no names, so their files are numbered."""
+    stamps = [STAMP + s * 10**8 for s in (0, 1, 100, 101)]
+    write_bag(tmp_path / "bag", [Frame.of(str(i), cloud_frame(scene(i), stamp))
+                                 for i, stamp in enumerate(stamps)])
+    out = tmp_path / "out"
+    assert detect(monkeypatch, tmp_path / "bag", "--out", out, "--format", "json,kitti",
+                  "--track") == 0
+    ids = [{row["id"] for row in frame["objects"]} for frame in read_json(out)["frames"]]
+    assert ids[0] & ids[1] and ids[2] & ids[3] and not (ids[0] | ids[1]) & (ids[2] | ids[3])
+    assert sorted(path.name for path in (out / "kitti").iterdir()) == ["0000.txt", "0001.txt"]
+    for name in "0000", "0001":
+        assert [*read_tracking_results(out / f"kitti/{name}.txt",
+                                       FORWARD_CAMERA.lidar_to_camera)] == [0, 1]
+
+
+# Runs that stop, and other runs
+
+
+class Stopped(Exception):
+    """Ends a run in the middle."""
+
+
+def test_a_run_that_was_stopped_is_resumed(drives, tmp_path, made):
+    def stop(scan):
+        if len(made) == 3:
+            raise Stopped
+    recording = open_recording(drives)
+    whole, parts = (made_run(recording, tmp_path / name) for name in ("whole", "parts"))
+    run_detector(whole, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
+    made.clear()
+    with pytest.raises(Stopped):
+        run_detector(parts, partial(MadeDetector, fails=stop), [Json], ego="none",
+                     tracking=TrackingParams())
+    assert len(made) == 3 and not (tmp_path / "parts/detections.json").exists()
+    run_detector(parts, MadeDetector, [Json], tracking=TrackingParams(), ego="none")
+    assert len(made) == len(recording)  # and none of them twice
+    assert read_json(tmp_path / "parts") == read_json(tmp_path / "whole")
+
+
+def test_the_number_of_processes_does_not_change_the_result(drives, tmp_path):
+    recording = open_recording(drives)
+    for name, jobs in ("one", 1), ("two", 2):
+        run_detector(made_run(recording, tmp_path / name), MadeDetector, [Json],
+                     tracking=TrackingParams(), ego="none", jobs=jobs)
+    assert read_json(tmp_path / "one") == read_json(tmp_path / "two")
+
+
+def test_another_run_in_the_folder_is_refused_and_forced(kitti, tmp_path, monkeypatch, capsys,
+                                                         made):
+    out = tmp_path / "out"
+    assert detect(monkeypatch, kitti, "--out", out, "--format", "kitti,csv", "--limit", 2) == 0
+    assert detect(monkeypatch, kitti, "--out", out) == 0  # more frames, another format
+    assert len(made) == 4 and len(read_json(out)["frames"]) == 4
+    capsys.readouterr()
+    line = refused(monkeypatch, capsys, kitti, "--out", out, "--min-score", 0.1)
+    assert f"{out} was begun with min_scores" in line and "--force" in line
+    assert detect(monkeypatch, kitti, "--out", out, "--min-score", 0.1, "--force") == 0
+    assert len(made) == 8 and not (out / "detections.csv").exists()
+    assert not [*out.glob("kitti/*")] and len(objects(read_json(out))["000000"]) == 2
+    write(tmp_path / "mine/letter.txt", "dear")
+    assert "holds no run" in refused(monkeypatch, capsys, kitti, "--out", tmp_path / "mine")
+
+
+# What cannot be used
+
+
+def test_frames_that_cannot_be_read_are_named_and_the_others_are_written(kitti, tmp_path,
+                                                                         monkeypatch, capsys, made):
+    cut, out = kitti / "training/velodyne/000001.bin", tmp_path / "out"
+    whole = cut.read_bytes()
+    write(cut, b"123")
+    for _ in range(2):  # tried again each time
+        assert detect(monkeypatch, kitti, "--out", out, "--format", ALL) == 1
+        assert "000001.bin" in (said := capsys.readouterr().out) and "3 frames" in said
+    assert len(made) == 3
+    content = read_json(out)
+    assert [frame["name"] for frame in content["frames"]] == ["000000", "000002", "000003"]
+    assert "000001.bin" in content["skipped"][0]
+    assert {path.stem for path in (out / "kitti").iterdir()} == {"000000", "000002", "000003"}
+    write(cut, whole)
+    assert detect(monkeypatch, kitti, "--out", out) == 0 and len(made) == 4
+
+
+def test_labels_and_cameras_that_cannot_be_read_are_not_needed(kitti, tmp_path, monkeypatch,
+                                                                capsys):
+    write(kitti / "training/label_2/000001.txt", "Car")
+    (kitti / "training/calib/000002.txt").unlink()
+    assert detect(monkeypatch, kitti, "--out", tmp_path / "out", "--format", ALL) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "labels left out: " in said and "000001.txt" in said
+    assert "camera calibration left out: " in said and "nominal camera" in said
+    assert len(read_json(tmp_path / "out")["frames"]) == 4
+
+
+def test_what_is_wrong_is_said_once_with_its_count(kitti, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(MadeDetector, "__call__", lambda self, frame: Found(
+        Detections.none(), problem=f"{np.ptp(frame.xyz)} m are not much"))
+    assert detect(monkeypatch, kitti, "--out", tmp_path / "out") == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("are not much") == 1 and "in 4 frames" in said
+
+
+def test_numbers_that_are_not_finite_are_not_written(kitti, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(MadeDetector, "__call__", lambda self, frame: Found(
+        Detections.of(np.full((1, 7), np.nan))))
+    assert detect(monkeypatch, kitti, "--out", tmp_path / "out", "--format", ALL) == 1
+    assert "not finite" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("arguments, words", [
+    (["--format", "kiti"], "'kiti' is unknown; did you mean 'kitti'"),
+    (["--ego", "none"], "are for --track"),
+    (["--track"], "do not follow each other"),
+    (["--min-score", 2], "2"),
+])
+def test_options_that_cannot_be_used_are_refused(arguments, words, kitti, tmp_path, monkeypatch,
+                                                 capsys, made):
+    assert detect(monkeypatch, kitti, "--out", tmp_path / "out", *arguments) == 2
+    assert words in capsys.readouterr().err and made == [] and not (tmp_path / "out").exists()
