@@ -67,8 +67,15 @@ MAX_DIAGONAL = 6.40  # metres, of the largest class: paper B, Table 2
 
 CLASSES = tuple(row.name for row in TABLE)
 # Into CLASSES, by all that a class is called, in lower case
+_NAME_BY_SPELLING = {"".join(filter(str.isalnum, name)).casefold(): name for name in CLASSES}
 CALLED = {name.casefold(): i for i, row in enumerate(TABLE) for name in (row.name, *row.called)}
 DETECTED = {row.name: row.numbers for row in TABLE if row.numbers is not None}
 BY_SIZE = sorted(DETECTED, key=lambda name: -DETECTED[name].min_diagonal)  # the largest first
 CAR, PEDESTRIAN, CYCLIST, DONT_CARE = map(CLASSES.index, ("Car", "Pedestrian", "Cyclist",
                                                           "DontCare"))
+
+
+def class_name(text: str) -> str:
+    """Return the name in CLASSES that a text spells in any case, with any blanks and punctuation
+    ("car", "Person (sitting)"), or else the text."""
+    return _NAME_BY_SPELLING.get("".join(filter(str.isalnum, text)).casefold(), text)

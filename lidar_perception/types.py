@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lidar_perception.classes import CLASSES, PEDESTRIAN
+from lidar_perception.classes import CLASSES, PEDESTRIAN, class_name
 from lidar_perception.intensity import to_unit
 
 __all__ = ["CLASSES", "PEDESTRIAN", "Detections", "GroundTruth", "InputError", "LidarFrame",
@@ -218,8 +218,10 @@ class Detections:
 
 
 def class_ids(names: Iterable[str]) -> list[int]:
-    """Into CLASSES; a name that is not there is Misc."""
-    return [CLASSES.index(name if name in CLASSES else "Misc") for name in names]
+    """Return indices into CLASSES of names in any spelling, see class_name; of another name that of
+    Misc."""
+    return [CLASSES.index(known if (known := class_name(name)) in CLASSES else "Misc")
+            for name in names]
 
 
 @dataclass(frozen=True)

@@ -134,6 +134,8 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
     from lidar_perception.data.open import open_recording
     recording = open_recording(data, **how)
     errors.print(str(recording), style="dim")
+    for line in lost_labels(recording):
+        errors.print(line, style="yellow")
     if recording.mounted:
         return recording
     from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
@@ -149,6 +151,12 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
                                      recorded_intensity_problem(recording.path, clouds[0]))):
             errors.print(problem, style="yellow")
     return measured
+
+
+def lost_labels(recording: Any) -> list[str]:
+    """Return a line that counts the labels whose scan is missing; none where all are there."""
+    lost = [reason for _, reason in recording.lost]
+    return [f"labels without a scan: {len(lost)}, such as {lost[0]}"] if lost else []
 
 
 def as_mounted(recording: Any, params: Any) -> Any:

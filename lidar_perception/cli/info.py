@@ -9,6 +9,7 @@ import click
 from rich.table import Table
 
 from lidar_perception.cli.command import Command
+from lidar_perception.cli.data import lost_labels
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import layout_of, open_recording
@@ -63,5 +64,5 @@ def _print_recording(recording: Any) -> None:
     truth = first.truth()
     if truth is not None:
         console.print(f"its labels: {', '.join(truth.labels) or 'none'}")
-    for _, reason in recording.lost[:1]:
-        console.print(f"labels without a scan: {len(recording.lost)}, such as {reason}")
+    for line in lost_labels(recording):
+        console.print(line)

@@ -13,6 +13,7 @@ from lidar_perception.data import bag_frames, cloud_folder, semantickitti
 from lidar_perception.data.cloud_files import SUFFIXES
 from lidar_perception.data.frame import Recording
 from lidar_perception.data.kitti import folder as kitti
+from lidar_perception.data.kitti import raw
 from lidar_perception.data.mounting import height_of
 from lidar_perception.data.nuscenes import folder as nuscenes
 from lidar_perception.runs.files import read_text
@@ -23,7 +24,8 @@ from lidar_perception.types import InputError
 LAYOUTS = {
     bag_frames: "",
     semantickitti: "KITTI odometry or SemanticKITTI (sequences/00/)",
-    kitti: "KITTI (velodyne/ or training/velodyne/, or raw drives)",
+    kitti: "KITTI (velodyne/ or training/velodyne/)",
+    raw: "KITTI raw drives (velodyne_points/data/)",
     nuscenes: "nuScenes (v1.0-*/ and samples/)",
     cloud_folder: "",
 }

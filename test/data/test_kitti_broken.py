@@ -61,7 +61,7 @@ def test_a_broken_file_is_named_and_the_other_frames_go_on(tmp_path, file, conte
     ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml", "<cut", "cannot read"),
     ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml", "<a/>", "cannot read"),
     ("raw", "2011_09_26/2011_09_26_drive_0001_sync/tracklet_labels.xml",
-     TRACKLETS.replace(">Pedestrian<", ">Unicorn<"), "cannot read"),
+     TRACKLETS.replace("<h>1.8</h>", "<h>tall</h>"), "cannot read"),
 ])
 def test_a_broken_file_of_a_sequence_is_named(tmp_path, layout, file, content, words):
     root = LAYOUTS[layout](tmp_path)

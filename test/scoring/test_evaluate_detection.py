@@ -251,7 +251,8 @@ BAD = {
     "score": (f"{PERSON} 0.9\n{WHOLE}", "000000.txt:2 is no result"),
     "too large": (f"{PERSON} 1e308", "000000.txt:1 is no KITTI label"),
     "nan": (f"{PERSON} nan", "000000.txt:1 is no KITTI label"),
-    "class": (f"{PERSON.lower()} 0.9", "000000.txt:1 has the unknown class 'pedestrian'"),
+    "class": (f"{PERSON} 0.9".replace("Pedestrian", "Walker"),
+              "000000.txt:1 has the unknown class 'Walker'"),
     "bytes": (b"\xff\xfe\x00", "cannot read the labels"),
 }
 

@@ -10,8 +10,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from lidar_perception.classes import class_name
 from lidar_perception.geometry import wrap_angle
-from lidar_perception.runs.files import regular
+from lidar_perception.runs.files import read_text, regular
 from lidar_perception.types import CLASSES, LARGEST, GroundTruth, InputError, class_ids
 
 # The label file's own names and numbers, in its order; they travel in GroundTruth.extras.
@@ -20,7 +21,6 @@ OTHER_NAMES = {"Person": "Person_sitting"}  # the tracking benchmark's name
 # A region that was not labelled: only its 2D box is known.
 DONT_CARE = {"track_id": -1, "truncated": -1.0, "occluded": -1, "alpha": -10.0,
              "dimensions": [-1.0] * 3, "location": [-1000.0] * 3, "rotation_y": -10.0}
-RAW_NAMES = {"Person (sitting)": "Person_sitting"}
 
 
 def read_object_labels(path: Path, lidar_to_camera: np.ndarray) -> GroundTruth:
@@ -59,19 +59,24 @@ def parsed_tracking_lines(path: Path, known_only: bool = False) -> list[tuple[in
 
 
 def parse(line: str, path: Path | str = "label", number: int = 0, known_only: bool = False) -> dict:
-    """One label line as a dict: class, the COLUMNS, and score where the line has one. InputError
-    for a class that is not in CLASSES, if they must be known."""
+    """Return one label line as a dict: class, the COLUMNS, and score where the line has one.
+
+    A class is the one in CLASSES that the line spells in any case, as KITTI's own program compares
+    names, or else the text of the line. InputError for the latter with known_only.
+    """
     words = line.split()
+    first = next((i for i, word in enumerate(words[1:], 1) if _is_number(word)), 1)
+    text = " ".join(words[:first])  # some tools leave blanks in the names of classes
     try:
-        numbers = [float(w) for w in words[1:]]
+        numbers = [float(w) for w in words[first:]]
         if len(numbers) not in (14, 15) or not all(abs(n) <= LARGEST for n in numbers):
             raise ValueError
     except ValueError:
         raise InputError(f"{path}:{number} is no KITTI label (a class and 14 or 15 numbers): "
                          f"{line[:200]!r}") from None
-    name = OTHER_NAMES.get(words[0], words[0])
+    name = OTHER_NAMES.get(text) or class_name(text)
     if name not in CLASSES and known_only:
-        raise InputError(f"{path}:{number} has the unknown class {words[0]!r}; known are "
+        raise InputError(f"{path}:{number} has the unknown class {text!r}; known are "
                          f"{', '.join(CLASSES)}")
     label = {"class": name, "truncated": numbers[0], "occluded": int(numbers[1]),
              "alpha": numbers[2], "bbox": numbers[3:7], "dimensions": numbers[7:10],
@@ -79,6 +84,14 @@ def parse(line: str, path: Path | str = "label", number: int = 0, known_only: bo
     if len(numbers) == 15:
         label["score"] = numbers[14]
     return label
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def to_ground_truth(labels: list[dict], lidar_to_camera: np.ndarray) -> GroundTruth:
@@ -150,24 +163,49 @@ def format_label(label: dict, decimals: int = 2, whole: bool = True) -> str:
 
 
 def read_tracklets(path: Path) -> dict[int, GroundTruth]:
-    """Frame number -> objects, of a raw recording's tracklet_labels.xml (LiDAR frame already)."""
+    """Read a raw drive's tracklet_labels.xml, of KITTI or as CVAT and Datumaro export it.
+
+    Returns: frame number -> objects in the LiDAR frame; of a class that is not in CLASSES Misc,
+    with its name as class_name. An object whose size is not above 0 is a note.
+    Raises: InputError for a file that is no such XML.
+    """
+    frames: dict[int, tuple[list, list]] = {}
     try:
         tracklets = _child(ElementTree.parse(regular(path)).getroot(), "tracklets")
-        frames: dict[int, list] = {}
         for track, item in enumerate(tracklets.iterfind("item")):
-            name = _text(item, "objectType")
+            text = _text(item, "objectType").strip()
             h, w, length = (float(_text(item, k)) for k in "hwl")
-            first = int(_text(item, "first_frame"))
+            first = int(item.findtext("first_frame") or 0)
             for i, pose in enumerate(_child(item, "poses").iterfind("item")):
                 x, y, z, yaw = (float(_text(pose, k)) for k in ("tx", "ty", "tz", "rz"))
-                extra = {"track_id": track, "occluded": int(float(pose.findtext("occlusion", "0"))),
-                         "truncated": float(pose.findtext("truncation", "0"))}
-                frames.setdefault(first + i, []).append(
-                    ([x, y, z + h / 2, length, w, h, yaw], CLASSES.index(RAW_NAMES.get(name, name)),
-                     extra))
-    except (OSError, ElementTree.ParseError, ValueError) as error:
+                occluded, truncated = (_state(pose, k) for k in ("occlusion", "truncation"))
+                if truncated is None:
+                    continue
+                extra = {"track_id": track, "occluded": int(occluded or 0), "truncated": truncated}
+                boxes, notes = frames.setdefault(first + i, ([], []))
+                if min(h, w, length) <= 0:
+                    notes.append((class_name(text), extra))
+                else:
+                    boxes.append(([x, y, z + h / 2, length, w, h, yaw], text, extra))
+    except (OSError, ElementTree.ParseError, ValueError, OverflowError) as error:
         raise InputError(f"cannot read the tracklets {path}: {error}") from None
-    return {k: GroundTruth.of(*map(list, zip(*objects))) for k, objects in frames.items()}
+    return {number: _of_tracklets(*found) for number, found in frames.items()}
+
+
+def _of_tracklets(rows: list, notes: list) -> GroundTruth:
+    boxes, texts, extras = (list(column) for column in zip(*rows)) if rows else ([], [], [])
+    extras = [extra if class_name(text) in CLASSES else {**extra, "class_name": text}
+              for text, extra in zip(texts, extras)]
+    return GroundTruth.of(boxes, class_ids(texts), extras, notes)
+
+
+def _state(pose: ElementTree.Element, name: str) -> float | None:
+    """The number of a pose's state, 0 where it has none; None where Datumaro only fills a gap
+    between two boxes of a track: it writes the name of the state then.
+    https://github.com/openvinotoolkit/datumaro/blob/develop/src/datumaro/plugins/data_formats/kitti_raw/exporter.py
+    """
+    text = (pose.findtext(name) or "0").strip()
+    return None if text.startswith(("TruncationStates.", "OcclusionStates.")) else float(text)
 
 
 def _child(element: ElementTree.Element, name: str) -> ElementTree.Element:
@@ -182,8 +220,5 @@ def _text(element: ElementTree.Element, name: str) -> str:
 
 
 def _lines(path: Path) -> list[tuple[int, str]]:
-    try:
-        text = regular(path).read_text()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read the labels {path}: {error}") from None
-    return [(i, line) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    lines = read_text(path, what="the labels").splitlines()
+    return [(i, line) for i, line in enumerate(lines, 1) if line.strip()]

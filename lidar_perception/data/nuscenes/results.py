@@ -64,7 +64,7 @@ def read_results(path: Path, frames: Sequence[Frame]) -> dict[str, GlobalBoxes]:
     """The boxes of each frame by its name; those of other frames are left out. InputError names the
     frame that is missing and the box that is wrong."""
     try:
-        content = json.loads(regular(path).read_text(encoding="utf-8"))
+        content = json.loads(regular(path).read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise InputError(f"cannot read the results {path}: {error.strerror}") from None
     except (ValueError, RecursionError) as error:

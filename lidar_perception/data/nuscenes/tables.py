@@ -67,7 +67,7 @@ class Tables:
     def _decoded(self, table: str) -> Iterator[Any]:
         path, decode = self.path(table), json.JSONDecoder().raw_decode
         try:
-            with open(regular(path), encoding="utf-8") as stream:
+            with open(regular(path), encoding="utf-8-sig") as stream:
                 text = stream.read(CHUNK).lstrip()
                 if text[:1] != "[":
                     raise InputError(f"{path} is no list of rows; download the tables of "
