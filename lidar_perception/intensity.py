@@ -17,7 +17,7 @@ MAX_OUTLIERS = 1e-4   # share of the values of a cloud that may lie beyond its s
 WHOLE_SAMPLE = 10_000  # values that are checked for being whole numbers
 MIN_BRIGHT = 0.05     # a cloud of MIN_POINTS whose values all lie below has another scale
 MIN_POINTS = 1000
-FIELDS = ("intensity", "reflectivity", "i")  # of clouds with named columns; the first one counts
+INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # the first one that a cloud has counts
 
 
 def full_scale(values: np.ndarray, dtype: DTypeLike | None = None) -> float:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.intensity import StreamScale
 from lidar_perception.robot.poses import moved_boxes, moved_points
 from lidar_perception.robot.tree import Missing, TransformTree
 from lidar_perception.types import InputError
@@ -89,6 +90,7 @@ class Live:
         self._unplaced: list[tuple[LiveFrame, str, MarkedObjects, Any]] = []  # until TF has come
         self._numbers: dict[tuple[str, str], int] = {}  # of each topic among those of its kind
         self._said: dict[str, Any] = {}
+        self._scale = StreamScale()
         self._lock = threading.RLock()
 
     @property
@@ -259,7 +261,7 @@ class Live:
     def clouds(self, i: int) -> Scan:
         """The points of a frame, with the ground and clusters that its cloud has. InputError where
         it is broken, or kept no more."""
-        return scan_in(self._frame(i).cloud)
+        return scan_in(self._frame(i).cloud, scale=self._scale)
 
     def layers(self, i: int, min_score: float) -> dict[str, Any]:
         """Labels and detections of a frame, as /api/labels has them, and what is missed from this

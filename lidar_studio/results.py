@@ -21,11 +21,18 @@ from lidar_perception.data.kitti.results import read_results, result_calibration
 from lidar_perception.data.to_bag import MARKERS
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.geometry import bev_iou
+from lidar_perception.intensity import full_scale
 from lidar_perception.runs.terminal import errors
 from lidar_perception.scoring.centres.matching import MAX_CENTRE_DISTANCE, one_to_one
 from lidar_perception.scoring.recorded import by_stamp
 from lidar_perception.types import Detections, GroundTruth, InputError
-from lidar_perception.wire.messages import cluster_column, column, to_detections, to_frame
+from lidar_perception.wire.messages import (
+    FullScale,
+    cluster_column,
+    column,
+    to_detections,
+    to_frame,
+)
 from lidar_perception.wire.topics import FOUND, TRACKS, TRUTH
 from lidar_studio.drive import Drive, Scan, scan_of, scanned
 from msg_utils.markers import MarkedObjects
@@ -205,13 +212,13 @@ def recorded_scan(frame: Frame) -> Scan:
     our own where there are none. InputError where it cannot be read."""
     message = frame.native()
     both = {"ground", "cluster_id"} <= {field.name for field in message.fields}
-    return scan_in(message) if both else scanned(frame)
+    return scan_in(message, frame.intensity_max()) if both else scanned(frame)
 
 
-def scan_in(message: Any) -> Scan:
-    """A PointCloud2 with the ground and clusters that it has; none where it has no such column.
-    InputError where it is broken."""
-    cloud, indices = to_frame(message, intensity_max=0.0)
+def scan_in(message: Any, intensity_max: float = 0.0, scale: FullScale = full_scale) -> Scan:
+    """Return a PointCloud2 with the ground and clusters that it has; none where it has no such
+    column. intensity_max, scale: see to_frame. InputError where it is broken."""
+    cloud, indices = to_frame(message, intensity_max, scale)
     ground, clusters = column(message, "ground", indices), cluster_column(message, indices)
     return scan_of(cloud, np.zeros(len(cloud), bool) if ground is None else ground > 0,
                    np.zeros(len(cloud), np.int32) if clusters is None else clusters[0])

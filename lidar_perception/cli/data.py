@@ -128,18 +128,16 @@ def walk_options(data: Callable = data_option) -> Callable:
 
 
 def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
-    """The recording at a path, see data.open.open_recording; says in a line what it is. The height
-    of a sensor that the recording does not say is measured, unless it is about KITTI's; where it is
-    to be level and leans, or its intensities have no known scale, that is said."""
+    """Open the recording at a path, see data.open.open_recording, and print its summary. The height
+    of a sensor that the recording does not give is measured, unless it is about KITTI's. With level
+    a sensor that leans and the scale of the intensity are reported."""
     from lidar_perception.data.open import open_recording
+    from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
+    from lidar_perception.wire.messages import recorded_intensity_problem
     recording = open_recording(data, **how)
     errors.print(str(recording), style="dim")
     for line in lost_labels(recording):
         errors.print(line, style="yellow")
-    if recording.mounted:
-        return recording
-    from lidar_perception.ground.segment import first_clouds, mount_problem, mounted
-    from lidar_perception.wire.messages import recorded_intensity_problem
     clouds = first_clouds(recording)
     measured = mounted(recording, clouds)
     if measured is not recording:
@@ -147,8 +145,11 @@ def opened(data: Path, *, level: bool = True, **how: Any) -> Any:
         errors.print(f"its sensor is {height:.2f} m above the ground, by the first clouds",
                      style="dim")
     if level and clouds:
-        for problem in filter(None, (mount_problem(recording, clouds),
-                                     recorded_intensity_problem(recording.path, clouds[0]))):
+        if (full := recording.frames[0].intensity_max()) > 1:
+            errors.print(f"its intensity is 0 .. {full:g}, read as 0 .. 1", style="dim")
+        for problem in filter(None, (
+                None if recording.mounted else mount_problem(recording, clouds),
+                recorded_intensity_problem(recording.path, clouds))):
             errors.print(problem, style="yellow")
     return measured
 

@@ -60,6 +60,8 @@ def _print_recording(recording: Any) -> None:
     scan = first.load()
     intensity = ("no intensity" if scan.intensity is None else
                  f"intensity up to {scan.intensity.max(initial=0):.3g}")
+    if first.intensity_max() > 1:
+        intensity += f" of 1, which is {first.intensity_max():g} in the files"
     console.print(f"first cloud: {first.name}, {len(scan)} points, {intensity}")
     truth = first.truth()
     if truth is not None:

@@ -28,10 +28,11 @@ from lidar_perception.data.frame import (
     PointTruth,
     Recording,
 )
+from lidar_perception.data.recorded_scale import SAMPLE, scale_of
 from lidar_perception.data.ros1_bag import is_ros1
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import decode
-from lidar_perception.wire.messages import calibration_of, column, to_frame, to_truth
+from lidar_perception.wire.messages import calibration_of, column, raw_intensity, to_frame, to_truth
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, INSTANCE, POINTS, SEMANTIC, TRUTH
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import SECOND
@@ -184,6 +185,17 @@ class BagFrames(Sequence):
         return next(((time, bytes(data)) for _, time, data in raw), None)
 
     @cached_property
+    def full_scale(self) -> float:
+        """The intensity of a full reflection, by the first clouds, as only they can be read without
+        a look through the bag; the same for all frames."""
+        return scale_of(self._first_clouds(), lambda data: raw_intensity(decode(data, self.kind)))
+
+    def _first_clouds(self) -> Iterator[bytes]:
+        with suppress(InputError):  # damage is named when it is read
+            for _, _, data in islice(self.opened.bag().raw({self.points}), SAMPLE):
+                yield bytes(data)
+
+    @cached_property
     def poses(self) -> BagPoses:
         """Of the frame that the first cloud is in."""
         return BagPoses(self.opened, _frame_id(self.first[1]) if self.first else "")
@@ -195,11 +207,12 @@ class BagFrames(Sequence):
                      point_truth=partial(self._point_truth, time, data),
                      calibration=partial(self._calibration, time),
                      pose=lambda: self.poses(stamp), index=i, sensor_height=self.sensor_height,
-                     files=self.files, native=lambda: decode(data(), self.kind))
+                     files=self.files, native=lambda: decode(data(), self.kind),
+                     intensity_max=lambda: self.full_scale)
 
     def _load(self, time: int, data: Callable[[], bytes]) -> LidarFrame:
         try:
-            return to_frame(decode(data(), self.kind), intensity_max=0.0)[0]
+            return to_frame(decode(data(), self.kind), self.full_scale)[0]
         except InputError as error:
             raise InputError(f"{self.path}, topic {self.points} at {time} ns: {error}") from None
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +11,12 @@ import numpy as np
 from lidar_perception.data.nuscenes.folder import SWEEP
 from lidar_perception.data.pcd import read_pcd
 from lidar_perception.data.ply import read_ply
+from lidar_perception.data.recorded_scale import recorded_scale
 from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import regular
 from lidar_perception.types import MAX_RANGE, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
-from lidar_perception.wire.messages import to_frame
+from lidar_perception.wire.messages import raw_intensity, to_frame
 from msg_utils.point_cloud2 import from_array, xyz
 from msg_utils.stamps import header_message
 
@@ -32,15 +33,22 @@ def is_cloud(path: Path) -> bool:
     return path.suffix.lower() in SUFFIXES and path.is_file()
 
 
-def load_points(file: Path, stamp_ns: int, frame_id: str = "") -> LidarFrame:
-    """Read the usable points of a file of SUFFIXES.
+def cloud_scale(files: Sequence[Path]) -> Callable[[], float]:
+    """Return the recorded_scale() of files of SUFFIXES."""
+    return recorded_scale(files, lambda file: raw_intensity(to_message(file)))
+
+
+def load_points(file: Path, stamp_ns: int, frame_id: str = "", *,
+                scale: Callable[[], float]) -> LidarFrame:
+    """Read the usable points of a file of SUFFIXES; scale() is the intensity of a full reflection,
+    see cloud_scale.
 
     Raises: InputError for a broken file, and for a cloud all of which is beyond MAX_RANGE, as one
     in map coordinates (UTM) is.
     """
     try:
         message = to_message(file, stamp_ns, frame_id)
-        frame = to_frame(message, 0.0)[0]
+        frame = to_frame(message, scale())[0]
     except InputError as error:
         raise InputError(str(error) if str(file) in str(error) else f"{file}: {error}") from None
     if len(frame) == 0:

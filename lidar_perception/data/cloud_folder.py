@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lidar_perception.data.cloud_files import is_cloud, load_points, to_message
+from lidar_perception.data.cloud_files import cloud_scale, is_cloud, load_points, to_message
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS
 
@@ -42,9 +42,11 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     times = named_times(files)
     stamps = times or [START_NS + i * PERIOD_NS for i in range(len(files))]
     kinds = " and ".join(sorted({file.suffix.lower() for file in files}))
+    scale = cloud_scale(files)
     return Recording(path, f"{kinds} clouds, {'times' if times else 'no times'} in their names",
-                     [Frame(name, stamp, partial(load_points, file, stamp), index=i, points=file,
-                            native=partial(to_message, file, stamp))
+                     [Frame(name, stamp, partial(load_points, file, stamp, scale=scale), index=i,
+                            points=file, native=partial(to_message, file, stamp),
+                            intensity_max=scale)
                       for i, (name, stamp, file) in enumerate(zip(names, stamps, files))],
                      mounted=False, timed=bool(times))
 

@@ -28,7 +28,12 @@ class PointTruth:
 
 
 def nothing() -> None:
-    """What a frame has of what its recording lacks."""
+    """Return None for data that the recording does not contain."""
+
+
+def fixed_scale() -> float:
+    """Return 0, for clouds whose format fixes the scale of the intensity."""
+    return 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +64,7 @@ class Frame:
     image: Path | None = None
     files: tuple[Path, ...] = ()
     native: Any = None
+    intensity_max: Callable[[], float] = fixed_scale
 
     def camera(self) -> Camera | None:
         """The camera that sees the frame; None without a calibration."""

@@ -24,7 +24,7 @@ class Robot:
     """How a sensor is mounted and read, as the parameters of nodes have it. height: metres above
     the ground, None what the recording says; roll, pitch: of the sensor, as a URDF's rpy, and
     ahead: counter-clockwise from its x axis, rad; crop: its body in the sensor's coordinates;
-    intensity_max: see wire.messages.to_frame."""
+    intensity_max: the value of a full reflection, 0 as the recording has it."""
 
     height: float | None = None
     roll: float = 0.0
@@ -48,7 +48,7 @@ def levelled(frame: Frame, robot: Robot, poses: Poses | None = None) -> Frame:
     def read() -> tuple[np.ndarray, LidarFrame]:
         """indices of the points that are kept, and these."""
         message = frame.native()
-        scan, indices = to_frame(message, robot.intensity_max)
+        scan, indices = to_frame(message, robot.intensity_max or frame.intensity_max())
         kept, scan = cropped(scan, robot.crop, level=level)
         if poses is not None:
             scan = moved_to_stamp(message, scan, indices.take(kept), poses)

@@ -18,6 +18,7 @@ from lidar_perception.data.kitti.folder import (
     load_velodyne,
     number_of,
     read_velodyne,
+    velodyne_scale,
 )
 from lidar_perception.data.kitti.write import numbers, write_velodyne
 from lidar_perception.data.records import read_records
@@ -50,6 +51,7 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     if not sequences:
         raise InputError(f"{path} has no SemanticKITTI scans: expected "
                          "sequences/00/velodyne/*.bin beside sequences/00/labels/*.label")
+    scale = velodyne_scale([scan for _, files in sequences for scan in files])
     frames: list[Frame] = []
     for sequence, files in sequences:
         if not (sequence / "labels").is_dir():
@@ -60,10 +62,11 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
             number = number_of(scan)
             stamp = start + (number - number_of(files[0])) * PERIOD_NS
             frames.append(Frame(
-                f"{sequence.name}/{scan.stem}", stamp, partial(load_velodyne, scan, stamp),
+                f"{sequence.name}/{scan.stem}", stamp, partial(load_velodyne, scan, stamp, scale),
                 point_truth=partial(_point_truth, scan, sequence / f"labels/{scan.stem}.label"),
                 pose=partial(_pose, poses, number), sequence=sequence.name, index=number,
-                points=scan, native=sequence / "poses.txt"))
+                points=scan, intensity_max=scale,
+                native=sequence / "poses.txt"))
     if not frames:
         raise InputError(f"{path} has scans but no labels: expected "
                          "sequences/00/labels/*.label; download the labels of SemanticKITTI too")

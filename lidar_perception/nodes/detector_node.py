@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
-from lidar_perception.detectors.contract import Found
+from lidar_perception.detectors.contract import Found, joined
 from lidar_perception.detectors.params import NetworkParams
 from lidar_perception.nodes.main import one_at_a_time
 from lidar_perception.nodes.managed import ManagedNode
@@ -100,8 +100,9 @@ class DetectorNode(ManagedNode):
 
     def _diagnose(self, frame: LidarFrame, found: Found, params: Any,
                   untracked: str | None) -> None:
-        problem = "; ".join(filter(None, (found.problem, self.sensor.problem(frame, params),
-                                          untracked)))
+        # The detector's own problem names the intensity, too.
+        problem = joined(found.problem, self.sensor.height_problem(
+            frame, params.ground.sensor_pose), untracked)
         self.counts.update(detections=len(found.detections), device=str(self.detector.device))
         self.counts["best scores"] = " ".join(
             f"{name} {score:.2f}" for name, score in found.best.items())

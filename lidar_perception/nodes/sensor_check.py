@@ -1,4 +1,4 @@
-"""A cloud as the core takes it, and whether the parameters fit the sensor: its height, the scale of
+"""Clouds as the core takes them, and a check of the sensor's parameters: its height, the scale of
 its intensity."""
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import numpy as np
 
 from lidar_perception.ground.params import SensorPoseParams
 from lidar_perception.ground.segment import height_problem, measured_height
+from lidar_perception.intensity import StreamScale
 from lidar_perception.robot.params import CropParams
 from lidar_perception.types import LidarFrame
 from lidar_perception.wire.messages import intensity_problem, to_frame
@@ -18,13 +19,14 @@ CLOUDS = 5  # on which the height is measured
 
 
 class SensorCheck:
-    """Measures the sensor's height on the first clouds, and again when sensor_pose changes. node
-    has the parameter groups input, crop and ground."""
+    """Measures the sensor's height on the first clouds, and again when sensor_pose changes, and
+    keeps the scale of its intensity. node has the parameter groups input, crop and ground."""
 
     def __init__(self, node: Any):
         self.node = node
         self.pose: SensorPoseParams | None = None
         self.heights: list[float | None] = []
+        self.scale = StreamScale()
 
     def frame(self, msg: Any, with_intensity: bool = False) -> tuple[LidarFrame, np.ndarray, Any]:
         """The cropped and, with base_frame, levelled frame of a cloud; the indices (N,) of its
@@ -32,7 +34,8 @@ class SensorCheck:
         is read where it is asked for, or the ground method uses it."""
         params = self.node.params
         reads_intensity = with_intensity or params.ground.method == "patchwork"
-        frame, indices = to_frame(msg, params.input.intensity_max if reads_intensity else None)
+        frame, indices = to_frame(msg, params.input.intensity_max if reads_intensity else None,
+                                  self.scale)
         placing = self.node.transforms.placing(msg.header)
         params = self.node.transforms.mounted(params, placing)
         self.node.counts.pop("cropped", None)
@@ -45,9 +48,11 @@ class SensorCheck:
     def problem(self, frame: LidarFrame, params: Any) -> str | None:
         """What does not fit the parameters that frame() gave, with the remedy; None if nothing is
         known against them."""
-        return self._height_problem(frame, params.ground.sensor_pose) or intensity_problem(frame)
+        return self.height_problem(frame, params.ground.sensor_pose) or intensity_problem(frame)
 
-    def _height_problem(self, frame: LidarFrame, pose: SensorPoseParams) -> str | None:
+    def height_problem(self, frame: LidarFrame, pose: SensorPoseParams) -> str | None:
+        """Say that the sensor is mounted at another height than pose has, by the first clouds, with
+        the remedy; None if not, or not known."""
         if pose != self.pose:
             self.pose, self.heights = pose, []
         if len(self.heights) < CLOUDS:

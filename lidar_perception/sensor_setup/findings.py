@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lidar_perception.intensity import INTENSITY_FIELDS
 from lidar_perception.sensor_setup.coverage import ALWAYS, ARM
 from lidar_perception.sensor_setup.doubts import SHORTEST_TURN, SLOPE, looks_elsewhere, told_doubts
 from lidar_perception.sensor_setup.measure import FEW_SCANS, SMALL_ROOM, Measured
 from lidar_perception.sensor_setup.scans import RINGS
 from lidar_perception.sensor_setup.told import FOOTPRINT
-from lidar_perception.wire.messages import INTENSITY_FIELDS
 from lidar_perception.wire.point_times import NAMES as TIMES
 
 SURE, FAIR, DOUBTFUL = "sure", "fair", "doubtful"

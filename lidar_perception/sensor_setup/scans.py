@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lidar_perception.geometry import elevations
+from lidar_perception.intensity import INTENSITY_FIELDS, MAX_UNIT, full_scale
 from lidar_perception.types import InputError
-from lidar_perception.wire.messages import INTENSITY_FIELDS, to_frame
+from lidar_perception.wire.messages import to_frame
 from lidar_perception.wire.point_times import NAMES as TIMES
 from lidar_perception.wire.point_times import point_times
 from msg_utils.point_cloud2 import to_array
 
 # As Velodyne and Ouster, Hesai and Nebula, Livox, RoboSense and others call the number of the beam.
 RINGS = ("ring", "channel", "line", "laser_id", "laser_number", "row")
-SCALES = (1.0, 100.0, 255.0, 65535.0)  # what drivers mean by a full reflection
 FAR = 250.0         # metres; a cloud whose middle range is farther is in millimetres, or far from
 TOGETHER = 200.0    # its origin: if half of its points are so near to their own middle
 FLAT = 1.0          # degrees: a sensor whose returns are within this sees in one plane
@@ -104,10 +104,13 @@ def _column(points: np.ndarray, indices: np.ndarray, names: Sequence[str],
 
 
 class Intensity(NamedTuple):
-    """Of all scans together. full: the value of a full reflection, one of SCALES, or the greatest
-    value where none fits; sure: whether it is told from the values; whole: only whole numbers;
-    zeros, bright: shares of the returns with 0, and from RETROREFLECTOR of full on; quantiles
-    (101,) and histogram (51,) over 0 .. full."""
+    """Intensities of all scans together.
+
+    full: the value of a full reflection, see intensity.full_scale, or the greatest value where that
+    is far beyond; sure: whether the values show it; whole: only whole numbers; zeros, bright:
+    shares of the returns with 0, and from RETROREFLECTOR of full on; quantiles (101,) and histogram
+    (51,) over 0 .. full.
+    """
 
     full: float
     sure: bool
@@ -129,11 +132,10 @@ def intensity_of(scans: Sequence[Scan]) -> Intensity | None:
     greatest = float(values.max())
     some = values[::max(1, len(values) // 10_000)]  # of all scans: one may begin with zeros
     whole = bool((some == np.round(some)).all())
-    # Whole numbers up to 1 are of no known driver; the next scale above the greatest value fits.
-    full = next((scale for scale in SCALES if greatest <= scale * 1.001
-                 and not (whole and scale <= 1.0)), greatest)
-    if whole and full == 100.0:
-        full = 255.0  # Velodyne: diffuse surfaces up to 100, retroreflectors beyond
+    # Whole numbers that end at 1, as floats, are of no known driver: they count as integers.
+    full = full_scale(values, np.int64 if whole else values.dtype)
+    if greatest > MAX_UNIT * full:
+        full = greatest
     bright = float((values >= RETROREFLECTOR * full).mean())
     return Intensity(full, full <= 1.0 or greatest > 0.5 * full, whole, greatest,
                      float((values == 0).mean()), bright,

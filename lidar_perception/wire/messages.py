@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 from scipy.spatial.transform import Rotation
 
 from lidar_perception.camera import Calibration, Camera
 from lidar_perception.classes import CALLED
 from lidar_perception.groups import renumbered
+from lidar_perception.intensity import INTENSITY_FIELDS, full_scale, scale_problem, to_unit
 from lidar_perception.robot import poses
 from lidar_perception.types import (
     CLASSES,
@@ -27,17 +29,16 @@ from msg_utils.point_cloud2 import CloudError, columns, from_array, to_array, xy
 from msg_utils.stamps import to_ns
 
 MAX_ID = 2**31  # a marker's id is an int32
-FLOAT_SCALES = ((1.5, 1.0), (255.0, 255.0), (np.inf, 65535.0))  # up to here: a full reflection
-DARK, MANY = 0.05, 1000  # no intensity of so many points beyond this: the scale is another one
-INTENSITY_FIELDS = ("intensity", "reflectivity", "i")  # the first that the cloud has
+FullScale = Callable[[np.ndarray, DTypeLike], float]  # see intensity.full_scale
 
 
-def to_frame(msg: Any, intensity_max: float | None = None) -> tuple[LidarFrame, np.ndarray]:
-    """The usable points of a PointCloud2 and their indices (N,) in the cloud; if the cloud has a
-    column in_view, only the points where it is not 0. InputError for a broken cloud.
+def to_frame(msg: Any, intensity_max: float | None = None,
+             scale: FullScale = full_scale) -> tuple[LidarFrame, np.ndarray]:
+    """Return the usable points of a PointCloud2 and their indices (N,) in the cloud; if the cloud
+    has a column in_view, only the points where it is not 0. InputError for a broken cloud.
 
-    intensity_max: the value that means 1; 0 takes the largest value of an integer field, and of a
-    float field 1, 255 or 65535, by the greatest value in it; None does not read intensity.
+    intensity_max: the value of a full reflection; 0: what scale says; None: intensity is not read.
+    scale: infers it; full_scale looks at this cloud alone, a StreamScale at those before it, too.
     """
     try:
         points = to_array(msg)
@@ -46,7 +47,7 @@ def to_frame(msg: Any, intensity_max: float | None = None) -> tuple[LidarFrame, 
             indices = np.flatnonzero(_single(points, "in_view"))
             points = points.take(indices)
         coordinates = xyz(points)
-        intensity = None if intensity_max is None else _intensity(points, intensity_max)
+        intensity = None if intensity_max is None else _intensity(points, intensity_max, scale)
     except CloudError as error:
         raise InputError(str(error)) from None
     usable = usable_returns(coordinates)
@@ -59,40 +60,38 @@ def to_frame(msg: Any, intensity_max: float | None = None) -> tuple[LidarFrame, 
     return frame, np.arange(len(points)) if indices is None else indices
 
 
-def _intensity(points: np.ndarray, full: float) -> np.ndarray | None:
-    """(N,) float32, 1 where the field has the value `full`, 0 where it is not finite; None without
-    such a field."""
-    name = next((n for n in INTENSITY_FIELDS if n in (points.dtype.names or ())), None)
-    if name is None:
+def _intensity(points: np.ndarray, full: float, scale: FullScale) -> np.ndarray | None:
+    """(N,) float32, see intensity.to_unit; None without such a field."""
+    if (raw := _raw_intensity(points)) is None:
         return None
-    values = columns(points, (name,))[:, 0]
-    if not (finite := np.isfinite(values)).all():
-        values = np.where(finite, values, np.float32(0))
-    if full == 0.0:
-        kind = points.dtype[name]
-        full = np.iinfo(kind).max if kind.kind in "iu" else _scale_of(values)
-    return values / np.float32(full)
+    values, kind = raw
+    return to_unit(values, full or scale(values, kind))
 
 
-def _scale_of(values: np.ndarray) -> float:
-    """What a full reflection is in a float field with these finite values (N,)."""
-    greatest = values.max(initial=0.0)
-    return next((scale for most, scale in FLOAT_SCALES if greatest <= most), FLOAT_SCALES[-1][1])
+def _raw_intensity(points: np.ndarray) -> tuple[np.ndarray, np.dtype] | None:
+    name = next((n for n in INTENSITY_FIELDS if n in (points.dtype.names or ())), None)
+    return None if name is None else (columns(points, (name,))[:, 0], points.dtype[name])
+
+
+def raw_intensity(msg: Any) -> tuple[np.ndarray, np.dtype] | None:
+    """Return the intensities (N,) float32 of all points of a PointCloud2 as the driver wrote them,
+    and their type in the message; None without such a field. InputError for a broken cloud."""
+    try:
+        return _raw_intensity(to_array(msg))
+    except CloudError as error:
+        raise InputError(str(error)) from None
 
 
 def intensity_problem(frame: LidarFrame) -> str | None:
-    """What is wrong with the scale of the intensity, with the remedy; None if nothing is."""
-    largest = 0.0 if frame.intensity is None else float(frame.intensity.max(initial=0.0))
-    if largest <= 1.5 and (largest == 0.0 or largest >= DARK or len(frame) < MANY):
-        return None
-    return (f"intensity goes up to {largest:.2g} where 1 is expected; set input.intensity_max to "
-            "what a full reflection is (1 or 255 for most drivers; setup measures it)")
+    """Return the scale_problem() of a frame's intensity."""
+    return scale_problem(frame.intensity)
 
 
-def recorded_intensity_problem(source: Any, frame: LidarFrame) -> str | None:
-    """intensity_problem of a frame of a recording, the source."""
-    problem = intensity_problem(frame)
-    return problem and f"{source}: {problem}, and use convert --robot"
+def recorded_intensity_problem(source: Any, clouds: Sequence[LidarFrame]) -> str | None:
+    """Return the scale_problem() of some clouds of a recording, the source, all together."""
+    found = [cloud.intensity for cloud in clouds if cloud.intensity is not None]
+    problem = scale_problem(np.concatenate(found)) if found else None
+    return problem and f"{source}: {problem}; a bag or cloud files need convert --robot then"
 
 
 def spread(values: np.ndarray | int, indices: np.ndarray, msg: Any, dtype: str) -> np.ndarray:

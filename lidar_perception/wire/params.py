@@ -13,8 +13,8 @@ class InputParams(Params):
 
     intensity_max: float = param(
         0.0, "The intensity of a full reflection: 1 for KITTI, 255 for Velodyne and nuScenes. 0: "
-        "the largest value of the type for integer fields; for float fields 1, 255 or 65535, "
-        "whichever fits the greatest value of the cloud.",
+        "255 for fields of 8 bits; otherwise, by the values of all clouds so far, the least that "
+        "holds them of 1 (floats), 100 (floats with fractions), 255, 1023, 4095 and 65535.",
         low=0.0, high=1e9)
 
 

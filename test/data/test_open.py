@@ -229,10 +229,11 @@ def test_unusable_returns_go_from_all_columns_alike(tmp_path):
     assert frame.xyz.dtype == np.float32 and frame.xyz.flags.c_contiguous
     assert np.array_equal(before[0], xyz, equal_nan=True) and np.array_equal(before[1], intensity)
     assert LidarFrame.of(xyz).intensity is None and len(LidarFrame.of(xyz[:0])) == 0
-    write_scan(tmp_path / "sequences/00", 0, np.column_stack([xyz, intensity]),
+    unit = intensity / np.float32(len(xyz))
+    write_scan(tmp_path / "sequences/00", 0, np.column_stack([xyz, unit]),
                np.arange(len(xyz)), np.arange(len(xyz)))
     read, = open_recording(tmp_path)
-    assert np.array_equal(read.load().intensity, read.point_truth().classes)
+    assert np.array_equal(read.load().intensity, unit[read.point_truth().classes])
     assert np.array_equal(read.point_truth().instances, kept)
 
 

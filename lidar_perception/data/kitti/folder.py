@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import BOXES, CAMERA, Frame, Recording
 from lidar_perception.data.kitti.calibration import read_calibration
 from lidar_perception.data.kitti.labels import read_object_labels, read_tracking_labels
+from lidar_perception.data.recorded_scale import recorded_scale
 from lidar_perception.data.records import read_records
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import GroundTruth, InputError, LidarFrame
@@ -30,10 +31,15 @@ def read_velodyne(path: Path) -> np.ndarray:
     return read_records(path, "x y z reflectance")
 
 
-def load_velodyne(path: Path, stamp_ns: int) -> LidarFrame:
-    """The usable points of a .bin file."""
-    cloud = read_velodyne(path)
-    return LidarFrame.of(cloud[:, :3], cloud[:, 3].copy(), stamp_ns, LIDAR_FRAME)
+def load_velodyne(path: Path, stamp_ns: int, scale: Callable[[], float]) -> LidarFrame:
+    """Return the usable points of a .bin file; scale() is the value of a full reflection."""
+    return LidarFrame.of(read_velodyne(path), None, stamp_ns, LIDAR_FRAME, scale())
+
+
+def velodyne_scale(scans: Sequence[Path]) -> Callable[[], float]:
+    """Return the recorded_scale() of .bin files: 1 for KITTI's; own recordings in its layout may
+    have another one."""
+    return recorded_scale(scans, lambda path: (read_velodyne(path)[:, 3], np.dtype(np.float32)))
 
 
 def recognises(path: Path) -> bool:
@@ -87,16 +93,16 @@ def _object(folder: Path, scans: bool) -> list[Frame]:
     files = {} if scans else {p.stem: folder / f"velodyne/{p.stem}.bin"
                               for p in folder.glob("label_2/*.txt")}
     files |= {p.stem: p for name in SCANS for p in folder.glob(f"{name}/*.bin")}
-    frames = []
+    frames, scale = [], velodyne_scale([points for _, points in sorted(files.items())])
     for i, (name, points) in enumerate(sorted(files.items())):
         image, label = folder / f"image_2/{name}.png", folder / f"label_2/{name}.txt"
         calib = folder / f"calib/{name}.txt"
         calibration = functools.cache(partial(read_calibration, calib, image))
         stamp = START_NS + i * PERIOD_NS
-        frames.append(Frame(name, stamp, partial(load_velodyne, points, stamp),
+        frames.append(Frame(name, stamp, partial(load_velodyne, points, stamp, scale),
                             partial(_object_truth, label, calibration), calibration=calibration,
                             index=i, points=points, image=image,
-                            files=(points, label, calib)))
+                            intensity_max=scale, files=(points, label, calib)))
     return frames
 
 
@@ -106,9 +112,10 @@ def _object_truth(label: Path, calibration: Callable[[], Calibration]) -> Ground
 
 def _tracking(folder: Path) -> list[Frame]:
     frames, start = [], START_NS
-    drives = {drive.name: drive for name in SCANS for drive in sorted(folder.glob(f"{name}/*/"))}
-    for name, drive in sorted(drives.items()):
-        scans = sorted(drive.glob("*.bin"))
+    drives = {drive.name: sorted(drive.glob("*.bin")) for name in SCANS
+              for drive in sorted(folder.glob(f"{name}/*/"))}
+    scale = velodyne_scale([scan for _, scans in sorted(drives.items()) for scan in scans])
+    for name, scans in sorted(drives.items()):
         images = folder / "image_02" / name
         calib, label = folder / f"calib/{name}.txt", folder / f"label_02/{name}.txt"
         calibration = functools.cache(partial(
@@ -118,10 +125,11 @@ def _tracking(folder: Path) -> list[Frame]:
             number = number_of(points)
             stamp = start + (number - number_of(scans[0])) * PERIOD_NS
             frames.append(Frame(f"{name}/{points.stem}", stamp,
-                                partial(load_velodyne, points, stamp), partial(truth, number),
-                                calibration=calibration, sequence=name, index=number,
-                                points=points, image=images / f"{points.stem}.png",
-                                files=(points, label, calib)))
+                                partial(load_velodyne, points, stamp, scale),
+                                partial(truth, number), calibration=calibration,
+                                sequence=name, index=number, points=points,
+                                image=images / f"{points.stem}.png",
+                                intensity_max=scale, files=(points, label, calib)))
         start = frames[-1].stamp_ns + GAP_NS if frames else start
     return frames
 

@@ -4,12 +4,12 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 
-from lidar_perception.data.cloud_files import SUFFIXES, is_cloud, load_points
+from lidar_perception.data.cloud_files import SUFFIXES, cloud_scale, is_cloud, load_points
 from lidar_perception.data.frame import BOXES, CAMERA, Frame, Recording, nothing
 from lidar_perception.data.kitti.calibration import RAW_CALIB, read_raw_calibration
 from lidar_perception.data.kitti.folder import (
@@ -44,8 +44,9 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     frames: list[Frame] = []
     labelled = calibrated = False
     timed = True
-    for drive in drives_of(path.absolute()):
-        files = scans_of(drive)
+    drives = {drive: scans_of(drive) for drive in drives_of(path.absolute())}
+    scale = cloud_scale([file for files in drives.values() for file in files])
+    for drive, files in drives.items():
         labels = drive / TRACKLETS
         truth = truth_by_number(labels, read_tracklets)
         calibration_files = [drive.parent / name for name in RAW_CALIB]
@@ -58,10 +59,10 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
         for i, (file, number) in enumerate(zip(files, own)):
             stamp = stamps[i] if stamps else start + (number - own[0]) * PERIOD_NS
             frames.append(Frame(
-                f"{drive.name}/{file.stem}", stamp, partial(load_scan, file, stamp),
+                f"{drive.name}/{file.stem}", stamp, partial(load_scan, file, stamp, scale),
                 partial(truth, number), calibration=calibration, sequence=drive.name, index=number,
                 points=file, image=drive / f"image_02/data/{file.stem}.png",
-                files=(file, labels, *calibration_files), native=drive))
+                files=(file, labels, *calibration_files), native=drive, intensity_max=scale))
         labelled = labelled or labels.exists()
         calibrated, timed = calibrated or has_camera, timed and bool(stamps)
     if not frames:
@@ -77,11 +78,11 @@ def scans_of(drive: Path) -> list[Path]:
     return [file for _, file in sorted(files.items())]
 
 
-def load_scan(file: Path, stamp_ns: int) -> LidarFrame:
-    """Read the usable points of a scan."""
+def load_scan(file: Path, stamp_ns: int, scale: Callable[[], float]) -> LidarFrame:
+    """Read the usable points of a scan; scale() is the intensity of a full reflection."""
     if file.suffix.lower() == ".bin":
-        return load_velodyne(file, stamp_ns)
-    return load_points(file, stamp_ns, LIDAR_FRAME)
+        return load_velodyne(file, stamp_ns, scale)
+    return load_points(file, stamp_ns, LIDAR_FRAME, scale=scale)
 
 
 def _numbers(drive: Path, files: Sequence[Path]) -> list[int]:

@@ -20,6 +20,7 @@ from lidar_perception.data.nuscenes.boxes import matrices
 from lidar_perception.data.nuscenes.labels import NuscenesLabels, read_labels
 from lidar_perception.data.nuscenes.tables import Tables
 from lidar_perception.data.records import read_records
+from lidar_perception.intensity import to_unit
 from lidar_perception.types import GroundTruth, InputError, LidarFrame, usable_returns
 from lidar_perception.wire.topics import LIDAR_FRAME
 
@@ -48,7 +49,7 @@ def load_sweep(path: Path, turn: np.ndarray, stamp_ns: int) -> LidarFrame:
     away = (np.abs(cloud[:, :2]) >= OWN_VEHICLE).any(axis=1)
     cloud = cloud.compress(away & usable_returns(cloud[:, :3]), axis=0)
     xyz = (cloud[:, :3].astype(np.float64) @ turn.T).astype(np.float32)
-    return LidarFrame(np.ascontiguousarray(xyz), cloud[:, 3] / np.float32(FULL_REFLECTION),
+    return LidarFrame(np.ascontiguousarray(xyz), to_unit(cloud[:, 3], FULL_REFLECTION),
                       stamp_ns, LIDAR_FRAME)
 
 

@@ -1,0 +1,144 @@
+"""The intensity of every source is read in one scale, the same for all frames, in any order."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from bag_samples import cloud_frame
+from cli_samples import exit_of
+from samples import STAMP, calibration_text, write
+
+from lidar_perception.data.bag import BagWriter
+from lidar_perception.data.frame import Frame
+from lidar_perception.data.levelled import Robot, levelled
+from lidar_perception.data.open import open_recording
+from lidar_perception.data.semantickitti import write_scan
+from lidar_perception.data.to_bag import write_bag
+from lidar_perception.wire.codec import bag_message
+from msg_utils.point_cloud2 import from_array
+from msg_utils.stamps import header_message
+
+COUNT = 5
+
+
+def clouds(full, whole=False):
+    """Frames of (50, 4) [x y z intensity], the first of them dark, of a sensor with this scale."""
+    rng = np.random.default_rng(0)
+    for i in range(COUNT):
+        cloud = rng.uniform([3, -9, -1, 0], [30, 9, 1, 1], (50, 4))
+        cloud[0, 3] = 1.0
+        cloud[:, 3] *= full if i else min(1.2, full)
+        cloud[:, 3] = np.round(cloud[:, 3]) if whole else cloud[:, 3]
+        yield i, cloud.astype(np.float32)
+
+
+def object_files(root, clouds):
+    for i, cloud in clouds:
+        write(root / f"training/velodyne/{i:06}.bin", cloud.tobytes())
+        write(root / f"training/calib/{i:06}.txt", calibration_text())
+
+
+def tracking_files(root, clouds):
+    for i, cloud in clouds:
+        write(root / f"training/velodyne/{i // 3:04}/{i:06}.bin", cloud.tobytes())
+        write(root / f"training/calib/{i // 3:04}.txt", calibration_text())
+    (root / "training/label_02").mkdir()
+
+
+def raw_files(root, clouds):
+    drive = root / "2011_09_26/2011_09_26_drive_0001_sync/velodyne_points"
+    for i, cloud in clouds:
+        write(drive / f"data/{i:010}.bin", cloud.tobytes())
+    write(drive / "timestamps.txt", "".join(f"2011-09-26 13:02:2{i}.0\n" for i in range(COUNT)))
+
+
+def semantic_files(root, clouds):
+    for i, cloud in clouds:
+        write_scan(root / "sequences/00", i, cloud, np.zeros(50), np.zeros(50))
+
+
+def bin_files(root, clouds):
+    for i, cloud in clouds:
+        write(root / f"{i}.bin", cloud.tobytes())
+
+
+def npy_files(root, clouds):
+    for i, cloud in clouds:
+        np.save(root / f"{i}.npy", cloud)
+
+
+def pcd_files(root, clouds):
+    for i, cloud in clouds:
+        write(root / f"{i}.pcd", (
+            b"VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+            b"WIDTH 50\nHEIGHT 1\nPOINTS 50\nDATA binary\n") + cloud.tobytes())
+
+
+def bag(root, clouds):
+    write_bag(root / "drive", [Frame.of(str(i), cloud_frame(cloud, STAMP + i * 10**8))
+                               for i, cloud in clouds])
+
+
+LAYOUTS = {each.__name__: each for each in (object_files, tracking_files, raw_files, semantic_files,
+                                            bin_files, npy_files, pcd_files, bag)}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("full, whole", [(1, False), (100, False), (255, False), (255, True),
+                                         (1023, True), (65535, True)])
+def test_all_frames_are_read_in_one_scale_in_any_order(tmp_path, layout, full, whole):
+    LAYOUTS[layout](tmp_path, clouds(full, whole))
+    path = tmp_path / "drive" if layout == "bag" else tmp_path
+    expected = [cloud[:, 3] / np.float32(full) for _, cloud in clouds(full, whole)]
+    for order in (range(COUNT), [COUNT - 1, 0, 2, 1, 3]):
+        frames = open_recording(path).frames
+        for i in order:
+            scan = frames[i].load()
+            assert scan.intensity.tobytes() == expected[i].tobytes()
+            assert frames[i].intensity_max() == full
+    assert np.array_equal(next(iter(open_recording(path))).load().intensity, expected[0])
+    if layout in ("bin_files", "pcd_files", "bag"):  # as convert --robot reads them
+        assert np.array_equal(levelled(frames[0], Robot()).load().intensity, expected[0])
+        given = levelled(frames[0], Robot(intensity_max=10.0)).load().intensity
+        assert np.allclose(given, expected[0] * full / 10)
+
+
+@pytest.mark.parametrize("kind, values, full", [
+    ("u1", [0, 3, 90], 255), ("<u2", [0, 3, 200], 255), ("<u2", [0, 3, 3000], 4095),
+    ("<u2", [0, 3, 60000], 65535), ("<f4", [np.nan, -1, 0.5], 1), ("<f4", [0, 0, 0], 1),
+    ("<f8", [7, 7, 7], 255)])
+def test_the_type_of_a_recorded_field_counts(tmp_path, kind, values, full):
+    points = np.ones(3, [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("reflectivity", kind)])
+    points["reflectivity"] = values
+    with BagWriter(tmp_path / "drive") as writer:
+        writer.add_topic("/points", "sensor_msgs/msg/PointCloud2")
+        for i in (1, 2):
+            stamped = header_message(i * 10**8, "lidar", bag_message)
+            writer.write("/points", i * 10**8, from_array(points, stamped, bag_message))
+    expected = np.where(np.asarray(values, float) > 0, values, 0).astype(np.float32)
+    for frame in open_recording(tmp_path / "drive"):
+        assert np.array_equal(frame.load().intensity, expected / np.float32(full))
+
+
+def test_a_broken_cloud_does_not_decide_on_the_scale(tmp_path):
+    object_files(tmp_path, clouds(255))
+    write(tmp_path / "training/velodyne/000004.bin", b"cut")
+    frames = open_recording(tmp_path).frames
+    assert frames[1].load().intensity.max() == 1.0
+    (tmp_path / "training/velodyne/000003.bin").unlink()
+    assert frames[0].load().intensity.max() == np.float32(1.2) / np.float32(255)
+
+
+def test_commands_say_the_scale_and_export_0_to_1(tmp_path, monkeypatch, capfd):
+    object_files(tmp_path / "own", clouds(255))
+    assert exit_of(monkeypatch, "convert", tmp_path / "own", "--out", tmp_path / "own.bag") == 0
+    assert "its intensity is 0 .. 255, read as 0 .. 1" in capfd.readouterr().err
+    assert open_recording(tmp_path / "own.bag").frames[1].load().intensity.max() == 1.0
+    assert exit_of(monkeypatch, "info", tmp_path / "own") == 0
+    assert "which is 255 in the files" in " ".join(capfd.readouterr().out.split())
+    dark = np.tile(next(clouds(0.01))[1], (30, 1))
+    object_files(tmp_path / "dark", [(0, dark)])
+    assert exit_of(monkeypatch, "convert", tmp_path / "dark", "--out", tmp_path / "dark.bag") == 0
+    said = " ".join(capfd.readouterr().err.split())
+    assert "intensity goes up to 0.01 where 1 is" in said and "input.intensity_max" in said
+
