@@ -16,6 +16,7 @@ from lidar_perception.data.kitti.labels import DONT_CARE
 from lidar_perception.geometry import box_corners
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
 from lidar_perception.labels.exchange import FORMATS, export_labels, import_labels, recognised
+from lidar_perception.types import InputError
 
 BOX = np.array([10.0, 5.0, -1.0, 4.0, 1.8, 1.5, 2.0])  # length, width, height, and to the left
 HEADING = np.array([math.cos(2.0), math.sin(2.0), 0.0])
@@ -196,3 +197,98 @@ def test_a_name_of_a_track_goes_to_one_of_the_parts_it_is_split_into(format, key
     after = import_labels(tmp_path / "out", format, frames).frames[0]
     assert sorted(after.track_ids.tolist()) == [8, 9]  # the name has the number behind
     assert [e.get(key) for e in after.extra if e] == [name]
+
+
+# Axes of coordinate systems as columns in the LiDAR's, and the sizes along them of a box 4 x 1.8 x
+# 1.5; the turn is about the axis that is vertical.
+AXES = {
+    "camera": (((0, 0, 1), (-1, 0, 0), (0, -1, 0)), (4.0, 1.5, 1.8)),
+    "y up": (((0, 0, -1), (-1, 0, 0), (0, 1, 0)), (4.0, 1.5, 1.8)),
+    "z down": (((1, 0, 0), (0, -1, 0), (0, 0, -1)), (4.0, 1.8, 1.5)),
+    "x up": (((0, 1, 0), (0, 0, 1), (1, 0, 0)), (1.5, 4.0, 1.8)),
+    "z up, y ahead": (((0, 1, 0), (-1, 0, 0), (0, 0, 1)), (4.0, 1.8, 1.5)),
+}
+
+
+def openlabel(path, systems, objects, types):
+    content = {"metadata": {"schema_version": "1.0.0"}, "coordinate_systems": systems,
+               "objects": {uid: {"name": uid, "type": kind} for uid, kind in types.items()},
+               "frames": {"5": {"objects": {uid: {"object_data": data}
+                                            for uid, data in objects.items()}}}}
+    path.write_bytes(b"\xef\xbb\xbf" + json.dumps({"openlabel": content}).encode())
+    return path
+
+
+def systems_of(axes, name="CAM_LEFT"):
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = axes, [0.27, 0.1, -0.08]
+    return pose, {"VELO_TOP": {"type": "sensor_cs", "parent": ""},
+                  name: {"type": "sensor_cs", "parent": "VELO_TOP",
+                         "pose_wrt_parent": {"matrix4x4": pose.ravel().tolist()}}}
+
+
+@pytest.mark.parametrize("numbers", ["euler", "quaternion"])
+@pytest.mark.parametrize("case", AXES)
+@pytest.mark.parametrize("turn", [0.0, 0.7, -2.9])
+def test_a_cuboid_in_other_axes_keeps_its_length_width_and_height(tmp_path, case, numbers, turn):
+    axes, sizes = AXES[case]
+    pose, systems = systems_of(axes)
+    angles = turn * np.abs(pose[2, :3])  # about the vertical axis
+    rotation = Rotation.from_euler("xyz", angles)
+    at = [0.5, 0.9, 12.0]
+    shape = rotation.as_quat().tolist() if numbers == "quaternion" else angles.tolist()
+    frames = frames_one()
+    labels = import_labels(openlabel(
+        tmp_path / "o.json", systems, {"1": {"cuboid": [{
+            "name": "b", "coordinate_system": "CAM_LEFT", "val": [*at, *shape, *sizes]}]}},
+        {"1": "CAR"}), "openlabel", frames).frames[0]
+    box, = labels.boxes
+    np.testing.assert_allclose(box[3:6], [4.0, 1.8, 1.5])
+    whole = pose[:3, :3] @ rotation.as_matrix()
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) / 2
+    near(box_corners(box[None])[0], pose[:3, 3] + (pose[:3, :3] @ at)
+         + corners * sizes @ whole.T)
+    assert labels.class_names == ["Car"]
+
+
+def test_a_camera_without_a_lidar_is_placed_by_the_calibration_of_the_drive(tmp_path):
+    frames = frames_one()
+    path = openlabel(tmp_path / "o.json", {"CAM_LEFT": {"type": "sensor_cs", "parent": ""}},
+                     {"1": {"cuboid": [{"name": "b", "coordinate_system": "CAM_LEFT",
+                                        "val": [0, 0.9, 12, 0, 0, 0, 3.9, 1.5, 1.6]}]}},
+                     {"1": "Car"})
+    box, = import_labels(path, "openlabel", frames).frames[0].boxes
+    np.testing.assert_allclose(CALIBRATION.lidar_to_camera[:3, :3] @ box[:3]
+                               + CALIBRATION.lidar_to_camera[:3, 3], [0, 0.9, 12], atol=1e-9)
+    assert box[3:6].tolist() == [3.9, 1.6, 1.5]
+    with pytest.raises(InputError, match="does not define the coordinate system 'lidar'"):
+        import_labels(path, "openlabel", drive("one", frames=1, camera=False))
+
+
+def test_regions_of_openlabel_stay_regions(tmp_path):
+    _, systems = systems_of(AXES["camera"][0])
+    frames = frames_one()
+    nowhere = {"name": "box3D", "coordinate_system": "CAM_LEFT",
+               "val": [-10, 499, -1, 0, -1, 0, -1000, -1000, -1000]}
+    data = {"cuboid": [nowhere], "num": [{"name": "occluded", "val": -1}],
+            "bbox": [{"name": "a", "coordinate_system": "CAM_LEFT", "val": [700, 190, 40, 16]},
+                     {"name": "b", "coordinate_system": "CAM_LEFT", "val": [100, 200, 10, 20]},
+                     {"name": "c", "coordinate_system": "CAM_RIGHT", "val": [1, 1, 1, 1]}]}
+    car = {"cuboid": [{"name": "box3D", "coordinate_system": "CAM_LEFT",
+                       "val": [0, 0.9, 12, 0, 0, 0, 3.9, 1.5, 1.6]}]}
+    path = openlabel(tmp_path / "o.json", systems, {"1": car, "-1": data},
+                     {"1": "car", "-1": "dontcare"})
+    labels = import_labels(path, "openlabel", frames)
+    assert labels.frames[0].class_names == ["Car"]
+    assert [(name, note["bbox"]) for name, note in labels.frames[0].notes] == [
+        ("DontCare", [680, 182, 720, 198]), ("DontCare", [95, 190, 105, 210])]
+    export_labels(labels, "kitti_object", tmp_path / "kitti", frames)
+    lines = (tmp_path / "kitti/000005.txt").read_text().splitlines()
+    assert lines[1:] == [
+        f"DontCare -1 -1 -10 {bbox} -1 -1 -1 -1000 -1000 -1000 -10"
+        for bbox in ("680.00 182.00 720.00 198.00", "95.00 190.00 105.00 210.00")]
+    export_labels(labels, "openlabel", tmp_path / "again.json", frames)
+    again = json.loads((tmp_path / "again.json").read_text())["openlabel"]
+    assert again["frames"]["5"]["objects"] == {"1": {"object_data": car},
+                                               "-1": {"object_data": data}}
+    assert [o["type"] for o in again["objects"].values()] == ["car", "dontcare"]

@@ -16,7 +16,9 @@ from typing import Any
 
 import numpy as np
 
+from lidar_perception.classes import class_name
 from lidar_perception.data.frame import Frame
+from lidar_perception.data.kitti.labels import COLUMNS, DONT_CARE
 from lidar_perception.labels.drive_labels import (
     NO_TRACK,
     DriveLabels,
@@ -44,6 +46,8 @@ SUFFIX, ROOT = ".json", "openlabel"
 # its object; a cuboid that is kept as it is while nobody moves it.
 SCORE, TRACKED, TYPE = "confidence", "tracked", "type"
 UID, OTHER, OBJECT = "uid", "openlabel_attributes", "openlabel_data"
+REGION = "openlabel_region"  # data of an object whose 2D boxes are notes with KITTI's columns
+REGION_CLASS = "DontCare"
 PROPERTIES = "frame_properties"
 KEPT, DATA, CUBOIDS = "openlabel_cuboid", "object_data", "cuboid"
 
@@ -83,9 +87,15 @@ def _read_drive(path: Path, frames: list[Frame],
         notes: list[tuple[str, dict[str, Any]]] = []
         for uid, element in here.get("objects", {}).items():
             data = dict(element.get(DATA, {}))
-            kind = str(objects.get(uid, {}).get("type", ""))
+            kind = class_name(str(objects.get(uid, {}).get("type", "")))
             named_so = {} if str(numbers[uid]) == uid else {UID: uid}
-            cuboids = data.pop(CUBOIDS, [])
+            cuboids = [cuboid for cuboid in data.get(CUBOIDS, ())
+                       if kind != REGION_CLASS and parts.has_size(cuboid)]
+            if not cuboids:
+                notes += _regions(kind, uid, data)
+                continue
+            data[CUBOIDS] = [cuboid for cuboid in data[CUBOIDS] if cuboid not in cuboids]
+            data = {key: items for key, items in data.items() if items}
             for k, cuboid in enumerate(cuboids):
                 system = cuboid.get("coordinate_system", "")
                 box, upright = parts.box_of(cuboid["val"], parts.to_lidar(
@@ -94,10 +104,6 @@ def _read_drive(path: Path, frames: list[Frame],
                              {**named_so, **({OBJECT: data} if data and k == 0 else {}),
                               **_rest(cuboid, box, upright and system in (
                                   "", parts.lidar_of(systems, where)))}))
-            if not cuboids:
-                values, rest = parts.from_named(data)
-                notes.append((kind, {**values, **({OBJECT: rest} if rest else {}),
-                                     **({} if values else {UID: uid})}))
         found.append(of_rows(frame, rows, notes, f"{where}, frame {frame.index}"))
     return found, {**content, "frames": {
         number: {**{key: value for key, value in frame.items() if key != "objects"},
@@ -105,10 +111,21 @@ def _read_drive(path: Path, frames: list[Frame],
         for number, frame in said.items()}}
 
 
+def _regions(kind: str, uid: str, data: dict[str, Any]) -> list[tuple[str, dict[str, Any]]]:
+    """Notes of an object without a box: for each of its 2D boxes one that KITTI has a line for,
+    of which the first holds the data; without a 2D box one of the data."""
+    values, rest = parts.from_named(data)
+    columns = {name: DONT_CARE[name] for name in COLUMNS if name in DONT_CARE}
+    notes = [(kind, {**columns, **values, "bbox": box, UID: uid, REGION: {} if k else data})
+             for k, box in enumerate(parts.regions_of(data))]
+    return notes or [(kind, {**values, **({OBJECT: rest} if rest else {}),
+                             **({} if values else {UID: uid})})]
+
+
 def _known(cuboid: dict[str, Any], kind: str, number: int) -> tuple[str, int, float]:
     """Class, track id and score."""
     values, _ = parts.from_named(cuboid.get("attributes", {}))
-    return (values.get(TYPE, kind), number if values.get(TRACKED, True) else NO_TRACK,
+    return (class_name(values.get(TYPE, kind)), number if values.get(TRACKED, True) else NO_TRACK,
             values.get(SCORE, np.nan))
 
 
@@ -152,7 +169,10 @@ def _content(labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[i
     def element(uid: str, kind: str, index: int) -> dict[str, Any]:
         """The object of this frame."""
         if uid not in seen:
-            objects[uid] = {"name": f"{kind} {uid}", **objects.get(uid, {}), "type": kind}
+            before = objects.get(uid, {})
+            same = class_name(str(before.get("type", ""))) == kind  # whatever its case is
+            objects[uid] = {"name": f"{kind} {uid}", **before,
+                            "type": before["type"] if same else kind}
         seen.setdefault(uid, []).append(index)
         return said[str(index)].setdefault("objects", {}).setdefault(uid, {DATA: {}})[DATA]
 
@@ -171,6 +191,7 @@ def _content(labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[i
         for kind, note in each.notes:
             values = {key: value for key, value in note.items() if key not in (UID, OBJECT)}
             element(str(note.get(UID, next(new))), kind, frame.index).update(
+                note[REGION] if REGION in note else
                 {**parts.named(values), **note.get(OBJECT, {})})
     for uid, numbers in seen.items():
         objects[uid]["frame_intervals"] = parts.intervals(numbers)
@@ -189,7 +210,7 @@ def _cuboid(labels: FrameLabels, k: int, kind: str, lidar: str) -> dict[str, Any
     values = {name: v for name, v in extra.items() if name not in (UID, OTHER, OBJECT, KEPT)}
     values |= {SCORE: float(labels.scores[k])} if np.isfinite(labels.scores[k]) else {}
     values |= {TRACKED: False} if labels.track_ids[k] == NO_TRACK else {}
-    values |= {TYPE: labels.class_names[k]} if labels.class_names[k] != kind else {}
+    values |= {TYPE: labels.class_names[k]} if labels.class_names[k] != class_name(kind) else {}
     attributes = parts.named(values)
     for name, items in extra.get(OTHER, {}).items():
         attributes.setdefault(name, []).extend(items)

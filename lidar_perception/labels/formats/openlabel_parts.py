@@ -28,17 +28,44 @@ def quaternion(yaw: float) -> list[float]:
 
 
 def box_of(val: Sequence[float], to_lidar: np.ndarray) -> tuple[list[float], bool]:
-    """[x y z l w h yaw] in the LiDAR's system of a cuboid's 10 numbers, or 9 with angles about x, y
-    and z, the turn about x first; and whether its z axis is up there. to_lidar (4, 4)."""
+    """Convert a cuboid to a box.
+
+    Args:
+        val: 10 numbers [x y z qx qy qz qw sx sy sz], or 9 with angles about x, y and z, the turn
+            about x first, instead of the quaternion.
+        to_lidar: (4, 4) from the cuboid's coordinate system to the LiDAR's.
+
+    Returns: [x y z l w h yaw] in the LiDAR's system, and whether the cuboid's z axis is up there.
+    The height is the size along the axis that is closest to the vertical: y in a camera's system (x
+    right, y down, z ahead). Of the other two the first is the length, as in KITTI and ISO 8855.
+    """
     if len(val) not in (9, 10):
         raise ValueError(f"a cuboid of {len(val)} numbers, where it needs 10 or 9")
     axes = to_lidar[:3, :3] @ (turned(val[3:7]) if len(val) == 10 else _turned(*val[3:6]))
     x, y, z = (to_lidar[:3, :3] @ np.array(val[:3], float) + to_lidar[:3, 3]).tolist()
+    up = 2 - int(np.abs(axes[2, ::-1]).argmax())
+    ahead, across = (axis for axis in range(3) if axis != up)
     same = np.array_equal(to_lidar, np.eye(4))
     yaw = (2 * math.atan2(val[5], val[6]) if same and len(val) == 10 and val[3] == val[4] == 0
-           else math.atan2(axes[1, 0], axes[0, 0]))
+           else math.atan2(axes[1, ahead], axes[0, ahead]))
     yaw = (yaw + math.pi) % (2 * math.pi) - math.pi if abs(yaw) > math.pi else yaw
-    return [x, y, z, *map(float, val[-3:]), yaw], bool(axes[2, 2] > 1 - LEAN)
+    sizes = [float(size) for size in val[-3:]]
+    return ([x, y, z, sizes[ahead], sizes[across], sizes[up], yaw],
+            bool(axes[2, 2] > 1 - LEAN))
+
+
+def has_size(cuboid: dict[str, Any]) -> bool:
+    """Return False for a cuboid none of whose sizes is above 0, as KITTI's DontCare has them."""
+    return not all(size <= 0 for size in cuboid["val"][-3:])
+
+
+def regions_of(data: dict[str, Any]) -> list[list[float]]:
+    """List the 2D boxes [left top right bottom] of an object's data, in pixels of the first camera
+    that is named."""
+    boxes = [box for box in data.get("bbox", ()) if len(box["val"]) == 4]
+    cameras = [box.get("coordinate_system") for box in boxes]
+    return [[x - w / 2, y - h / 2, x + w / 2, y + h / 2] for box, camera in zip(boxes, cameras)
+            if camera == cameras[0] for x, y, w, h in [map(float, box["val"])]]
 
 
 def turned(quaternion: Sequence[float]) -> np.ndarray:
@@ -55,12 +82,15 @@ def _turned(x: float, y: float, z: float) -> np.ndarray:
 
 def to_lidar(name: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame,
              where: str) -> np.ndarray:
-    """(4, 4) from the coordinate system of this name, "" for that of the LiDAR, by the poses of
-    systems and of the frame, or by the recording's own pose. InputError where no way leads
-    there."""
+    """Return (4, 4) from the coordinate system of this name, "" for that of the LiDAR, by the poses
+    of systems and of the frame, or by the recording's own pose; from a camera of a file without a
+    LiDAR by the recording's calibration. InputError where they are not connected."""
     lidar = lidar_of(systems, where)
     if name in ("", lidar):
         return np.eye(4)
+    calibration = own.calibration() if _is_camera(name) and lidar not in systems else None
+    if calibration is not None:
+        return np.linalg.inv(calibration.lidar_to_camera)
     roots = []
     for start in (name, lidar):
         place, at = np.eye(4), start
@@ -78,14 +108,19 @@ def to_lidar(name: str, systems: dict[str, Any], frame: dict[str, Any], own: Fra
 
 
 def lidar_of(systems: dict[str, Any], where: str) -> str:
-    """The name of the LiDAR's coordinate system. InputError if several may be it."""
-    sensors = [name for name, s in systems.items() if s.get("type") == "sensor_cs"]
+    """Return the name of the LiDAR's coordinate system. InputError if several may be it."""
+    sensors = [name for name, s in systems.items()
+               if s.get("type") == "sensor_cs" and not _is_camera(name)]
     like = [name for name in sensors if any(word in name.lower() for word in
                                             ("lidar", "velo", "laser"))] or sensors
     if len(like) > 1:
         raise InputError(f"{where} has several sensors that may be the LiDAR: {', '.join(like)}; "
                          f"rename the right one to {LIDAR!r}, and give the others other names")
     return like[0] if like else LIDAR
+
+
+def _is_camera(name: str) -> bool:
+    return "cam" in name.lower()
 
 
 def _pose(name: str, parent: str, systems: dict[str, Any], frame: dict[str, Any], own: Frame,
