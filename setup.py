@@ -3,16 +3,14 @@
 import os
 import re
 import subprocess
-import sys
 from glob import glob
 from pathlib import Path
 from runpy import run_path
 
-from setuptools import find_packages, setup
+from setuptools import Distribution, find_packages, setup
 
 NAME = "lidar_perception"
 ROOT = Path(__file__).resolve().parent  # colcon links setup.py elsewhere
-NODES = list(run_path("lidar_perception/nodes/__init__.py")["NODES"])
 VERSION = run_path("lidar_perception/__init__.py")["__version__"]
 
 
@@ -43,24 +41,18 @@ def project_urls(url: str) -> dict[str, str]:
     return {name: url + path for name, path in pages.items()} if url else {}
 
 
-def node_executables() -> list[str]:
-    """Copies of scripts/node under the nodes' names, for lib/lidar_perception of a pip install.
+class WithDataFiles(Distribution):
+    """Editable installs get the data files too, or ros2 run and ros2 launch would not find us.
 
-    `ros2 run` looks there and nowhere else. colcon puts the console scripts there by itself
-    (setup.cfg), but pip puts them into bin.
+    setuptools asks for `has_data` there (_run_install in setuptools/command/editable_wheel.py, 84),
+    which its own class calls has_data_files.
     """
-    if not {"bdist_wheel", "editable_wheel"} & set(sys.argv):
-        return []
-    folder = Path("build/node_executables")
-    folder.mkdir(parents=True, exist_ok=True)
-    for name in NODES:
-        script = folder / name
-        script.write_text(Path("scripts/node").read_text())
-        script.chmod(0o755)
-    return [str(folder / name) for name in NODES]
+
+    has_data = Distribution.has_data_files
 
 
 setup(
+    distclass=WithDataFiles,
     name=NAME,
     version=VERSION,
     description="LiDAR perception for ROS 2: ground, clusters, pedestrian candidates, learned "
@@ -98,7 +90,7 @@ setup(
         (f"share/{NAME}/launch", glob("launch/*.launch.py")),
         (f"share/{NAME}/config", glob("config/*.*")),
         (f"share/{NAME}/config/sensors", glob("config/sensors/*")),
-        (f"lib/{NAME}", node_executables()),
+        (f"lib/{NAME}", glob("scripts/nodes/*")),  # where ros2 run looks, and nowhere else
     ],
     install_requires=[
         "click>=8.1", "jinja2>=3.1", "matplotlib>=3.7", "lz4>=4.0", "mcap>=1.2",
@@ -119,9 +111,6 @@ setup(
         "benchmark": ["cloth-simulation-filter>=1.1.5", "dbscan>=1.0",
                       "opencv-python-headless>=4.8"],
     },
-    entry_points={"console_scripts": [
-        "lidar-perception = lidar_perception.cli.main:main",
-        *(f"{name} = lidar_perception.nodes.main:main" for name in NODES),
-    ]},
+    entry_points={"console_scripts": ["lidar-perception = lidar_perception.cli.entry:main"]},
     zip_safe=False,
 )

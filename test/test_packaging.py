@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from runpy import run_path
@@ -11,6 +12,7 @@ import pytest
 import setuptools
 
 import lidar_perception
+from lidar_perception.nodes import NODES
 
 ROOT = Path(__file__).resolve().parents[1]
 URL = "https://example.org/robots/lidar_perception"
@@ -84,3 +86,13 @@ def test_citation_names_the_three_papers():
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert len(cited["references"]) == 3
     assert all(paper["doi"].startswith("10.") for paper in cited["references"])
+
+
+def test_each_node_has_one_executable_beside_the_package(metadata):
+    """In lib, so that no `tracker` or `evaluator` of ours is on a user's path."""
+    given = metadata(URL)
+    files = dict(given["data_files"])["lib/lidar_perception"]
+    assert sorted(Path(file).name for file in files) == sorted(NODES)
+    assert all(os.access(ROOT / file, os.X_OK) for file in files)
+    assert [line.split()[0] for line in given["entry_points"]["console_scripts"]] == [
+        "lidar-perception"]

@@ -1,8 +1,8 @@
 """rclpy nodes: convert, call the core, publish. The only part of the package that needs ROS."""
 
 _BOXES, _DETECTIONS = "params.BoxNodeParams", "params.DetectionNodeParams"
-# Executable -> its class, in the module of the executable's name, and its parameters. setup.py
-# reads this table too.
+# Executable -> its class, in the module of the executable's name, and its parameters. scripts/nodes
+# has a link of each name.
 NODES = {
     "bag_player": ("BagPlayer", "params.PlayerParams"),
     "bag_recorder": ("BagRecorder", "params.RecorderParams"),

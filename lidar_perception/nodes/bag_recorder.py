@@ -26,6 +26,8 @@ class BagRecorder(LidarNode):
     """Raw bytes from DDS to the file, compressed in a thread of its own. The bag is complete when
     the node has ended."""
 
+    writes_files = True
+
     def __init__(self, **options: Any):
         super().__init__("bag_recorder", RecorderParams(), **options)
         if not self.params.bag or not self.params.topics:

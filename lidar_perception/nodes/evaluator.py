@@ -31,6 +31,8 @@ class Evaluator(LidarNode):
     header.stamp, once: a bag in a loop does not count twice. Frames that stay incomplete are
     counted as lost, never as misses."""
 
+    writes_files = True
+
     def __init__(self, **options: Any):
         super().__init__("evaluator", EvaluatorParams(), **options)
         self.inputs_of_frame = (TRUTH, *self.params.stages)

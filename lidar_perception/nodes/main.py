@@ -1,4 +1,9 @@
-"""Starts a node: signals first, then compiled code, then ROS. Every executable enters here."""
+"""Start a node: block signals first, then compile, then ROS. Every executable enters here.
+
+A thread that a library starts before the signals are blocked, such as one of NumPy's OpenBLAS,
+never blocks them, and they end the process there. So this module imports the standard library
+only, and each function its own imports.
+"""
 
 from __future__ import annotations
 
@@ -8,36 +13,27 @@ import os
 import signal
 import sys
 import tempfile
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
 
 from lidar_perception.nodes import NODES, require_rclpy
-from lidar_perception.nodes.known import misspelt, node_parameters
-from lidar_perception.nodes.shared_memory import fed_by_a_driver, use_large_shared_memory
-from lidar_perception.param_fields import described
-from lidar_perception.runs.files import refusals_named
-from lidar_perception.runs.memory import keep_freed
-from lidar_perception.runs.threads import one_thread_each
 
 if TYPE_CHECKING:
+    from lidar_perception.nodes.runtime import LidarNode
     from lidar_perception.nodes.stopping import Stop
+
+STOP_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 
 
 def help_text(name: str) -> str:
     """What --help prints: how to start the node, and its parameters."""
+    from lidar_perception.nodes.known import node_parameters
+    from lidar_perception.param_fields import described
     lines = [f"Usage: {name} --ros-args [-p PARAMETER:=VALUE] [-r FROM:=TO] [--params-file YAML]",
              "", "Parameters:"]
     return "\n".join([*lines, *described(node_parameters(name))])
-
-
-def main() -> int:
-    """The entry point of all executables of setup.py: the node is named by the program's name."""
-    return run(Path(sys.argv[0]).name.removesuffix(".exe"), sys.argv)
-
-
-STOP_SIGNALS = frozenset({signal.SIGINT, signal.SIGTERM})
 
 
 @contextmanager
@@ -51,21 +47,22 @@ def one_at_a_time():
 
 def run(name: str, arguments: list[str]) -> int:
     """Run a node until SIGINT or SIGTERM (exit code 0), or until it is done. 2: it cannot start."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+    begin = perf_counter()
+    from lidar_perception.runs.memory import keep_freed
+    from lidar_perception.runs.threads import one_thread_each
+    one_thread_each()  # or nodes that share few cores stand in each other's way
+    keep_freed()
+    from lidar_perception.nodes.stopping import Stop
+    stop = Stop(STOP_SIGNALS)
     if {"-h", "--help"} & set(arguments[1:]):
         try:
             print(help_text(name), flush=True)
         except BrokenPipeError:  # `| head`: Python shall not try again at its end
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    begin = perf_counter()
-    # Threads inherit the mask, so this comes before any library starts one; what arrives from now
-    # on waits for Stop.
-    signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
-    one_thread_each()  # or nodes that share few cores stand in each other's way
-    keep_freed()
+    from lidar_perception.nodes.shared_memory import fed_by_a_driver, use_large_shared_memory
     use_large_shared_memory(fed_by_a_driver(arguments))
-    from lidar_perception.nodes.stopping import Stop
-    stop = Stop(STOP_SIGNALS)
     from lidar_perception.types import InputError
     try:
         require_rclpy()
@@ -79,6 +76,15 @@ def run(name: str, arguments: list[str]) -> int:
     return _spin(getattr(module, NODES[name][0]), arguments, perf_counter() - begin, stop)
 
 
+def _leave(node: LidarNode) -> None:
+    """End the process beside work that goes on, such as a compilation."""
+    import rclpy
+    with suppress(Exception):
+        node.destroy_node()
+        rclpy.try_shutdown()
+    os._exit(0)
+
+
 def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) -> int:
     import rclpy
     from rclpy.exceptions import NameValidationException, ParameterException
@@ -86,6 +92,8 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
     from rclpy.impl.implementation_singleton import rclpy_implementation
     from rclpy.signals import SignalHandlerOptions
 
+    from lidar_perception.nodes.known import misspelt
+    from lidar_perception.runs.files import refusals_named
     from lidar_perception.types import InputError
 
     RCLError = rclpy_implementation.RCLError
@@ -93,17 +101,24 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
     node, code = None, 1
     kept: BaseException | None = None  # and with it what a refused node has made
     try:
+        stop.react = lambda: None  # DDS has to be taken down from here on: see stop.asked
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
         with refusals_named():
             node = node_class()
+        stop.react = lambda: node.stop.set_result(None)
+        if not node.writes_files:
+            stop.leave = lambda: _leave(node)
+        if stop.asked:
+            node.stop.set_result(None)
         for line in misspelt(n for n in node._parameter_overrides if not node.has_parameter(n)):
             node.get_logger().warning(line)  # before anything that takes long
-        node.start()
-        stop.react = lambda: node.stop.set_result(None)
-        node.get_logger().info(f"ready: code loaded and warmed up in {seconds:.1f} s")
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        node.spin(executor)
+        if not node.stop.done():
+            node.start()
+        if not node.stop.done():
+            node.get_logger().info(f"ready: code loaded and warmed up in {seconds:.1f} s")
+            executor = SingleThreadedExecutor()
+            executor.add_node(node)
+            node.spin(executor)
         code = 0
     except UnknownROSArgsError as error:
         rclpy.logging.get_logger(node_class.__name__).fatal(f"unknown after --ros-args: {error}")
@@ -128,4 +143,7 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
 
 
 if __name__ == "__main__":
-    sys.exit(run(sys.argv[1], sys.argv[1:]))
+    code = run(sys.argv[1], sys.argv[1:])
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)  # DDS is down; to unload torch, too, would take two seconds on busy cores

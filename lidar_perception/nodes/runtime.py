@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import contextmanager
 from functools import partial
 from time import monotonic, perf_counter
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import rclpy
@@ -56,6 +56,7 @@ class LidarNode(Node):
     """
 
     transforms: Any = None  # of transforms.py
+    writes_files: ClassVar[bool] = False  # that close() completes, so a signal waits for the work
 
     def __init__(self, name: str, params: Any, robot: Any = None, **options: Any):
         super().__init__(name, **options)

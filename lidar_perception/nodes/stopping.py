@@ -1,75 +1,76 @@
-"""How a node's process ends at a signal, even where DDS hangs and holds the interpreter's lock."""
+"""How a node's process ends at a signal, also while it starts, or while DDS is stuck."""
 
 from __future__ import annotations
 
+import ctypes
 import os
+import select
 import signal
 import threading
 from collections.abc import Callable, Collection
 
-import numpy as np
-from numba import njit, types
-
-REACTION = 5.0  # seconds for the work in hand; what hangs longer is not waited for
-TEARDOWN = 3.0  # seconds for DDS to be taken down, after all is written; cut short, it may leave
-# others a port in shared memory that they wait for (docs/reliability.md); launch sends SIGTERM at 5
-RUNNING, CLOSING, CLOSED = range(3)
-TICK = 0.02  # seconds
-
-_sigwait = types.ExternalFunction("sigwait", types.int32(types.uintp, types.uintp))
-_write = types.ExternalFunction("write", types.intp(types.int32, types.uintp, types.uintp))
-_usleep = types.ExternalFunction("usleep", types.int32(types.uint32))
-_exit = types.ExternalFunction("_exit", types.void(types.int32))
+PATIENCE = 0.7  # seconds for the current work, before `leave` ends the process without it
+POLL = 0.05  # seconds, while the guard is loaded
 
 
 class Stop:
     """Takes the given signals, which every thread must block, in threads of its own: as exceptions
     in the main thread they could be lost in a destructor, or cut short what must be finished.
 
-    react is called at the first signal; until there is a node, it ends the process. Fast DDS can
-    wait for a lock in shared memory that a process which died still holds, and rclpy holds the
-    interpreter's lock meanwhile, so no Python thread runs: the guard is compiled code that needs
-    neither. The node calls closing() before it writes its last, closed() after that.
+    `react` is called at the first signal; until there is a node, it ends the process. Where the
+    work goes on for PATIENCE seconds after that, `leave` is called. The node calls closing() before
+    it writes its last, closed() after that.
+
+    Fast DDS can wait for a lock in shared memory that a process which died still holds, and rclpy
+    holds the interpreter's lock meanwhile, so no Python thread runs: guard.py needs none. It takes
+    a second to load, and longer to compile, so a Python thread listens until then.
     """
 
     def __init__(self, signals: Collection[signal.Signals]) -> None:
         self.react: Callable[[], object] = lambda: os._exit(0)
-        self._state = np.array([RUNNING, 0], np.int64)  # phase, exit code
-        waited_for = np.zeros(128, np.uint8)  # sigset_t
-        for number in signals:
-            waited_for[(number - 1) // 8] |= 1 << (number - 1) % 8
-        self._awake, write = os.pipe()
-        guarded = self._state, waited_for, write
-        threading.Thread(target=_guard, args=guarded, daemon=True).start()
+        self.leave: Callable[[], object] | None = None
+        self.asked = False  # a signal has come
+        self._closing = threading.Event()
+        self._leaving = threading.Lock()
+        self._awake, pipe = os.pipe()
         threading.Thread(target=self._wait, daemon=True).start()
+        # A descriptor to read signals from: in sigwait(3) a thread does not block them.
+        mask = sum(1 << number - 1 for number in signals).to_bytes(128, "little")  # sigset_t
+        arrived, loaded = ctypes.CDLL(None).signalfd(-1, mask, os.O_CLOEXEC), threading.Event()
+        listener = threading.Thread(target=_listen, args=(arrived, loaded, pipe), daemon=True)
+        listener.start()
+        from lidar_perception.nodes import guard  # NumPy and Numba: seconds on a busy machine
+        loaded.set()
+        listener.join()
+        self._state = guard.start_guard(arrived, pipe)
+        self._closing_phase, self._closed_phase = guard.CLOSING, guard.CLOSED
 
     def _wait(self) -> None:
         os.read(self._awake, 1)
+        self.asked = True
         self.react()
+        if not self._closing.wait(PATIENCE) and self.leave:
+            with self._leaving:
+                if not self._closing.is_set():
+                    self.leave()
 
     def closing(self) -> None:
-        """The work is done; what follows may take its time."""
-        self._state[0] = CLOSING
+        """The work is done; what follows may take its time. While leave() ends the process this
+        does not return."""
+        with self._leaving:
+            self._closing.set()
+        self._state[0] = self._closing_phase
 
     def closed(self, code: int) -> None:
-        """All is written: the process ends with this code within TEARDOWN seconds."""
-        self._state[:] = CLOSED, code
+        """All is written: the process ends with this code within guard.TEARDOWN seconds."""
+        self._state[:] = self._closed_phase, code
         self.react = lambda: None
         os.kill(os.getpid(), signal.SIGTERM)  # wakes the guard, if no signal has
 
 
-@njit("void(i8[::1], u1[::1], i8)", nogil=True, cache=True)
-def _guard(state, signals, pipe):
-    number = np.zeros(1, np.int32)
-    _sigwait(signals.ctypes.data, number.ctypes.data)
-    _write(pipe, number.ctypes.data, 1)
-    waited = 0.0
-    while state[0] == RUNNING:
-        if waited > REACTION:
-            _exit(0)
-        _usleep(int(TICK * 1e6))
-        waited += TICK
-    while state[0] == CLOSING:
-        _usleep(int(TICK * 1e6))
-    _usleep(int(TEARDOWN * 1e6))
-    _exit(state[1])
+def _listen(arrived: int, loaded: threading.Event, pipe: int) -> None:
+    """Until the guard is loaded."""
+    while not loaded.is_set():
+        if select.select([arrived], [], [], POLL)[0]:
+            os.write(pipe, b"\0")
+            return

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import re
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,25 +44,6 @@ def test_every_node_ends_with_code_0(processes, peer, tmp_path, drive_bag):
     logs = [*map(processes.log, NODES)]
     assert not any("Traceback" in log for log in logs)
     assert all("'input.queu', so it changes nothing; is 'input.queue' meant" in log for log in logs)
-
-
-@pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_during_the_start_ends_with_code_0_too(processes, number):
-    """From the moment on when the node has signals wait for it, which is before anything that takes
-    time; before that Python itself starts, and nobody can hold them."""
-    from time import sleep
-    processes.fresh = True
-    processes.start("perception", {}, {})
-    process = processes.running["perception"]
-    status = Path(f"/proc/{process.pid}/status")
-    if not status.is_file():
-        pytest.skip("needs /proc, which says what a process holds")
-    held = re.compile(r"^SigBlk:\s*(\w+)", re.MULTILINE)
-    while not int(held.search(status.read_text())[1], 16) >> (number - 1) & 1:
-        assert process.poll() is None
-        sleep(0.01)
-    process.send_signal(number)
-    assert process.wait(timeout=60) == 0
 
 
 @pytest.fixture(scope="module")

@@ -68,17 +68,6 @@ def test_ends_whatever_hangs(ended, name):
     assert ended[name] == (output, code)
 
 
-@pytest.mark.parametrize("number", (signal.SIGINT, signal.SIGTERM))
-def test_run_ends_its_node_cleanly(number, processes, peer):
-    pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
-    command = [sys.executable, "-m", "lidar_perception.cli.main", "run", "evaluator"]
-    processes.run("evaluator", command)
-    peer.wait_for_diagnostics("evaluator")
-    node = processes.running["evaluator"]
-    node.send_signal(number)
-    assert node.wait(timeout=20) == 0
-
-
 class Changing:
     """A node that sees others leave at its first looks, or for ever."""
 

@@ -1,0 +1,16 @@
+"""The command lidar-perception: `run NODE` waits for signals as a node does from its first line."""
+
+from __future__ import annotations
+
+import signal
+import sys
+
+
+def main() -> None:
+    if sys.argv[1:2] == ["run"]:
+        # Before click and the rest are loaded. The node replaces this process and inherits the
+        # blocked signals, and those that have arrived.
+        from lidar_perception.nodes.main import STOP_SIGNALS
+        signal.pthread_sigmask(signal.SIG_BLOCK, STOP_SIGNALS)
+    from lidar_perception.cli.main import main as command
+    command()

@@ -1,0 +1,98 @@
+"""The installed executables end with code 0 at SIGINT and SIGTERM, at any moment after their start,
+and leave no shared memory behind."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from time import monotonic, sleep
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from lidar_perception.data.bag import Bag
+from lidar_perception.nodes.main import STOP_SIGNALS
+from lidar_perception.wire.codec import bag_message
+
+PREFIX = Path(sys.prefix)
+STARTED_BY = {"ros2 run": lambda node: [PREFIX / "lib/lidar_perception" / node],
+              "lidar-perception run": lambda node: [PREFIX / "bin/lidar-perception", "run", node]}
+LIMIT = 120.0  # seconds until a process is where a test wants it, on a busy machine
+NOTE = "std_msgs/msg/String"
+
+pytestmark = pytest.mark.skipif(
+    not (Path("/proc/self/maps").is_file() and STARTED_BY["ros2 run"]("tracker")[0].is_file()),
+    reason="needs /proc, and the package installed by pip")
+
+
+def blocks_signals(thread: Path) -> bool:
+    """Return True if a thread of /proc holds back all signals that end a node."""
+    blocked = int(re.search(r"^SigBlk:\s*(\w+)", (thread / "status").read_text(), re.M)[1], 16)
+    return all(blocked >> (number - 1) & 1 for number in STOP_SIGNALS)
+
+
+def shared_segments(process: Path) -> set[Path]:
+    """Return the segments of Fast DDS that a process has made: it holds their locks open."""
+    opened = {file.readlink() for file in (process / "fd").iterdir() if file.is_symlink()}
+    return {path.with_name(path.name.removesuffix("_el")) for path in opened
+            if re.fullmatch(r"fastrtps_[0-9a-f]{16}_el", path.name)}
+
+
+def wait_for_stage(process: subprocess.Popen, stage: str, log: Path) -> None:
+    """Wait until a starting node blocks signals, has loaded a library, or has logged a word."""
+    proc, end = Path(f"/proc/{process.pid}"), monotonic() + LIMIT
+    while not (blocks_signals(proc) if stage == "blocked" else
+               stage in (proc / "maps").read_text() or stage in log.read_text()):
+        assert process.poll() is None and monotonic() < end, log.read_text()
+        sleep(0.01)
+
+
+def start(processes, how: str, node: str, *arguments: str) -> tuple[subprocess.Popen, Path]:
+    processes.run(node, [*map(str, STARTED_BY[how](node)), *arguments])
+    return processes.running[node], processes.logs / f"{node}.log"
+
+
+@pytest.mark.parametrize("how, node, stage, number", [
+    ("ros2 run", "clustering", "blocked", signal.SIGINT),
+    ("ros2 run", "perception", "numpy", signal.SIGTERM),
+    ("ros2 run", "fused_detector", "libtorch", signal.SIGINT),
+    ("lidar-perception run", "tracker", "blocked", signal.SIGTERM),
+    ("lidar-perception run", "evaluator", "ready", signal.SIGINT)])
+def test_node_stops_cleanly_at_any_stage(how, node, stage, number, processes):
+    process, log = start(processes, how, node)
+    wait_for_stage(process, stage, log)
+    proc = Path(f"/proc/{process.pid}")
+    if stage == "ready":
+        assert all(map(blocks_signals, (proc / "task").iterdir()))
+    segments = shared_segments(proc)
+    assert segments or stage not in ("libtorch", "ready")  # DDS is up by then
+    process.send_signal(number)
+    assert process.wait(timeout=60) == 0
+    assert not [path for path in segments if path.exists()] and "Traceback" not in log.read_text()
+
+
+@pytest.mark.parametrize("number", sorted(STOP_SIGNALS))
+def test_recorder_completes_its_bag(number, processes, peer, tmp_path):
+    bag, note = tmp_path / "bag", bag_message(NOTE)
+    process, _ = start(processes, "ros2 run", "bag_recorder", "--ros-args", "-p", f"bag:={bag}",
+                       "-p", "topics:=[/note]")
+    peer.send(peer.talker("/note", NOTE), note,
+              lambda: int(peer.value_of("bag_recorder", "frames") or 0) > 1, "two notes")
+    process.send_signal(number)
+    assert process.wait(timeout=60) == 0
+    with Bag(bag) as recorded:
+        assert recorded.counts["/note"] > 1
+    assert [path.name for path in tmp_path.glob("bag*")] == ["bag"]
+
+
+def test_entry_of_nodes_loads_no_library_before_signals_are_blocked():
+    """A thread that one starts would not block them: of NumPy's OpenBLAS, for one."""
+    code = ("import sys; before = {*sys.modules}; import lidar_perception.nodes.main, "
+            "lidar_perception.cli.entry; print(*{n.partition('.')[0] for n in {*sys.modules} - "
+            "before} - sys.stdlib_module_names)")
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).split() == [
+        "lidar_perception"]
