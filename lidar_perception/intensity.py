@@ -93,10 +93,10 @@ def scale_problem(intensity: np.ndarray | None, factor: float = 1.0) -> str | No
     if inferred == 1.0 and (greatest == 0.0 or greatest >= MIN_BRIGHT
                             or len(intensity) < MIN_POINTS):
         return None
-    guess = f" (probably {inferred:g})" if inferred != 1.0 else ""
-    return (f"intensity goes up to {greatest:.3g} where 1 is a full reflection; set "
-            f"input.intensity_max, or in Python intensity_max of LidarFrame.of, to the value of a "
-            f"full reflection{guess}: 1, 100 or 255 for most drivers; setup measures it")
+    guess = f", so it is divided by {inferred:g}, a guess" if inferred != 1.0 else ""
+    return (f"intensity goes up to {greatest:.3g} where 1 is a full reflection{guess}; set "
+            "input.intensity_max, or in Python intensity_max of LidarFrame.of, to the value of a "
+            "full reflection (1, 100 or 255 for most drivers; setup measures it)")
 
 
 def guessed_scale(intensity: np.ndarray, factor: float = 1.0) -> float:

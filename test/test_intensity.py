@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -15,8 +17,12 @@ from lidar_perception.intensity import (
     scale_problem,
     to_unit,
 )
+from lidar_perception.nodes.sensor_check import SensorCheck
+from lidar_perception.robot.params import CropParams
+from lidar_perception.testing.clouds import cloud_message
 from lidar_perception.tracking.tracker import Tracker
 from lidar_perception.types import Detections, InputError, LidarFrame
+from lidar_perception.wire.params import InputParams
 
 UNIT = np.random.default_rng(0).uniform(0, 1, 3000).astype(np.float32) ** 3
 UNIT[0] = 1.0
@@ -62,12 +68,33 @@ def test_the_scale_of_a_stream_never_falls(order):
     assert found == sorted(found) and scale.full == 255.0
 
 
+def test_a_node_reads_dark_clouds_in_the_scale_of_those_before():
+    """And one whose driver writes another scale does not change the scale of another node."""
+    def message(values, stamp):
+        return cloud_message(np.column_stack([np.ones((len(values), 3)), values]), stamp)
+
+    params = SimpleNamespace(input=InputParams(), crop=CropParams(), ground=GroundParams())
+    placing = SimpleNamespace(levelled=lambda frame: frame)
+    transforms = SimpleNamespace(placing=lambda header: placing,
+                                 mounted=lambda params, placing: params)
+    node = SimpleNamespace(params=params, transforms=transforms, counts={})
+    check, other = SensorCheck(node), SensorCheck(node)
+    bright, dark = WHOLE[255], np.float32([0, 1, 1])
+    assert np.array_equal(check.frame(message(bright, 1), True)[0].intensity,
+                          bright / np.float32(255))
+    assert np.array_equal(check.frame(message(dark, 2), True)[0].intensity, dark / np.float32(255))
+    assert np.array_equal(other.frame(message(dark, 2), True)[0].intensity, dark)
+    node.params.input = InputParams(intensity_max=2.0)
+    assert np.array_equal(check.frame(message(dark, 3), True)[0].intensity, dark / 2)
+    assert check.frame(message(dark, 4))[0].intensity is None  # nobody reads it
+
+
 @pytest.mark.parametrize("full", [100, 255, 1023, 4095, 65535])
 def test_another_scale_is_said_with_the_remedy(full):
     values = UNIT * np.float32(full)
     assert guessed_scale(values) == full
     problem = scale_problem(values)
-    assert "input.intensity_max" in problem and f"probably {full}" in problem
+    assert "input.intensity_max" in problem and f"divided by {full}, a guess" in problem
     assert "LidarFrame.of" in problem and "\n" not in problem
     for factor in (0.0, 1 / full):  # fused.intensity_scale leaves it out, or makes up for it
         assert scale_problem(values, factor) is None and guessed_scale(values, factor) == 1.0
