@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 MAX_WORKERS = 4  # each loads torch and compiles
 NODE_WORKERS = 2  # for tests that mostly wait
 # Their folders and files, those with the slowest tests first.
-WITH_PROCESSES = ("test/testing", "test/campaign",
+WITH_PROCESSES = ("test/testing", "test/fuzz",
                   "test/studio/test_label_server.py", "test/studio/test_page.py",
                   "test/studio/test_page_saves.py", "test/launch", "test/ros")
 # Numba caches what these compile, so that each test process loads it.

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import io
+from contextlib import redirect_stdout
+from pathlib import Path
+
 import numpy as np
+from rosbags.convert.converter import convert
+from rosbags.typesys import Stores, get_typestore
 from samples import CALIBRATION, STAMP, scene, walker_truth
 
 from lidar_perception.camera import Calibration
@@ -35,3 +41,11 @@ def message_bytes(path) -> list[tuple[str, int, bytes]]:
 
 def same_cloud(cloud: np.ndarray, xyz: np.ndarray) -> bool:
     return cloud[:, :3].tobytes() == xyz.tobytes()
+
+
+def as_ros1(source: Path, path: Path, compress: str | None = None) -> Path:
+    """Write a copy of a bag for ROS 1 to path and return path; compress: lz4, bz2 or None."""
+    with redirect_stdout(io.StringIO()):
+        convert([source], path, "", 0, compress, "", None, get_typestore(Stores.ROS1_NOETIC),
+                (), (), (), ())
+    return path

@@ -30,7 +30,6 @@ COMMANDS = {  # verb -> module.function, and its line in the overview
     "export": ("weights.export", "Export a network for another runtime."),
     "info": ("info.info", "List what is in a bag or another recording."),
     "run": ("run.run_node", "Start one ROS node."),
-    "campaign": ("campaign.campaign", "Try to break the package, and say what came of it."),
 }
 
 

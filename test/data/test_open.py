@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from itertools import pairwise
 
 import numpy as np
@@ -19,9 +20,9 @@ from recording_samples import (
 from samples import STAMP, object_folder, scene, write
 
 from lidar_perception.cli.data import opened
-from lidar_perception.data.bag import BagWriter
+from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.frame import BOXES, CAMERA, POINT_LABELS, POSES, Frame
-from lidar_perception.data.kitti.folder import GAP_NS, PERIOD_NS
+from lidar_perception.data.kitti.folder import GAP_NS, PERIOD_NS, read_velodyne
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.raw_clouds import open_clouds
 from lidar_perception.data.semantickitti import write_scan
@@ -253,3 +254,13 @@ def test_poses_of_semantickitti_invert_pose_line_also_of_some_of_the_scans(tmp_p
     (tmp_path / "sequences/08/calib.txt").write_text("")
     with pytest.raises(InputError, match=r"calib.txt has no Tr"):
         open_recording(tmp_path).frames[-1].pose()
+
+
+def test_a_pipe_in_place_of_a_file_is_refused_without_waiting(tmp_path):
+    (tmp_path / "bag").mkdir()
+    for path in ("bag/bag.mcap", "pipe.bin"):
+        os.mkfifo(tmp_path / path)
+    for read in (lambda: open_recording(tmp_path / "bag"), lambda: Bag(tmp_path / "bag/bag.mcap"),
+                 lambda: read_velodyne(tmp_path / "pipe.bin")):
+        with pytest.raises(InputError, match="is no file"):
+            read()

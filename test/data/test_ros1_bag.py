@@ -4,11 +4,11 @@ import shutil
 
 import numpy as np
 import pytest
+from bag_samples import as_ros1
 from robot_bags import check, mount, moving, recorded, tf, transform
 from rosbags.rosbag1 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from lidar_perception.campaign.samples import as_ros1
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import open_recording
 from lidar_perception.data.raw_clouds import open_clouds

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from bag_samples import as_ros1
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
@@ -16,7 +17,6 @@ from rclpy.clock import ClockType
 from rclpy.task import Future
 from std_srvs.srv import Trigger
 
-from lidar_perception.campaign.samples import as_ros1
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
 from lidar_perception.nodes.runtime import LATCHED, RELIABLE, SENSOR_DATA, WAITING
 from lidar_perception.wire.codec import bag_message, decode, encode

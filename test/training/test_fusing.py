@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from cli_samples import error_line, exit_of
 from detection_samples import frame, random_detector, same
+from fuzz.mutation import mutate_text
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import expit
 
 from lidar_perception.camera import Camera
-from lidar_perception.campaign.mutation import mutate_text
 from lidar_perception.classes import CAR, DETECTED
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.checkpoint import read_header, save_header

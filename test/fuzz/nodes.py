@@ -1,5 +1,4 @@
-"""Mutated messages through the callbacks of every node, all in this process: as bytes, as they come
-from DDS, without DDS in between."""
+"""Nodes in this process, fed through their callbacks with bytes as they come from DDS."""
 
 from __future__ import annotations
 
@@ -10,10 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from rclpy.logging import LoggingSeverity, set_logger_level
 
-from lidar_perception.campaign.case import FAILED, REFUSED, SURVIVED, Case, Outcome, generator, pick
-from lidar_perception.campaign.good import CLOUD, good, mutated
-from lidar_perception.campaign.mutation import mutate_bytes
+from fuzz.case import FAILED, REFUSED, SURVIVED, Outcome
+from fuzz.valid_messages import CLOUD, valid_message
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.nodes import NODES
 from lidar_perception.nodes.graph import private_domain
@@ -27,13 +26,13 @@ from msg_utils.markers import from_marker_array
 from msg_utils.messages import message_class
 from msg_utils.point_cloud2 import CloudError, to_array
 
-INFO, TRANSFORM = "sensor_msgs/msg/CameraInfo", "geometry_msgs/msg/TransformStamped"
-CAMERA = {"input/camera_info": INFO, "input/extrinsics": TRANSFORM}
+CAMERA = {"input/camera_info": "sensor_msgs/msg/CameraInfo",
+          "input/extrinsics": "geometry_msgs/msg/TransformStamped"}
 SEED = {"input/ground_truth": MARKERS, "clicked_point": "geometry_msgs/msg/PointStamped"}
 POINTS = {"input/points": CLOUD}
-# Node -> how often it is drawn, its inputs with their types, settings of which each case has one.
-# PointPillars takes a tenth of a second, whatever the cloud, alone and fused.
-TRIED: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
+# Node -> its weight, its inputs with their types, the settings of which each case has one.
+# Detectors have small weights, as they take a tenth of a second for any cloud.
+INPUTS: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
     "ground_segmentation": (20, POINTS | CAMERA, [
         {"ground.method": "threshold", "view.enabled": False},
         {"ground.method": "threshold", "view.enabled": True},
@@ -60,42 +59,30 @@ TRIED: dict[str, tuple[float, dict[str, str], list[dict[str, Any]]]] = {
     "pointpillars_detector": (0.2, POINTS, [{}]),
     "fused_detector": (0.2, POINTS, [{}]),
 }
-THEN_GOOD = 0.125  # of the cases: the next good message must be served
-BUG = "this is a bug"  # what a node says of an exception that it did not expect
+WEIGHTS = np.array([weight for weight, _, _ in INPUTS.values()])
+BUG = "this is a bug"  # in a node's state after an exception that it did not expect
 
 
-def case_of(seed: int, number: int) -> Case:
-    """One message for one input of one node."""
-    rng = generator("messages", seed, number)
-    weights = np.array([weight for weight, _, _ in TRIED.values()])
-    node = list(TRIED)[int(rng.choice(len(TRIED), p=weights / weights.sum()))]
-    _, inputs, variants = TRIED[node]
-    topic = "input/points" if "input/points" in inputs and rng.random() < 0.7 else pick(
-        rng, list(inputs))
-    data, change = mutated(inputs[topic], rng)
-    if rng.random() < 0.1:
-        data, damage = mutate_bytes(data, rng)
-        change += f"; {damage}"
-    return Case("messages", f"{node}/{topic}: {change}", seed, number,
-                {"node": node, "topic": topic, "params": pick(rng, variants),
-                 "then_good": topic != "input/points" or bool(rng.random() < THEN_GOOD)}, data)
+def draw_node(rng: np.random.Generator) -> str:
+    """Return the name of a node by its weight."""
+    return list(INPUTS)[int(rng.choice(len(INPUTS), p=WEIGHTS / WEIGHTS.sum()))]
 
 
-class Attempt:
-    """All nodes of TRIED, made once, on a private domain."""
+class Nodes:
+    """All nodes of INPUTS on a private domain, or the given ones. Parts derive from it."""
 
-    def __init__(self, folder: Path):
-        os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-        self.context = new_context(private_domain())
-        warm_up()
-        self.nodes = {name: Tried(name, self.context) for name in TRIED}
+    def __init__(self, folder: Path, nodes: dict[str, FedNode] | None = None):
+        if nodes is None:
+            os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+            set_logger_level("", LoggingSeverity.FATAL)
+            warm_up()
+            context = new_context(private_domain())
+            nodes = {name: FedNode(name, context) for name in INPUTS}
+        self.nodes = nodes
 
-    def __call__(self, case: Case) -> Outcome:
-        return self.nodes[case.settings["node"]].attempt(case)
 
-
-class Tried:
-    """A node whose messages come from here and go nowhere."""
+class FedNode:
+    """A node whose messages are delivered by calls, and whose output is kept in `sent`."""
 
     def __init__(self, name: str, context: Context, **values: Any):
         module = importlib.import_module(f"lidar_perception.nodes.{name}")
@@ -103,57 +90,61 @@ class Tried:
             context=context, enable_rosout=False, start_parameter_services=False,
             parameter_overrides=parameters_of(values))
         self.node.start()
-        self.inputs = TRIED[name][1]
+        self.inputs = INPUTS[name][1]
         self.calls = {s.topic_name.removeprefix(f"/{name}").lstrip("/"): s.callback
                       for s in self.node.subscriptions}
         for made in self.node.inputs:
-            if isinstance(made, Reception):  # what it delivers, without its queue
+            if isinstance(made, Reception):  # without its queue
                 self.calls[made.topic.removeprefix(f"/{name}").lstrip("/")] = made.deliver
         self.params: dict[str, Any] = {}
         self.sent: list[tuple[Any, bytes]] = []
         for publisher in self.node.publishers:
             publisher.publish = lambda data, by=publisher: self.sent.append((by, data))
-            publisher.get_subscription_count = lambda: 1  # so that all is made that can be
+            publisher.get_subscription_count = lambda: 1  # so that every output is made
 
-    def attempt(self, case: Case) -> Outcome:
-        """Deliver the messages that the case needs beside its own, its own, and perhaps a good
-        one."""
-        self.set(case.settings["params"])
-        topic, beside = case.settings["topic"], [t for t in self.inputs if t != "input/points"]
-        for other in beside:
-            if other != topic:
-                self.calls[other](good(self.inputs[other]))
-        said = [self.deliver(topic, case.data)]
-        if case.settings["then_good"]:
-            said += [self.deliver(t, good(self.inputs[t])) for t in [topic, *self.inputs]]
-        for _, message in said:
-            if BUG in message:
-                return Outcome(FAILED, message)
-        if (problem := self._unsound()) is not None:
-            return Outcome(FAILED, problem)
-        level, message = said[0]
-        if len(said) > 1 and said[-1][0] == ERROR:
-            return Outcome(FAILED, f"a good message was refused after it: {said[-1][1]}")
+    def attempt(self, topic: str, data: bytes, params: dict[str, Any], then_valid: bool) -> Outcome:
+        """Deliver valid messages to the other inputs, then data, and with then_valid valid messages
+        again, which must be served."""
+        if params != self.params:
+            results = self.node.set_parameters(parameters_of(params))
+            assert all(result.successful for result in results), results
+            self.params = params
+        for other in self.inputs:
+            if other not in (topic, "input/points"):
+                self.calls[other](valid_message(self.inputs[other]))
+        states = [self.deliver(topic, data)]
+        if then_valid:
+            states += self.deliver_valid(topic)
+        outcome = self.judge(states)
+        if outcome.verdict == FAILED:
+            return outcome
+        level, message = states[0]
         return Outcome(REFUSED, message) if level == ERROR else Outcome(SURVIVED)
 
-    def set(self, params: dict[str, Any]) -> None:
-        """Change parameters of the node, as at run time."""
-        if params != self.params:
-            for result in self.node.set_parameters(parameters_of(params)):
-                if not result.successful:
-                    raise InputError(result.reason)
-            self.params = params
-
     def deliver(self, topic: str, data: bytes) -> tuple[bytes, str]:
-        """The level and message of the diagnostics after a message, which starts from OK."""
+        """Return level and message of the node's state after a message; before it the state is
+        OK."""
         if topic == "input/points":
             self.sent.clear()
         self.node.state = (OK, "")
         self.calls[topic](data)
         return self.node.state
 
-    def _unsound(self) -> str | None:
-        """What is wrong with what the node has published; None if nothing is."""
+    def deliver_valid(self, *first: str) -> list[tuple[bytes, str]]:
+        """Deliver a valid message to some inputs, then to all, the cloud last."""
+        return [self.deliver(t, valid_message(self.inputs[t])) for t in [
+            *first, *sorted(self.inputs, key=lambda t: t == "input/points")]]
+
+    def judge(self, states: list[tuple[bytes, str]]) -> Outcome:
+        """Fail on a bug, on output that cannot be read, and if the last message, which is valid
+        where there are several, was refused."""
+        problem = next((message for _, message in states if BUG in message), None)
+        if problem is None and len(states) > 1 and states[-1][0] == ERROR:
+            problem = f"a valid message was refused: {states[-1][1]}"
+        problem = problem or self._invalid_output()
+        return Outcome(FAILED, problem) if problem else Outcome(SURVIVED)
+
+    def _invalid_output(self) -> str | None:
         clouds, boxes = message_class(CLOUD), message_class(MARKERS)
         for publisher, data in self.sent:
             topic, kind = publisher.topic_name, publisher.msg_type

@@ -1,4 +1,4 @@
-"""Good messages, small enough that thousands a second can be tried: what the campaign damages."""
+"""Valid messages, small enough to try thousands a second, and how they are mutated."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from lidar_perception.campaign.case import pick
-from lidar_perception.campaign.mutation import FLOATS, INTEGERS, mutate_message
+from fuzz.case import pick
+from fuzz.mutation import FLOATS, INTEGERS, mutate_message
 from lidar_perception.simulation.camera import FORWARD_CAMERA
-from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, Detections, GroundTruth
+from lidar_perception.types import PEDESTRIAN, SENSOR_HEIGHT, GroundTruth
 from lidar_perception.wire.codec import bag_message, decode, encode
-from lidar_perception.wire.messages import camera_info, detection_markers, extrinsics, truth_markers
+from lidar_perception.wire.messages import camera_info, extrinsics, truth_markers
 from msg_utils.point_cloud2 import CloudError, add_columns, from_array, to_array
 from msg_utils.stamps import header_message
 
@@ -34,7 +34,8 @@ LAYOUTS: dict[str, Any] = {
 
 @functools.cache
 def street(seed: int = 0, people: int = 3, ground: int = 500) -> np.ndarray:
-    """(N, 3) float32: level ground, people of whom the first fills PERSON, and a wall."""
+    """Return points (N, 3) float32 of level ground, people (the first one fills PERSON) and a
+    wall."""
     rng = np.random.default_rng(seed)
     parts = [rng.uniform([2, -10, -SENSOR_HEIGHT], [22, 10, -SENSOR_HEIGHT + 0.02], (ground, 3))]
     for i in range(people):
@@ -44,18 +45,18 @@ def street(seed: int = 0, people: int = 3, ground: int = 500) -> np.ndarray:
     return np.concatenate(parts).astype(np.float32)
 
 
-def header(stamp: int = STAMP) -> Any:
-    """Of all good messages."""
-    return header_message(stamp, "lidar", bag_message)
+def header() -> Any:
+    """Return the header of all messages."""
+    return header_message(STAMP, "lidar", bag_message)
 
 
-def cloud(kind: str = "columns", stamp: int = STAMP) -> Any:
-    """A good PointCloud2 of a kind of KINDS."""
+def cloud(kind: str = "columns") -> Any:
+    """Return a valid PointCloud2; kind: one of KINDS."""
     xyz = street()[:{"empty": 0, "one": 1}.get(kind)]
     points = np.zeros(len(xyz), np.dtype(LAYOUTS.get(kind, PLAIN)))
     for i, name in enumerate("xyz"):
         points[name] = xyz[:, i]
-    message = from_array(points, header(stamp), bag_message,
+    message = from_array(points, header(), bag_message,
                          height=4 if kind == "rows" else 1)
     if kind == "columns":
         body = (xyz[:, 2] > -SENSOR_HEIGHT + 0.05).astype("u1")
@@ -66,9 +67,13 @@ def cloud(kind: str = "columns", stamp: int = STAMP) -> Any:
 
 
 @functools.cache
-def _good(kind: str) -> bytes:
+def valid_message(kind: str) -> bytes:
+    """Return the CDR of a valid message of a type."""
     if kind == CLOUD:
         return encode(cloud())
+    if kind == "visualization_msgs/msg/MarkerArray":
+        truth = GroundTruth.of([PERSON], [PEDESTRIAN], [{"track_id": 3}])
+        return encode(truth_markers(truth, header(), bag_message))
     if kind == "sensor_msgs/msg/CameraInfo":
         return encode(camera_info(FORWARD_CAMERA, header_message(STAMP, "camera_optical",
                                                                  bag_message), bag_message))
@@ -82,33 +87,19 @@ def _good(kind: str) -> bytes:
         message = bag_message(kind, header=header(), child_frame_id="lidar")
         message.pose.pose.orientation.w = 1.0
         return encode(message)
-    raise LookupError(f"there is no good message of type {kind}")
-
-
-def markers(truth: bool, stamp: int = STAMP) -> bytes:
-    """CDR of a MarkerArray of the street: its labels, or detections."""
-    message = (truth_markers(GroundTruth.of([PERSON], [PEDESTRIAN], [{"track_id": 3}]),
-                             header(stamp), bag_message) if truth else
-               detection_markers(Detections.of([PERSON], PEDESTRIAN, 0.7), header(stamp),
-                                 bag_message))
-    return encode(message)
-
-
-def good(kind: str) -> bytes:
-    """CDR of a good message of a type."""
-    return markers(True) if kind == "visualization_msgs/msg/MarkerArray" else _good(kind)
+    raise LookupError(f"there is no valid message of type {kind}")
 
 
 def mutated(kind: str, rng: np.random.Generator) -> tuple[bytes, str]:
-    """CDR of a message of a type with one to three changes that leave it decodable, and what they
-    were."""
+    """Return the CDR of a message with one to three changes that leave it decodable, and their
+    description."""
     changes = []
     if kind == CLOUD:
         form = pick(rng, KINDS)
         message = cloud(form)
         changes.append(form)
     else:
-        message = decode(good(kind), kind)
+        message = decode(valid_message(kind), kind)
     for _ in range(int(rng.integers(1, 4))):
         change = pick(rng, CLOUD_CHANGES) if kind == CLOUD else mutate_message
         changes.append(change(message, rng))
@@ -116,7 +107,7 @@ def mutated(kind: str, rng: np.random.Generator) -> tuple[bytes, str]:
 
 
 def _values(message: Any, rng: np.random.Generator) -> str:
-    """Values of one field of some points, or of all."""
+    """Set the values of one field, of some points or of all."""
     fields = [f for f in message.fields if 1 <= f.datatype <= 8
               and f.offset + 8 <= message.point_step]
     count = len(message.data) // message.point_step if message.point_step else 0
@@ -137,7 +128,7 @@ def _values(message: Any, rng: np.random.Generator) -> str:
 
 
 def _column(message: Any, rng: np.random.Generator) -> str:
-    """A column of ours, of any type and with any values."""
+    """Add a column that our nodes read, of any type and with any values."""
     try:
         count = len(to_array(message))
     except CloudError:  # an earlier change has made it no cloud
@@ -161,14 +152,14 @@ def _column(message: Any, rng: np.random.Generator) -> str:
 
 
 def _field(message: Any, rng: np.random.Generator) -> str:
-    """The description of one field."""
+    """Change the description of one field."""
     if not message.fields:
         return mutate_message(message, rng)
     return f"{(f := pick(rng, message.fields)).name}.{mutate_message(f, rng)}"
 
 
 def _layout(message: Any, rng: np.random.Generator) -> str:
-    """Two numbers that must fit each other are swapped, or one is another's multiple."""
+    """Make one number of the layout a multiple of another."""
     a, b = rng.permutation(["height", "width", "point_step", "row_step"])[:2]
     factor = pick(rng, (0.5, 1, 2, 3))
     setattr(message, a, int(getattr(message, b) * factor) % 2**32)

@@ -1,6 +1,6 @@
-"""Small damage to bytes, to text and to messages, drawn from a generator of random numbers.
+"""Random small damage to bytes, text and messages.
 
-Each function returns what it made and, in a few words, what it did.
+Each function returns the damaged copy and a short description.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from lidar_perception.campaign.case import pick
+from fuzz.case import pick
 from lidar_perception.wire.codec import bag_message, typestore
 
 INTEGERS = (0, 1, 255, 2**15, 2**16 - 1, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**64 - 1)
@@ -23,8 +23,8 @@ TEXTS = ("", "x" * 70_000, "é\u202e", "a b", "/", "../..", "\n", "x", "intensit
 
 
 def mutate_bytes(data: bytes, rng: np.random.Generator) -> tuple[bytes, str]:
-    """1 to 3 of: bits flipped, bytes deleted, inserted, repeated, zeroed, cut off, a number put
-    there; anywhere, or near either end, where headers and indices are."""
+    """Apply 1 to 3 of: flip a bit, delete, insert, repeat or zero bytes, write a number, cut off;
+    anywhere, or near either end, where headers and indices are."""
     changes = []
     for _ in range(int(rng.integers(1, 4))):
         data, change = _one_change(data, rng)
@@ -37,30 +37,30 @@ def _one_change(data: bytes, rng: np.random.Generator) -> tuple[bytes, str]:
     low, high = pick(rng, ((0, size), (0, size), (0, min(size, 512)), (max(0, size - 4096), size)))
     at = int(rng.integers(low, high + 1))
     count = int(rng.integers(1, 1 + pick(rng, (1, 8, 64, 4096))))
+    before, part, after = data[:at], data[at:at + count], data[at + count:]
     kind = pick(rng, ("flip", "flip", "delete", "insert", "repeat", "zero", "number", "number",
                       "cut"))
-    if kind == "flip" and at < size:
-        changed = bytearray(data)
-        changed[at] ^= 1 << int(rng.integers(8))
-        return bytes(changed), f"bit flipped at {at}"
-    if kind == "delete":
-        return data[:at] + data[at + count:], f"{count} bytes deleted at {at}"
-    if kind == "insert":
-        return data[:at] + rng.bytes(count) + data[at:], f"{count} bytes inserted at {at}"
-    if kind == "repeat":
-        return data[:at] + data[at:at + count] + data[at:], f"{count} bytes repeated at {at}"
-    if kind == "zero":
-        return data[:at] + bytes(len(data[at:at + count])) + data[at + count:], \
-            f"{count} bytes zeroed at {at}"
-    if kind == "number":
-        number = struct.pack("<Q", pick(rng, (*INTEGERS, size, size + 1)))
-        number = number[:pick(rng, (1, 2, 4, 8))]
-        return data[:at] + number + data[at + len(number):], f"a number put at {at}"
-    return data[:at], f"cut at {at} of {size}"
+    if kind == "flip":
+        part = bytes([part[0] ^ 1 << int(rng.integers(8))]) + part[1:] if part else b""
+    elif kind == "delete":
+        part = b""
+    elif kind == "insert":
+        part = rng.bytes(count) + part
+    elif kind == "repeat":
+        part *= 2
+    elif kind == "zero":
+        part = bytes(len(part))
+    elif kind == "number":
+        number = struct.pack("<Q", pick(rng, (*INTEGERS, size, size + 1)))[:pick(rng, (1, 2, 4, 8))]
+        part, after = number, (part + after)[len(number):]
+    else:
+        part = after = b""
+    return before + part + after, f"{kind} at {at} of {size}, {count} bytes"
 
 
 def mutate_text(text: str, rng: np.random.Generator) -> tuple[str, str]:
-    """1 to 3 of: a word or number replaced, moved or doubled, a line deleted, doubled or cut."""
+    """Apply 1 to 3 of: replace, delete or copy a word, delete or double a line, insert a character,
+    cut off."""
     changes = []
     for _ in range(int(rng.integers(1, 4))):
         spans = [m.span() for m in re.finditer(r"[\w.+-]+", text)] or [(0, 0)]
@@ -72,14 +72,12 @@ def mutate_text(text: str, rng: np.random.Generator) -> tuple[str, str]:
             text = text[:begin] + word + text[end:]
             kind = f"{word[:12]!r} put at {begin}"
         elif kind == "number":
-            text = text[:begin] + repr(float(rng.normal(0, 10.0 ** rng.integers(-3, 9)))) \
-                + text[end:]
+            number = float(rng.normal(0, 10.0 ** rng.integers(-3, 9)))
+            text = f"{text[:begin]}{number!r}{text[end:]}"
         elif kind == "drop":
             text = text[:begin] + text[end:]
         elif kind == "swap":
-            b, e = pick(rng, spans)
-            other = text[b:e]
-            text = text[:begin] + other + text[end:]
+            text = text[:begin] + text[slice(*pick(rng, spans))] + text[end:]
         elif kind in ("line", "no line"):
             lines = text.splitlines(keepends=True) or [""]
             i = int(rng.integers(len(lines)))
@@ -94,7 +92,8 @@ def mutate_text(text: str, rng: np.random.Generator) -> tuple[str, str]:
 
 
 def mutate_message(message: Any, rng: np.random.Generator) -> str:
-    """One field of a message of rosbags' classes, at any depth, gets another value of its type."""
+    """Give one field of a message, at any depth, another value of its type. message: of rosbags'
+    classes, changed in place."""
     name, kind = pick(rng, [field for field in typestore().fielddefs[message.__msgtype__][1]])
     (node, detail), value = kind, getattr(message, name)
     if node == Nodetype.NAME:
@@ -137,9 +136,8 @@ def _array(values: np.ndarray, rng: np.random.Generator, fixed: bool) -> tuple[n
 
 
 def _list(message: Any, name: str, element: tuple, rng: np.random.Generator) -> str:
-    items, kind = list(getattr(message, name)), pick(rng, ("inside", "inside", "drop", "double",
-                                                           "new", "order"))
-    what = kind
+    items = list(getattr(message, name))
+    kind = what = pick(rng, ("inside", "inside", "drop", "double", "new"))
     if kind == "new" or not items:
         items.append("x" if element[0] == Nodetype.BASE else bag_message(element[1]))
     elif kind == "inside" and element[0] == Nodetype.NAME:
@@ -149,9 +147,7 @@ def _list(message: Any, name: str, element: tuple, rng: np.random.Generator) -> 
         items[int(rng.integers(len(items)))] = pick(rng, TEXTS)
     elif kind == "drop":
         del items[int(rng.integers(len(items)))]
-    elif kind == "double":
-        items.append(pick(rng, items))
     else:
-        items.reverse()
+        items.append(pick(rng, items))
     setattr(message, name, items)
     return what

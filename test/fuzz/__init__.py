@@ -1,0 +1,8 @@
+"""Fuzzing: mutated messages, parameters and files against the package.
+
+A case is given by its part, seed and number. It survives (there is a result), is refused with a
+reason, or fails. test_fuzz.py runs a few cases of every part; for long runs, in the folder test:
+
+    ../.venv/bin/python -m fuzz messages --minutes 20 --seed 1
+    ../.venv/bin/python -m fuzz files --first 17 --cases 1
+"""

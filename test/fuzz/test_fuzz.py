@@ -1,0 +1,150 @@
+"""A few cases of each part of the fuzzer, and the fuzzer itself."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pointnet_samples
+import pytest
+
+pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
+
+from detection_samples import lively, tiny
+
+from fuzz import files, messages, mutation, parameters
+from fuzz.case import FAILED, REFUSED, SURVIVED, Case, Outcome, memory_mb, run_cases
+from fuzz.command import command_outcome
+from fuzz.nodes import INPUTS, FedNode
+from fuzz.valid_messages import CLOUD, cloud, mutated, valid_message
+from lidar_perception.detectors.checkpoint import Header, save_checkpoint
+from lidar_perception.nodes import NODES
+from lidar_perception.nodes.watch import leave, new_context
+from lidar_perception.wire.codec import bag_message, encode
+from msg_utils.point_cloud2 import add_columns, to_array
+
+COLUMNS = ("ground", "in_view", "cluster_id", "intensity")
+LARGEST = {kind: np.iinfo(kind).max for kind in ("u1", "i2", "u4", "i4")} | {
+    "f4": 3e38, "f8": 1e308}
+WITH_CLOUDS = [name for name, (_, inputs, _) in INPUTS.items() if "input/points" in inputs]
+
+
+@pytest.fixture(scope="module")
+def nodes(domain, tmp_path_factory):
+    """Return every node by its name, with small networks."""
+    context, folder = new_context(domain), tmp_path_factory.mktemp("weights")
+    pillars, clusters = str(folder / "v4.safetensors"), str(folder / "pointnet.safetensors")
+    config = tiny("v4", low=(0.0, -10.24, -3.0), high=(20.48, 10.24, 1.0))
+    save_checkpoint(pillars, lively(config), Header(config))
+    config = pointnet_samples.small()
+    save_checkpoint(clusters, pointnet_samples.lively(config), Header(config))
+    values = {"pointpillars_detector": {"pointpillars.weights": pillars},
+              "pointnet_detector": {"pointnet.weights": clusters},
+              "fused_detector": {"fused.weights": pillars, "fused.classifier": clusters}}
+    made = {name: FedNode(name, context, **values.get(name, {})) for name in INPUTS}
+    yield made
+    leave(context, *(each.node for each in made.values()))
+
+
+def test_every_input_of_a_node_is_fuzzed(nodes):
+    assert set(INPUTS) == set(NODES) - {"bag_player", "bag_recorder"}
+    for name, (_, inputs, _) in INPUTS.items():
+        assert set(inputs) == {topic for topic in nodes[name].calls if "parameter" not in topic
+                               and topic not in ("clock", "tf", "tf_static")}
+
+
+@pytest.mark.no_cover
+@pytest.mark.parametrize("part, cases", [(messages, 150), (parameters, 150)])
+def test_nodes_survive_or_refuse_each_case(part, cases, nodes, tmp_path):
+    attempt = part.Attempt(tmp_path, nodes)
+    outcomes = [outcome for _, _, outcome, _ in run_cases(
+        part.case_of, attempt, 1, range(cases), 500.0, np.inf)]
+    assert [outcome for outcome in outcomes if outcome.verdict == FAILED] == []
+    assert len(outcomes) == cases
+    assert min(sum(o.verdict == v for o in outcomes) for v in (SURVIVED, REFUSED)) >= cases // 10
+
+
+@pytest.mark.no_cover
+def test_commands_survive_or_refuse_damaged_files():
+    done = subprocess.run([sys.executable, "-m", "fuzz", "files", "--cases", "16"], text=True,
+                          capture_output=True, cwd=Path(__file__).parents[1])
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "0 failed" in done.stdout
+
+
+def test_a_node_says_that_its_curves_are_of_other_weights(nodes):
+    fused = nodes["fused_detector"].node
+    assert "other weights than" in fused.counts["doubt"] == fused.detector.doubt
+
+
+@pytest.mark.no_cover
+@pytest.mark.parametrize("name", WITH_CLOUDS)
+def test_no_value_of_a_column_costs_memory_or_goes_unchecked(nodes, name):
+    plain, node, params = cloud("columns"), nodes[name], INPUTS[name][2][0]
+    turn = np.arange(len(to_array(plain))) % 7
+    assert node.attempt("input/points", encode(plain), params, False).reason == ""
+    for column in COLUMNS:
+        for kind, largest in LARGEST.items():
+            least, odd = -largest if kind[0] in "if" else 0, np.nan if kind[0] == "f" else 2
+            for values in (np.where(turn < 7, largest, 0),
+                           np.choose(turn, [1, largest, least, odd, largest, 0, 1])):
+                data = encode(add_columns(plain, bag_message, **{column: values.astype(kind)}))
+                before = memory_mb("VmRSS", reset=True)
+                outcome = node.attempt("input/points", data, params, False)
+                case = column, kind, values[:7].tolist(), outcome.reason
+                assert outcome.verdict != FAILED, case
+                assert memory_mb("VmHWM") - before < 64, case  # a byte for each id up to 2^31: 2048
+    assert node.attempt("input/points", data, params, True).verdict != FAILED
+
+
+@pytest.mark.parametrize("column, reading", [
+    ("ground", {"clustering"}), ("in_view", set(WITH_CLOUDS)),
+    ("cluster_id", {"candidate_refinement", "pointnet_detector"})])
+def test_a_column_of_several_numbers_a_point_is_refused(nodes, column, reading):
+    plain = cloud("columns")
+    plain.fields = [f for f in plain.fields if f.name in ("x", "y", "z", column)]
+    plain.fields[-1].offset, plain.fields[-1].datatype, plain.fields[-1].count = 12, 2, 2  # uint8
+    for name in WITH_CLOUDS:
+        outcome = nodes[name].attempt("input/points", encode(plain), INPUTS[name][2][0], False)
+        assert outcome.verdict != FAILED, (name, outcome)
+        if name in reading:
+            assert outcome.verdict == REFUSED and "count > 1" in outcome.reason, (name, outcome)
+
+
+def test_the_same_seed_gives_the_same_cases_and_another_one_others(monkeypatch):
+    samples = {f"{name}/a.bin": bytes(99) for name in files.COMMANDS}
+    monkeypatch.setattr(files, "samples", lambda: samples)
+    for part in (messages, files, parameters):
+        first, again, other = ([part.case_of(seed, i) for i in range(30)] for seed in (5, 5, 6))
+        assert first == again != other
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_mutation_changes_a_copy(seed):
+    data, rng = valid_message(CLOUD), np.random.default_rng(seed)
+    assert mutation.mutate_bytes(data, rng)[1] and data == valid_message(CLOUD)
+    assert mutation.mutate_text("a: 1\nb: [2.5, x]\n", rng)[1]
+    assert mutated(CLOUD, rng)[0] != data == valid_message(CLOUD)
+
+
+def test_a_command_gives_a_result_or_one_line():
+    assert command_outcome(0, "", "").verdict == SURVIVED
+    assert command_outcome(2, "", "3 frames\nError: cannot read it\n").verdict == REFUSED
+    assert command_outcome(1, "left out: a frame\n", "").verdict == REFUSED
+    traceback = "Traceback (most recent call last):\n\nError: x"
+    bad = [command_outcome(code, "", errors) for code, errors in (
+        *((code, "") for code in (None, -11, 1, 2, 70)), (0, traceback), (2, traceback))]
+    assert {outcome.verdict for outcome in bad} == {FAILED}
+
+
+def test_exceptions_and_memory_are_failures():
+    def attempt(case):
+        if case.name == "1":
+            raise ValueError("planted")
+        np.ones((60 if case.name == "2" else 1) * 2**17)  # 60 or 1 MB
+        return Outcome(SURVIVED)
+    first, second, third = (outcome for *_, outcome, _ in run_cases(
+        lambda seed, i: Case(str(i)), attempt, 1, range(3), 40.0, np.inf))
+    assert first.verdict == SURVIVED and "planted" in second.reason and "MB" in third.reason
