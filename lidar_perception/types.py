@@ -17,8 +17,8 @@ from numpy.typing import ArrayLike
 from lidar_perception.classes import CLASSES, PEDESTRIAN, class_name
 from lidar_perception.intensity import to_unit
 
-__all__ = ["CLASSES", "PEDESTRIAN", "Detections", "GroundTruth", "InputError", "LidarFrame",
-           "usable_returns"]
+__all__ = ["CLASSES", "PEDESTRIAN", "Detections", "GroundTruth", "InputError", "InputWarning",
+           "LidarFrame", "usable_returns"]
 
 MAX_RANGE = 1e5  # metres; what is farther is a broken return, not a point
 LIKELY = 0.6  # 0..1, see difflib: two names that are this similar may be the same one, misspelt
@@ -28,6 +28,10 @@ SENSOR_HEIGHT = 1.73  # metres: KITTI's sensor above the road. Defaults, anchors
 
 class InputError(ValueError):
     """Input that cannot be used. The message is one line: what is wrong, and the remedy."""
+
+
+class InputWarning(UserWarning):
+    """Input that is used, though something in it is wrong. The message is one line."""
 
 
 def closest_name(name: object, known: Iterable[str]) -> str | None:

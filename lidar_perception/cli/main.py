@@ -49,8 +49,10 @@ class LazyGroup(Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         """A command that is stopped ends with 130, as everywhere; click would say 1, an error."""
+        from lidar_perception.runs.terminal import input_warnings_shown
         try:
-            return super().invoke(ctx)
+            with input_warnings_shown():
+                return super().invoke(ctx)
         except KeyboardInterrupt:
             ctx.exit(130)
 

@@ -3,35 +3,39 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import threading
-from collections.abc import Iterable, Iterator
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, cast
 
 import yaml
 from mcap.writer import CompressionType, Writer
-from rosbags.interfaces import Connection, ConnectionExtRosbag2
-from rosbags.rosbag2 import Reader
+from rosbags.interfaces import Qos
 
-from lidar_perception.data.mcap_index import NO_INDEX, check_index, profile_of
+from lidar_perception.data.bag_metadata import NAME, compare, read_metadata
+from lidar_perception.data.mcap_file import NO_INDEX
+from lidar_perception.data.open_storage import damaged, find_files, open_file
+from lidar_perception.data.qos import LATCHED_QOS, SENSOR_QOS, full_profile, read_profiles
 from lidar_perception.data.record_file import RecordFile
-from lidar_perception.data.ros1_bag import Ros1Reader, is_ros1
-from lidar_perception.data.unchunked import Unchunked
-from lidar_perception.runs.files import check_free, refuse_others, regular, require_name, short
+from lidar_perception.data.ros1_bag import Ros1File
+from lidar_perception.data.storage import END, START, StorageFile, in_time_order
+from lidar_perception.runs.files import check_free, refuse_others, require_name
 from lidar_perception.runs.resuming import locked
-from lidar_perception.types import InputError
+from lidar_perception.types import InputError, InputWarning
 from lidar_perception.wire.codec import decode, encode, typestore
+from lidar_perception.wire.unpacking import unpack_message
+
+__all__ = ["LATCHED_QOS", "SENSOR_QOS", "Bag", "BagWriter", "KeptOpen"]
 
 # A KITTI cloud is 1.9 MB. Chunks that hold several compress better and are read in fewer steps.
 CHUNK_BYTES = 8 * 2**20
-
-# Quality of service as rosbag2 names it. Latched topics reach whoever subscribes later.
-SENSOR_QOS = dict(history="keep_last", depth=10, reliability="reliable", durability="volatile")
-LATCHED_QOS = dict(history="keep_last", depth=1, reliability="reliable",
-                   durability="transient_local")
-
+SHOWN = 3  # differences between metadata.yaml and the files, in a warning
 
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # faster, where it was built
 
@@ -96,7 +100,7 @@ class BagWriter:
     def add_topic(self, topic: str, type_name: str, qos: dict = SENSOR_QOS) -> None:
         definition, _ = typestore().generate_msgdef(type_name, ros_version=2)
         schema = self.mcap.register_schema(type_name, "ros2msg", definition.encode())
-        profile = [_full_qos(qos)]
+        profile = [full_profile(qos)]
         metadata = {"offered_qos_profiles": _yaml(profile),
                     "topic_type_hash": typestore().hash_rihs01(type_name)}
         channel = self.mcap.register_channel(topic, "cdr", schema, metadata)
@@ -151,68 +155,107 @@ class BagWriter:
             os.fsync(stream.fileno())
 
 
-def _full_qos(qos: dict) -> dict:
-    forever = {"sec": 9223372036, "nsec": 854775807}
-    return {**qos, "deadline": forever, "lifespan": forever, "liveliness": "automatic",
-            "liveliness_lease_duration": forever, "avoid_ros_namespace_conventions": False}
-
-
 class Bag:
-    """A bag open for reading; a context manager. topics maps name to type, counts to the number of
-    messages. InputError where it is damaged: checksums and counts are compared, so that what is
-    read is what was written, in as far as the writer left checksums."""
+    """A bag open for reading; a context manager.
 
-    def __init__(self, path: str | Path):
+    A bag is a rosbag2 folder, a folder of ROS 1 bags, or one storage file. Topics, counts and times
+    are those of its files; where metadata.yaml says otherwise, an InputWarning says so.
+
+    Args:
+        warn: whether to warn; False where another Bag of this path has done so.
+
+    Attributes:
+        topics: name -> type, of the topics that can be read.
+        counts: name -> number of messages of each of them.
+        unreadable: name -> type and encoding, of topics that nothing here reads.
+        start_ns, end_ns: time of the first message, and after the last one; 0 without messages.
+
+    Raises:
+        InputError: it is damaged, or no bag. Checksums and counts are compared; damage in a file
+            without checksums may pass.
+    """
+
+    def __init__(self, path: str | Path, *, warn: bool = True):
         self.path = Path(path)
-        source = _storage(self.path)
-        try:
-            self.reader: Reader | Ros1Reader = (
-                Ros1Reader(source) if is_ros1(source) else Reader(source))
-            self.reader.open()
-        except Exception as error:  # rosbags lets through what damaged sizes lead to
-            raise InputError(_foreign(source) or _unreadable(source, error)) from None
-        try:
-            for part in _mcap_parts(self.reader):
-                if check_index(part.path) == 0:
-                    part.messages = Unchunked(part).messages
-            # They are read one after the other as metadata.yaml names them, in whatever order.
-            _parts(self.reader).sort(key=lambda part: part.metadata.start_time)
-            self.connections = list(self.reader.connections)
-            _check(self.reader, self.connections)
-            self.topics = {c.topic: c.msgtype for c in self.connections}
-            self.counts = dict.fromkeys(self.topics, 0)
-            for connection in self.connections:
-                self.counts[connection.topic] += connection.msgcount
-        except Exception as error:
-            self.reader.close()
-            raise InputError(_unreadable(source, error)) from None
+        self.close: Callable[[], None] = lambda: None
+        with ExitStack() as stack:
+            metadata = read_metadata(self.path)
+            self.files = [(file, open_file(file, stack))
+                          for file in find_files(self.path, metadata)]
+            self.topics: dict[str, str] = {}
+            self.counts: dict[str, int] = {}
+            self.unreadable: dict[str, str] = {}
+            recorded, problems = self._take_topics()
+            times = [file.times for _, file in self.files if file.times is not None]
+            self.start_ns = min((first for first, _ in times), default=0)
+            self.end_ns = max((last + 1 for _, last in times), default=0)
+            compare(metadata, recorded, self.start_ns, self.end_ns - self.start_ns - 1)
+            self._offered = metadata.qos
+            for topic, (kind, _) in metadata.topics.items():
+                if topic not in self.unreadable:
+                    self.topics.setdefault(topic, _full_name(kind))
+                    self.counts.setdefault(topic, 0)
+            if metadata.problems:
+                shown, more = metadata.problems[:SHOWN], len(metadata.problems) - SHOWN
+                problems.append(f"{self.path / NAME} is wrong: {'; '.join(shown)}"
+                                f"{f', and {more} more' if more > 0 else ''}. The bag is read by "
+                                "what its files hold")
+            for problem in problems if warn else ():
+                warnings.warn(problem, InputWarning, stacklevel=2)
+            self.close = stack.pop_all().close
+
+    def _take_topics(self) -> tuple[Counter[str], list[str]]:
+        """Set topics, counts and unreadable. Return the number of messages by topic, readable or
+        not, and a line for each topic with several types, of which the most frequent one counts."""
+        recorded, problems = Counter[str](), []
+        kinds: dict[str, Counter[str]] = {}
+        for _, file in self.files:
+            for topic in file.topics:
+                recorded[topic.name] += topic.count
+                if topic.encoding in ("cdr", ""):
+                    kinds.setdefault(topic.name, Counter())[_full_name(topic.type)] += topic.count
+                else:
+                    self.unreadable[topic.name] = f"{topic.type} as {topic.encoding}"
+        for name, found in kinds.items():
+            self.unreadable.pop(name, None)
+            (self.topics[name], self.counts[name]), *others = found.most_common()
+            if left_out := [f"{count} of {kind}" for kind, count in others if count]:
+                problems.append(f"{self.path}: {name} has messages of several types; those of "
+                                f"{self.topics[name]} are read, not {', '.join(left_out)}")
+        return recorded, problems
 
     def __enter__(self) -> Bag:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        self.reader.close()
+        self.close()
+
+    def __del__(self) -> None:
+        self.close()
 
     @property
-    def start_ns(self) -> int:
-        return self.reader.start_time
-
-    @property
-    def end_ns(self) -> int:
-        return self.reader.end_time
+    def layout(self) -> str:
+        """Kind of the bag: "rosbag2 bag" or "ROS 1 bag"."""
+        return f"{'ROS 1' if isinstance(self.files[0][1], Ros1File) else 'rosbag2'} bag"
 
     @property
     def content(self) -> str:
         """Its topics, each with its type, for people."""
-        return ", ".join(f"{topic} ({kind})"
-                         for topic, kind in sorted(self.topics.items())) or "nothing"
+        return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(
+            {**self.unreadable, **self.topics}.items())) or "nothing"
 
-    def qos(self, topic: str) -> list:
-        """The profiles the topic was recorded with, as rosbags has them; maybe none."""
-        return next(offered_qos(c) for c in self.connections if c.topic == topic)
+    def qos(self, topic: str) -> list[Qos]:
+        """Return the profiles that the topic was recorded with, as rosbags has them; maybe none.
+        Those of metadata.yaml come first, where people edit them for `ros2 bag play`."""
+        return read_profiles(self._offered.get(topic)) or list(dict.fromkeys(
+            profile for _, file in self.files for each in file.topics if each.name == topic
+            for profile in read_profiles(each.qos)))
 
     def require(self, topic: str) -> None:
         """InputError that lists what there is, if the bag has no such topic."""
+        if topic in self.unreadable:
+            raise InputError(f"{self.path} has {self.unreadable[topic]} on {topic}, which is not "
+                             "read; record it with ROS 2")
         if topic not in self.topics:
             raise InputError(f"{self.path} has no topic {topic}; it has {self.content}")
 
@@ -220,21 +263,33 @@ class Bag:
             stop_ns: int | None = None) -> Iterator[tuple[str, int, bytes]]:
         """(topic, time, CDR bytes) in order of time; all topics by default. InputError where the
         bag is damaged, at the end if other numbers of messages were read than it says."""
-        wanted = [c for c in self.connections if topics is None or c.topic in topics]
-        if not wanted:
-            return
-        found = dict.fromkeys((c.topic for c in wanted), 0)
-        try:
-            for connection, stamp, data in self.reader.messages(wanted, start_ns, stop_ns):
-                found[connection.topic] += 1
-                yield connection.topic, stamp, data
-        except Exception as error:  # rosbags lets through what zstd, struct and SQLite raise
-            raise InputError(_unreadable(self.path, error)) from None
-        if (start_ns is None or start_ns <= self.start_ns) and stop_ns is None:
+        wanted = self.topics.keys() & (self.topics if topics is None else {*topics})
+        start, stop = START if start_ns is None else start_ns, END if stop_ns is None else stop_ns
+        found = dict.fromkeys(wanted, 0)
+        for name, time, data in in_time_order(
+                (file.times[0], partial(self._of_file, path, file, wanted, start, stop))
+                for path, file in self.files
+                if file.times and file.times[0] < stop and start <= file.times[1]):
+            found[name] += 1
+            yield name, time, data
+        if start <= self.start_ns and stop_ns is None:
             for topic, count in found.items():
                 if count != self.counts[topic]:
-                    raise InputError(_unreadable(self.path, ValueError(
-                        f"it says {self.counts[topic]} messages on {topic} and holds {count}")))
+                    raise InputError(damaged(self.path, f"it says {self.counts[topic]} messages on "
+                                             f"{topic} and holds {count}"))
+
+    def _of_file(self, path: Path, file: StorageFile, wanted: set[str], start: int, stop: int
+                 ) -> Iterator[tuple[str, int, bytes]]:
+        names = {topic.id: topic.name for topic in file.topics if topic.name in wanted
+                 and topic.encoding in ("cdr", "")
+                 and _full_name(topic.type) == self.topics[topic.name]}
+        if not names:
+            return
+        try:
+            for topic, time, data in file.messages(names, start, stop):
+                yield names[topic], time, unpack_message(data)
+        except Exception as error:  # zstd, struct, SQLite and rosbags raise their own
+            raise InputError(damaged(path, error)) from None
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         """(topic, time, message) of rosbags' classes."""
@@ -248,80 +303,23 @@ class Bag:
 class KeptOpen:
     """A bag that stays open for whoever reads single messages of it: to open one takes as long as
     its index, which grows with the bag. Each process and each thread has its own, as SQLite wants
-    it; they are closed with their thread, or when nobody has this any more."""
+    it; they are closed with their thread, or when nobody has this any more. The first one warns."""
 
-    def __init__(self, path: Path):
-        self.path, self.here = path, threading.local()
+    def __init__(self, path: Path, warn: bool = True):
+        self.path, self.warn, self.here = path, warn, threading.local()
 
-    def __reduce__(self) -> tuple[type[KeptOpen], tuple[Path]]:
-        return KeptOpen, (self.path,)
+    def __reduce__(self) -> tuple[type[KeptOpen], tuple[Path, bool]]:
+        return KeptOpen, (self.path, False)
 
     def bag(self) -> Bag:
+        """The bag, opened by the first call of this thread."""
         if getattr(self.here, "process", None) != os.getpid():  # a fork shares what was open
-            self.here.bag, self.here.process = Bag(self.path), os.getpid()
+            self.here.bag, self.here.process = Bag(self.path, warn=self.warn), os.getpid()
+            self.warn = False
         bag: Bag = self.here.bag
         return bag
 
 
-def _check(reader: Reader | Ros1Reader, connections: list[Connection]) -> None:
-    """ValueError where metadata.yaml, which may say anything, has no names, numbers or times."""
-    for connection in connections:
-        topic, kind, count = connection.topic, connection.msgtype, connection.msgcount
-        if not isinstance(topic, str) or not isinstance(kind, str):
-            raise ValueError(f"it names a topic {topic!r} of type {kind!r}")
-        if not isinstance(count, int) or count < 0:
-            raise ValueError(f"it says {count!r} messages on {topic}")
-    for time in reader.start_time, reader.end_time:
-        if not isinstance(time, int) or abs(time) > 2**63:
-            raise ValueError(f"it has {time!r} for a time in nanoseconds")
-
-
-def _parts(reader: Reader | Ros1Reader) -> list[Any]:
-    """rosbags' readers of the files of a bag of ROS 2."""
-    storage = getattr(reader, "storage", None)
-    parts: list[Any] = getattr(storage, "storages", [storage] if storage else [])
-    return parts
-
-
-def _mcap_parts(reader: Reader | Ros1Reader) -> list[Any]:
-    return [part for part in _parts(reader) if part.path.suffix == ".mcap"]
-
-
-def offered_qos(connection: Connection) -> list:
-    """The profiles of a topic of a rosbag2 bag, as rosbags has them; maybe none."""
-    return cast(ConnectionExtRosbag2, connection.ext).offered_qos_profiles
-
-
-def _storage(path: Path) -> Path:
-    """The folder, or the one storage file in a folder without metadata.yaml."""
-    if not path.exists():
-        raise InputError(f"there is no bag {path}")
-    for file in path.iterdir() if path.is_dir() else [path]:
-        regular(file)
-    if path.is_dir() and not (path / "metadata.yaml").exists():
-        files = [*path.glob("*.mcap"), *path.glob("*.db3")]
-        if len(files) != 1:
-            raise InputError(f"{path} has no metadata.yaml and {len(files)} storage files, so it "
-                             "is no rosbag2 bag; run 'ros2 bag reindex' or give one .mcap file")
-        return files[0]
-    if path.is_file() and path.suffix not in (".mcap", ".db3") and not is_ros1(path):
-        raise InputError(f"{path} is no bag; give the folder of a rosbag2 bag, an .mcap, a .db3 or "
-                         "a ROS 1 .bag file")
-    return path
-
-
-def _foreign(source: Path) -> str:
-    """What to do with an MCAP file whose messages are not those of ROS 2; "" where it is none."""
-    profile = profile_of(source) if source.is_file() and source.suffix == ".mcap" else None
-    if profile in (None, "ros2"):
-        return ""
-    if profile == "ros1":
-        return f"{source} has messages of ROS 1 in MCAP; give the .bag that it was made of"
-    return (f"{source} is MCAP but no bag of ROS 2 (profile {profile!r}), as Foxglove and others "
-            "write it; give clouds as sensor_msgs/PointCloud2 in a bag of ROS 2")
-
-
-def _unreadable(path: Path, error: Exception) -> str:
-    reason = short(error).rstrip(".")
-    remedy = "rosbag reindex" if is_ros1(path) else "mcap recover"
-    return f"the bag {path} is truncated or damaged ({reason}); '{remedy}' may save what it holds"
+def _full_name(kind: str) -> str:
+    """Name of a type as ROS 2 has it: pkg/msg/Name, where a writer left out msg."""
+    return re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", kind)

@@ -17,6 +17,7 @@ import numpy as np
 
 from lidar_perception.camera import Calibration
 from lidar_perception.data.bag import Bag, KeptOpen
+from lidar_perception.data.bag_metadata import NAME
 from lidar_perception.data.bag_poses import BagPoses
 from lidar_perception.data.cloud_files import is_cloud
 from lidar_perception.data.frame import (
@@ -28,8 +29,8 @@ from lidar_perception.data.frame import (
     PointTruth,
     Recording,
 )
+from lidar_perception.data.open_storage import storage_files
 from lidar_perception.data.recorded_scale import SAMPLE, scale_of
-from lidar_perception.data.ros1_bag import is_ros1
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import decode
 from lidar_perception.wire.messages import calibration_of, column, raw_intensity, to_frame, to_truth
@@ -46,7 +47,7 @@ def recognises(path: Path) -> bool:
     """Whether a bag lies there: a file, or a folder with one."""
     if path.is_file():
         return not is_cloud(path)  # nothing else is one file
-    return (path / "metadata.yaml").is_file() or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
+    return (path / NAME).is_file() or bool(storage_files(path))
 
 
 def cloud_topic(bag: Bag, points: str = "") -> str:
@@ -81,12 +82,8 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
         labelled = frames.first is not None and frames.labelled(frames.first[1]) is not None
     has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | {
         *[POINT_LABELS] * labelled, *[POSES] * frames.poses.known}
-    return Recording(path, layout(path, points), frames, has, mounted=False, timed=True)
-
-
-def layout(path: Path, points: str) -> str:
-    """What the bag at a path is, for people."""
-    return f"{'ROS 1' if is_ros1(path) else 'rosbag2'} bag, clouds on {points}"
+    return Recording(path, f"{bag.layout}, clouds on {points}", frames, has, mounted=False,
+                     timed=True)
 
 
 class BagFrames(Sequence):
@@ -109,7 +106,7 @@ class BagFrames(Sequence):
 
     def __iter__(self) -> Iterator[Frame]:
         names: Counter[int] = Counter()
-        with Bag(self.path) as bag:
+        with Bag(self.path, warn=False) as bag:
             for i, (_, time, data) in enumerate(bag.raw({self.points})):
                 stamp = _stamp(data, time)
                 names[stamp] += 1

@@ -66,7 +66,7 @@ def _of_bag(path: Path, topic: str) -> RawClouds:
     if not bag.counts[topic]:
         raise InputError(f"{path} has no cloud on {topic}; record it again")
     frames = bag_frames.BagFrames(opened, topic, bag_frames.CLOUD, bag.counts[topic])
-    return RawClouds(path, bag_frames.layout(path, topic), len(frames), frames.stamps(),
+    return RawClouds(path, f"{bag.layout}, clouds on {topic}", len(frames), frames.stamps(),
                      frames.message, frames.poses, topic)
 
 

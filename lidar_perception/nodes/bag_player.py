@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import warnings
 from collections import deque
 from time import monotonic
 from typing import Any
@@ -20,7 +21,7 @@ from lidar_perception.nodes.pacing import Pace
 from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
 from lidar_perception.nodes.transforms import STATIC_QOS
 from lidar_perception.params import PlayerParams
-from lidar_perception.types import InputError
+from lidar_perception.types import InputError, InputWarning
 from lidar_perception.wire.transforms import TF_MESSAGE
 from msg_utils.messages import ros_message
 from msg_utils.stamps import SECOND, time_message
@@ -42,7 +43,10 @@ class BagPlayer(LidarNode):
         super().__init__("bag_player", PlayerParams(), **options)
         if not self.params.bag:
             raise InputError("parameter 'bag' is empty; give the folder of a bag")
-        self.bag = Bag(self.params.bag)
+        with warnings.catch_warnings(record=True, action="always", category=InputWarning) as wrong:
+            self.bag = Bag(self.params.bag)
+        for warning in wrong:
+            self.get_logger().warning(str(warning.message))
         self.names = self._chosen_topics()
         self.publishers_by_topic = {t: p for t in self.names if (p := self._publisher(t))}
         if not self.publishers_by_topic:
@@ -285,7 +289,7 @@ class BagPlayer(LidarNode):
         return response
 
     def close(self) -> None:
-        self.bag.reader.close()
+        self.bag.close()
 
 
 def _done(response: Any, message: str, success: bool = True) -> Any:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -21,6 +22,8 @@ from rich.progress import (
 from rich.status import Status
 from rich.text import Text
 
+from lidar_perception.types import InputWarning
+
 
 class Terminal(Console):
     """What is printed has names of files, so text is no markup, and only the terminal breaks its
@@ -36,6 +39,23 @@ class Terminal(Console):
 
 console = Terminal()
 errors = Terminal(stderr=True)
+
+@contextmanager
+def input_warnings_shown() -> Iterator[None]:
+    """Print each InputWarning once, as one line on standard error."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("once", category=InputWarning)
+        show = warnings.showwarning
+
+        def print_line(message: Any, category: type[Warning], *where: Any) -> None:
+            if issubclass(category, InputWarning):
+                errors.print(Text("warning", "yellow") + f": {message}")
+            else:
+                show(message, category, *where)
+
+        warnings.showwarning = print_line
+        yield
+
 
 EVERY = 15.0  # seconds between lines where there is no terminal
 

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin, Writer
 
-from lidar_perception.data.bag import offered_qos
+from lidar_perception.data.bag import Bag
 from lidar_perception.data.frame import Frame
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.testing.detections import objects_of
@@ -67,13 +67,13 @@ def copy_bag(source: Path, path: Path, storage: str, names: Mapping[str, str] = 
     """The same messages in a bag that rosbags writes: storage is mcap or sqlite3."""
     if storage not in STORAGES:
         raise InputError(f"storage '{storage}' is none of {', '.join(STORAGES)}")
-    with Reader(source) as reader, Writer(path, version=9,
-                                          storage_plugin=STORAGES[storage]) as bag:
-        copies = {c.id: bag.add_connection(
-            names.get(c.topic, c.topic), c.msgtype, typestore=typestore(),
-            offered_qos_profiles=offered_qos(c)) for c in reader.connections}
-        for connection, stamp, data in reader.messages():
-            bag.write(copies[connection.id], stamp, data)
+    with Bag(source) as recorded, Writer(path, version=9,
+                                         storage_plugin=STORAGES[storage]) as bag:
+        copies = {topic: bag.add_connection(
+            names.get(topic, topic), kind, typestore=typestore(),
+            offered_qos_profiles=recorded.qos(topic)) for topic, kind in recorded.topics.items()}
+        for topic, stamp, data in recorded.raw():
+            bag.write(copies[topic], stamp, data)
     return path
 
 

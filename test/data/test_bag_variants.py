@@ -1,0 +1,380 @@
+"""Bags as other recorders, other versions and other people leave them: all read alike."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import sqlite3
+import warnings
+from pathlib import Path
+
+import pytest
+import yaml
+import zstandard
+from bag_samples import message_bytes
+from mcap.writer import CompressionType, IndexType, Writer
+
+from lidar_perception.campaign.samples import as_ros1
+from lidar_perception.data.bag import Bag, BagWriter
+from lidar_perception.data.open import open_recording
+from lidar_perception.testing.bags import copy_bag
+from lidar_perception.types import InputError, InputWarning
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.topics import EXTRINSICS, POINTS
+
+STATE = "my_robot_msgs/msg/State"
+
+
+@pytest.fixture(autouse=True)
+def no_warning():
+    """A test that does not ask for a warning gets none."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", InputWarning)
+        yield
+
+
+@pytest.fixture(scope="module")
+def rows(written):
+    return message_bytes(written)
+
+
+def write_mcap(path, bag, rows, *, profile="ros2", encoding="cdr", definition="ros2msg",
+               short_names=False, channels=1, late=False, **options):
+    """rows on `channels` channels for each topic; late: their channels are defined first."""
+    with open(path, "wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start(profile=profile)
+        known = {}
+
+        def channel(topic, number):
+            if (topic, number) not in known:
+                kind = bag.topics[topic]
+                schema = writer.register_schema(kind.replace("/msg", "") if short_names else kind,
+                                                definition, b"")
+                known[topic, number] = writer.register_channel(topic, encoding, schema, {})
+            return known[topic, number]
+
+        if late:
+            for topic in bag.topics:
+                channel(topic, 0)
+        for i, (topic, time, data) in enumerate(rows):
+            writer.add_message(channel(topic, i % channels), time, data, time)
+        writer.finish()
+    return path
+
+
+NO_SUMMARY = dict(index_types=IndexType.NONE, repeat_channels=False, repeat_schemas=False,
+                  use_statistics=False, use_summary_offsets=False)
+
+
+@pytest.mark.parametrize("options", [
+    {}, dict(chunk_size=1), dict(index_types=IndexType.CHUNK), dict(index_types=IndexType.MESSAGE),
+    dict(index_types=IndexType.NONE), dict(repeat_channels=False), dict(repeat_schemas=False),
+    dict(chunk_size=1, late=True, repeat_channels=False, repeat_schemas=False),
+    dict(use_statistics=False), dict(use_summary_offsets=False), NO_SUMMARY,
+    dict(use_chunking=False), dict(use_chunking=False, **NO_SUMMARY), dict(enable_crcs=False),
+    dict(enable_data_crcs=True), dict(compression=CompressionType.LZ4),
+    dict(compression=CompressionType.NONE, chunk_size=1), dict(profile=""), dict(profile="other"),
+    dict(definition="ros2idl"), dict(definition="unknown"), dict(definition=""),
+    dict(short_names=True), dict(encoding=""), dict(channels=3),
+], ids=str)
+def test_mcap_of_any_writer_is_read(written, rows, tmp_path, options):
+    with Bag(written) as bag:
+        path = write_mcap(tmp_path / "a.mcap", bag, rows, **options)
+        with Bag(path) as other:
+            assert (other.topics, other.counts) == (bag.topics, bag.counts)
+            assert (other.start_ns, other.end_ns) == (bag.start_ns, bag.end_ns)
+            assert list(other.raw()) == rows
+            last = rows[-1][1]
+            assert list(other.raw(None, last)) == [row for row in rows if row[1] == last]
+
+
+def test_messages_in_and_outside_of_chunks_are_merged(written, rows, tmp_path):
+    """As the specification allows."""
+    with Bag(written) as bag:
+        plain = write_mcap(tmp_path / "a", bag, rows[::2], late=True,
+                           use_chunking=False, **NO_SUMMARY)
+        packed = write_mcap(tmp_path / "b", bag, rows[1::2], late=True, chunk_size=1,
+                            **NO_SUMMARY)
+    body, end = plain.read_bytes()[:-37 - 13], packed.read_bytes()
+    header = 8 + 9 + int.from_bytes(end[9:17], "little")
+    (tmp_path / "c.mcap").write_bytes(body + end[header:])
+    assert sorted(message_bytes(tmp_path / "c.mcap")) == sorted(rows)
+
+
+def test_topics_that_nothing_reads_leave_the_others(written, rows, tmp_path):
+    with open(tmp_path / "a.mcap", "wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="")
+        for topic, kind, definition, encoding in (
+                (POINTS, "sensor_msgs/msg/PointCloud2", "ros2msg", "cdr"),
+                ("/state", STATE, "unknown", "cdr"), ("/log", "foxglove.Log", "protobuf",
+                                                      "protobuf")):
+            channel = writer.register_channel(
+                topic, encoding, writer.register_schema(kind, definition, b""))
+            for name, time, data in rows:
+                if name == POINTS:
+                    writer.add_message(channel, time, data, time)
+        writer.finish()
+    assert len(open_recording(tmp_path / "a.mcap")) == 3
+    with Bag(tmp_path / "a.mcap") as bag:
+        assert bag.topics == {POINTS: "sensor_msgs/msg/PointCloud2", "/state": STATE}
+        assert bag.unreadable == {"/log": "foxglove.Log as protobuf"}
+        with pytest.raises(InputError, match=r"foxglove\.Log as protobuf on /log"):
+            bag.require("/log")
+
+
+def test_a_topic_of_two_types_is_read_as_the_more_frequent_one(written, rows, tmp_path):
+    clouds = [row for row in rows if row[0] == POINTS]
+    with open(tmp_path / "a.mcap", "wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        for kind, found in ((STATE, clouds[:1]), ("sensor_msgs/msg/PointCloud2", clouds)):
+            channel = writer.register_channel(POINTS, "cdr",
+                                              writer.register_schema(kind, "ros2msg", b""))
+            for _, time, data in found:
+                writer.add_message(channel, time, data, time)
+        writer.finish()
+    with pytest.warns(InputWarning, match=f"of several types; those of .*PointCloud2 are read, "
+                                          f"not 1 of {STATE}"):
+        assert message_bytes(tmp_path / "a.mcap") == clouds
+
+
+SCHEMAS = {  # of distributions, by the columns of topics
+    "dashing": "id INTEGER PRIMARY KEY, name TEXT, type TEXT",
+    "foxy": "id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, "
+            "offered_qos_profiles TEXT",
+    "jazzy": "id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT, "
+             "offered_qos_profiles TEXT, type_description_hash TEXT",
+}
+
+
+def write_sqlite(path, bag, rows, schema="jazzy", mode="DELETE"):
+    """The open database, of which the second half of the rows is committed last."""
+    database = sqlite3.connect(path)
+    database.execute(f"PRAGMA journal_mode={mode}")
+    database.execute("PRAGMA wal_autocheckpoint=0")
+    columns = SCHEMAS[schema]
+    database.execute(f"CREATE TABLE topics({columns})")
+    database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, "
+                     "timestamp INTEGER, data BLOB)")
+    database.execute("CREATE TABLE message_definitions(id INTEGER PRIMARY KEY, topic_type TEXT, "
+                     "encoding TEXT, encoded_message_definition TEXT, type_description_hash TEXT)")
+    ids = {topic: i for i, topic in enumerate(bag.topics, 1)}
+    for topic, i in ids.items():
+        values = [i, topic, bag.topics[topic], "cdr", "", ""][:columns.count(",") + 1]
+        database.execute(f"INSERT INTO topics VALUES({','.join('?' * len(values))})", values)
+        database.execute("INSERT INTO message_definitions VALUES(?, ?, 'unknown', '', '')",
+                         (i, bag.topics[topic]))
+    for part in (rows[:len(rows) // 2], rows[len(rows) // 2:]):
+        database.executemany("INSERT INTO messages(topic_id, timestamp, data) VALUES(?, ?, ?)",
+                             [(ids[topic], time, data) for topic, time, data in part])
+        database.commit()
+        if part[0] is rows[0]:
+            database.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    return database
+
+
+@pytest.mark.parametrize("schema", SCHEMAS)
+def test_sqlite_of_any_distribution_is_read(written, rows, tmp_path, schema):
+    with Bag(written) as bag:
+        write_sqlite(tmp_path / "a?b#c%20.db3", bag, rows, schema).close()
+        with Bag(tmp_path / "a?b#c%20.db3") as other:
+            assert (other.topics, other.counts, [*other.raw()]) == (bag.topics, bag.counts, rows)
+
+
+@pytest.mark.parametrize("shm", [True, False])
+def test_what_is_only_in_the_wal_of_sqlite_is_read_and_nothing_is_written(written, rows, tmp_path,
+                                                                          shm):
+    """As after a crash of the recorder with the preset resilient; from a read-only disk, too."""
+    with Bag(written) as bag:
+        database = write_sqlite(tmp_path / "a.db3", bag, rows, mode="WAL")
+    (tmp_path / "bag").mkdir()
+    for end in ("", "-wal", "-shm")[:3 if shm else 2]:
+        shutil.copy(tmp_path / f"a.db3{end}", tmp_path / "bag")
+    database.close()
+    files = {file: file.read_bytes() for file in (tmp_path / "bag").iterdir()}
+    for file in files:
+        file.chmod(0o444)
+    (tmp_path / "bag").chmod(0o555)
+    assert len(files[tmp_path / "bag/a.db3-wal"]) > 0
+    assert message_bytes(tmp_path / "bag") == message_bytes(tmp_path / "bag/a.db3") == rows
+    assert {file: file.read_bytes() for file in (tmp_path / "bag").iterdir()} == files
+    (tmp_path / "bag").chmod(0o755)
+
+
+def changed(written, folder, change) -> Path:
+    """A copy of the bag whose metadata.yaml `change` has changed."""
+    shutil.copytree(written, folder)
+    metadata = yaml.safe_load((folder / "metadata.yaml").read_text())
+    change(metadata["rosbag2_bagfile_information"])
+    (folder / "metadata.yaml").write_text(yaml.safe_dump(metadata))
+    return folder
+
+
+def each_topic(info, **values):
+    for topic in info["topics_with_message_count"]:
+        topic["topic_metadata"].update(values)
+
+
+@pytest.mark.parametrize("change", [
+    lambda info: info.update(storage_identifier=""),
+    lambda info: info.pop("storage_identifier"),
+    lambda info: info.update(storage_identifier="my_plugin"),
+    lambda info: info.update(version=10),
+    lambda info: info.update(version=1, relative_file_paths=["drive/drive.mcap"]),
+    lambda info: [info.pop(key) for key in ("files", "custom_data", "ros_distro",
+                                            "compression_format", "compression_mode")],
+    lambda info: info.update(files=[]),
+    lambda info: info.update(topics_with_message_count=[]),
+    lambda info: each_topic(info, offered_qos_profiles=""),
+    lambda info: each_topic(info, offered_qos_profiles=[]),
+    lambda info: each_topic(info, offered_qos_profiles="- history: [\n"),
+    lambda info: each_topic(info, offered_qos_profiles="- infinite"),
+    lambda info: each_topic(info, offered_qos_profiles=[{"deadline": "infinite"}]),
+    lambda info: each_topic(info, type_description_hash="RIHS01_0", serialization_format=""),
+])
+def test_other_texts_in_metadata_change_nothing(written, rows, tmp_path, change):
+    path = changed(written, tmp_path / "bag", change)
+    assert message_bytes(path) == rows
+    assert len(open_recording(path)) == 3
+
+
+@pytest.mark.parametrize("text, durability, depth", [
+    ("- history: 1\n  depth: 7\n  reliability: 2\n  durability: 1", "TRANSIENT_LOCAL", 7),
+    ("- history: keep_last\n  depth: 7\n  reliability: best_effort\n  durability: volatile\n"
+     "  deadline: {sec: 2147483647, nsec: 4294967295}\n  lifespan: infinite", "VOLATILE", 7),
+])
+def test_the_qos_of_metadata_comes_first_in_any_spelling(written, tmp_path, text, durability,
+                                                         depth):
+    path = changed(written, tmp_path / "bag",
+                   lambda info: each_topic(info, offered_qos_profiles=text))
+    with Bag(path) as bag:
+        profile, = bag.qos(POINTS)
+        assert (profile.durability.name, profile.depth) == (durability, depth)
+        assert profile.reliability.name == "BEST_EFFORT"
+    path = changed(written, tmp_path / "other",
+                   lambda info: each_topic(info, offered_qos_profiles="nonsense"))
+    with Bag(path) as bag:
+        assert bag.qos(EXTRINSICS)[0].durability.name == "TRANSIENT_LOCAL"
+
+
+def counts(info, count):
+    for topic in info["topics_with_message_count"]:
+        topic["message_count"] = count
+
+
+@pytest.mark.parametrize("change, words", [
+    (lambda info: counts(info, 5), "it says 5 messages on /camera/camera_info, and there are 2.*"
+                                   "and 2 more"),
+    (lambda info: counts(info, -1), "it says -1 messages"),
+    (lambda info: counts(info, "1,5"), "'1,5' for message_count"),
+    (lambda info: counts(info, 2.5), "2.5 for message_count"),
+    (lambda info: each_topic(info, name=3), "a topic 3 of type"),
+    (lambda info: each_topic(info, type=[1]), r"of type \[1\]"),
+    (lambda info: info["duration"].update(nanoseconds=10**8), "a duration of 0.100 s, and it is 0"),
+    (lambda info: info["duration"].update(nanoseconds=10**30), "a duration of"),
+    (lambda info: info["starting_time"].update(nanoseconds_since_epoch=0), "a start of 0.000 s"),
+    (lambda info: info.pop("duration"), "KeyError: 'duration'"),
+    (lambda info: info.update(relative_file_paths=["a.mcap", "b.mcap"]),
+     "it names a.mcap, b.mcap, and there is drive.mcap"),
+    (lambda info: info.clear(), "KeyError: 'relative_file_paths'"),
+])
+def test_a_wrong_metadata_is_said_once_and_the_files_are_read(written, rows, tmp_path, change,
+                                                              words):
+    path = changed(written, tmp_path / "bag", change)
+    with pytest.warns(InputWarning, match=f"bag/metadata.yaml is wrong: .*{words}") as said:
+        recording = open_recording(path)
+        assert [len(frame.load()) for frame in recording] == [
+            len(frame.load()) for frame in open_recording(written)]
+        recording.frames[2].load()
+    assert len(said) == 1 and "\n" not in str(said[0].message)
+    with pytest.warns(InputWarning), Bag(path) as bag:
+        assert (bag.start_ns, bag.end_ns) == (rows[0][1], rows[-1][1] + 1)
+        assert [*bag.raw()] == rows
+
+
+@pytest.mark.parametrize("text", ["text", "a: [\n", "", "\xff\x00"])
+def test_a_metadata_that_is_none_is_said(written, rows, tmp_path, text):
+    shutil.copytree(written, tmp_path / "bag")
+    (tmp_path / "bag/metadata.yaml").write_text(text, encoding="latin-1")
+    with pytest.warns(InputWarning, match="is not readable"):
+        assert message_bytes(tmp_path / "bag") == rows
+
+
+def pack(data: bytes) -> bytes:
+    return zstandard.ZstdCompressor().compress(data)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize("metadata", [True, False])
+def test_files_that_were_compressed_whole_are_read(written, rows, tmp_path, storage, metadata):
+    path = copy_bag(written, tmp_path / "bag", storage)
+    file, = (file for file in path.iterdir() if file.suffix != ".yaml")
+    (path / f"{file.name}.zstd").write_bytes(pack(file.read_bytes()))
+    file.unlink()
+    text = (path / "metadata.yaml").read_text()
+    (path / "metadata.yaml").write_text(text.replace(file.name, f"{file.name}.zstd"))
+    if not metadata:
+        (path / "metadata.yaml").unlink()
+    assert message_bytes(path) == rows
+    whole = path / f"{file.name}.zstd"
+    whole.write_bytes(whole.read_bytes()[:1000])
+    with pytest.raises(InputError, match=rf"{file.name}.zstd is truncated or damaged"):
+        message_bytes(path)
+
+
+def test_messages_that_were_compressed_one_by_one_are_read(written, rows, tmp_path):
+    with Bag(written) as bag:
+        path = write_mcap(tmp_path / "a.mcap", bag,
+                          [(topic, time, pack(data)) for topic, time, data in rows])
+    assert message_bytes(path) == rows
+
+
+def parts_of(folder, stamps):
+    """Storage files of bags, each with a text at its stamps."""
+    for i, part in enumerate(stamps):
+        with BagWriter(folder / f"part{i}") as bag:
+            bag.add_topic("/text", "std_msgs/msg/String")
+            for stamp in part:
+                bag.write("/text", stamp, bag_message("std_msgs/msg/String", data=str(stamp)))
+        yield folder / f"part{i}"
+
+
+@pytest.mark.parametrize("kind", ["drive_{}.mcap", "drive_{}.db3", "drive_2024-01-01_{}.bag",
+                                  "any{}.bag"])
+@pytest.mark.parametrize("stamps", [([10, 20], [30, 40], [50]), ([50, 60], [30], [10, 20]),
+                                    ([10, 30, 50], [20, 40], [30]), ([], [10], [])])
+def test_files_of_one_drive_are_read_in_order_of_time(tmp_path, kind, stamps):
+    """Without metadata.yaml, as after a crash or from ROS 1; also where they overlap."""
+    (tmp_path / "drive").mkdir()
+    for i, part in enumerate(parts_of(tmp_path, stamps)):
+        file = tmp_path / "drive" / kind.format(i)
+        if file.suffix == ".bag":
+            as_ros1(part, file)
+        elif file.suffix == ".db3":
+            copied = copy_bag(part, tmp_path / f"copied{i}", "sqlite3")
+            shutil.copy(copied / f"{copied.name}.db3", file)
+        else:
+            shutil.copy(part / f"{part.name}.mcap", file)
+    times = sorted(itertools.chain(*stamps))
+    with Bag(tmp_path / "drive") as bag:
+        assert [time for _, time, _ in bag.raw()] == times
+        assert bag.counts == {"/text": len(times)}
+        assert (bag.start_ns, bag.end_ns) == (times[0], times[-1] + 1)
+        assert [time for _, time, _ in bag.raw(None, 20, 40)] == [t for t in times if 20 <= t < 40]
+
+
+def test_a_folder_of_ros_1_bags_is_one_drive(written, tmp_path):
+    with Bag(written) as bag:
+        clouds = [*bag.raw({POINTS})]
+        for i in range(3):
+            with BagWriter(tmp_path / f"part{i}") as part:
+                part.add_topic(POINTS, bag.topics[POINTS])
+                part.write(*clouds[i])
+            (tmp_path / "drive").mkdir(exist_ok=True)
+            as_ros1(tmp_path / f"part{i}", tmp_path / f"drive/drive_{i}.bag", "bz2")
+    recording, expected = open_recording(tmp_path / "drive"), open_recording(written)
+    assert "ROS 1 bag, clouds on /points" in str(recording)
+    assert [(f.stamp_ns, len(f.load())) for f in recording] == [
+        (f.stamp_ns, len(f.load())) for f in expected]
