@@ -50,7 +50,8 @@ def to_array(msg: Any) -> np.ndarray:
     """The points of a cloud, (height * width,) structured, row by row.
 
     A read-only view of the message's buffer; copied only where rows are padded. CloudError when
-    the buffer is shorter than height, width and the steps say.
+    the buffer is shorter than height, width and the steps say. A row_step of 0, or one of the whole
+    cloud, as some drivers send it, counts as that of rows without padding.
     """
     count = msg.height * msg.width
     if count == 0:
@@ -58,11 +59,9 @@ def to_array(msg: Any) -> np.ndarray:
     if msg.point_step == 0:
         raise CloudError(f"point_step is 0 for {count} points; the message is broken")
     dtype = dtype_of(msg)
-    data = np.frombuffer(msg.data, np.uint8)
-    row = msg.width * msg.point_step
-    if msg.height > 1 and msg.row_step < row:
-        raise CloudError(f"row_step = {msg.row_step} is less than width x point_step = {row}")
-    step = msg.row_step if msg.height > 1 else row
+    data, row, step = np.frombuffer(msg.data, np.uint8), msg.width * msg.point_step, row_step(msg)
+    if step < row:
+        raise CloudError(f"row_step = {step} is less than width x point_step = {row}")
     needed = (msg.height - 1) * step + row
     if len(data) < needed:
         raise CloudError(f"data has {len(data)} bytes where height {msg.height} x width "
@@ -71,6 +70,15 @@ def to_array(msg: Any) -> np.ndarray:
     rows = np.ndarray((msg.height, msg.width), dtype, data, strides=(step, msg.point_step))
     rows.flags.writeable = False
     return rows.reshape(count)
+
+
+def row_step(msg: Any) -> int:
+    """Return the bytes from one row of a cloud to the next, also where the message says 0 or the
+    size of all rows, though its data are those of rows without padding."""
+    row, given = msg.width * msg.point_step, msg.row_step
+    whole = msg.height * row
+    complete = given == whole <= len(msg.data) < (msg.height - 1) * whole + row
+    return int(row if msg.height <= 1 or given == 0 or complete else given)
 
 
 def columns(points: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
@@ -155,9 +163,9 @@ def add_columns(msg: Any, make: Any, **new: np.ndarray) -> Any:
     data = np.zeros((len(old), step), np.uint8)
     if len(old):
         raw = np.frombuffer(msg.data, np.uint8)
-        if msg.height > 1 and msg.row_step != msg.width * msg.point_step:
+        if (step_in := row_step(msg)) != msg.width * msg.point_step:
             raw = np.ndarray((msg.height, msg.width * msg.point_step), np.uint8, raw,
-                             strides=(msg.row_step, 1)).reshape(-1)
+                             strides=(step_in, 1)).reshape(-1)
         data[:, :msg.point_step] = raw[:len(old) * msg.point_step].reshape(-1, msg.point_step)
         for name, (at, kind) in places.items():
             np.ndarray(len(old), kind, data, offset=at, strides=(step,))[:] = new[name]

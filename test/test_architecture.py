@@ -33,7 +33,7 @@ STRANGERS = {
     "classes": [], "intensity": ["numpy"], "types": ["numpy"], "param_fields": [],
     "geometry": ["numpy", "numba"], "camera": NUMBERS,
     "groups": ["numpy"], "robot": ["numpy", "scipy"], "runs": ["rich", "jinja2", "threadpoolctl"],
-    "wire": ["numpy", "scipy", "rosbags", "msg_utils"],
+    "wire": ["numpy", "scipy", "rosbags", "msg_utils", "lz4", "zstandard"],
     "data": ["numpy", "scipy", "yaml", "mcap", "rosbags", "msg_utils", "lz4", "zstandard"],
     "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,
     "detectors": [*NUMBERS, "torch", "safetensors", "onnx", "onnxruntime", "onnxscript"],

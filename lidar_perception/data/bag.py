@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import threading
 import warnings
@@ -193,7 +192,7 @@ class Bag:
             self._offered = metadata.qos
             for topic, (kind, _) in metadata.topics.items():
                 if topic not in self.unreadable:
-                    self.topics.setdefault(topic, _full_name(kind))
+                    self.topics.setdefault(topic, kind)
                     self.counts.setdefault(topic, 0)
             if metadata.problems:
                 shown, more = metadata.problems[:SHOWN], len(metadata.problems) - SHOWN
@@ -211,9 +210,9 @@ class Bag:
         kinds: dict[str, Counter[str]] = {}
         for _, file in self.files:
             for topic in file.topics:
-                recorded[topic.name] += topic.count
-                if topic.encoding in ("cdr", ""):
-                    kinds.setdefault(topic.name, Counter())[_full_name(topic.type)] += topic.count
+                recorded[topic.name] += topic.messages
+                if topic.encoding == "cdr":
+                    kinds.setdefault(topic.name, Counter())[topic.type] += topic.messages
                 else:
                     self.unreadable[topic.name] = f"{topic.type} as {topic.encoding}"
         for name, found in kinds.items():
@@ -281,8 +280,7 @@ class Bag:
     def _of_file(self, path: Path, file: StorageFile, wanted: set[str], start: int, stop: int
                  ) -> Iterator[tuple[str, int, bytes]]:
         names = {topic.id: topic.name for topic in file.topics if topic.name in wanted
-                 and topic.encoding in ("cdr", "")
-                 and _full_name(topic.type) == self.topics[topic.name]}
+                 and topic.encoding == "cdr" and topic.type == self.topics[topic.name]}
         if not names:
             return
         try:
@@ -318,8 +316,3 @@ class KeptOpen:
             self.warn = False
         bag: Bag = self.here.bag
         return bag
-
-
-def _full_name(kind: str) -> str:
-    """Name of a type as ROS 2 has it: pkg/msg/Name, where a writer left out msg."""
-    return re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", kind)

@@ -108,7 +108,7 @@ class BagFrames(Sequence):
         names: Counter[int] = Counter()
         with Bag(self.path, warn=False) as bag:
             for i, (_, time, data) in enumerate(bag.raw({self.points})):
-                stamp = _stamp(data, time)
+                stamp = self._stamp(data, time)
                 names[stamp] += 1
                 yield self._frame(i, time, stamp, names[stamp], partial(bytes, data))
 
@@ -129,7 +129,7 @@ class BagFrames(Sequence):
         i %= self.clouds
         if i == 0 and self.first is not None:
             time, data = self.first
-            return self._frame(0, time, _stamp(data, time), 1, lambda: data)
+            return self._frame(0, time, self._stamp(data, time), 1, lambda: data)
         time, before, stamp, which = self._index[i]
         return self._frame(i, time, stamp, which, partial(self._read, time, before))
 
@@ -141,7 +141,7 @@ class BagFrames(Sequence):
         names: Counter[int] = Counter()
         rows = []
         for _, time, data in self.opened.bag().raw({self.points}):
-            stamp = _stamp(data, time)
+            stamp = self._stamp(data, time)
             names[stamp] += 1
             rows.append((time, times[time], stamp, names[stamp]))
             times[time] += 1
@@ -163,6 +163,8 @@ class BagFrames(Sequence):
             if topic == TRUTH:
                 objects = from_marker_array(msg)
                 truth[objects.stamp_ns or time] = to_truth(objects)
+                if not objects.stamp_ns:  # of a cloud without a stamp, or where time begins
+                    truth.setdefault(0, truth[time])
             else:
                 (infos if topic == CAMERA_INFO else transforms).append((time, msg))
         return truth, infos, transforms
@@ -180,6 +182,18 @@ class BagFrames(Sequence):
         """Time of the first cloud, and it, serialised; None where there is none."""
         raw = self.opened.bag().raw({self.points})
         return next(((time, bytes(data)) for _, time, data in raw), None)
+
+    def _stamp(self, data: bytes, time: int) -> int:
+        """Return the header.stamp of a serialised cloud; its time in the bag if no cloud has one,
+        or if it is too short for one."""
+        if (stamp := _header_stamp(data)) == 0 and self._unstamped:
+            stamp = None
+        return time if stamp is None else stamp
+
+    @cached_property
+    def _unstamped(self) -> bool:
+        """True if all stamps are 0; some are where simulated time begins."""
+        return not any(_header_stamp(data) for *_, data in self.opened.bag().raw({self.points}))
 
     @cached_property
     def full_scale(self) -> float:
@@ -242,12 +256,12 @@ class BagFrames(Sequence):
         return calibration_of(info, transform) if info and transform else None
 
 
-def _stamp(data: bytes, time: int) -> int:
-    """header.stamp of a serialised message; its time if it has none, or is too short for one."""
+def _header_stamp(data: bytes) -> int | None:
+    """header.stamp of a serialised message in ns; None if it is too short for one."""
     if len(data) < 12:
-        return time
+        return None
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-    return seconds * SECOND + nanoseconds or time
+    return int(seconds * SECOND + nanoseconds)
 
 
 def _frame_id(data: bytes) -> str:

@@ -24,11 +24,11 @@ _Loader: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # faster, where it
 
 @dataclass
 class Metadata:
-    """What metadata.yaml says, as far as it can be read.
+    """The readable part of a metadata.yaml.
 
     files: names of the storage files. topics: name -> (type, number of messages). qos: offered
-    profiles of topics, as text or parsed. start_ns, duration_ns: None where it does not say them.
-    problems: what is wrong in it, for people.
+    profiles of topics, as text or parsed. start_ns, duration_ns: None if it does not say them.
+    problems: one sentence per error in it.
     """
 
     files: list[str] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""Which files a bag consists of, and what each of them is, by what it holds."""
+"""Find the storage files of a bag, and open each by its content."""
 
 from __future__ import annotations
 
@@ -27,12 +27,15 @@ FORMATS: dict[str, tuple[bytes, Callable[[Path], StorageFile], str]] = {
     ".db3": (sqlite_file.MAGIC, SqliteFile, "sqlite3 FILE .recover"),
     ".bag": (ros1_bag.MAGIC, Ros1File, "rosbag reindex"),
 }
-PACKED = ".zstd"  # as rosbag2 names what it compressed file by file
+PACKED = ".zstd"  # suffix of the files that rosbag2 compressed
 WANTED = "give the folder of a rosbag2 bag, an .mcap, a .db3 or a ROS 1 .bag file"
 
 
 def storage_files(folder: Path) -> list[Path]:
-    """Return the files in a folder that are named as storage files of a bag, by name."""
+    """Return the files in a folder that are named as storage files of a bag, by name; none where
+    there is no folder."""
+    if not folder.is_dir():
+        return []
     return sorted(file for file in folder.iterdir() if _suffix(file) in FORMATS and file.is_file())
 
 
@@ -83,6 +86,9 @@ def open_file(path: Path, stack: ExitStack) -> StorageFile:
         for topic in file.topics:
             if not all(isinstance(text, str) for text in (topic.name, topic.type, topic.encoding)):
                 raise ValueError(f"it names a topic {topic.name!r} of type {topic.type!r}")
+        # Some writers leave out "msg" or the encoding, which is then that of ROS 2.
+        file.topics = [topic._replace(type=re.sub(r"^(\w+)/(\w+)$", r"\1/msg/\2", topic.type),
+                                      encoding=topic.encoding or "cdr") for topic in file.topics]
         if file.times and not all(isinstance(time, int) for time in file.times):
             raise ValueError(f"it has {file.times!r} for times in nanoseconds")
     except Exception as error:  # struct, SQLite, mcap and rosbags raise their own
@@ -109,13 +115,13 @@ def _head(path: Path) -> bytes:
 
 
 def _belong_together(files: list[Path]) -> bool:
-    """Whether files are all ROS 1 bags, or named as rosbag2 names the parts of one."""
+    """Return True if all files are ROS 1 bags, or named as rosbag2 names the parts of one."""
     names = {re.sub(r"_\d+(?=\.(mcap|db3)(\.zstd)?$)", "", file.name) for file in files}
     return all(file.suffix == ".bag" for file in files) or len(names) == 1
 
 
 def _unpacked(path: Path, stack: ExitStack) -> Path:
-    """A copy of a compressed file, until the stack is closed."""
+    """Return an unpacked copy of a file, which is removed when the stack is closed."""
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
     target = folder / path.name.removesuffix(PACKED)
     try:
@@ -131,9 +137,9 @@ def _unpacked(path: Path, stack: ExitStack) -> Path:
 
 
 def _foreign(path: Path, file: McapFile) -> str:
-    """What to do with an MCAP file whose messages are not those of ROS 2; "" where they are."""
+    """Return the error for an MCAP file without a message of ROS 2; "" if it has some."""
     encodings = {topic.encoding for topic in file.topics}
-    if file.profile == "ros2" or encodings & {"cdr", ""}:
+    if file.profile == "ros2" or "cdr" in encodings:
         return ""
     if file.profile == "ros1" or "ros1" in encodings:
         return f"{path} has messages of ROS 1 in MCAP; give the .bag that it was made of"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import yaml
 from rosbags.interfaces import Qos
 from rosbags.rosbag2.metadata import parse_qos
 
-# As rosbag2 names it. Latched topics reach whoever subscribes later.
+# In rosbag2's words. Late subscribers get the last message of a latched topic.
 SENSOR_QOS = dict(history="keep_last", depth=10, reliability="reliable", durability="volatile")
 LATCHED_QOS = dict(history="keep_last", depth=1, reliability="reliable",
                    durability="transient_local")
@@ -32,8 +32,9 @@ def read_profiles(given: Any) -> list[Qos]:
     try:
         profiles = yaml.safe_load(given) if isinstance(given, str) else given
         # rosbags needs all of them to be there (rosbags/rosbag2/metadata.py, parse_qos).
-        return parse_qos([{**SENSOR_QOS, **{key: profile[key] for key in SENSOR_QOS
-                                            if isinstance(profile.get(key), str | int)}, **_REST}
-                          for profile in profiles or ()])
+        return parse_qos(cast(Any, [
+            {**SENSOR_QOS, **{key: profile[key] for key in SENSOR_QOS
+                              if isinstance(profile.get(key), str | int)}, **_REST}
+            for profile in profiles or ()]))
     except (yaml.YAMLError, AttributeError, TypeError, ValueError):
         return []

@@ -17,9 +17,9 @@ class SqliteFile:
     written there. ValueError or sqlite3.Error where it is damaged."""
 
     def __init__(self, path: Path):
-        # rosbags reads every file as immutable, and so without what is only in the -wal file
-        # (rosbags/rosbag2/storage_sqlite3.py, Sqlite3Reader.open). SQLite reads that file without
-        # making its -shm file if it has the database for itself, and without locks in any folder.
+        # rosbags opens every file as immutable and so misses messages that are only in the -wal
+        # file (rosbags/rosbag2/storage_sqlite3.py, Sqlite3Reader.open). In exclusive mode SQLite
+        # reads that file without a -shm file; without locks this works in read-only folders.
         unfinished = any(_size(path.with_name(path.name + end)) for end in ("-wal", "-journal"))
         how = "mode=ro&vfs=unix-none" if unfinished else "immutable=1"
         self.database = sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True,
@@ -58,7 +58,8 @@ class SqliteFile:
                                          "MAX(timestamp) FROM messages GROUP BY topic_id")}
         rows = self.database.execute(
             f"SELECT id, name, type, {encoding}, {qos} FROM topics ORDER BY id")
-        self.topics = [Topic(*row, counted.get(row[0], (0,))[0]) for row in rows]
+        self.topics = [Topic(number, name, kind, encoding, qos, counted.get(number, (0,))[0])
+                       for number, name, kind, encoding, qos in rows]
         known = [counted[topic.id] for topic in self.topics if topic.id in counted]
         self.times = (min(first for _, first, _ in known),
                       max(last for *_, last in known)) if known else None

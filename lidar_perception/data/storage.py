@@ -1,4 +1,4 @@
-"""Interface of the storage files of bags (MCAP, SQLite, ROS 1), whatever their format."""
+"""Interface of the storage files of bags: MCAP, SQLite and ROS 1."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ class Topic(NamedTuple):
     """A topic of one file; a file may have several of one name.
 
     id: of its messages. type: "pkg/msg/Name", or "" where the file does not say it. encoding: "cdr"
-    where its messages can be read. qos: the offered profiles, as YAML text or parsed. count: number
-    of its messages.
+    where its messages can be read. qos: the offered profiles, as YAML text or parsed.
+    messages: number of its messages.
     """
 
     id: int
@@ -24,7 +24,7 @@ class Topic(NamedTuple):
     type: str
     encoding: str
     qos: Any
-    count: int
+    messages: int
 
 
 class StorageFile(Protocol):

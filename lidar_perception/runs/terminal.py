@@ -47,11 +47,12 @@ def input_warnings_shown() -> Iterator[None]:
         warnings.filterwarnings("once", category=InputWarning)
         show = warnings.showwarning
 
-        def print_line(message: Any, category: type[Warning], *where: Any) -> None:
+        def print_line(message: Warning | str, category: type[Warning], *where: Any,
+                       **more: Any) -> None:
             if issubclass(category, InputWarning):
                 errors.print(Text("warning", "yellow") + f": {message}")
             else:
-                show(message, category, *where)
+                show(message, category, *where, **more)
 
         warnings.showwarning = print_line
         yield

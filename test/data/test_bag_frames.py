@@ -7,17 +7,21 @@ import shutil
 
 import numpy as np
 import pytest
-from bag_samples import cloud_frame, message_bytes, same_cloud
+from bag_samples import cloud_frame, message_bytes, same_cloud, scans
 from recording_samples import MADE, each_recording
-from samples import STAMP, object_folder, scene, write
+from samples import STAMP, header, object_folder, scene, walker_truth, write
 
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag, BagWriter
+from lidar_perception.data.drives import drives_of
 from lidar_perception.data.frame import CAMERA, Frame
 from lidar_perception.data.open import open_recording
-from lidar_perception.data.to_bag import write_bag
+from lidar_perception.data.to_bag import points_of, write_bag
 from lidar_perception.types import InputError
-from lidar_perception.wire.topics import CAMERA_INFO, POINTS
+from lidar_perception.wire.codec import bag_message
+from lidar_perception.wire.messages import truth_markers
+from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
+from msg_utils.point_cloud2 import from_array
 
 
 def same_frames(a, b):
@@ -55,7 +59,8 @@ def scene_of(frame):
 def test_the_first_frame_is_known_without_a_look_through_the_bag(written, monkeypatch):
     """An hour of clouds takes minutes to look through, and many commands ask for the first only."""
     stamped = []
-    monkeypatch.setattr(bag_frames, "_stamp", lambda data, time: stamped.append(time) or time)
+    monkeypatch.setattr(bag_frames.BagFrames, "_stamp",
+                        lambda self, data, time: stamped.append(time) or time)
     frames = open_recording(written).frames
     assert frames[0].index == frames[-3].index == 0 and len({*stamped}) == 1
     assert frames[1].index == 1 and len({*stamped}) == 3
@@ -122,3 +127,22 @@ def test_a_scan_with_a_stamp_that_no_bag_can_hold_is_left_out_and_named(tmp_path
     scans, skipped = [Frame.of(str(t), cloud_frame(scene(), t)) for t in (-5, 7)], []
     assert write_bag(tmp_path / "bag", scans, skipped=skipped) == 1
     assert "-5" in skipped[0] and open_recording(tmp_path / "bag").frames[0].stamp_ns == 7
+
+
+@pytest.mark.parametrize("stamps, expected", [
+    ([0, 1, 2], [0, 1, 2]), ([0, 0, 2], [0, 0, 2]), ([5, 0, 2], [5, 0, 2]), ([0, 0], [70, 71]),
+    ([0], [70])])
+def test_stamps_of_0_count_unless_all_are_0(tmp_path, stamps, expected):
+    """Simulated time begins at 0; a driver that sets no stamp leaves them all 0."""
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic(POINTS, "sensor_msgs/msg/PointCloud2")
+        bag.add_topic(TRUTH, "visualization_msgs/msg/MarkerArray")
+        for i, stamp in enumerate(stamps):
+            head = header(bag_message, stamp)
+            bag.write(POINTS, 70 + i, from_array(points_of(scans(1)[0].load()), head, bag_message))
+            bag.write(TRUTH, 70 + i, truth_markers(walker_truth(), head, bag_message))
+    recording = open_recording(tmp_path / "bag")
+    assert [frame.stamp_ns for frame in recording] == expected
+    assert [frame.stamp_ns for frame in recording.frames[:]] == expected
+    assert all(frame.truth() is not None for frame in recording)
+    assert len(drives_of(recording.frames)[""]) == (1 if expected == sorted(expected) else 2)

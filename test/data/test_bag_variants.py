@@ -90,7 +90,7 @@ def test_mcap_of_any_writer_is_read(written, rows, tmp_path, options):
 
 
 def test_messages_in_and_outside_of_chunks_are_merged(written, rows, tmp_path):
-    """As the specification allows."""
+    """The MCAP specification allows both in one file."""
     with Bag(written) as bag:
         plain = write_mcap(tmp_path / "a", bag, rows[::2], late=True,
                            use_chunking=False, **NO_SUMMARY)
@@ -186,7 +186,7 @@ def test_sqlite_of_any_distribution_is_read(written, rows, tmp_path, schema):
 @pytest.mark.parametrize("shm", [True, False])
 def test_what_is_only_in_the_wal_of_sqlite_is_read_and_nothing_is_written(written, rows, tmp_path,
                                                                           shm):
-    """As after a crash of the recorder with the preset resilient; from a read-only disk, too."""
+    """A crash leaves such a file with the recorder's preset resilient. The disk is read-only."""
     with Bag(written) as bag:
         database = write_sqlite(tmp_path / "a.db3", bag, rows, mode="WAL")
     (tmp_path / "bag").mkdir()

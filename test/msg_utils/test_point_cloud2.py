@@ -245,6 +245,20 @@ def test_a_cloud_without_metres_names_the_field(dtype, words):
 
 
 @each_make
+@pytest.mark.parametrize("height, width", [(3, 1), (1, 3), (2, 3), (31, 16)])
+@pytest.mark.parametrize("step", [lambda h, w: 0, lambda h, w: h * w * 8, lambda h, w: w * 8])
+@pytest.mark.parametrize("more", [0, 4])
+def test_row_step_0_or_of_the_whole_cloud_is_that_of_a_row(make, height, width, step, more):
+    cloud = np.arange(height * width * 2, dtype="f4").view([("a", "f4"), ("b", "f4")])
+    data = np.pad(cloud.view(np.uint8), (0, more))
+    msg = message(make, point_fields(cloud.dtype, make), data, height=height, width=width,
+                  point_step=8, row_step=step(height, width))
+    assert same(to_array(msg), cloud)
+    wider = to_array(add_columns(msg, make, c=cloud["a"]))
+    assert all(np.array_equal(wider[name], cloud[old]) for name, old in zip("abc", "aba"))
+
+
+@each_make
 @pytest.mark.parametrize("change, words", [
     (dict(width=4), "data has 24 bytes where height 1 x width 4 x point_step 8 needs 32"),
     (dict(height=2, width=2), "data has 24 bytes where height 2 .* needs 32"),

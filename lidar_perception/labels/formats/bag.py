@@ -30,6 +30,7 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
     """The boxes on a topic, MarkerArray or Detection3DArray, of this or any other node. Ids are
     those of tracks: track_id in the text of a label, id in that of a track; of a Detection3DArray,
     unless it numbers what each message has."""
+    stamps = {frame.stamp_ns for frame in frames}
     with Bag(path) as bag:
         bag.require(topic)
         if bag.topics[topic] not in (MARKERS, DETECTIONS):
@@ -40,8 +41,7 @@ def read(path: Path, frames: Sequence[Frame], topic: str = TRUTH) -> DriveLabels
         poses = BagPoses(KeptOpen(path), frame_id_of(frames))
         for _, time, msg in bag.messages({topic}):
             objects = from_marker_array(msg) if markers else from_detection_array(msg)
-            found[objects.stamp_ns or time] = poses.brought(objects, topic)
-    stamps = {frame.stamp_ns for frame in frames}
+            found[objects.stamp_ns or (0 if 0 in stamps else time)] = poses.brought(objects, topic)
     if strange := sorted(found.keys() - stamps):
         raise InputError(f"{path}: {topic} has labels of {strange[0]} ns ({len(strange)} of "
                          f"{len(found)} such), when the drive has no frame; give the drive that "
