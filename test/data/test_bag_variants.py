@@ -11,10 +11,9 @@ from pathlib import Path
 import pytest
 import yaml
 import zstandard
-from bag_samples import message_bytes
+from bag_samples import as_ros1, message_bytes
 from mcap.writer import CompressionType, IndexType, Writer
 
-from lidar_perception.campaign.samples import as_ros1
 from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.open import open_recording
 from lidar_perception.testing.bags import copy_bag
