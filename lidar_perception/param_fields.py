@@ -14,6 +14,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import field, fields
 from typing import Any
 
+from lidar_perception.types import did_you_mean
+
 MAX_INT = 2**31 - 1
 SHOWN = reprlib.Repr()  # of a value that is refused, as much as fits into a line
 SHOWN.maxstring = SHOWN.maxother = SHOWN.maxlong = 80
@@ -59,7 +61,8 @@ def _checked(f: dataclasses.Field[Any], value: Any) -> Any:
         return tuple(_scalar(f, limits["item"], item) for item in value)
     value = _scalar(f, type(default), value)
     if limits["choices"] and value not in limits["choices"]:
-        raise ValueError(f"{f.name} = {value!r} must be one of {', '.join(limits['choices'])}")
+        raise ValueError(f"{f.name} = {value!r} must be one of {', '.join(limits['choices'])}"
+                         + did_you_mean(value, limits["choices"]))
     return value
 
 

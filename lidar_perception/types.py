@@ -53,11 +53,21 @@ def unknown_name(what: str, name: object, known: Iterable[str]) -> InputError:
     Args:
         what: the kind of thing, such as "sensor".
     """
+    return InputError(f"there is no {what} {str(name)[:80]!r}{valid_names(name, known)}")
+
+
+def valid_names(name: object, known: Iterable[str]) -> str:
+    """Return the end of a message about an unknown name: the closest match and all valid names."""
     known = list(known)
+    guess = did_you_mean(name, known)
+    return f"{guess} Valid names: {', '.join(known)}" if guess else (
+        f"; valid names: {', '.join(known)}")
+
+
+def did_you_mean(name: object, known: Iterable[str]) -> str:
+    """Return "; did you mean 'X'?", or "" where no known name is close."""
     guess = closest_name(name, known)
-    return InputError(f"there is no {what} {str(name)[:80]!r}"
-                      + (f"; did you mean {guess!r}? Valid" if guess else "; valid")
-                      + f" names: {', '.join(known)}")
+    return f"; did you mean {guess!r}?" if guess else ""
 
 
 @dataclass(frozen=True)

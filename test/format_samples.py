@@ -14,13 +14,13 @@ from lidar_perception.types import LidarFrame
 
 CALIBRATION = Calibration(INTRINSICS, LIDAR_TO_CAMERA, 1242, 375)
 DRIVES = {"one": ("0000",), "several": ("0003", "0011")}
-NOTES = ("openlabel", "bag", "bag_labels")
-KITTI = ("kitti_object", "kitti_tracking")
+NOTES = ("openlabel", "mcap", "mcap-labels")
+KITTI = ("kitti", "kitti-tracking")
 # What a format rounds, metres and radians.
-EXACT = {"kitti_object": 2e-6, "kitti_tracking": 2e-6, "openlabel": 1e-12,
-         "nuscenes_detection": 1e-9, "nuscenes_tracking": 1e-9, "labelcloud": 1e-8,
-         "labelcloud_rel": 1e-8, "labelcloud_vertices": 5e-8, "sustech": 1e-12, "bag": 1e-12,
-         "bag_labels": 1e-12}
+EXACT = {"kitti": 2e-6, "kitti-tracking": 2e-6, "openlabel": 1e-12,
+         "nuscenes-detection": 1e-9, "nuscenes-tracking": 1e-9, "labelcloud": 1e-8,
+         "labelcloud-rel": 1e-8, "labelcloud-vertices": 5e-8, "sustech": 1e-12, "mcap": 1e-12,
+         "mcap-labels": 1e-12}
 
 
 def pose(i: int) -> np.ndarray:
@@ -64,7 +64,7 @@ def labels_of(frames: list[Frame], format: str, seed: int = 0) -> DriveLabels:
         extra = [{"occluded": 2, "obj_attr": "dark, ünder a tree", "seen": {"by": [1, "two"]}}
                  ] * count
         notes = [("DontCare", {"bbox": [1.0, 2.0, 3.0, 4.0]})] * (format in NOTES)
-        if format == "kitti_object":
+        if format == "kitti":
             ids = np.full(count, -1)
         found.append(FrameLabels.of(frame.name, frame.stamp_ns, boxes,
                                     rng.choice(names, count).tolist(), ids, scores, extra, notes))

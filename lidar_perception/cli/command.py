@@ -7,20 +7,7 @@ from typing import Any
 
 import click
 
-from lidar_perception.types import closest_name
-
-
-def guessed(name: str, known: Iterable[str]) -> str:
-    """Return "; did you mean 'X'?", or "" where no known name is close."""
-    guess = closest_name(name, known)
-    return f"; did you mean {guess!r}?" if guess else ""
-
-
-def meant(name: str, known: Iterable[str]) -> str:
-    """Return the closest match for an unknown name, and all valid ones."""
-    known = list(known)
-    guess = guessed(name, known)
-    return f"{guess} Valid" * bool(guess) + "; valid" * (not guess) + f" names: {', '.join(known)}"
+from lidar_perception.types import did_you_mean, valid_names
 
 
 class Choice(click.ParamType):
@@ -39,7 +26,7 @@ class Choice(click.ParamType):
         known |= {_plain(name): name for name in self.choices}
         if (found := known.get(_plain(str(value)))) is not None:
             return found
-        self.fail(f"{value!r} is unknown{meant(str(value), self.choices)}", param, ctx)
+        self.fail(f"{value!r} is unknown{valid_names(str(value), self.choices)}", param, ctx)
 
     def get_metavar(self, param: Any, ctx: Any = None) -> str:
         return f"[{'|'.join(self.choices)}]"
@@ -68,7 +55,7 @@ class Command(click.Command):
         except click.NoSuchOption as error:
             flags = [flag for param in self.get_params(ctx) for flag in
                      (*param.opts, *param.secondary_opts) if flag.startswith("-")]
-            remedy = self.remedy(error.option_name) or guessed(error.option_name, flags)
+            remedy = self.remedy(error.option_name) or did_you_mean(error.option_name, flags)
             raise click.UsageError(f"no such option {error.option_name}"
                                    + (remedy or f"; {ctx.command_path} --help lists them"),
                                    ctx) from None
@@ -106,5 +93,5 @@ class Group(click.Group):
         name = args[0]
         if self.get_command(ctx, name) is None and not name.startswith("-"):
             known = self.list_commands(ctx)
-            ctx.fail(f"there is no command {name!r}{meant(name, known)}")
+            ctx.fail(f"there is no command {name!r}{valid_names(name, known)}")
         return super().resolve_command(ctx, args)

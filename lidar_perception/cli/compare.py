@@ -56,9 +56,9 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, range: str,
 
     \b
     Examples:
-      lidar-perception compare --data /data/kitti/object --json compare.json --png compare.png
-      lidar-perception compare --data /data/kitti/tracking --intervals 200
-      lidar-perception compare --data training_data --weights v4.safetensors --limit 100
+      lidar-perception compare /data/kitti/object --json compare.json --png compare.png
+      lidar-perception compare /data/kitti/tracking --intervals 200
+      lidar-perception compare training_data --weights v4.safetensors --limit 100
     """
     from lidar_perception.data.frame import BOXES
     from lidar_perception.runs.machine import cpu_name

@@ -14,26 +14,29 @@ from rich.text import Text
 
 from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import a_path, limit_option, opened, split_option
+from lidar_perception.labels.datasets import LAYOUTS
+from lidar_perception.labels.exchange import FORMATS
+from lidar_perception.labels.names import ALIASES
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.types import InputError
 
-BAG = "bag"
-DATASETS = ("kitti_object", "kitti_tracking", "nuscenes", "semantickitti")
-LABELS = ("kitti_object", "kitti_tracking", "nuscenes_detection", "nuscenes_tracking", "labelcloud",
-          "labelcloud_rel", "labelcloud_vertices", "sustech", "openlabel", "bag", "bag_labels")
+MCAP = "mcap"
+DATASETS, LABELS = tuple(LAYOUTS), tuple(FORMATS)
 
 
 @click.command(cls=Command)
-@click.argument("source", type=click.Path(path_type=Path), metavar="PATH")
-@click.option("--to", "format", type=Choice(list(dict.fromkeys((BAG, *DATASETS, *LABELS)))),
-              default=BAG, show_default=True, help="What to make.")
+@click.argument("source", type=click.Path(path_type=Path), metavar="DATA", required=False)
+@click.option("--to", "--format", "format", default=MCAP, show_default=True,
+              type=Choice(dict.fromkeys((MCAP, *DATASETS, *LABELS)), ALIASES),
+              help="Format to write.")
 @click.option("--out", type=click.Path(path_type=Path), required=True,
               help="Bag, folder or file to make.")
-@a_path("--data", "PATH holds labels of this drive, a recording; convert the labels.", "DRIVE")
-@click.option("--from", "given", type=Choice(LABELS), help="Format of the labels at PATH. "
+@a_path("--data", "Same as DATA. With both, DATA is the path of labels of this drive, which are "
+        "converted.", "DRIVE")
+@click.option("--from", "given", type=Choice(LABELS, ALIASES), help="Format of the labels at DATA. "
               "Default: recognised.")
 @click.option("--detections", metavar="TOPIC", help="Take the boxes on this topic of the bag at "
-              "PATH (MarkerArray or Detection3DArray), instead of its labels.")
+              "DATA (MarkerArray or Detection3DArray), instead of its labels.")
 @click.option("--points", default="", metavar="TOPIC",
               help="Clouds of a bag.  [default: /points, else the only ones]")
 @a_path("--robot", "robot.param.yaml that `setup` wrote, for a recording with a tilted or turned "
@@ -45,12 +48,12 @@ LABELS = ("kitti_object", "kitti_tracking", "nuscenes_detection", "nuscenes_trac
 @limit_option
 @click.option("--force", is_flag=True, help="Replace what is there: a bag, or files of the same "
               "names.")
-def convert(source: Path, format: str, out: Path, data: Path | None, given: str | None,
+def convert(source: Path | None, format: str, out: Path, data: Path | None, given: str | None,
             detections: str | None, points: str, robot: Path | None, deskew: bool, images: bool,
             split: Path | None, limit: int | None, force: bool) -> None:
-    """The recording at PATH (KITTI, nuScenes, SemanticKITTI, a bag) to one MCAP bag, or to a folder
-    of a data set with clouds, labels, poses and calibration, or only its labels to a format of
-    other tools. With --data, PATH holds labels.
+    """Convert the recording DATA to one MCAP bag, to the folder of a data set with clouds, labels,
+    poses and calibration, or only its labels to a format of other tools. With --data DRIVE, DATA is
+    the path of labels of that drive.
 
     A bag has the topics /points, /ground_truth/detections, /camera/camera_info, /camera/extrinsics,
     /tf_static, /odom and with --images /camera/image/compressed; scans that cannot be read are left
@@ -61,23 +64,27 @@ def convert(source: Path, format: str, out: Path, data: Path | None, given: str 
     Examples:
       lidar-perception convert /data/kitti/tracking --out tracking.bag
       lidar-perception convert drive.bag --robot robot/robot.param.yaml --out level.bag
-      lidar-perception convert drive --to kitti_tracking --out drive_kitti
+      lidar-perception convert drive --to kitti-tracking --out drive_kitti
       lidar-perception convert result --detections /fused_detector/output/detections \\
-        --to kitti_object --out detected
+        --to kitti --out detected
       lidar-perception convert /data/kitti/tracking --to openlabel --out labels.json
       lidar-perception convert labels --data drive --to sustech --out drive_sustech/label
     """
-    given_labels = data is not None or (format in LABELS and format not in (BAG, *DATASETS))
+    if source is None:
+        source, data = data, None
+    if source is None:
+        raise click.UsageError("DATA is missing: give the path of a recording")
+    given_labels = data is not None or (format in LABELS and format not in (MCAP, *DATASETS))
     for wrong, what in (
-            (images and (given_labels or format != BAG), "--images is for --to bag"),
+            (images and (given_labels or format != MCAP), "--images is for --to mcap"),
             ((robot is not None or deskew) and (given_labels or detections is not None),
              "--robot and --deskew are for a recording with its clouds"),
-            (given is not None and data is None, "--from says what labels PATH holds; give their "
-                                                 "drive with --data"),
+            (given is not None and data is None, "--from is for labels at DATA; give their drive "
+                                                 "with --data"),
             (given is not None and detections is not None, "--detections is for a bag, --from for "
                                                            "other labels"),
-            (data is not None and format == "nuscenes", "labels are written as nuscenes_detection "
-                                                        "or nuscenes_tracking")):
+            (data is not None and format == "nuscenes", "labels are written as nuscenes-detection "
+                                                        "or nuscenes-tracking")):
         if wrong:
             raise click.UsageError(what)
     recording = opened(source if data is None else data, level=robot is None, split=split,
@@ -85,7 +92,7 @@ def convert(source: Path, format: str, out: Path, data: Path | None, given: str 
     seen = _seen(recording, robot, deskew)
     if given_labels:
         _labels(source, recording, format, out, given, data is not None, detections, limit, force)
-    elif format == BAG and detections is None:
+    elif format == MCAP and detections is None:
         _bag(source, recording, seen, out, images, limit, force)
     else:
         _dataset(source, recording, seen, format, out, detections, limit, force)
@@ -167,7 +174,7 @@ def _dataset(source: Path, recording: Any, seen: Callable[[Any], Any], format: s
     from lidar_perception.labels.exchange import export_labels
     labels = None if detections is None else _on_topic(source, recording, detections)
     count = min(len(recording), limit or len(recording))
-    if labels is not None and format == BAG:
+    if labels is not None and format == MCAP:
         export_labels(labels.first(count), format, out, recording.frames[:count], force)
         console.print(f"{out}: {count} scans")
         return

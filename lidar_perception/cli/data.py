@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from lidar_perception.runs.files import write_text
+from lidar_perception.runs.files import check_folder, write_text
 from lidar_perception.runs.machine import cores
 from lidar_perception.runs.terminal import errors
 from lidar_perception.types import InputError
@@ -46,6 +46,20 @@ def out_file(name: str, what: str, *names: str, **more: Any) -> Callable:
                         **more)
 
 
+class OutFolder(click.Path):
+    """A folder to write into. It is checked now and made when there is something to write."""
+
+    def convert(self, value: Any, param: Any, ctx: Any) -> Any:
+        path = Path(os.fsdecode(super().convert(value, param, ctx)))
+        check_folder(path)
+        return path
+
+
+def out_folder(what: str, name: str = "--out", **more: Any) -> Callable:
+    """An option that takes the path of a folder to write into."""
+    return click.option(name, type=OutFolder(path_type=Path), metavar="FOLDER", help=what, **more)
+
+
 def jobs_for_all_cores(what: str, least: int = 0) -> Callable:
     """--jobs, of processes that do what is said and none of which changes the result."""
     return click.option("--jobs", type=click.IntRange(least),
@@ -53,7 +67,34 @@ def jobs_for_all_cores(what: str, least: int = 0) -> Callable:
                         f"core, {MOST_JOBS} at most", help=f"{what} The result is the same.")
 
 
-data_option = a_path("--data", WHAT, "PATH", required=True)
+def data_argument(what: str = WHAT, *, required: bool = True, several: bool = False,
+                  kind: Any = click.Path(path_type=Path)) -> Callable:
+    """Decorator: the argument DATA, and --data as another way to give it.
+
+    Args:
+        what: help of --data.
+        required: it is an error to give neither; else the function gets data=None, or ().
+        several: any number of them, as a tuple.
+        kind: their type.
+    """
+    def decorate(function: Callable) -> Callable:
+        @functools.wraps(function)
+        def wrapper(*args: Any, data: Any, data_option: Any, **kwargs: Any) -> Any:
+            if data and data_option:
+                shown, again = (" ".join(map(str, each if several else [each]))
+                                for each in (data, data_option))
+                raise click.UsageError(f"DATA is given twice, {shown} and --data {again}; give one")
+            if required and not (data or data_option):
+                raise click.UsageError("DATA is missing: give the path of a recording")
+            return function(*args, data=data or data_option, **kwargs)
+
+        wrapper = click.option("--data", "data_option", type=kind, multiple=several,
+                               metavar="DATA", help=f"Same as DATA. {what}")(wrapper)
+        return click.argument("data", type=kind, required=False, nargs=-1 if several else 1,
+                              metavar=("DATA" if required else "[DATA]") + "..." * several)(wrapper)
+    return decorate
+
+
 split_option = a_path("--split", "Only the frames, or whole sequences, named in this file, one a "
                       "line.")
 limit_option = click.option("--limit", type=click.IntRange(1), metavar="N",
@@ -62,7 +103,7 @@ jobs_option = click.option("--jobs", type=click.IntRange(1), default=1, show_def
                            metavar="N", help="Number of processes.")
 dask_option = click.option("--dask", metavar="ADDRESS", help="Run on the workers of the Dask "
                            "scheduler at this address, such as tcp://10.0.0.1:8786. They must see "
-                           "PATH under the same name.")
+                           "DATA under the same name.")
 json_option = out_file("--json", "Write the scores to this file.", "json_file")
 intervals_option = click.option("--intervals", type=click.IntRange(0), default=0, metavar="N",
                                 help="Also print bootstrap intervals from N resamples of the "
@@ -110,8 +151,8 @@ class Walk:
         write_json(self.json_file, content)
 
 
-def walk_options(data: Callable = data_option) -> Callable:
-    """Decorator: --data, --split, --limit, --jobs, --dask and --json, which the function gets as
+def walk_options(data: Callable = data_argument()) -> Callable:
+    """Decorator: DATA, --split, --limit, --jobs, --dask and --json, which the function gets as
     walk=Walk(...)."""
     def decorate(function: Callable) -> Callable:
         @functools.wraps(function)

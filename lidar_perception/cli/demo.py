@@ -16,7 +16,7 @@ from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.classes import DETECTED
 from lidar_perception.cli.command import Choice, Command
-from lidar_perception.cli.data import WHAT, a_path, opened
+from lidar_perception.cli.data import WHAT, data_argument, opened, out_folder
 from lidar_perception.cli.evaluate.candidates import as_recorded
 from lidar_perception.cli.options import (
     CANDIDATES,
@@ -62,12 +62,11 @@ def _runs(detector: str) -> Runs:
 
 
 @click.command(cls=Command)
-@a_path("--data", f"Replay this instead of the simulated drive; it needs labelled boxes: {WHAT}",
-        "PATH")
+@data_argument(f"Replay this instead of the simulated drive; it needs labelled boxes: {WHAT}",
+               required=False)
 @click.option("--detector", type=Choice(ALONE), default=FUSED, show_default=True,
               help="What detects.")
-@click.option("--out", type=click.Path(path_type=Path), default=Path("out/demo"),
-              show_default=True, help="Folder for the results.")
+@out_folder("Folder for the results.", default=Path("out/demo"), show_default=True)
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
               help="Length of the simulated drive, 10 frames a second.")
 @click.option("--drive-seed", type=click.IntRange(0), default=38, show_default=True,
@@ -91,14 +90,14 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
     prints the scores. Leaves in --out: the bag, the result bag, scores.json, birdseye.png and the
     logs. With --detector candidates, pedestrians alone, by the protocol of the STM-CPA paper.
 
-    As it scores, --data needs labelled boxes. A recording without labels is looked at with
+    It scores, so DATA needs labelled boxes. A recording without labels is looked at with
     `view PATH --weights fused`, and its sensor is measured with `setup`.
 
     \b
     Examples:
       lidar-perception demo
-      lidar-perception demo --data /data/kitti/tracking
-      lidar-perception demo --data drive.bag --rate 0.5 --single
+      lidar-perception demo /data/kitti/tracking
+      lidar-perception demo drive.bag --rate 0.5 --single
       lidar-perception demo --detector candidates --config best
     """
     values, = settings.values(_runs(detector))

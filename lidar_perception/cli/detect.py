@@ -11,15 +11,17 @@ from rich.text import Text
 
 from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import (
-    a_path,
     dask_option,
+    data_argument,
     jobs_option,
     limit_option,
     opened,
+    out_folder,
     split_option,
 )
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
+from lidar_perception.labels.names import ALIASES
 from lidar_perception.runs.terminal import console, errors
 from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
 from lidar_perception.types import InputError
@@ -39,16 +41,16 @@ class Formats(click.ParamType):
     def convert(self, value: Any, param: Any, ctx: Any) -> tuple[str, ...]:
         if isinstance(value, tuple):
             return value
-        one = Choice(FORMATS, {"bag": "mcap"})
+        one = Choice(FORMATS, ALIASES)
         return tuple(one.convert(name, param, ctx) for name in str(value).split(","))
 
 
 @click.command(cls=Command)
-@click.argument("data", type=click.Path(path_type=Path))
-@a_path("--out", "Folder of the results.", "DIR", required=True)
-@click.option("--format", "formats", type=Formats(), multiple=True, metavar="FORMAT[,FORMAT...]",
-              help=f"What to write: {', '.join(FORMATS)}. May be given several times.  "
-              "[default: json]")
+@data_argument()
+@out_folder("Folder of the results.", required=True)
+@click.option("--format", "--to", "formats", type=Formats(), multiple=True,
+              metavar="FORMAT[,FORMAT...]", help=f"What to write: {', '.join(FORMATS)}. May be "
+              "repeated.  [default: json]")
 @detector_options(tracking=True)
 @click.option("--min-score", type=click.FloatRange(0, 1), metavar="SCORE", help="Least score of a "
               "box of any class. Default: the thresholds of the detector.")
@@ -66,13 +68,13 @@ class Formats(click.ParamType):
 @limit_option
 @jobs_option
 @dask_option
-@click.option("--force", is_flag=True, help="Start over where DIR holds another run.")
+@click.option("--force", is_flag=True, help="Start over where FOLDER holds another run.")
 def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector: DetectorChoice,
            tracking: TrackingParams, min_score: float | None, mount_height: float, track: bool,
            ego: str, clouds: bool, split: Path | None, limit: int | None, jobs: int,
            dask: str | None, force: bool) -> None:
     """Run a detector on every frame of the recording at DATA, labels or not, and write its boxes,
-    classes and scores, with --track also ids and velocities, into DIR.
+    classes and scores, with --track also ids and velocities, into FOLDER.
 
     \b
     kitti      kitti/FRAME.txt, as KITTI's object benchmark has results;

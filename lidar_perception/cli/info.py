@@ -9,7 +9,7 @@ import click
 from rich.table import Table
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import lost_labels
+from lidar_perception.cli.data import data_argument, lost_labels
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag
 from lidar_perception.data.open import layout_of, open_recording
@@ -17,7 +17,7 @@ from lidar_perception.runs.terminal import console
 
 
 @click.command(cls=Command)
-@click.argument("data", type=click.Path(path_type=Path))
+@data_argument()
 def info(data: Path) -> None:
     """Print the topics, types, counts and length of a bag; of any other recording its layout,
     frames, times, first cloud and labels.

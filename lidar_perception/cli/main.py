@@ -70,10 +70,10 @@ def cli() -> None:
     \b
     Examples:
       lidar-perception demo
-      lidar-perception demo --data /data/kitti/tracking
+      lidar-perception demo /data/kitti/tracking
       lidar-perception convert /data/kitti/object --out kitti.bag
-      lidar-perception evaluate candidates --data /data/kitti/object --json scores.json
-      lidar-perception reproduce stm-cpa --data /data/kitti/object --out report
+      lidar-perception evaluate candidates /data/kitti/object --json scores.json
+      lidar-perception reproduce stm-cpa /data/kitti/object --out report
       lidar-perception run perception --ros-args -r '~/input/points:=/points'
 
     Exit codes: 0 done, 1 ran but something failed, 2 the command or its input cannot be used, 130

@@ -18,7 +18,7 @@ import click
 import yaml
 
 from lidar_perception.candidates.configurations import CONFIGURATIONS, PAPER
-from lidar_perception.cli.command import Choice, HelpfulOption, guessed, meant
+from lidar_perception.cli.command import Choice, HelpfulOption
 from lidar_perception.detectors.contract import FUSED
 from lidar_perception.detectors.open import DetectorChoice, default_params
 from lidar_perception.detectors.params import RANGE_CHOICES
@@ -28,7 +28,7 @@ from lidar_perception.param_fields import described, parameter_fields, with_valu
 from lidar_perception.runs.files import read_text, short
 from lidar_perception.runs.terminal import errors
 from lidar_perception.tracking.params import TrackingParams
-from lidar_perception.types import InputError, closest_name
+from lidar_perception.types import InputError, closest_name, did_you_mean, valid_names
 
 MAX_BYTES, MAX_NAMES = 10**6, 10_000  # of a parameter file; aliases in YAML make many of few bytes
 MAX_DEPTH = 20  # groups in each other
@@ -87,7 +87,7 @@ def _guess(name: str, known: Fields) -> str:
     if inner:
         return f", which is a group with {', '.join(inner)}"
     ends = [each for each in known if each.endswith(f".{name}")]
-    return f"; did you mean {ends[0]!r}?" if len(ends) == 1 else guessed(name, known)
+    return f"; did you mean {ends[0]!r}?" if len(ends) == 1 else did_you_mean(name, known)
 
 
 def _value(name: str, f: Field[Any], text: str) -> Any:
@@ -351,7 +351,7 @@ def _loaded(path: Path) -> dict[Any, Any]:
     """The content of a parameter file. InputError where it cannot be read."""
     if not path.exists():
         raise InputError(f"cannot read the parameter file {path}: there is no such file"
-                         + meant(str(path), CONFIGURATIONS))
+                         + valid_names(str(path), CONFIGURATIONS))
     try:
         content = yaml.safe_load(read_text(path, MAX_BYTES))
     except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:

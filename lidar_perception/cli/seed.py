@@ -15,7 +15,7 @@ from lidar_perception.candidates.seed_sources import clicked_seed, truth_seed
 from lidar_perception.candidates.seeds import save_seed
 from lidar_perception.candidates.silhouette import to_pixels
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import as_mounted, data_option, opened
+from lidar_perception.cli.data import as_mounted, data_argument, opened, out_file
 from lidar_perception.cli.options import parameter_options
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.runs.terminal import console
@@ -25,12 +25,12 @@ from lidar_perception.wire.params import ViewParams
 
 
 @click.command(cls=Command)
-@data_option
+@data_argument()
 @click.option("--frame", "number", type=click.IntRange(0), metavar="N",
               help="Number of the frame; default: the first with a Pedestrian label.")
 @click.option("--at", nargs=3, type=float, metavar="X Y Z",
               help="A point on the pedestrian, in the LiDAR frame; default: the nearest label.")
-@click.option("--out", type=click.Path(path_type=Path), required=True, help="Template to write.")
+@out_file("--out", "Template to write.", required=True)
 @parameter_options(PipelineParams(view=ViewParams(enabled=True)))
 def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, out: Path,
          params: PipelineParams) -> None:
@@ -40,8 +40,8 @@ def seed(data: Path, number: int | None, at: tuple[float, float, float] | None, 
 
     \b
     Examples:
-      lidar-perception seed --data /data/kitti/object --out pedestrian.json
-      lidar-perception seed --data drive --frame 40 --at 18.0 8.6 -0.9 --out pedestrian.json
+      lidar-perception seed /data/kitti/object --out pedestrian.json
+      lidar-perception seed drive --frame 40 --at 18.0 8.6 -0.9 --out pedestrian.json
     """
     recording = opened(data)
     params, frame = as_mounted(recording, params), _pick(recording, number, params.view, at is None)

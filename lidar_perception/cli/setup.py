@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import a_path
+from lidar_perception.cli.data import data_argument, out_folder
 from lidar_perception.runs.files import make_folder, write_text
 from lidar_perception.runs.terminal import console, errors, looking_through, progress
 from lidar_perception.types import InputError
@@ -24,9 +24,9 @@ HINT_TOLERANCE = 0.1  # metres
 
 
 @click.command(cls=Command)
-@a_path("--data", "A bag, a .pcd, .ply, .npy or .bin file or a folder of them, or the folder of a "
-        "data set. No label is needed.", "PATH", required=True)
-@a_path("--out", "Folder for the files.", "FOLDER", required=True)
+@data_argument("A bag, a .pcd, .ply, .npy or .bin file or a folder of them, or the folder of a "
+               "data set. No label is needed.")
+@out_folder("Folder for the files.", required=True)
 @click.option("--topic", metavar="TOPIC", help="Clouds of a bag that holds those of several "
               "sensors.")
 @click.option("--scans", type=click.IntRange(1), default=40, show_default=True,
@@ -45,7 +45,7 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
 
     \b
     Examples:
-      lidar-perception setup --data drive.bag --topic /points --out robot
+      lidar-perception setup drive.bag --topic /points --out robot
       lidar-perception simulate --sensor robot/sensor.yaml --out street
       lidar-perception run perception --ros-args --params-file robot/robot.param.yaml
     """
@@ -63,6 +63,8 @@ def setup(data: Path, out: Path, topic: str | None, scans: int, height_hint: flo
 
     with looking_through(data):
         clouds = open_clouds(data, topic)
+    if topic is not None and not clouds.topic:
+        raise InputError(f"--topic {topic} is for a bag, and {data} is {clouds.layout}")
     count = f"{clouds.count} cloud{'s' * (clouds.count != 1)}"
     errors.print(f"{data}: {clouds.layout}, {count}", style="dim")
     numbers, found, skipped = [], [], []

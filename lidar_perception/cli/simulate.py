@@ -10,9 +10,10 @@ import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.command import Choice, Command
-from lidar_perception.cli.data import a_path, opened, out_file, write_json
+from lidar_perception.cli.data import a_path, opened, out_file, out_folder, write_json
 from lidar_perception.data.frame import BOXES
 from lidar_perception.data.to_bag import write_bag
+from lidar_perception.labels.names import ALIASES
 from lidar_perception.runs.folder import is_finished, unfinished
 from lidar_perception.runs.machine import cores
 from lidar_perception.runs.resuming import digest
@@ -26,9 +27,10 @@ from lidar_perception.types import InputError
 
 
 @click.command(cls=Command)
-@a_path("--out", "Folder to make.", "FOLDER")
-@click.option("--format", "layout", type=Choice(["mcap", *LAYOUTS]), default="mcap",
-              show_default=True, help="A rosbag2 bag, or the folders of one of these data sets.")
+@out_folder("Bag or folder to make.")
+@click.option("--format", "--to", "layout", type=Choice(["mcap", *LAYOUTS], ALIASES),
+              default="mcap", show_default=True, help="A rosbag2 bag, or the folders of one of "
+              "these data sets.")
 @click.option("--sensor", "sensor_name", default="hdl64e", show_default=True,
               help=f"One of {', '.join(NAMES)}, in any spelling (hdl64e is hdl-64e), a .yaml "
               f"file (`setup` writes one), or {GENERIC}.")

@@ -14,7 +14,13 @@ import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.command import Choice, Group
-from lidar_perception.cli.data import a_path, jobs_for_all_cores, out_file
+from lidar_perception.cli.data import (
+    a_path,
+    data_argument,
+    jobs_for_all_cores,
+    out_file,
+    out_folder,
+)
 from lidar_perception.cli.options import checked, device_option, parameter_options
 from lidar_perception.param_fields import parameter_fields
 from lidar_perception.runs.terminal import console
@@ -25,17 +31,15 @@ from lidar_perception.types import InputError
 PAPER_ABLATION = (75.52, 80.15, 81.33, 83.44, 85.10, 86.33, 86.89, 88.96)  # paper C, Table 5
 
 OPTIONS = (
-    click.option("--data", multiple=True, required=True, metavar="PATH|sim",
-                 help="What to train on: a data set or bag, or `sim` for simulated scenes; may be "
-                 "repeated to mix them."),
+    data_argument("Training data: a data set or bag, or `sim` for simulated scenes; may be "
+                  "repeated to mix them.", several=True, kind=str),
     click.option("--val", multiple=True, metavar="PATH|sim",
                  help="What to validate on. Default: frames held out of --data, and other "
                  "simulated streets."),
     a_path("--split", "Train on the frames of --data, or whole sequences, that are named in this "
            "file, one a line."),
     a_path("--val-split", "Likewise the frames to validate on."),
-    a_path("--out", "Folder for best.safetensors, last.safetensors, logs and the state.", "DIR",
-           required=True),
+    out_folder("Folder for best.safetensors, last.safetensors, logs and the state.", required=True),
     click.option("--resume", is_flag=True, help="Resume the run in --out, if there is one."),
     a_path("--init", "Start from the weights of this checkpoint, as far as they fit; `package`: "
            "those that come with the package.", "FILE|package"),
@@ -108,13 +112,13 @@ def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
 
     \b
     Examples:
-      lidar-perception train pointpillars --version v4 --data sim --out v4
-      lidar-perception train pointpillars --data sim --sensor vlp16 --mount-height 0.6 \\
+      lidar-perception train pointpillars sim --version v4 --out v4
+      lidar-perception train pointpillars sim --sensor vlp16 --mount-height 0.6 \\
           --range around --init package --out robot
-      lidar-perception train pointpillars --data /data/kitti/object --split train.txt \\
+      lidar-perception train pointpillars /data/kitti/object --split train.txt \\
           --val-split val.txt --epochs 80 --out v4 --resume
-      torchrun --nproc-per-node 4 -m lidar_perception.cli.main train pointpillars --size full \\
-          --data sim --budget 12 --out v4
+      torchrun --nproc-per-node 4 -m lidar_perception.cli.main train pointpillars sim \\
+          --size full --budget 12 --out v4
     """
     from lidar_perception.detectors.pointpillars.config import RANGES, network_config
     from lidar_perception.training.pointpillars.start import PointPillarsStart
@@ -137,12 +141,12 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
 
     \b
     Examples:
-      lidar-perception train pointnet --data sim --out pointnet
-      lidar-perception train pointnet --data sim --scene campus,indoor --sensor vlp16 \\
+      lidar-perception train pointnet sim --out pointnet
+      lidar-perception train pointnet sim --scene campus,indoor --sensor vlp16 \\
           --mount-height 0.6 --init package --out robot
-      lidar-perception train pointnet --data /data/kitti/object --split train.txt \\
+      lidar-perception train pointnet /data/kitti/object --split train.txt \\
           --val-split val.txt --epochs 20 --out pointnet --resume
-      lidar-perception train pointnet --ablation --data sim --steps 1000 --out ablation
+      lidar-perception train pointnet sim --ablation --steps 1000 --out ablation
     """
     from lidar_perception.detectors.pointnet.config import ABLATIONS, pointnet_config
     from lidar_perception.training.ablation import compared
@@ -190,7 +194,7 @@ def fused(weights: Path | None, classifier: Path | None, out: Path, force: bool,
           --classifier robot/pointnet/best.safetensors --out robot/fused.json
       lidar-perception train fused --sensor vlp-16 --mount-height 0.6 --scene campus \\
           --range around --out vlp16.json
-      lidar-perception evaluate detection --data drive --weights robot/fused.json
+      lidar-perception evaluate detection drive --weights robot/fused.json
       lidar-perception run fused_detector --ros-args -p fused.weights:=$PWD/robot/fused.json
     """
     from lidar_perception.detectors.fused.fusion import SUFFIX

@@ -7,13 +7,13 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.command import Command, Group
+from lidar_perception.cli.data import out_file
 from lidar_perception.runs.terminal import console
 
 
 @click.command("import-weights", cls=Command)
 @click.argument("source", type=click.Path(path_type=Path), metavar="FILE.pth")
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FILE",
-              help="Checkpoint to write (.safetensors).")
+@out_file("--out", "Checkpoint to write (.safetensors).", required=True)
 @click.option("--classes", metavar="A,B,C", default="",
               help="Classes in the order of training. Default: the project's own order for KITTI.")
 @click.option("--half", is_flag=True, help="Store the weights of layers as float16.")
@@ -44,8 +44,7 @@ def export() -> None:
 
 @export.command()
 @click.argument("weights", type=click.Path(path_type=Path), metavar="WEIGHTS")
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FILE",
-              help="File to write (.onnx).")
+@out_file("--out", "File to write (.onnx).", required=True)
 def onnx(weights: Path, out: Path) -> None:
     """Write a checkpoint of any version, size and classes as ONNX (needs the extra [onnx]).
 

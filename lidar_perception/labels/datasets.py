@@ -22,6 +22,7 @@ from lidar_perception.labels.datasets_nuscenes import NuscenesTables
 from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels, FrameLabels, of_truth
 from lidar_perception.labels.formats import kitti_object, kitti_tracking
 from lidar_perception.labels.formats.nuscenes import LIKE
+from lidar_perception.labels.names import format_name
 from lidar_perception.runs.files import whole_folder, write_bytes
 from lidar_perception.simulation.camera import FORWARD_CAMERA
 from lidar_perception.types import SENSOR_HEIGHT, InputError
@@ -68,8 +69,7 @@ def write_dataset(layout: str, frames: Iterable[Frame], out: Path,
     where the recording says so, at a gap of 5 s, and where the calibration changes. How high the
     sensor is, if not as KITTI's, is written beside, see data/mounting.py.
     """
-    if layout not in LAYOUTS:
-        raise InputError(f"there is no layout {layout!r}; there are {', '.join(LAYOUTS)}")
+    layout = format_name(layout, LAYOUTS)
     summary = Summary()
     with whole_folder(out, force) as folder:
         for placed in LAYOUTS[layout](folder, _placed(frames, labels), summary):
@@ -165,7 +165,7 @@ def _semantickitti(folder: Path, frames: Iterator[Placed], summary: Summary) -> 
         frame, points = placed.frame, placed.frame.point_truth()
         if points is None:
             raise InputError(f"frame {frame.name} has no labels of points, of which SemanticKITTI "
-                             "is made; take kitti_object, kitti_tracking or nuscenes for boxes")
+                             "is made; take kitti, kitti-tracking or nuscenes for boxes")
         before = drives.setdefault(placed.drive, [])
         semantickitti.write_scan(folder / f"sequences/{placed.drive:02}", len(before),
                                  _cloud(frame, summary), points.classes, points.instances)
@@ -201,5 +201,5 @@ def _nuscenes(folder: Path, frames: Iterator[Placed], summary: Summary) -> Itera
 
 
 LAYOUTS: dict[str, Callable[[Path, Iterator[Placed], Summary], Iterator[Placed]]] = {
-    "kitti_object": _kitti_object, "kitti_tracking": _kitti_tracking, "nuscenes": _nuscenes,
+    "kitti": _kitti_object, "kitti-tracking": _kitti_tracking, "nuscenes": _nuscenes,
     "semantickitti": _semantickitti}

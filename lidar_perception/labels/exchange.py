@@ -24,6 +24,7 @@ from lidar_perception.labels.formats import (
 )
 from lidar_perception.labels.formats.files import MAX_BYTES, in_file, read_json
 from lidar_perception.labels.formats.kitti_lines import label_folder
+from lidar_perception.labels.names import format_name
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
@@ -33,21 +34,21 @@ Write = Callable[..., None]  # labels, out, frames, force
 # Each reads the labels of a drive's frames at a path, and writes them to one, with force over what
 # is there. A new format is a file and a line here.
 FORMATS: dict[str, tuple[Read, Write]] = {
-    "kitti_object": (kitti_object.read, kitti_object.write),
-    "kitti_tracking": (kitti_tracking.read, kitti_tracking.write),
-    "nuscenes_detection": nuscenes.detection,
-    "nuscenes_tracking": nuscenes.tracking,
+    "kitti": (kitti_object.read, kitti_object.write),
+    "kitti-tracking": (kitti_tracking.read, kitti_tracking.write),
+    "nuscenes-detection": nuscenes.detection,
+    "nuscenes-tracking": nuscenes.tracking,
     "labelcloud": labelcloud.absolute,
-    "labelcloud_rel": labelcloud.relative,
-    "labelcloud_vertices": labelcloud.vertices,
+    "labelcloud-rel": labelcloud.relative,
+    "labelcloud-vertices": labelcloud.vertices,
     "sustech": (sustech.read, sustech.write),
     "openlabel": (openlabel.read, openlabel.write),
-    "bag": (bag.read, bag.write),
-    "bag_labels": (bag.read, bag.write_labels),
+    "mcap": (bag.read, bag.write),
+    "mcap-labels": (bag.read, bag.write_labels),
 }
 
 
-WITH_NOTES = {"kitti_object", "kitti_tracking", "openlabel", "bag", "bag_labels"}
+WITH_NOTES = {"kitti", "kitti-tracking", "openlabel", "mcap", "mcap-labels"}
 
 
 @dataclass(frozen=True)
@@ -72,13 +73,14 @@ def export_labels(labels: DriveLabels, format: str, out: Path, frames: Sequence[
                   force: bool = False) -> Written:
     """Write the labels of the frames of a drive. InputError in one line where they cannot be
     written; then nothing is half-written. What exists is replaced with force only."""
+    format = format_name(format, FORMATS)
     if len(labels) != len(frames):
         raise InputError(f"labels of {len(labels)} frames for a drive of {len(frames)}; give those "
                          "of the same frames")
     in_file("what the labels keep of the file that they were read from",
             lambda: _of(format)[1](labels, out, frames[:], force))
     notes = 0 if format in WITH_NOTES else sum(len(each.notes) for each in labels.frames)
-    ids = format == "kitti_object" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
+    ids = format == "kitti" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
     return Written(out, labels.boxes, len(labels), (
         *((f"{notes} regions without a box",) if notes else ()), *(("track ids",) if ids else ())))
 
@@ -92,8 +94,8 @@ def recognised(path: Path) -> str:
         raise InputError(f"there is no file or folder {path}; give one with labels: "
                          f"{', '.join(FORMATS)}")
     if path.suffix in (".mcap", ".db3") or (path.is_dir() and is_bag(path)):
-        return "bag"
-    for folder, format in ("label_02", "kitti_tracking"), ("label_2", "kitti_object"):
+        return "mcap"
+    for folder, format in ("label_02", "kitti-tracking"), ("label_2", "kitti"):
         if label_folder(path, folder) != path:
             return format
     for file in files:
@@ -111,8 +113,8 @@ def _by_text(file: Path) -> str:
         return ""  # a calibration
     with suppress(ValueError, IndexError):
         float(words[0]), float(words[1])
-        return "kitti_tracking"
-    return "kitti_object" if len(words) > 3 else ""
+        return "kitti-tracking"
+    return "kitti" if len(words) > 3 else ""
 
 
 def _by_json(content: Any) -> str:
@@ -129,12 +131,9 @@ def _by_json(content: Any) -> str:
             return "labelcloud" if "centroid" in box or "vertices" in box else ""
         for boxes in content["results"].values():
             for row in boxes:
-                return "nuscenes_tracking" if "tracking_name" in row else "nuscenes_detection"
+                return "nuscenes-tracking" if "tracking_name" in row else "nuscenes-detection"
     return ""
 
 
 def _of(format: str) -> tuple[Read, Write]:
-    if format not in FORMATS:
-        raise InputError(f"there is no format {format!r} for labels; there are "
-                         f"{', '.join(FORMATS)}")
-    return FORMATS[format]
+    return FORMATS[format_name(format, FORMATS)]

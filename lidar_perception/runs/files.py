@@ -151,6 +151,15 @@ def whole_folder(path: Path, force: bool = False) -> Iterator[Path]:
         shutil.rmtree(hidden, ignore_errors=True)
 
 
+def check_folder(path: Path) -> None:
+    """Raise InputError if a folder cannot be made or written into. Nothing is made."""
+    above = next(each for each in (path, *path.absolute().parents) if each.exists())
+    if not above.is_dir():
+        raise InputError(f"cannot write into the folder {path}: {above} is a file")
+    if not os.access(above, os.W_OK | os.X_OK):
+        raise InputError(f"cannot write into the folder {path}: {os.strerror(errno.EACCES)}")
+
+
 def make_folder(path: Path) -> None:
     """Make a folder, with those above it, if it is not there. InputError where that cannot be, or
     nothing can be written into it."""

@@ -7,7 +7,7 @@ import fcntl
 import hashlib
 import os
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,9 @@ def claim(descriptor: int, path: Path) -> str:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Makes the folder if need be, and keeps a second process from writing into it."""
+    """Make the folder if need be, and keep a second process from writing into it. After an error,
+    folders that were made here and are still empty are removed."""
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
@@ -39,6 +41,11 @@ def locked(folder: Path) -> Iterator[None]:
     try:
         claim(descriptor, folder)
         yield
+    except BaseException:
+        with suppress(OSError):
+            for each in made:
+                each.rmdir()
+        raise
     finally:
         os.close(descriptor)
 

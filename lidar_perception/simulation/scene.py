@@ -23,7 +23,7 @@ from lidar_perception.simulation.street import KINDS, Kind, lay_out
 from lidar_perception.simulation.terrain import Ground, surface_height
 from lidar_perception.simulation.traffic import populate
 from lidar_perception.simulation.way import SECONDS, Way
-from lidar_perception.types import CLASSES, InputError
+from lidar_perception.types import CLASSES, InputError, did_you_mean
 
 MOST_PEOPLE = 100  # times as many as usual; a street then takes 3 s, and has no room for more
 EGO = (3.0, 1.1)  # half length and width that the ego vehicle keeps clear, m
@@ -45,11 +45,12 @@ class Scenes(NamedTuple):
         names = self.scene.split(",")
         if unknown := [name for name in names if name not in SCENES]:
             raise InputError(f"unknown scene {unknown[0]!r}: must be one of {', '.join(SCENES)}, "
-                             "or several with commas between")
+                             f"or several with commas between{did_you_mean(unknown[0], SCENES)}")
         for name in names:
             if self.kind is not None and self.kind not in SCENES[name].kinds:
                 raise InputError(f"kind = {self.kind!r} must be one of "
-                                 f"{', '.join(SCENES[name].kinds)} where scene is {name}")
+                                 f"{', '.join(SCENES[name].kinds)} where scene is {name}"
+                                 f"{did_you_mean(self.kind, SCENES[name].kinds)}")
         return [SCENES[name] for name in names]
 
     @property

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 
 from lidar_perception.runs.files import read_text, short
-from lidar_perception.types import SENSOR_HEIGHT, InputError
+from lidar_perception.types import SENSOR_HEIGHT, InputError, did_you_mean
 
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # ten times faster, where it was built
 MAX_BYTES = 1 << 20  # of a file that describes a sensor
@@ -294,5 +294,5 @@ def _named(name: str) -> Sensor:
         return SENSORS[name]
     if _key(name) not in READY:
         raise InputError(f"unknown sensor {name!r}: must be one of {', '.join(NAMES)}, a file "
-                         f".yaml, or {GENERIC}")
+                         f".yaml, or {GENERIC}{did_you_mean(name, NAMES)}")
     return _ready(_key(name))

@@ -74,10 +74,10 @@ def compared(networks: Sequence[Network], asked: Asked, params: Any) -> Iterator
         params = with_values(params, {"data.cache": str(asked.out / SCANS)})
     hours = asked.budget or (None if params.steps or params.epochs else BUDGET)
     share = replace(asked, budget=hours and hours / len(networks))
+    sensor = sensor_named(params.sensor, params.mount_height)
+    settings = settings_of(asked, params, sensor, init, compared=len(networks))
     with joined(chosen_device(asked.device)) as device, alone(asked.out):
         wait()  # until all have looked at what the first is going to write
-        sensor = sensor_named(params.sensor, params.mount_height)
-        settings = settings_of(asked, params, sensor, init, compared=len(networks))
         try:
             params = planned(Compared(tuple(networks)), share, params, settings, sensor, device)
         except TooShort as error:

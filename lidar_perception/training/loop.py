@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from lidar_perception.runs.files import write_bytes
+from lidar_perception.runs.files import make_folder, write_bytes
 from lidar_perception.runs.resuming import differences
 from lidar_perception.runs.terminal import errors, paused, progress
 from lidar_perception.training.log import Log
@@ -48,6 +48,7 @@ def train(task: Task, params: LoopParams, out: Path, device: torch.device = torc
     can be written, or if the loss stays not finite. resume without a run in out begins one.
     """
     path = may_begin(out, resume)
+    make_folder(out)
     torch.manual_seed(params.seed + rank())
     run = Run(task, params, device)
     if path.exists():

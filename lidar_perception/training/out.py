@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from lidar_perception.runs.files import make_folder, remove_temporaries
+from lidar_perception.runs.files import check_folder, remove_temporaries
 from lidar_perception.runs.resuming import locked
 from lidar_perception.runs.stopping import terminated_as_interrupted
 from lidar_perception.training.ranks import rank
@@ -24,7 +24,7 @@ def may_begin(out: Path, resume: bool, name: str = STATE) -> Path:
     asked for; or if out cannot be a folder that is written into, before hours are spent on the
     data."""
     path = out / name
-    make_folder(out)
+    check_folder(out)
     if path.exists() and not resume:
         raise InputError(f"{out} holds a training run already; give --resume to resume it, or "
                          "another --out")

@@ -49,6 +49,8 @@ def training_scenes(data: tuple[str, ...], val: tuple[str, ...], split: Path | N
     judge_on: list[RecordedScenes | SimulatedScenes] = [one.scenes(settings.view) for one in held]
     simulated = partial(SimulatedScenes, sensor=sensor, cache_gb=settings.cache_gb,
                         cache=Path(settings.cache) if settings.cache else None)
+    if SIM in (*data, *val):
+        Scenes(None, settings.people, scene).sorts()  # InputError before anything is made
     if SIM in data:
         train_on.append(simulated(FIRST_SCENE, settings.scans,
                                   scenes=Scenes(None, settings.people, scene),

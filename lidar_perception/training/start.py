@@ -142,10 +142,10 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "") -> Ende
         params = with_values(params, {"data.cache": str(asked.out / SCANS)})
     decided = bool(params.steps or params.epochs)
     hours = asked.budget if decided else asked.budget or BUDGET
+    sensor = sensor_named(params.sensor, params.mount_height)
+    settings = settings_of(asked, params, sensor, init)
     with joined(chosen_device(asked.device)) as device, alone(asked.out):
         wait()  # until all have looked at what rank 0 is going to write
-        sensor = sensor_named(params.sensor, params.mount_height)
-        settings = settings_of(asked, params, sensor, init)
         given, params = params, planned(network, asked, params, settings, sensor, device)
         sources, held_out = _scenes_of(asked, params, sensor)
         cut = network.cut(params, sources, held_out, Path(params.data.cache))

@@ -11,11 +11,11 @@ import click
 
 from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import (
-    a_path,
     browser_option,
-    data_option,
+    data_argument,
     json_option,
     opened,
+    out_folder,
     port_option,
     write_json,
 )
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
 
 
 @click.command(cls=Command)
-@data_option
-@click.option("--sequence", metavar="NAME", help="The drive of PATH to label, where it has "
+@data_argument()
+@click.option("--sequence", metavar="NAME", help="The drive of DATA to label, where it has "
               "several.")
-@a_path("--out", "Folder of the journal; one that is there is continued. Default: "
-        "out/label/NAME OF THE DRIVE.", "FOLDER")
+@out_folder("Folder of the journal; one that is there is continued. Default: out/label/NAME OF THE "
+            "DRIVE.")
 @port_option
 @browser_option
 @detector_options()
@@ -44,15 +44,14 @@ if TYPE_CHECKING:
 @click.option("--show-labels", is_flag=True, help="Show the labels that the drive has.")
 @click.option("--import", "imports", multiple=True, metavar="FORMAT:PATH",
               help="Take the labels at PATH, before the page is served.")
-@click.option("--export", "exports", metavar="FORMAT", help="Write the accepted tracks of the "
-              "journal to --to, and end.")
-@a_path("--to", "Where --export writes.", "PATH")
+@click.option("--export", "exports", metavar="FORMAT:PATH", help="Write the accepted tracks of the "
+              "journal to PATH, and end.")
 @click.option("--force", is_flag=True, help="With --export: replace what is there.")
 @click.option("--simulate-annotator", is_flag=True, help="Let a script that knows the labels do "
-              "the work, in each drive of PATH, and count its clicks, keys and drags.")
+              "the work, in each drive of DATA, and count its clicks, keys and drags.")
 @json_option
 def label(data: Path, sequence: str | None, out: Path | None, detector: DetectorChoice,
-          imports: tuple[str, ...], exports: str | None, to: Path | None, force: bool,
+          imports: tuple[str, ...], exports: str | None, force: bool,
           simulate_annotator: bool, json_file: Path | None, **page: Any) -> None:
     """Label a drive on a page in the browser: click, accept, correct.
 
@@ -60,16 +59,16 @@ def label(data: Path, sequence: str | None, out: Path | None, detector: Detector
 
     \b
     Examples:
-      lidar-perception label --data /data/kitti/tracking --sequence 0000
-      lidar-perception label --data drive --out labels --no-open --port 8080
-      lidar-perception label --data drive --export kitti_tracking --to labels
+      lidar-perception label /data/kitti/tracking --sequence 0000
+      lidar-perception label drive --out labels --no-open --port 8080
+      lidar-perception label drive --export kitti-tracking:labels
     """
     from lidar_studio.drive import one_drive
     from lidar_studio.journal import NAME as JOURNAL
     from lidar_studio.session import ImportedAlready, session
 
-    if (exports is None) != (to is None):
-        raise click.UsageError("--export and --to go together")
+    pairs = [_format_and_path("--import", each) for each in imports]
+    target = None if exports is None else _format_and_path("--export", exports)
     recording = opened(data)
     if simulate_annotator:
         write_json(json_file, _simulated(recording, sequence, detector))
@@ -77,25 +76,35 @@ def label(data: Path, sequence: str | None, out: Path | None, detector: Detector
     with looking_through(data):
         drive = one_drive(recording, sequence)
     folder = out or Path("out/label") / drive.name
-    if exports is not None and not imports and not (folder / JOURNAL).is_file():
+    if target is not None and not imports and not (folder / JOURNAL).is_file():
         raise InputError(f"there is no journal in {folder}; give its folder with --out")
     with session(drive, folder, detector) as made:
         if made.journal.message:
             errors.print(made.journal.message, style="yellow")
-        for each in imports:
-            named, _, path = each.partition(":")
+        for named, path in pairs:
             try:
                 made.do({"do": "import", "format": named, "path": path})
             except ImportedAlready as error:  # the same command, another day
                 errors.print(str(error), style="yellow")
-        if exports is not None:
-            written = made.export(exports, os.path.abspath(str(to)), force)
+        if target is not None:
+            written = made.export(target[0], os.path.abspath(target[1]), force)
             console.print(f"{written['path']}: {written['boxes']} boxes in {written['frames']} "
                           "frames")
             for each in written["left_out"]:
                 errors.print(f"left out: {each}", style="yellow")
         else:
             _serve(drive, made, **page)
+
+
+def _format_and_path(option: str, text: str) -> tuple[str, str]:
+    """Split FORMAT:PATH. InputError for an unknown format, UsageError without a path."""
+    from lidar_perception.labels.exchange import FORMATS
+    from lidar_perception.labels.names import format_name
+    named, _, path = text.partition(":")
+    if not path:
+        raise click.UsageError(f"{option} {text} must be FORMAT:PATH, such as "
+                               "openlabel:labels.json")
+    return format_name(named, FORMATS), path
 
 
 def _serve(drive: Drive, made: Session, port: int, browser: bool, propose: bool,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import click
 
 from lidar_perception.cli.command import Choice, Command
-from lidar_perception.cli.data import browser_option, opened, port_option
+from lidar_perception.cli.data import browser_option, data_argument, opened, port_option
 from lidar_perception.cli.options import detectors_options
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.runs.terminal import console, looking_through
@@ -24,7 +24,7 @@ WEIGHTS = (".safetensors", ".onnx", ".json")
 
 
 @click.command(cls=Command)
-@click.argument("path", type=click.Path(path_type=Path), required=False)
+@data_argument(required=False)
 @click.option("--live", is_flag=True, help="Look at the running graph instead of a recording.")
 @detectors_options
 @click.option("--results", multiple=True, type=click.Path(path_type=Path), metavar="FOLDER",
@@ -38,7 +38,7 @@ WEIGHTS = (".safetensors", ".onnx", ".json")
               "clouds. May be given several times.")
 @click.option("--namespace", default="", metavar="NAME", help="With --live: follow the nodes in "
               "this namespace, / for those in none, where several graphs run.")
-@click.option("--sequence", metavar="NAME", help="The drive of PATH to show, where it has "
+@click.option("--sequence", metavar="NAME", help="The drive of DATA to show, where it has "
               "several.")
 @port_option
 @browser_option
@@ -48,12 +48,12 @@ WEIGHTS = (".safetensors", ".onnx", ".json")
               help="Frame to begin with.")
 @click.option("--theme", type=Choice(["auto", "light", "dark"]), default="auto",
               show_default=True, help="Of the page.")
-def view(path: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
+def view(data: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
          results: tuple[Path, ...], points: str | None, detections: tuple[str, ...],
          namespace: str, sequence: str | None, port: int, browser: bool, screenshot: Path | None,
          frame: int, theme: str) -> None:
     """Look at a recording and its results on a page in the browser: clouds with ground and
-    clusters, labels, detections by source and score, what is missed and false, tracks. PATH is a
+    clusters, labels, detections by source and score, missed and false ones, tracks. DATA is a
     bag, such as the result bag of the demo, or the folder of a data set; with --live the nodes
     that run on this ROS_DOMAIN_ID are looked at, the newest frame first.
 
@@ -71,8 +71,8 @@ def view(path: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
     from lidar_studio.picture import screenshot_of
     from lidar_studio.server import serve
 
-    if (path is None) != live:
-        raise click.UsageError("give the PATH of a recording, or --live")
+    if (data is None) != live:
+        raise click.UsageError("give DATA, the path of a recording, or --live")
     only = {"--weights": detectors, "--results": results, "--sequence": sequence,
             "--screenshot": screenshot} if live else {"--detections": detections,
                                                       "--namespace": namespace}
@@ -84,13 +84,13 @@ def view(path: Path | None, live: bool, detectors: tuple[DetectorChoice, ...],
         console.print(url)
         if screenshot is None and browser:
             webbrowser.open(url)
-    if path is None:
+    if data is None:
         with _listening(namespace, points or "", detections) as served:
             asyncio.run(serve(served, port, started))
         return
-    served = _served(path, detectors, results, points, sequence)
+    served = _served(data, detectors, results, points, sequence)
     if frame >= served.drive.end:
-        raise InputError(f"{path} has no frame {frame}; it has {served.drive.end}")
+        raise InputError(f"{data} has no frame {frame}; it has {served.drive.end}")
     if screenshot is None:
         asyncio.run(serve(served, port, started))
     else:

@@ -220,6 +220,54 @@ def test_parameters_reach_the_pipeline(bag, tmp_path, flags):
     assert changed != scores(evaluate(tmp_path, "--data", bag))
 
 
+@pytest.mark.parametrize("words", [("reproduce", "stm-cpa"), *(
+    words for words, command in LEAVES
+    if {"data", "data_option"} <= {p.name for p in command.params})], ids=" ".join)
+def test_data_is_an_argument_and_data_option_is_the_same(words, tmp_path, monkeypatch, capsys):
+    needs_out = "detect", "reproduce", "setup", "train", "seed"
+    out = ("--out", tmp_path / "out") if words[0] in needs_out else ()
+    results = ("--results", tmp_path / "r.json") if words[-1] == "nuscenes" else ()
+    said = {}
+    for name, given in {"argument": ["none"], "option": ["--data", "none"],
+                        "both": ["none", "--data", "none"], "neither": []}.items():
+        if name == "neither" and words[0] in ("demo", "view"):
+            continue
+        assert exit_of(monkeypatch, *words, *given, *out, *results) == 2
+        said[name] = capsys.readouterr().err.splitlines()[-1]
+    assert said["argument"] == said["option"] and said["argument"].startswith("Error: there is no")
+    assert "DATA is given twice" in said["both"]
+    assert "DATA is missing" in said.get("neither", "DATA is missing")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("words", [
+    "train pointpillars sim --sensor vlp99", "train pointnet sim --scene stret",
+    "train pointnet none", "train pointnet sim --init none", "train pointnet sim --set lrr=1",
+    "train pointnet --ablation sim --sensor vlp99",
+    "simulate --format kitti --sensor vlp99", "simulate --format kitti --scene stret",
+    "simulate --format kitti --kind nowhere", "simulate --format kiti", "demo none",
+    "demo --detector fuesd", "setup none", "setup {kitti} --topic /a", "label none",
+    "label {kitti} --sequence 7", "label {kitti} --import openlabl:x", "reproduce none",
+    "reproduce {kitti} --study sedes", "convert none", "convert {kitti} --to kiti",
+    "evaluate detection {kitti} --weights fussed", "detect {kitti} --weights fussed",
+    "detect {kitti} --format kiti", "detect none", "seed none", "seed {kitti} --frame 9"])
+def test_nothing_is_made_for_a_command_that_cannot_be_used(words, kitti, tmp_path, monkeypatch,
+                                                           capsys):
+    option = "--write-results" if words.startswith("evaluate") else "--out"
+    assert exit_of(monkeypatch, *words.format(kitti=kitti).split(), option,
+                   tmp_path / "not/there") == 2
+    assert "Error: " in capsys.readouterr().err
+    assert not (tmp_path / "not").exists()
+
+
+@pytest.mark.parametrize("name", ["kitti", "KITTI", "kitti-object", "kitti_object"])
+def test_names_of_formats_are_taken_in_any_spelling(kitti, tmp_path, name):
+    run("convert", "--data", kitti, "--to", name, "--limit", 1, "--out", tmp_path / "k")
+    assert (tmp_path / "k/training/velodyne").is_dir()
+    run("simulate", "--to", name, "--frames", 1, "--out", tmp_path / "s")
+    assert (tmp_path / "s/training/velodyne").is_dir()
+
+
 def test_without_core_points_there_are_no_candidates(bag, tmp_path):
     content = evaluate(tmp_path, "--data", bag, *given("clustering.dbscan.min_samples=100000"))
     for stage in STAGES:
@@ -357,7 +405,7 @@ def test_no_pedestrian_is_bad_input_and_leaves_the_scores(tmp_path, monkeypatch,
 
 @pytest.mark.parametrize("arguments, words", [
     (["bogus"], "there is no command 'bogus'; valid names: demo"),
-    (["evaluate", "candidates"], "Missing option '--data'"),
+    (["evaluate", "candidates"], "DATA is missing"),
     (["evaluate", "candidates", "--data", "a", "--jobs", "2", "--dask", "b"], "give one of them"),
     (["evaluate", "candidates", "--data", "b", "--set", "clustering.dbscan.min_samples=few"],
      "must be a whole number"),

@@ -37,9 +37,8 @@ from msg_utils.stamps import header_message
 
 MARKERS = "visualization_msgs/msg/MarkerArray"
 SMALL = generic(32, -25.0, 5.0, 0.4, 10.0)
-LAYOUTS = {"kitti": "kitti_object", "kitti-tracking": "kitti_tracking",
-           "semantickitti": "semantickitti"}
-REAL = {"kitti_object": "kitti_object", "kitti_tracking": "kitti_tracking",
+LAYOUTS = ("kitti", "kitti-tracking", "semantickitti")
+REAL = {"kitti_object": "kitti", "kitti_tracking": "kitti-tracking",
         "semantickitti": "semantickitti"}
 
 
@@ -69,7 +68,7 @@ def test_a_simulated_data_set_comes_back_from_its_bag(layout, made, tmp_path):
     recording = open_recording(made / layout)
     write_bag(tmp_path / "bag", recording)
     bag = open_recording(tmp_path / "bag")
-    summary = write_dataset(LAYOUTS[layout], bag, tmp_path / "back")
+    summary = write_dataset(layout, bag, tmp_path / "back")
     assert summary.frames == len(recording)
     back = open_recording(tmp_path / "back")
     assert (back.layout, back.has) == (recording.layout, recording.has)
@@ -137,7 +136,7 @@ def test_labels_of_a_vehicle_that_leans_come_back_from_nuscenes_as_they_were(kin
         written = json.loads(next(tmp_path.glob("back/*/sample_annotation.json")).read_text())
     else:
         labels = DriveLabels(list(map(of_truth, recording)))
-        export_labels(labels, "nuscenes_detection", tmp_path / "r.json", recording.frames)
+        export_labels(labels, "nuscenes-detection", tmp_path / "r.json", recording.frames)
         results = json.loads((tmp_path / "r.json").read_text())["results"]
         written = [row for rows in results.values() for row in rows]
     counts = ("num_lidar_pts", "num_radar_pts")
@@ -153,8 +152,8 @@ def test_labels_of_a_vehicle_that_leans_come_back_from_nuscenes_as_they_were(kin
 def test_without_a_camera_one_is_assumed_and_numbers_follow_the_time(tmp_path):
     """A missing scan leaves its number free; after a gap the next drive begins."""
     frames = frames_at([0, 0.1, 0.31, 0.4, 30, 30.07, 30.13], pose=np.eye(4).copy)
-    labels = labels_of(frames, "kitti_tracking")
-    summary = write_dataset("kitti_tracking", frames, tmp_path / "k", labels)
+    labels = labels_of(frames, "kitti-tracking")
+    summary = write_dataset("kitti-tracking", frames, tmp_path / "k", labels)
     assert (summary.frames, summary.drives) == (7, 2)
     assert {remark.split(":")[0]: n for remark, n in summary.remarks.items()} == {
         "assumed": 7, "left out": 7, "without a track id, which tracking needs": 6}
@@ -186,7 +185,7 @@ def test_point_labels_need_columns_and_go_only_where_they_fit(tmp_path, monkeypa
                    tmp_path / "s") == 0
     for frame in open_recording(tmp_path / "s"):
         assert frame.point_truth().instances.tolist() == [0, 7, 65535]
-    assert exit_of(monkeypatch, "convert", tmp_path / "labelled", "--to", "kitti_object", "--out",
+    assert exit_of(monkeypatch, "convert", tmp_path / "labelled", "--to", "kitti", "--out",
                    tmp_path / "k") == 0
     assert "left out: points' labels" in capsys.readouterr().out
     assert exit_of(monkeypatch, "convert", tmp_path / "bare", "--to", "semantickitti", "--out",
@@ -272,7 +271,7 @@ def test_results_of_a_bag_become_a_data_set(simulated, tmp_path, monkeypatch, ca
     bag_format.write(labels, export, recording)
     for topic in ("/ground_truth/detections", "/ground_truth/detections_3d"):
         out = tmp_path / topic.replace("/", "_")
-        assert exit_of(monkeypatch, "convert", export, "--to", "kitti_tracking", "--detections",
+        assert exit_of(monkeypatch, "convert", export, "--to", "kitti-tracking", "--detections",
                        topic, "--out", out) == 0
         back = open_recording(out)
         found = DriveLabels([replace(of_truth(f), name=a.name, stamp_ns=a.stamp_ns)

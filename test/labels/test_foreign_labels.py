@@ -49,7 +49,7 @@ def test_sustech_points_front_is_where_scale_x_points(tmp_path):
     assert (item["obj_type"], item["obj_id"]) == ("Car", "7")
 
 
-@pytest.mark.parametrize(("format", "degrees"), [("labelcloud", True), ("labelcloud_rel", False)])
+@pytest.mark.parametrize(("format", "degrees"), [("labelcloud", True), ("labelcloud-rel", False)])
 def test_labelcloud_turns_the_length_from_x_counterclockwise(format, degrees, tmp_path):
     content = json.loads((written(format, tmp_path / "l") / "000005.json").read_text())
     (item,) = content["objects"]
@@ -65,7 +65,7 @@ def test_labelcloud_turns_the_length_from_x_counterclockwise(format, degrees, tm
 
 
 def test_labelcloud_reads_heading_and_sides_off_its_vertices(tmp_path):
-    content = json.loads((written("labelcloud_vertices", tmp_path / "l") / "000005.json")
+    content = json.loads((written("labelcloud-vertices", tmp_path / "l") / "000005.json")
                          .read_text())
     corners = np.array(content["objects"][0]["vertices"])
     near(corners, box_corners(BOX[None])[0])
@@ -142,7 +142,7 @@ def test_openlabel_of_another_tool_is_placed_by_its_systems_and_kept(tmp_path):
     flat = [replace(each, notes=[("lane mark", {"bbox": [{"name": "seen"}]}), ("DontCare", {
         **DONT_CARE, "bbox": [1.0, 2.0, 3.0, 4.0]})])]  # regions that only an image shows
     frames = [replace(frames[0], calibration=lambda: CALIBRATION)]
-    for format in ("kitti_tracking", "kitti_object"):
+    for format in ("kitti-tracking", "kitti"):
         export_labels(DriveLabels(flat), format, tmp_path / format, frames)
         notes = import_labels(tmp_path / format, format, frames).frames[0].notes
         assert [(name, extra["bbox"]) for name, extra in notes] == [
@@ -172,7 +172,7 @@ def test_a_box_that_leans_is_kept_until_it_is_moved(format, tmp_path):
     turn = (Rotation.from_euler("XYZ", [-0.05, 0.003, 1.45]) if format == "sustech"
             else Rotation.from_euler("ZYX", [235, 350, 10], degrees=True)).as_matrix()
     assert box[6] == pytest.approx(math.atan2(turn[1, 0], turn[0, 0]))
-    for other in sorted(FORMATS.keys() - {"kitti_object"}):  # which has no ids
+    for other in sorted(FORMATS.keys() - {"kitti"}):  # which has no ids
         export_labels(labels, other, tmp_path / f"{format}_{other}", frames)
     export_labels(labels, format, tmp_path / "same", frames)
     assert json.loads((tmp_path / "same/000005.json").read_text()) == TILTED[format] or (
@@ -187,7 +187,7 @@ def test_a_box_that_leans_is_kept_until_it_is_moved(format, tmp_path):
 
 
 @pytest.mark.parametrize(("format", "key"), [
-    ("sustech", "obj_id"), ("openlabel", "uid"), ("nuscenes_tracking", "tracking_id")])
+    ("sustech", "obj_id"), ("openlabel", "uid"), ("nuscenes-tracking", "tracking_id")])
 def test_a_name_of_a_track_goes_to_one_of_the_parts_it_is_split_into(format, key, tmp_path):
     name = "0b3f7a52-5a7e-4a9b-9a3e-0d2c6f1b8e11"
     frame, = frames = frames_one()

@@ -14,8 +14,9 @@ from lidar_perception.labels.drive_labels import DriveLabels
 from lidar_perception.labels.exchange import FORMATS, export_labels, import_labels
 from lidar_perception.labels.formats.kitti_lines import occlusion_levels
 
-VERTICES = "labelcloud_vertices"  # the sides follow from corners that were rounded
-REAL = {"kitti_tracking": "training/label_02", "kitti_object": "training/label_2"}
+VERTICES = "labelcloud-vertices"  # the sides follow from corners that were rounded
+REAL = {"kitti-tracking": "kitti_tracking/training/label_02",
+        "kitti": "kitti_object/training/label_2"}
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -48,10 +49,12 @@ def test_reading_and_writing_again_changes_nothing(format, name, tmp_path):
 def test_kittis_own_label_files_come_back_line_by_line(format, tmp_path):
     """Also through every other format, which keeps what it does not know; there the first frames,
     without track ids where it has none, and without DontCare where it has no such thing."""
-    frames = [replace(frame, pose=np.eye(4).copy) for frame in open_recording(DATA / format)]
-    labels = import_labels(DATA / format, format, frames)
+    folder = DATA / REAL[format]
+    frames = [replace(frame, pose=np.eye(4).copy)
+              for frame in open_recording(folder.parent.parent)]
+    labels = import_labels(folder, format, frames)
     export_labels(labels, format, tmp_path / "own", frames)
-    assert lines(tmp_path / "own") == lines(DATA / format / REAL[format])
+    assert lines(tmp_path / "own") == lines(folder)
     first = DriveLabels(labels.frames[:4])
     export_labels(first, format, tmp_path / "first", frames[:4])
     for other in FORMATS:
@@ -78,11 +81,11 @@ def test_a_moved_box_gets_new_numbers_and_the_others_keep_theirs(tmp_path):
     folder = tmp_path / "label_2"
     folder.mkdir()
     (folder / "000005.txt").write_text(text)
-    labels = import_labels(folder, "kitti_object", frames)
-    export_labels(labels, "kitti_object", tmp_path / "same", frames)
+    labels = import_labels(folder, "kitti", frames)
+    export_labels(labels, "kitti", tmp_path / "same", frames)
     assert (tmp_path / "same/000005.txt").read_text() == text
     labels.frames[0].boxes[1, 0] += 1.0
-    export_labels(labels, "kitti_object", tmp_path / "moved", frames)
+    export_labels(labels, "kitti", tmp_path / "moved", frames)
     old, new = text.splitlines(), (tmp_path / "moved/000005.txt").read_text().splitlines()
     assert (new[0], new[2]) == (old[0], old[2])
     name, truncated, occluded, alpha, left, top, right, bottom, *rest = new[1].split()

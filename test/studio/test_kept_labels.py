@@ -155,7 +155,7 @@ def test_no_export_is_written_over_the_journal(tmp_path, name):
         labelled(made)
         (tmp_path / "other").symlink_to(tmp_path)
         with pytest.raises(InputError, match="is the journal"):
-            made.export("nuscenes_detection", name, force=True)
+            made.export("nuscenes-detection", name, force=True)
 
 
 def test_numbers_that_are_none_are_null_in_the_journal():
@@ -175,7 +175,7 @@ def test_the_command_imports_once_and_exports_no_journal_that_is_not_there(tmp_p
 
     def run(*words):
         return CliRunner().invoke(cli, ["label", "--data", str(tmp_path / "bag"), *map(str, words)])
-    to = ("--export", "openlabel", "--to", tmp_path / "made/../labels.json")
+    to = ("--export", f"OpenLabel:{tmp_path}/made/../labels.json")
     nowhere = run("--out", tmp_path / "empty", *to)
     assert isinstance(nowhere.exception, InputError) and "no journal" in str(nowhere.exception)
     assert not (tmp_path / "empty").exists()

@@ -115,7 +115,7 @@ def test_a_cloud_says_all_that_the_page_draws(served, written):
         assert (drive["mode"], len(drive["frames"]), drive["live"]) == ("label", 3, False)
         assert {c["name"] for c in drive["classes"]} >= {"Car", "Pedestrian", "Cyclist"}
         assert all(re.fullmatch("#[0-9a-f]{6}", c["color"]) for c in drive["classes"])
-        assert {"kitti_object", "openlabel"} <= set(drive["can_export"])
+        assert {"kitti", "openlabel"} <= set(drive["can_export"])
         one, again = [(await page.get("/api/cloud/1"))[1] for _ in range(2)]
         assert one == again  # the order is always the same
         return one
@@ -177,7 +177,7 @@ def test_a_second_page_sees_what_the_first_does(served):
     {"do": "fly"}, {}, {**ADD, "frame": 3}, {**ADD, "frame": "0"}, {**ADD, "box": BOX[:6]},
     {**ADD, "box": [float("nan"), *BOX[1:]]}, {**ADD, "box": [1e9, *BOX[1:]]},
     {"do": "snap", "track": 10**6, "frame": 0, "to": "ground"}, {"do": "poses", "poses": []},
-    {"do": "import", "path": "/nowhere", "format": "kitti_object"},
+    {"do": "import", "path": "/nowhere", "format": "kitti"},
     {"do": "import", "path": 5, "format": []},
     {"do": "seed", "frame": 0, "xyz": [0, 0], "class": "Car"},
 ], ids=str)

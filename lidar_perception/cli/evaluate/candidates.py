@@ -40,8 +40,8 @@ def candidates(walk: Walk, png: Path | None, params: PipelineParams) -> None:
 
     \b
     Examples:
-      lidar-perception evaluate candidates --data /data/kitti/object --json scores.json
-      lidar-perception evaluate candidates --data drive.bag --config best --set seed.source=file
+      lidar-perception evaluate candidates /data/kitti/object --json scores.json
+      lidar-perception evaluate candidates drive.bag --config best --set seed.source=file
     """
     from lidar_perception.data.frame import BOXES
     from lidar_perception.scoring.centres.report import CandidateReport, by_pipeline

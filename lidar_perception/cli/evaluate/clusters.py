@@ -26,7 +26,7 @@ def clusters(walk: Walk, weights: Path | None) -> None:
 
     \b
     Example:
-      lidar-perception evaluate clusters --data /data/kitti/object --json clusters.json
+      lidar-perception evaluate clusters /data/kitti/object --json clusters.json
     """
     from lidar_perception.data.frame import BOXES
     from lidar_perception.detectors.checkpoint import read_header

@@ -8,7 +8,14 @@ from pathlib import Path
 import click
 
 from lidar_perception.cli.command import Command
-from lidar_perception.cli.data import Walk, a_path, intervals_option, no_labels, walk_options
+from lidar_perception.cli.data import (
+    Walk,
+    a_path,
+    intervals_option,
+    no_labels,
+    out_folder,
+    walk_options,
+)
 from lidar_perception.cli.options import detector_options
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.detectors.params import MIN_SCORE
@@ -30,8 +37,8 @@ from lidar_perception.types import InputError
 @click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
               help="Height of the sensor above the ground. Default: what the recording says, or "
               "else what its first clouds show.")
-@a_path("--write-results", "Write the detections of --weights as KITTI result files, also for "
-                           "frames without labels.", "DIR")
+@out_folder("Write the detections of --weights as KITTI result files, also for frames without "
+            "labels.", "--write-results")
 @click.option("--errors", is_flag=True, help="Also say where found boxes differ from the true "
               "ones, by class and range, what each difference costs, and whether scores are the "
               "share of boxes that are right.")
@@ -49,11 +56,11 @@ def detection(walk: Walk, results: Path | None, detector: DetectorChoice | None,
 
     \b
     Examples:
-      lidar-perception evaluate detection --data /data/kitti/object --errors
-      lidar-perception evaluate detection --data /data/kitti/object --results out/data
-      lidar-perception evaluate detection --data /data/kitti/object --weights v4.safetensors \\
+      lidar-perception evaluate detection /data/kitti/object --errors
+      lidar-perception evaluate detection /data/kitti/object --results out/data
+      lidar-perception evaluate detection /data/kitti/object --weights v4.safetensors \\
           --split val.txt --json scores.json --write-results out/data
-      lidar-perception evaluate detection --data drive --weights v4.safetensors --keep 0.1
+      lidar-perception evaluate detection drive --weights v4.safetensors --keep 0.1
     """
     from lidar_perception.data.frame import BOXES, CAMERA
     from lidar_perception.detectors.open import doubts

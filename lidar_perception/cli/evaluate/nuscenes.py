@@ -34,8 +34,8 @@ def nuscenes(walk: Walk, results: Path | None, detector: DetectorChoice | None,
 
     \b
     Examples:
-      lidar-perception evaluate nuscenes --data /data/nuscenes --results results.json
-      lidar-perception evaluate nuscenes --data /data/nuscenes/v1.0-trainval \\
+      lidar-perception evaluate nuscenes /data/nuscenes --results results.json
+      lidar-perception evaluate nuscenes /data/nuscenes/v1.0-trainval \\
           --split val.txt --weights v4.safetensors --json scores.json
     """
     from lidar_perception.data.nuscenes.folder import KeyFrame

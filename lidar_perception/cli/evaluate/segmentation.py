@@ -13,8 +13,8 @@ from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import (
     WHAT,
     Walk,
-    a_path,
     as_mounted,
+    data_argument,
     no_labels,
     out_file,
     walk_options,
@@ -40,7 +40,7 @@ class MethodList(click.ParamType):
 
 
 @click.command(cls=Command)
-@walk_options(a_path("--data", f"{WHAT} May be repeated.", "PATH", multiple=True, required=True))
+@walk_options(data_argument(f"{WHAT} May be repeated.", several=True))
 @click.option("--methods", type=MethodList(), default=GROUND_METHODS + CLUSTERING_METHODS,
               help="Methods to score, of ground and of clustering, with commas between. "
               "Default: all.")
@@ -56,10 +56,10 @@ def segmentation(walk: Walk, methods: tuple, png: Path | None, params: Segmentat
 
     \b
     Examples:
-      lidar-perception evaluate segmentation --data /data/semantickitti --png ground.png
-      lidar-perception evaluate segmentation --data /data/kitti/object \\
+      lidar-perception evaluate segmentation /data/semantickitti --png ground.png
+      lidar-perception evaluate segmentation /data/kitti/object \\
           --set ground.method=patchwork
-      lidar-perception evaluate segmentation --data drive.bag --methods dbscan --json scores.json
+      lidar-perception evaluate segmentation drive.bag --methods dbscan --json scores.json
     """
     from lidar_perception.data.frame import BOXES, POINT_LABELS
     from lidar_perception.scoring.points.report import SegmentationReport, by_methods

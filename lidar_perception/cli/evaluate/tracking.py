@@ -10,7 +10,7 @@ from rich.text import Text
 
 from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import (
-    data_option,
+    data_argument,
     json_option,
     limit_option,
     no_labels,
@@ -25,7 +25,7 @@ from lidar_perception.tracking.params import RECORDED_EGO, TrackingParams
 
 
 @click.command(cls=Command)
-@data_option
+@data_argument()
 @split_option
 @limit_option
 @detector_options(tracking=True)
@@ -43,8 +43,8 @@ def tracking(data: Path, split: Path | None, limit: int | None, detector: Detect
 
     \b
     Examples:
-      lidar-perception evaluate tracking --data /data/kitti/tracking --json tracks.json
-      lidar-perception evaluate tracking --data drive --ego kiss_icp --weights v4.safetensors
+      lidar-perception evaluate tracking /data/kitti/tracking --json tracks.json
+      lidar-perception evaluate tracking drive --ego kiss_icp --weights v4.safetensors
     """
     from lidar_perception.data.frame import BOXES, POSES
     from lidar_perception.scoring.run import fill
