@@ -304,7 +304,6 @@ LIGHT = [
     ("lidar_perception.detectors.pointnet.params",
      "numba torch matplotlib scipy sklearn rich click"),
     ("lidar_perception.training.params", "numba torch matplotlib scipy rich click"),
-    ("lidar_perception.detectors.hybrid.params", "numba torch matplotlib scipy rich click"),
     ("lidar_perception.detectors.pointpillars.params", "numba torch matplotlib scipy click"),
     ("lidar_perception.detectors.pointpillars.weights_file", "numba torch matplotlib scipy click"),
     ("lidar_perception.detectors.pointnet.weights_file", "numba torch matplotlib scipy click"),

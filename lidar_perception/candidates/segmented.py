@@ -31,13 +31,6 @@ class Segmented:
     numbers: np.ndarray | None = None
     ms: dict[str, float] = field(default_factory=dict)
 
-    @property
-    def cloud_ids(self) -> np.ndarray:
-        """(M,) cluster_ids by the numbers that the cloud gives them, which may have gaps."""
-        if self.numbers is None:
-            return self.cluster_ids
-        return np.concatenate([[0], self.numbers])[self.cluster_ids]
-
 
 def grounded_boxes(xyz: np.ndarray, ground: np.ndarray, cluster_ids: np.ndarray,
                    shape: str) -> np.ndarray:

@@ -48,9 +48,9 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, range: str,
             settings: Settings, intervals: int) -> None:
     """Run all detectors on the same frames, in turns, and print scores and times side by side.
 
-    STM-CPA (`paper` and `best`), PointPillars V0 to V4 in both sizes, PointNet, fused (the default
-    detector) and hybrids of two of them: average precision, F1 of pedestrians by centre distance as
-    in the STM-CPA paper, ms a frame.
+    STM-CPA (`paper` and `best`), PointPillars V0 to V4 in both sizes, PointNet, and fused (the
+    default detector): average precision, F1 of pedestrians by centre distance as in the STM-CPA
+    paper, ms a frame.
     Networks without weights are listed as missing. With several --jobs the processes share the
     machine, and times are longer.
 

@@ -1,7 +1,7 @@
 """What a detector is: a frame in, a value out, and nothing to be read off it afterwards.
 
-PointPillars, PointNet, exported networks, STM-CPA candidates and the hybrids all fulfil this;
-nodes, scores, training and scripts know nothing else of them.
+PointPillars, PointNet, fused, exported networks and STM-CPA candidates all fulfil this; nodes,
+scores, training and scripts know nothing else of them.
 """
 
 from __future__ import annotations

@@ -28,7 +28,7 @@ from lidar_perception.types import CLASSES, SENSOR_HEIGHT, Detections, InputErro
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 NAMES = ["STM-CPA paper", "STM-CPA best", "STM-CPA best, auto", "PointPillars v0 compact",
-         "PointNet", "STM-CPA + PointNet", "STM-CPA + PointNet, auto", "PP v0 compact + PointNet"]
+         "PointNet"]
 each_name = pytest.mark.parametrize("name", NAMES)
 
 

@@ -17,7 +17,7 @@ from lidar_perception.candidates.configurations import BEST
 from lidar_perception.clustering.shapes import oriented_boxes
 from lidar_perception.detectors.pointnet.clusters import points_of
 from lidar_perception.detectors.pointnet.detector import PointNetDetector
-from lidar_perception.detectors.pointnet.rescoring import known, rescored_by
+from lidar_perception.detectors.pointnet.rescoring import class_probabilities, known
 from lidar_perception.geometry import centre_distances
 from lidar_perception.ground.threshold import fit_plane
 from lidar_perception.groups import group_points
@@ -56,13 +56,12 @@ def judged(proposed: Detections, obstacles: LidarFrame, ground: np.ndarray,
     (K, 7) the box that these points are of, if it is of that class; NaN where it is decided
     already, not open_ (K,), where the classifier does not know the class, and where there are less
     than FEWEST points."""
-    clusters = points_of(proposed.boxes, obstacles, obstacles, MARGIN)
+    clusters = points_of(proposed.boxes, obstacles, MARGIN)
     asked = np.flatnonzero(open_ & (clusters.sizes >= FEWEST)
                            & known(classifier, proposed.class_ids))
     clusters = clusters.take(asked).on(ground)
     probabilities, boxes = np.full(len(proposed), np.nan), np.full((len(proposed), 7), np.nan)
-    rescored, boxes[asked] = rescored_by(classifier, proposed[asked], clusters, 1.0)
-    probabilities[asked] = rescored.scores
+    probabilities[asked], boxes[asked] = class_probabilities(classifier, proposed[asked], clusters)
     return probabilities, boxes
 
 

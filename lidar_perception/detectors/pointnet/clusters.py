@@ -98,15 +98,14 @@ def clusters_of(frame: LidarFrame, cluster_ids: np.ndarray, min_points: int = 1,
     return found if ground is None else found.on(frame.xyz.compress(ground, axis=0))
 
 
-def points_of(boxes: np.ndarray, frame: LidarFrame, seen: LidarFrame, margin: float) -> Clusters:
-    """One cluster for each of boxes (K, 7), in their order: the points of a frame within it, grown
-    by margin metres, with the coordinates and the intensity that `seen` has of the same points. A
-    point can be in several, and a cluster can be without points."""
+def points_of(boxes: np.ndarray, frame: LidarFrame, margin: float) -> Clusters:
+    """Return one cluster for each of boxes (K, 7), in their order: the points of a frame within the
+    box, grown by margin metres. A point can be in several; a cluster can be without points."""
     indices, first = points_in_boxes(frame.xyz, boxes, margin)
     points = np.zeros((len(indices), 4), np.float32)
-    points[:, :3] = seen.xyz[indices]
-    if seen.intensity is not None:
-        points[:, 3] = seen.intensity[indices]
+    points[:, :3] = frame.xyz[indices]
+    if frame.intensity is not None:
+        points[:, 3] = frame.intensity[indices]
     return Clusters(points, first, np.arange(1, len(boxes) + 1))
 
 

@@ -1,9 +1,8 @@
-"""The detectors that are compared: those of the paper, the networks that have weights, hybrids."""
+"""The detectors that are compared: those of the paper and the networks that have weights."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -17,16 +16,11 @@ from lidar_perception.candidates.warm_up import warm_up
 from lidar_perception.data.frame import Frame
 from lidar_perception.detectors.base import NetworkDetector
 from lidar_perception.detectors.candidates import CandidateDetector
-from lidar_perception.detectors.checkpoint import NETWORKS, POINTNET, POINTPILLARS
+from lidar_perception.detectors.checkpoint import NETWORKS, POINTNET
 from lidar_perception.detectors.contract import Detector
-from lidar_perception.detectors.hybrid.candidates import RescoredCandidates
-from lidar_perception.detectors.hybrid.params import ConfirmingParams, RescoringParams
-from lidar_perception.detectors.hybrid.proposals import ConfirmedProposals
 from lidar_perception.detectors.open import FUSED, LOAD, Configured, kind_and_file, open_detector
 from lidar_perception.detectors.params import MIN_SCORE
-from lidar_perception.detectors.pointnet.detector import PointNetDetector
 from lidar_perception.detectors.pointnet.params import PointNetParams
-from lidar_perception.detectors.pointnet.weights_file import judge_file
 from lidar_perception.detectors.pointnet.weights_file import weights_file as pointnet_file
 from lidar_perception.detectors.pointpillars.config import SIZES, VERSIONS
 from lidar_perception.detectors.pointpillars.params import PointPillarsParams
@@ -37,8 +31,6 @@ from lidar_perception.scoring.centres.report import pedestrians_of
 from lidar_perception.scoring.comparison.outcomes import Contender
 from lidar_perception.types import CLASSES, PEDESTRIAN, SENSOR_HEIGHT, InputError
 
-PROPOSER = "PointPillars v4 compact"  # whose proposals the hybrid confirms, if it is there
-PROPOSED = 0.05  # its least score, not calibrated
 NO_WEIGHTS = "no weights come with the package; give some with --weights"
 PERSON = CLASSES[PEDESTRIAN]
 CANDIDATES = "candidates"
@@ -63,10 +55,6 @@ class Opened:
     detector: NetworkDetector
     source: Path
 
-    @property
-    def network(self) -> str:
-        return self.detector.group
-
     def contender(self) -> Contender:
         """By itself."""
         return always(self.name, self.detector, str(self.source))
@@ -82,7 +70,7 @@ def always(name: str, detector: Detector, source: str) -> Contender:
 def contenders(weights: Sequence[Path] = (), device: str = "auto",
                sensor_height: float = SENSOR_HEIGHT, range: str = "auto",
                settings: Settings = NO_SETTINGS) -> tuple[list[Contender], list[Missing]]:
-    """Open every detector of the package that has weights, and hybrids of them.
+    """Open every detector of the package that has weights.
 
     Args:
         weights: files of more networks.
@@ -121,8 +109,7 @@ def contenders(weights: Sequence[Path] = (), device: str = "auto",
         missing.append(Missing(FUSED, str(error)))
     paper, best = (with_values(mounted(params, sensor_height), settings.get(CANDIDATES, {}))
                    for params in (PAPER, BEST))
-    hybrids, lacking = _hybrids(opened, best, opened_as)
-    return [*_candidates(paper, best), *found, *hybrids], [*missing, *lacking]
+    return [*_candidates(paper, best), *found], missing
 
 
 def opened_in_a_process(*asked: Any) -> list[Contender]:
@@ -164,37 +151,8 @@ def _candidates(paper: PipelineParams, best: PipelineParams) -> list[Contender]:
             _seeded("STM-CPA best, auto", CandidateDetector, best, _own_seed(best))]
 
 
-def _hybrids(opened: Sequence[Opened], best: PipelineParams,
-             opened_as: Callable[[Path], Detector]) -> tuple[list[Contender], list[Missing]]:
-    """STM-CPA and PointPillars, each with the judge of `fused`, or else the first PointNet."""
-    proposers = {each.name: each for each in reversed(opened) if each.network == POINTPILLARS}
-    proposer = proposers.get(PROPOSER, next(reversed(proposers.values()), None))
-    names = "STM-CPA + PointNet", "STM-CPA + PointNet, auto", "PointPillars + PointNet"
-    classifiers = [(each.detector, str(each.source)) for each in opened
-                   if isinstance(each.detector, PointNetDetector)]
-    with suppress(InputError):
-        judge = opened_as(judge_file())
-        assert isinstance(judge, PointNetDetector)
-        classifiers.insert(0, (judge, str(judge_file())))
-    if not classifiers:
-        return [], [Missing(name, "no PointNet has weights") for name in names]
-    classifier, source = classifiers[0]
-
-    def rescored(seed, camera, pipeline):
-        return RescoredCandidates(classifier, seed, camera, RescoringParams(), pipeline)
-    own = rescored(_no_seed, None, best).pipeline
-    found = [_seeded(names[0], rescored, best, _labelled, source),
-             _seeded(names[1], rescored, best, _own_seed(own), source)]
-    if proposer is None:
-        return found, [Missing(names[2], "there is no PointPillars to propose")]
-    confirmed = ConfirmedProposals(proposer.detector.with_min_score(PROPOSED), classifier,
-                                   ConfirmingParams())
-    return [*found, always(proposer.name.replace("PointPillars", "PP") + " + PointNet", confirmed,
-                           f"{proposer.source} {source}")], []
-
-
 def _seeded(name: str, make: Callable[..., Detector], params: PipelineParams,
-            seed_of: Callable[[Frame], SeedSource | None], source: str = "") -> Contender:
+            seed_of: Callable[[Frame], SeedSource | None]) -> Contender:
     """A detector make(seed, camera, params) that needs a seed for each frame; where there is no
     camera it sees the whole scan, as the others do."""
     uncropped = with_values(params, {"view.enabled": False})
@@ -204,7 +162,7 @@ def _seeded(name: str, make: Callable[..., Detector], params: PipelineParams,
         return None if seed is None else make(
             seed, camera, uncropped if camera is None else params).with_min_score(MIN_SCORE)
     operating = make(_no_seed, None, params).min_scores[PERSON]
-    return Contender(name, detector_of, (PERSON,), operating, source)
+    return Contender(name, detector_of, (PERSON,), operating)
 
 
 def _no_seed(segmented):

@@ -127,7 +127,7 @@ def cut(scene: TrainingScene, config: PointNetConfig, min_points: int,
     of_around = np.append([config.classes.index(CLASSES[scene.class_ids[i]]) for i in wanted],
                           np.full(len(around) - len(wanted), background)).astype(np.int64)
     obstacles = frame.take(np.flatnonzero(~ground))
-    loose = points_of(around, obstacles, obstacles, AROUND)
+    loose = points_of(around, obstacles, AROUND)
     kept = np.flatnonzero(loose.sizes >= min_points)
     loose = loose.take(kept).on(frame.xyz.compress(ground, axis=0))
     both = Clusters(np.concatenate([clusters.points, loose.points]),
