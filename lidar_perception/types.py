@@ -173,6 +173,15 @@ def _numbers(given: Any, what: str, allowed: str) -> np.ndarray:
     return values
 
 
+def check_columns(count: int, **columns: ArrayLike | None) -> None:
+    """Raise InputError naming a column that has not one value for each of count points."""
+    for name, column in columns.items():
+        if column is not None and np.shape(column) != (count,):
+            size = np.size(column)
+            has = f"{size} values" if size != count else f"shape {np.shape(column)}"
+            raise InputError(f"{name} has {has} for {count} points")
+
+
 def usable_returns(xyz: np.ndarray) -> np.ndarray:
     """(N,) bool: finite, within 100 km, and not the origin, where drivers put missing returns."""
     with np.errstate(invalid="ignore", over="ignore"):

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from lidar_perception.candidates.pipeline import segment
 from lidar_perception.clustering.cluster import cluster, cluster_obstacles
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
@@ -185,8 +186,13 @@ def test_ground_of_an_array_is_that_of_its_frame(method):
 def test_clusters_of_an_array_are_those_of_its_frame():
     ids = cluster(LidarFrame.of(CLOUD))
     assert np.array_equal(cluster(CLOUD), ids) and np.array_equal(cluster(CLOUD[:, :3]), ids)
-    with pytest.raises(InputError, match=r"ground has shape \(3,\) for 400 points"):
+    with pytest.raises(InputError, match="ground has 3 values for 400 points"):
         cluster_obstacles(CLOUD, np.zeros(3, bool))
+    with pytest.raises(InputError, match="cluster_ids has 3 values for 400 points"):
+        segment(CLOUD, cluster_ids=np.zeros(3, int))
+    expected = segment(LidarFrame.of(CLOUD))
+    for same in (segment(CLOUD), segment(CLOUD.tolist(), ground=expected.ground.tolist())):
+        assert np.array_equal(same.cluster_ids, expected.cluster_ids)
 
 
 @pytest.mark.parametrize("boxes, said", [

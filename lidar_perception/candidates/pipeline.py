@@ -22,7 +22,7 @@ from lidar_perception.candidates.segmented import Segmented, grounded_boxes, poi
 from lidar_perception.clustering.cluster import cluster_obstacles
 from lidar_perception.ground.segment import cropped_as_mounted, segment_ground
 from lidar_perception.groups import renumbered
-from lidar_perception.types import LidarFrame, as_frame
+from lidar_perception.types import LidarFrame, as_frame, check_columns
 
 
 def segment(cloud: LidarFrame | ArrayLike, camera: Camera | None = None,
@@ -30,20 +30,23 @@ def segment(cloud: LidarFrame | ArrayLike, camera: Camera | None = None,
             cluster_ids: np.ndarray | None = None) -> Segmented:
     """Run the stages up to the boxes on a LidarFrame, or an array (N, 3) or (N, 4) as LidarFrame.of
     takes it. ground (N,) bool and cluster_ids (N,) of its points, from any clustering, are computed
-    where they are None. InputError if the view is on and there is no camera, and for other
-    arrays."""
+    where they are None. InputError if the view is on and there is no camera, for other arrays, and
+    for columns of another length."""
     t0 = perf_counter()
-    kept, frame = cropped_as_mounted(as_frame(cloud), params.crop, params.ground.sensor_pose)
+    frame = as_frame(cloud)
+    check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
+    kept, frame = cropped_as_mounted(frame, params.crop, params.ground.sensor_pose)
     indices, seen = points_in_view(frame, camera, params.view)
     indices = kept.take(indices)
     t1 = perf_counter()
-    ground = segment_ground(seen, params.ground) if ground is None else ground[indices]
+    ground = (segment_ground(seen, params.ground) if ground is None else
+              np.asarray(ground, bool)[indices])
     t2 = perf_counter()
     numbers = None
     if cluster_ids is None:
         cluster_ids = cluster_obstacles(seen.xyz, ground, params.clustering)
     else:
-        cluster_ids, numbers = renumbered(cluster_ids[indices])
+        cluster_ids, numbers = renumbered(np.asarray(cluster_ids)[indices])
     t3 = perf_counter()
     boxes = grounded_boxes(seen.xyz, ground, cluster_ids, params.boxes.shape)
     t4 = perf_counter()

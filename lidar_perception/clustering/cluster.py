@@ -9,7 +9,7 @@ from lidar_perception.clustering.dbscan import distance_aware_dbscan
 from lidar_perception.clustering.density import density, followed, radii
 from lidar_perception.clustering.euclidean import euclidean
 from lidar_perception.clustering.params import ClusteringParams
-from lidar_perception.types import InputError, LidarFrame, as_frame, usable_returns
+from lidar_perception.types import LidarFrame, as_frame, check_columns, usable_returns
 
 
 def cluster(cloud: LidarFrame | ArrayLike, params: ClusteringParams = ClusteringParams(),
@@ -44,9 +44,7 @@ def cluster_obstacles(cloud: LidarFrame | ArrayLike, ground: np.ndarray,
     or of sensed (N, 3), the cloud as the sensor sees it, where its points have been moved to
     another height. InputError for a ground of another length."""
     xyz, ground = as_frame(cloud).xyz, np.asarray(ground, bool)
-    if ground.shape != (len(xyz),):
-        raise InputError(f"ground has shape {ground.shape} for {len(xyz)} points; give an array "
-                         f"({len(xyz)},)")
+    check_columns(len(xyz), ground=ground)
     labels = np.zeros(len(xyz), np.int32)
     obstacles = np.flatnonzero(~ground)
     seen = density(xyz if sensed is None else sensed) if params.density else 0.0

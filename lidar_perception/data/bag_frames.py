@@ -30,7 +30,7 @@ from lidar_perception.data.frame import (
     Recording,
 )
 from lidar_perception.data.open_storage import storage_files
-from lidar_perception.data.recorded_scale import SAMPLE, scale_of
+from lidar_perception.data.recorded_scale import MAX_READ, scale_of
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
 from lidar_perception.wire.codec import decode
 from lidar_perception.wire.messages import calibration_of, column, raw_intensity, to_frame, to_truth
@@ -203,7 +203,7 @@ class BagFrames(Sequence):
 
     def _first_clouds(self) -> Iterator[bytes]:
         with suppress(InputError):  # damage is named when it is read
-            for _, _, data in islice(self.opened.bag().raw({self.points}), SAMPLE):
+            for _, _, data in islice(self.opened.bag().raw({self.points}), MAX_READ):
                 yield bytes(data)
 
     @cached_property

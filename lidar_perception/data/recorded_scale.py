@@ -13,6 +13,7 @@ from lidar_perception.intensity import StreamScale
 from lidar_perception.types import InputError
 
 SAMPLE = 10  # clouds on which the scale of a recording is decided
+MAX_READ = 100  # clouds of a bag that are read for them
 
 Item = TypeVar("Item")
 Column = tuple[np.ndarray, np.dtype] | None  # see wire.messages.raw_intensity
@@ -31,10 +32,15 @@ def recorded_scale(items: Sequence[Item], read: Callable[[Item], Column]
 
 
 def scale_of(items: Iterable[Item], read: Callable[[Item], Column]) -> float:
-    """Return the scale that the intensities of all these clouds have; 1 without any."""
-    scale = StreamScale()
+    """Return the scale of the first SAMPLE clouds, not counting those that are empty or all 0, as
+    drivers publish at their start; 1 without any. Arguments as of recorded_scale."""
+    scale, count = StreamScale(), 0
     for item in items:
         with suppress(InputError):
-            if (column := read(item)) is not None:
+            column = read(item)
+            if column is not None:
                 scale(*column)
+            count += column is None or bool((column[0] > 0).any())
+        if count == SAMPLE:
+            break
     return scale.full or 1.0

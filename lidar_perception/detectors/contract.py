@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lidar_perception.intensity import guessed_scale, scale_problem, to_unit
-from lidar_perception.types import Detections, InputError, LidarFrame, as_frame, usable_returns
+from lidar_perception.types import Detections, LidarFrame, as_frame, check_columns, usable_returns
 
 Cloud = LidarFrame | ArrayLike  # see LidarFrame.of
 FUSED = "fused"  # the default where one detector is wanted: all of them together
@@ -86,15 +86,13 @@ def accept(cloud: Cloud, ground: np.ndarray | None, cluster_ids: np.ndarray | No
     intensity_scale: the factor by which the detector multiplies the intensity; 0: it reads none.
     """
     frame = as_frame(cloud)
-    for name, column in (("ground", ground), ("cluster_ids", cluster_ids)):
-        if column is not None and np.shape(column) != (len(frame),):
-            size = np.size(column)
-            has = f"{size} values" if size != len(frame) else f"shape {np.shape(column)}"
-            raise InputError(f"{name} has {has} for {len(frame)} points")
+    check_columns(len(frame), ground=ground, cluster_ids=cluster_ids)
+    ground, cluster_ids = (column if column is None else np.asarray(column)
+                           for column in (ground, cluster_ids))
     if frame is not cloud and not (usable := usable_returns(frame.xyz)).all():
         kept = np.flatnonzero(usable)
         frame = frame.take(kept)
-        ground, cluster_ids = (column if column is None else np.asarray(column).take(kept)
+        ground, cluster_ids = (column if column is None else column.take(kept)
                                for column in (ground, cluster_ids))
     problem = scale_problem(frame.intensity, intensity_scale)
     if problem and frame.intensity is not None:

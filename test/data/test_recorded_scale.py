@@ -120,6 +120,17 @@ def test_the_type_of_a_recorded_field_counts(tmp_path, kind, values, full):
         assert np.array_equal(frame.load().intensity, expected / np.float32(full))
 
 
+def test_empty_and_black_clouds_at_the_start_of_a_bag_do_not_decide_on_the_scale(tmp_path):
+    xyz = np.ones((50, 3))
+    first = [np.zeros((0, 4), np.float32), np.column_stack([xyz, np.zeros(50)])] * 8
+    rest = [cloud for _, cloud in clouds(255)]
+    write_bag(tmp_path / "drive", [
+        Frame.of(str(i), cloud_frame(cloud.astype(np.float32), STAMP + i * 10**8))
+        for i, cloud in enumerate([*first, *rest])])
+    frames = open_recording(tmp_path / "drive").frames
+    assert not frames[1].load().intensity.any() and frames[-1].load().intensity.max() == 1.0
+
+
 def test_a_broken_cloud_does_not_decide_on_the_scale(tmp_path):
     object_files(tmp_path, clouds(255))
     write(tmp_path / "training/velodyne/000004.bin", b"cut")
