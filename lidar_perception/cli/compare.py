@@ -67,7 +67,7 @@ def compare(walk: Walk, weights: tuple[Path, ...], png: Path | None, range: str,
     from lidar_perception.scoring.comparison.report import draw_comparison, print_comparison
     from lidar_perception.scoring.kitti.tables import CENTRE_F1
 
-    runs = _runs()
+    runs = _runs() if settings else []
     values = {each.name: own for each, own in zip(runs, settings.values(*runs))}
     recording = walk.opened(BOXES)
     with errors.status("loading detectors"):

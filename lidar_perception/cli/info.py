@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,8 @@ from lidar_perception.runs.terminal import console
 
 @click.command(cls=Command)
 @data_argument()
-def info(data: Path) -> None:
+@click.option("--json", "as_json", is_flag=True, help="Print JSON to standard output.")
+def info(data: Path, as_json: bool) -> None:
     """Print the topics, types, counts and length of a bag; of any other recording its layout,
     frames, times, first cloud and labels.
 
@@ -26,45 +28,70 @@ def info(data: Path) -> None:
     Examples:
       lidar-perception info drive.bag
       lidar-perception info /data/kitti/tracking
+      lidar-perception info drive.bag --json
     """
     if layout_of(data) in (None, bag_frames):
-        _print_bag(data)
+        content, show = _bag(data), _print_bag
     else:
-        _print_recording(open_recording(data))
+        content, show = _recording(data), _print_recording
+    if as_json:
+        click.echo(json.dumps(content, indent=1))
+    else:
+        show(content)
 
 
-def _print_bag(path: Path) -> None:
-    with Bag(path) as opened:
-        seconds = max(0, opened.end_ns - opened.start_ns) / 1e9
-        table = Table(title=f"{path}: {seconds:.1f} s", title_justify="left")
-        for column in ("topic", "type", "messages", "QoS"):
-            table.add_column(column, justify="right" if column == "messages" else "left",
-                             overflow="fold")
-        for topic, kind in sorted(opened.topics.items()):
-            profile = "; ".join(f"{q.reliability.name.lower()}, {q.durability.name.lower()}"
-                                for q in opened.qos(topic)[:1])
-            table.add_row(topic, kind, str(opened.counts[topic]), profile)
+def _bag(path: Path) -> dict[str, Any]:
+    with Bag(path) as bag:
+        return {"path": str(path), "start_ns": bag.start_ns,
+                "seconds": max(0, bag.end_ns - bag.start_ns) / 1e9,
+                "topics": [{"topic": topic, "type": kind, "messages": bag.counts[topic],
+                            "qos": next((f"{qos.reliability.name.lower()}, "
+                                         f"{qos.durability.name.lower()}"
+                                         for qos in bag.qos(topic)), None)}
+                           for topic, kind in sorted(bag.topics.items())]}
+
+
+def _print_bag(content: dict[str, Any]) -> None:
+    table = Table(title=f"{content['path']}: {content['seconds']:.1f} s", title_justify="left")
+    for column in ("topic", "type", "messages", "QoS"):
+        table.add_column(column, justify="right" if column == "messages" else "left",
+                         overflow="fold")
+    for row in content["topics"]:
+        table.add_row(row["topic"], row["type"], str(row["messages"]), row["qos"])
     console.print(table)
 
 
-def _print_recording(recording: Any) -> None:
-    console.print(str(recording))
-    drives = sorted({frame.sequence for frame in recording if frame.sequence})
-    if drives:
-        console.print(f"drives: {', '.join(drives)}")
-    stamps = [frame.stamp_ns for frame in recording]
-    console.print("times: as recorded, the first at "
-                  f"{min(stamps) // 10**9}.{min(stamps) % 10**9:09} s" if recording.timed
-                  else "times: none, 10 Hz assumed")
+def _recording(path: Path) -> dict[str, Any]:
+    recording = open_recording(path)
     first = recording.frames[0]
-    scan = first.load()
-    intensity = ("no intensity" if scan.intensity is None else
-                 f"intensity up to {scan.intensity.max(initial=0):.3g}")
-    if first.intensity_max() > 1:
-        intensity += f" of 1, which is {first.intensity_max():g} in the files"
-    console.print(f"first cloud: {first.name}, {len(scan)} points, {intensity}")
-    truth = first.truth()
-    if truth is not None:
-        console.print(f"its labels: {', '.join(truth.labels) or 'none'}")
-    for line in lost_labels(recording):
+    scan, truth = first.load(), first.truth()
+    return {
+        "path": str(path), "summary": str(recording), "layout": recording.layout,
+        "frames": len(recording), "has": sorted(recording.has),
+        "drives": sorted({frame.sequence for frame in recording if frame.sequence}),
+        "start_ns": min(frame.stamp_ns for frame in recording) if recording.timed else None,
+        "first_cloud": {
+            "name": first.name, "points": len(scan), "full_intensity": first.intensity_max(),
+            "greatest_intensity": None if scan.intensity is None else
+            float(scan.intensity.max(initial=0)),
+            "labels": None if truth is None else truth.labels},
+        "lost_labels": lost_labels(recording)}
+
+
+def _print_recording(content: dict[str, Any]) -> None:
+    console.print(content["summary"])
+    if content["drives"]:
+        console.print(f"drives: {', '.join(content['drives'])}")
+    start = content["start_ns"]
+    console.print("times: none, 10 Hz assumed" if start is None else
+                  f"times: as recorded, the first at {start // 10**9}.{start % 10**9:09} s")
+    first = content["first_cloud"]
+    greatest = first["greatest_intensity"]
+    intensity = "no intensity" if greatest is None else f"intensity up to {greatest:.3g}"
+    if first["full_intensity"] > 1:
+        intensity += f" of 1, which is {first['full_intensity']:g} in the files"
+    console.print(f"first cloud: {first['name']}, {first['points']} points, {intensity}")
+    if first["labels"] is not None:
+        console.print(f"its labels: {', '.join(first['labels']) or 'none'}")
+    for line in content["lost_labels"]:
         console.print(line)

@@ -123,7 +123,12 @@ def _as_trained(params: Any, path: Path | None) -> Any:
     from lidar_perception.detectors.checkpoint import read_header
     from lidar_perception.detectors.pointnet.config import PointNetConfig
     from lidar_perception.detectors.pointnet.weights_file import weights_file
-    config = read_header(path or weights_file(params.pointnet), PointNetConfig).config
+    try:
+        config = read_header(path or weights_file(params.pointnet), PointNetConfig).config
+    except InputError:
+        if path is not None:
+            raise
+        return params  # without weights there is nothing to open, which is said then
     return replace(params, ground=config.ground, clustering=config.clustering)
 
 
@@ -136,7 +141,7 @@ def kind_and_file(weights: str | Path) -> tuple[str, Path | None]:
     name, path = str(weights), Path(weights)
     if name in LOAD:
         return name, None
-    if not path.suffix and not path.exists():
+    if path.name == name and not path.suffix and not path.exists():
         raise unknown_name("detector or file of weights", name, LOAD)
     return kind_of(path), path
 

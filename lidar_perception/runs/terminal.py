@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import time
 import warnings
 from collections.abc import Iterable, Iterator
@@ -9,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -20,22 +21,42 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.status import Status
+from rich.table import Table
 from rich.text import Text
 
 from lidar_perception.types import InputWarning
 
 
 class Terminal(Console):
-    """What is printed has names of files, so text is no markup, and only the terminal breaks its
-    lines; tables are as wide as it."""
+    """A console whose text is no markup, as it holds names of files. Only a terminal breaks lines
+    of text, and tables are as wide as it; in a file or a pipe nothing is broken or cut."""
 
     def __init__(self, **more: Any) -> None:
         super().__init__(highlight=False, markup=False, **more)
 
+    @property
+    def options(self) -> ConsoleOptions:
+        return super().options if self.file.isatty() else super().options.update(max_width=WIDE)
+
     def print(self, *objects: Any, **how: Any) -> None:
         text = all(isinstance(each, str | Text) for each in objects)
-        super().print(*objects, **{"soft_wrap": text, **how})
+        if self.file.isatty():
+            super().print(*objects, **{"soft_wrap": text, **how})
+            return
+        for each in [objects] if text else [[each] for each in objects]:
+            parts = _parts(each[0]) if isinstance(each[0], Table) else [each]
+            for part in parts:
+                super().print(*part, **{"soft_wrap": text, "crop": False, **how})
 
+
+def _parts(table: Table) -> list[list[Any]]:
+    """The title, which rich would break at the width of the table, and the rest of a table."""
+    bare = copy.copy(table)
+    bare.title = None
+    return [[each] for each in (table.title, bare) if each is not None]
+
+
+WIDE = 100_000  # characters; wider than any table
 
 console = Terminal()
 errors = Terminal(stderr=True)

@@ -12,12 +12,11 @@ from rich.text import Text
 SHOWN = 5  # reasons why frames were skipped
 
 
-def narrow_table(title: str, first: str, *others: str, width: int = 0,
-                 fold: bool = False) -> Table:
-    """A table whose columns fit into 80 characters: the first one of words, which may fold, the
-    others, each at least width wide, of numbers."""
+def narrow_table(title: str, first: str, *others: str, width: int = 0) -> Table:
+    """A table whose columns fit into 80 characters: the first one of words, which are folded on a
+    narrow terminal, the others, each at least `width` wide, of numbers."""
     table = Table(title=title, box=SIMPLE_HEAD, padding=0, caption_justify="left")
-    table.add_column(first, no_wrap=not fold, overflow="fold" if fold else "ellipsis")
+    table.add_column(first, overflow="fold")
     for name in others:
         table.add_column(name, justify="right", no_wrap=True, min_width=width)
     return table

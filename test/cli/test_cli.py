@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import subprocess
@@ -16,6 +17,7 @@ from samples import LABELS, WALKER, lowered_crowd, object_folder, walker_label, 
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.cli import info
 from lidar_perception.cli.data import opened
 from lidar_perception.cli.demo import _as_replayed, _params_of
 from lidar_perception.cli.main import COMMANDS, cli
@@ -24,6 +26,8 @@ from lidar_perception.data.bag import Bag, BagWriter
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detectors.open import DetectorChoice
 from lidar_perception.param_fields import parameter_fields, with_values
+from lidar_perception.runs.terminal import Terminal
+from lidar_perception.scoring.tables import narrow_table
 from lidar_perception.types import InputError
 from lidar_perception.wire.topics import POINTS, TRUTH
 
@@ -150,15 +154,50 @@ def test_convert_replaces_a_bag_only_by_force(kitti, tmp_path, monkeypatch, caps
     assert capsys.readouterr().out.replace("\n", "").count("run [/final]") == 3
 
 
-def test_info_cuts_no_name_on_a_narrow_terminal(bag, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "80")
+class Tty(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_info_folds_names_on_a_narrow_terminal_and_breaks_nothing_elsewhere(bag, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    with Bag(bag) as opened:
+        topics, kinds = [*opened.topics], [*opened.topics.values()]
     text = run("info", bag)
+    assert all(f"│ {topic} " in text for topic in topics) and str(bag) in text
+    narrow = Terminal(file=Tty(), width=60, color_system=None)
+    monkeypatch.setattr(info, "console", narrow)
+    run("info", bag)
+    text = narrow.file.getvalue()
     columns = [[cell.strip() for cell in line.split("│")[1:3]] for line in text.splitlines()
                if line.startswith("│")]
-    topics, kinds = ("".join(cells) for cells in zip(*columns))
-    assert "…" not in text and max(map(len, text.splitlines())) <= 80
+    assert "…" not in text and max(map(len, text.splitlines())) <= 60
+    for names, cells in zip((topics, kinds), zip(*columns)):
+        assert all(name in "".join(cells) for name in names)
+
+
+@pytest.mark.parametrize("wide", [False, True])
+def test_a_table_in_a_pipe_is_not_cut_whatever_its_width(wide, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "20")
+    table = narrow_table("a title that is wider than its table" * (1 + 20 * wide), "", "score",
+                         "another" * (1 + 30 * wide))
+    table.add_row("a name of a detector", "100.0", "200.0")
+    pipe = Terminal(file=io.StringIO())
+    pipe.print(table)
+    title, *rows = pipe.file.getvalue().splitlines()
+    assert title == table.title
+    assert rows[-2].split() == "a name of a detector 100.0 200.0".split()
+
+
+def test_info_as_json_has_what_the_table_has(bag, kitti):
+    content = json.loads(run("info", "--json", bag))
     with Bag(bag) as opened:
-        assert all(topic in topics and kind in kinds for topic, kind in opened.topics.items())
+        assert {row["topic"]: (row["type"], row["messages"]) for row in content["topics"]} == {
+            topic: (kind, opened.counts[topic]) for topic, kind in opened.topics.items()}
+    assert content["seconds"] == pytest.approx(0.1)
+    folder = json.loads(run("info", kitti, "--json"))
+    assert (folder["frames"], folder["layout"]) == (2, "KITTI object data")
+    assert folder["first_cloud"]["labels"] == ["Pedestrian"]
 
 
 def test_info_describes_a_recording_that_is_no_bag(kitti):
@@ -167,8 +206,7 @@ def test_info_describes_a_recording_that_is_no_bag(kitti):
     assert "10 Hz assumed" in text and "first cloud: 000000, " in text and "labels: " in text
 
 
-def test_info_shows_topics_types_counts_and_length(bag, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
+def test_info_shows_topics_types_counts_and_length(bag):
     text = run("info", bag)
     rows = {line.split("│")[1].strip(): line for line in text.splitlines() if "│ /" in line}
     with Bag(bag) as opened:

@@ -44,7 +44,7 @@ def typical_factor(curve: dict) -> float | None:
 
 def _print_curves(content: dict, console: Console) -> None:
     table = narrow_table("Simulated against real, worst curves first",
-                   "curve", "within 20 %", "typical", "worst at", "ratio", fold=True)
+                   "curve", "within 20 %", "typical", "worst at", "ratio")
     judged = [c for c in content["curves"].values() if c["judged"]]
     for curve in sorted(judged, key=lambda c: (c["share"], -(typical_factor(c) or 0.0))):
         worst = max((b for b in curve["bins"] if b["within"] is not None), key=factor_off)
@@ -63,8 +63,7 @@ def _print_worst(content: dict, console: Console) -> None:
     bins = [(curve, b) for curve in content["curves"].values() for b in curve["bins"]
             if b["within"] is False]
     table = narrow_table(f"The {min(WORST, len(bins))} worst bins of {len(bins)} not within 20 %",
-                   "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio",
-                         fold=True)
+                   "curve", "bin", "real", "10..90 %", "n", "sim.", "10..90 %", "n", "ratio")
     for curve, b in sorted(bins, key=lambda item: -factor_off(item[1]))[:WORST]:
         table.add_row(_title(curve), b["bin"],
                       *(cell for side in ("real", "simulated") for cell in _cells(b[side])),
