@@ -94,7 +94,7 @@ setup(
     ],
     install_requires=[
         "click>=8.1", "jinja2>=3.1", "matplotlib>=3.7", "lz4>=4.0", "mcap>=1.2",
-        "numba>=0.59", "numpy>=1.26", "pypatchworkpp>=1.0", "pyyaml>=6", "rich>=13",
+        "numba>=0.59", "numpy>=1.26", "pillow>=9.4", "pypatchworkpp>=1.0", "pyyaml>=6", "rich>=13",
         "rosbags>=0.11.6", "ruamel.yaml.clib>=0.2.12", "safetensors>=0.4", "scikit-learn>=1.3",
         "scipy>=1.11", "threadpoolctl>=3.1", "torch>=2.2", "zstandard>=0.21",
     ],
@@ -108,6 +108,7 @@ setup(
         "odometry": ["kiss-icp>=1.2"],
         "onnx": ["onnx>=1.16", "onnxruntime>=1.18", "onnxscript>=0.2", "torch>=2.6"],
         "train": ["tensorboard>=2.15"],
+        "video": ["av>=14"],
         "benchmark": ["cloth-simulation-filter>=1.1.5", "dbscan>=1.0",
                       "opencv-python-headless>=4.8"],
     },

@@ -25,8 +25,8 @@ MAX_LINES = 400
 # From the ground up: a room imports only those before it, and itself.
 ROOMS = ("classes", "intensity", "types", "param_fields", "geometry", "camera", "groups", "robot",
          "runs", "wire", "data", "ground", "clustering", "candidates", "detectors", "tracking",
-         "scoring", "simulation", "sensor_setup", "training", "reproduction", "labels", "detecting",
-         "params", "nodes", "cli", "testing")
+         "rendering", "scoring", "simulation", "sensor_setup", "training", "reproduction", "labels",
+         "detecting", "params", "nodes", "cli", "testing")
 # What the files of a room may import besides the rooms below and the standard library.
 NUMBERS = ["numpy", "scipy", "numba"]
 STRANGERS = {
@@ -38,6 +38,7 @@ STRANGERS = {
     "ground": [*NUMBERS, "pypatchworkpp"], "clustering": NUMBERS, "candidates": NUMBERS,
     "detectors": [*NUMBERS, "torch", "safetensors", "onnx", "onnxruntime", "onnxscript"],
     "tracking": ["numpy", "scipy", "kiss_icp"],
+    "rendering": ["numpy", "PIL", "matplotlib", "av", "msg_utils"],
     "sensor_setup": ["numpy", "scipy", "matplotlib", "msg_utils"],
     "labels": ["numpy", "msg_utils"], "params": [],
 }

@@ -16,6 +16,7 @@ from lidar_perception.cli.data import (
     jobs_option,
     limit_option,
     opened,
+    out_file,
     out_folder,
     split_option,
 )
@@ -64,6 +65,10 @@ class Formats(click.ParamType):
               "by KISS-ICP (the extra [odometry]); or none: tracks are relative to the sensor.")
 @click.option("--clouds/--no-clouds", default=True, show_default=True, help="With --format mcap: "
               "write the clouds into the bag too.")
+@click.option("--png", is_flag=True, help="Draw a picture of every frame, png/FRAME.png.")
+@out_file("--video", "Draw a film: .mp4 (the extra [video]), .gif or .webp.")
+@click.option("--color", type=Choice(["height", "intensity"]), default="height", show_default=True,
+              help="Of the points in pictures.")
 @split_option
 @limit_option
 @jobs_option
@@ -71,8 +76,8 @@ class Formats(click.ParamType):
 @click.option("--force", is_flag=True, help="Start over where FOLDER holds another run.")
 def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector: DetectorChoice,
            tracking: TrackingParams, min_score: float | None, mount_height: float, track: bool,
-           ego: str, clouds: bool, split: Path | None, limit: int | None, jobs: int,
-           dask: str | None, force: bool) -> None:
+           ego: str, clouds: bool, png: bool, video: Path | None, color: str, split: Path | None,
+           limit: int | None, jobs: int, dask: str | None, force: bool) -> None:
     """Run a detector on every frame of the recording at DATA, labels or not, and write its boxes,
     classes and scores, with --track also ids and velocities, into FOLDER.
 
@@ -83,6 +88,8 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
     mcap       bag/, a rosbag2 bag with the topics of the nodes, for RViz, Foxglove and view
     openlabel  openlabel/SEQUENCE.json, ASAM OpenLABEL, for label and convert
 
+    --png draws every frame, png/FRAME.png, and --video a film, without a browser.
+
     Finished frames are kept at once: the same command resumes a run that was stopped, and makes
     more formats of one that is complete. Frames that cannot be read are named and counted; the exit
     code is then 1.
@@ -92,13 +99,16 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
       lidar-perception detect drive.bag --out results
       lidar-perception detect /data/kitti/object --format kitti,csv --out results --jobs 4
       lidar-perception detect drive.bag --track --range around --format mcap --out results
+      lidar-perception detect drive.bag --track --out results --video drive.mp4
     """
     from lidar_perception.detecting.bag import Bag
     from lidar_perception.detecting.formats import FORMATS as WRITERS
     from lidar_perception.detecting.formats import Run
+    from lidar_perception.detecting.pictures import FilmOfFrames, FrameDrawer, Pictures
     from lidar_perception.detecting.run import detect as run_detector
     from lidar_perception.detecting.run import header_of
     from lidar_perception.detectors.open import doubts
+    from lidar_perception.rendering.files import check_film
     from lidar_perception.tracking.drive_tracker import ego_of
 
     if dask and jobs > 1:
@@ -109,6 +119,12 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
     if track and not recording.drives:
         raise InputError(f"{data} ({recording.layout}) has frames that do not follow each other, "
                          "so nothing can be tracked; leave out --track")
+    chosen = list(dict.fromkeys(name for names in formats for name in names))
+    if not chosen and not png and video is None:
+        chosen = ["json"]
+    count = min(len(recording), limit or len(recording))
+    if video is not None:
+        check_film(video, count)
     height = recording.frames[0].sensor_height
     for doubt in doubts(Path(detector.weights), height):
         errors.print(doubt)
@@ -121,12 +137,14 @@ def detect(data: Path, out: Path, formats: tuple[tuple[str, ...], ...], detector
     if track and min_score is None:  # the tracker is given weak ones too
         open_ = partial(detector.open, sensor_height=height, min_score=tracking.min_score)
         opened_detector = open_()
-    chosen = list(dict.fromkeys(name for names in formats for name in names)) or ["json"]
-    run = Run(recording, out, header, min(len(recording), limit or len(recording)))
+    run = Run(recording, out, header, count)
+    drawer = FrameDrawer(run, color)
+    makes: list[Any] = [partial(Bag, clouds=clouds, tracked=track) if name == "mcap" else
+                        WRITERS[name] for name in chosen]
+    makes += [partial(Pictures, drawer=drawer)] if png else []
+    makes += [partial(FilmOfFrames, drawer=drawer, path=video)] if video else []
     summary = run_detector(
-        run, open_ if jobs > 1 or dask else lambda: opened_detector,
-        [partial(Bag, clouds=clouds, tracked=track) if name == "mcap" else WRITERS[name]
-         for name in chosen],
+        run, open_ if jobs > 1 or dask else lambda: opened_detector, makes,
         tracking=tracking if track else None, ego=header["ego"] or "none", jobs=jobs, dask=dask,
         force=force)
     print_summary(summary, run)

@@ -28,6 +28,7 @@ class Bag:
 
     def __init__(self, run: Run, clouds: bool, tracked: bool) -> None:
         self.run, self.clouds = run, clouds
+        self.needs_scans = clouds
         self.path = run.out / "bag"
         self.found = f"/{run.header['detector']}_detector{FOUND}"
         self.tracks = f"/tracker{TRACKS}" if tracked else None

@@ -56,9 +56,11 @@ class Run:
 
 class Format(Protocol):
     """A context manager that gets all results in order of time; path, where they are, is complete
-    after it. InputError where they cannot be written."""
+    after it. needs_scans: it draws or writes the points, too. InputError where results cannot be
+    written."""
 
     path: Path
+    needs_scans: bool
 
     def __enter__(self) -> Self: ...
 
@@ -71,6 +73,8 @@ class Format(Protocol):
 
 class WrittenAtEnd:
     """Base of formats that write everything at the end, if no error came before."""
+
+    needs_scans = False
 
     def __init__(self, run: Run, path: Path) -> None:
         self.run, self.path = run, path

@@ -107,17 +107,23 @@ def with_optional_parts(frame: Frame, say: Callable[[str], None]) -> Frame:
 
 def by_record(record_of: Callable[[str], Mapping[str, Any]], min_scores: Mapping[str, float],
               tracker: Callable[[Recording], DriveTracker] | None,
-              say: Callable[[str], None]) -> Start:
-    """Make the FrameResult of every frame from its record, record_of(name). min_scores: the
-    threshold of each class. tracker(recording) tracks all detections, weak ones too; None where no
-    tracks are wanted. say: see with_optional_parts. Frames must be measured in order of time, in
-    one process."""
-    return partial(_by_record, record_of, min_scores, tracker, say)
+              say: Callable[[str], None], scans: bool = False) -> Start:
+    """Make the FrameResult of every frame from its record, record_of(name). Frames must be measured
+    in order of time, in one process.
+
+    Args:
+        min_scores: the threshold of each class.
+        tracker: tracker(recording) tracks all detections, weak ones too; None: no tracks.
+        say: see with_optional_parts.
+        scans: read the scans too; a frame whose scan cannot be read is skipped.
+    """
+    return partial(_by_record, record_of, min_scores, tracker, say, scans)
 
 
 def _by_record(record_of: Callable[[str], Mapping[str, Any]], min_scores: Mapping[str, float],
                tracker_of: Callable[[Recording], DriveTracker] | None,
-               say: Callable[[str], None], recording: Recording) -> Callable[[Frame], FrameResult]:
+               say: Callable[[str], None], scans: bool,
+               recording: Recording) -> Callable[[Frame], FrameResult]:
     least = np.array([min_scores.get(name, 0.0) for name in CLASSES], np.float32)
     tracker = None if tracker_of is None else tracker_of(recording)
     trails = Trails()
@@ -127,6 +133,8 @@ def _by_record(record_of: Callable[[str], Mapping[str, Any]], min_scores: Mappin
         if (reason := record.get("skipped")) is not None:
             raise InputError(reason)
         frame, found = with_optional_parts(frame, say), detections_in(record)
+        if scans:
+            frame.load()
         result = FrameResult(frame, found[found.scores >= least[found.class_ids]],
                              record["frame_id"], record["ms"], record["problem"])
         if tracker is None:

@@ -93,7 +93,8 @@ def header_of(recording: Recording, weights: str, detector: Configured, *,
     return {"version": __version__, "data": str(recording.path.absolute()),
             "layout": recording.layout, "frames_in_data": len(recording), **more,
             "detector": kind, "weights": weights, "weights_sha256": digest,
-            "classes": list(detector.classes), "min_scores": dict(detector.min_scores),
+            "range": getattr(detector, "range", "around"), "classes": list(detector.classes),
+            "min_scores": dict(detector.min_scores),
             "parameters": flatten(detector.params),
             "tracking": None if tracking is None else flatten(tracking), "ego": ego}
 
@@ -122,10 +123,11 @@ def detect(run: Run, open_: Callable[[], Detector], formats: Sequence[Callable[[
             return json.loads(done.lines[name])
 
         with ExitStack() as stack:
-            summary = Summary([stack.enter_context(make(run)) for make in formats],
-                              skipped=run.skipped)
-            fill(summary, recording, by_record(record_of, run.header["min_scores"], tracker,
-                                               run.say), limit=run.count, title="writing")
+            made = [stack.enter_context(make(run)) for make in formats]
+            start = by_record(record_of, run.header["min_scores"], tracker, run.say,
+                              scans=any(each.needs_scans for each in made))
+            summary = Summary(made, skipped=run.skipped)
+            fill(summary, recording, start, limit=run.count, title="writing")
     return summary
 
 

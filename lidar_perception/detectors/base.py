@@ -91,6 +91,12 @@ class NetworkDetector:
         """By class, the least score of a detection."""
         return {name: self.settings.scores.of_class(name) for name in self.classes}
 
+    @property
+    def range(self) -> str:
+        """What the detector covers: "ahead" of the sensor only, or all "around" it."""
+        low = getattr(self.config, "low", None)  # only some networks have a range
+        return "around" if low is None or low[0] < 0 else "ahead"
+
     def raw_min_scores(self) -> list[float]:
         """The same in the order of classes, before calibration."""
         return [raw_score(name, score, self.header.calibration)

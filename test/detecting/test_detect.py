@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import importlib.util
 from dataclasses import replace
 from functools import partial
 
@@ -13,6 +14,7 @@ from bag_samples import cloud_frame, scans
 from cli_samples import evaluate_detection
 from detect_samples import NAME, MadeDetector, detect, objects, read_json, refused
 from kitti_samples import tracking_folder
+from PIL import Image
 from recording_samples import MADE
 from samples import STAMP, object_folder, scene, walker_label, write
 
@@ -28,6 +30,8 @@ from lidar_perception.data.open import open_recording
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.detecting.bag import Bag as BagFormat
 from lidar_perception.detecting.formats import Json, Run
+from lidar_perception.detecting.pictures import FrameDrawer
+from lidar_perception.detecting.results import FrameResult
 from lidar_perception.detecting.run import detect as run_detector
 from lidar_perception.detectors import open as opening
 from lidar_perception.detectors.contract import Found
@@ -337,3 +341,47 @@ def test_options_that_cannot_be_used_are_refused(arguments, words, kitti, tmp_pa
                                                  capsys, made):
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out", *arguments) == 2
     assert words in capsys.readouterr().err and made == [] and not (tmp_path / "out").exists()
+
+
+# Pictures and films
+
+
+def test_pictures_and_a_film_of_every_frame(drives, tmp_path, monkeypatch, made):
+    out, film = tmp_path / "out", tmp_path / "films/drive.gif"
+    assert detect(monkeypatch, drives, "--out", out, "--png", "--video", film, "--track",
+                  "--ego", "none") == 0
+    names = [frame.name for frame in open_recording(drives)]
+    images = {name: Image.open(out / f"png/{name}.png") for name in names}
+    assert {image.size for image in images.values()} == {(1280, 720)}
+    assert Image.open(film).n_frames == len(names)
+    assert not (out / "detections.json").exists()  # which nobody asked for
+    drawn = {name: (out / f"png/{name}.png").stat().st_mtime_ns for name in names}
+    (out / f"png/{names[1]}.png").unlink()
+    assert detect(monkeypatch, drives, "--out", out, "--png", "--track", "--ego", "none") == 0
+    again = {name: (out / f"png/{name}.png").stat().st_mtime_ns for name in names}
+    assert [name for name in names if again[name] != drawn[name]] == [names[1]]
+    assert len(made) == len(names)
+
+
+def test_a_film_that_cannot_be_made_is_refused_before_any_work(drives, tmp_path, monkeypatch,
+                                                               capsys, made):
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec",
+                        lambda name, *more: None if name == "av" else find(name, *more))
+    for name, words in ("a.mp4", "lidar_perception[video]"), ("a.avi", "is not a film"):
+        line = refused(monkeypatch, capsys, drives, "--out", tmp_path / "out", "--video",
+                       tmp_path / name)
+        assert words in line
+    assert made == [] and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("stamp, timed, expected", [
+    (STAMP, True, "2023-11-14 22:13:20.123 UTC"), (STAMP, False, "1.5 s"),
+    (7 * 10**9, True, "1.5 s")])
+def test_pictures_say_when_they_are(stamp, timed, expected, tmp_path):
+    frames = [Frame.of(str(i), cloud_frame(scene(i), stamp + i * 10**9 - 15 * 10**8))
+              for i in range(2)]
+    run = made_run(Recording(tmp_path / "drive", "", frames, timed=timed), tmp_path / "out")
+    drawer = FrameDrawer(run)
+    drawer.stage_of(FrameResult(frames[0], Detections.none(), "velodyne", 1.0))
+    assert drawer.time(stamp) == expected

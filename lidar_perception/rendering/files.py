@@ -1,0 +1,127 @@
+"""Pictures and films as files: PNG, GIF and WebP by Pillow; MP4 by PyAV, the extra [video]."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from PIL import Image, PngImagePlugin
+
+from lidar_perception.runs.files import write_bytes
+from lidar_perception.types import InputError
+
+ENCODED, ANIMATED = (".mp4", ".mkv", ".mov"), (".gif", ".webp")
+ANIMATED_WIDTH = 960   # pixels
+MAX_ANIMATED = 300     # pictures of an animation, which is made in memory
+TICKS = 1000           # a second
+PNG_KEY, PNG_LEVEL = "lidar_perception", 3
+QUALITY = {"crf": "20", "preset": "veryfast"}
+
+
+def write_png(path: Path, picture: np.ndarray, note: str = "") -> None:
+    """Write a picture (height, width, 3) uint8 with a note that png_note() reads. InputError where
+    it cannot be written."""
+    info, stream = PngImagePlugin.PngInfo(), io.BytesIO()
+    info.add_text(PNG_KEY, note)
+    Image.fromarray(picture).save(stream, "png", pnginfo=info, compress_level=PNG_LEVEL)
+    write_bytes(path, stream.getbuffer())
+
+
+def png_note(path: Path) -> str | None:
+    """Return the note of a picture that write_png wrote; None where there is none."""
+    try:
+        with Image.open(path) as image:
+            return image.info.get(PNG_KEY)
+    except OSError:
+        return None
+
+
+class Film(Protocol):
+    """A film that is being written."""
+
+    def add(self, picture: np.ndarray, seconds: float) -> None:
+        """Add a picture (height, width, 3) uint8 with its duration."""
+
+
+def check_film(path: Path, count: int) -> None:
+    """Raise InputError if a film of `count` pictures cannot be written to a path."""
+    if path.suffix not in (*ENCODED, *ANIMATED):
+        raise InputError(f"{path} is not a film: its name must end with one of "
+                         f"{', '.join((*ENCODED, *ANIMATED))}")
+    if path.suffix in ENCODED and importlib.util.find_spec("av") is None:
+        raise InputError(f"{path} needs PyAV: pip install 'lidar_perception[video]', or give a "
+                         "name that ends with .gif or .webp")
+    if path.suffix in ANIMATED and count > MAX_ANIMATED:
+        raise InputError(f"{path} would have {count} pictures, and {path.suffix} files are made of "
+                         f"{MAX_ANIMATED} at most; give --limit, or a name that ends with .mp4")
+
+
+@contextmanager
+def film(path: Path, size: tuple[int, int]) -> Iterator[Film]:
+    """Write a film of pictures of a size (width, height); the file appears when it is complete.
+    InputError where it cannot be written."""
+    partial = path.with_name(f".{path.stem}.incomplete{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        writer: Any = _Encoded(partial, size) if path.suffix in ENCODED else _Animated(partial)
+        yield writer
+        writer.close()
+        partial.replace(path)
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {error.strerror or error}") from None
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+class _Encoded:
+    """H.264. Its pictures have even sides."""
+
+    def __init__(self, path: Path, size: tuple[int, int]) -> None:
+        import av
+        self.video = av
+        self.container = av.open(str(path), "w")
+        self.stream = self.container.add_stream("libx264", rate=30, options=QUALITY)
+        self.stream.width, self.stream.height = (side - side % 2 for side in size)
+        self.stream.pix_fmt = "yuv420p"
+        self.stream.codec_context.time_base = Fraction(1, TICKS)
+        self.ticks = 0
+
+    def add(self, picture: np.ndarray, seconds: float) -> None:
+        frame = self.video.VideoFrame.from_ndarray(np.ascontiguousarray(
+            picture[:self.stream.height, :self.stream.width]), format="rgb24")
+        frame.pts, frame.time_base = self.ticks, Fraction(1, TICKS)
+        self.ticks += max(1, round(seconds * TICKS))
+        self.container.mux(self.stream.encode(frame))
+
+    def close(self) -> None:
+        self.container.mux(self.stream.encode(None))
+        self.container.close()
+
+
+class _Animated:
+    """GIF or WebP, which Pillow writes at once."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.pictures: list[Image.Image] = []
+        self.durations: list[int] = []  # milliseconds
+
+    def add(self, picture: np.ndarray, seconds: float) -> None:
+        image = Image.fromarray(picture)
+        image.thumbnail((ANIMATED_WIDTH, ANIMATED_WIDTH), Image.Resampling.LANCZOS)
+        if self.path.suffix == ".gif":
+            image = image.quantize(128, dither=Image.Dither.NONE)
+        self.pictures.append(image)
+        self.durations.append(max(20, round(seconds * 1000)))
+
+    def close(self) -> None:
+        if self.pictures:
+            first, *others = self.pictures
+            first.save(self.path, save_all=True, append_images=others, duration=self.durations,
+                       loop=0, quality=80)  # which GIF has not
