@@ -6,7 +6,7 @@ import functools
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import Field, fields, replace
+from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,6 @@ from lidar_perception.runs.terminal import console
 from lidar_perception.training.asked import Asked
 from lidar_perception.training.params import FusedTraining, PointNetTraining, PointPillarsTraining
 from lidar_perception.types import InputError
-
-PAPER_ABLATION = (75.52, 80.15, 81.33, 83.44, 85.10, 86.33, 86.89, 88.96)  # paper C, Table 5
 
 OPTIONS = (
     data_argument("Training data: a data set or bag, or `sim` for simulated scenes; may be "
@@ -129,10 +127,8 @@ def pointpillars(asked: Asked, params: PointPillarsTraining) -> None:
 
 @train.command()
 @shared_options
-@click.option("--ablation", is_flag=True, help="Train every row of the paper's ablation, each into "
-              "a folder in --out, and compare them.")
 @training_options(PointNetTraining())
-def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
+def pointnet(asked: Asked, params: PointNetTraining) -> None:
     """The cluster network (PointNet), on labelled frames, simulated streets, or both.
 
     Scenes are cut into clusters by the package's own ground and clustering. Scans and steps are
@@ -146,27 +142,11 @@ def pointnet(asked: Asked, ablation: bool, params: PointNetTraining) -> None:
           --mount-height 0.6 --init package --out robot
       lidar-perception train pointnet /data/kitti/object --split train.txt \\
           --val-split val.txt --epochs 20 --out pointnet --resume
-      lidar-perception train pointnet sim --ablation --steps 1000 --out ablation
     """
-    from lidar_perception.detectors.pointnet.config import ABLATIONS, pointnet_config
-    from lidar_perception.training.ablation import compared
+    from lidar_perception.detectors.pointnet.config import pointnet_config
     from lidar_perception.training.pointnet.start import PointNetStart, proposer_of
-    from lidar_perception.training.ranks import rank
     proposer_of(params)  # InputError before anything is made
-    if not ablation:
-        run(PointNetStart(pointnet_config(params.network)), asked, params)
-        return
-    if params.network != PointNetTraining().network or (
-            click.get_current_context().params.get("network")):
-        raise InputError("--ablation trains a network for each row; leave out --network")
-    networks = {name: PointNetStart(pointnet_config(name)) for name in ABLATIONS}
-    with compared([*networks.values()], asked, params) as (share, planned):
-        for name, network in networks.items():
-            if rank() == 0:
-                console.print(f"{name}:", style="bold")
-            run(network, replace(share, out=asked.out / name), replace(planned, network=name))
-        if rank() == 0:
-            print_ablation(asked.out)
+    run(PointNetStart(pointnet_config(params.network)), asked, params)
 
 
 @train.command()
@@ -234,22 +214,6 @@ def print_fused(judged: Any) -> None:
     if few:
         console.print(f"{', '.join(few)}: too few to fit curves to; those of the package stay. "
                       "More --scans, or another --scene, have more")
-
-
-def print_ablation(out: Path) -> None:
-    """The best of each row beside the paper's mAP on KITTI (Table 5)."""
-    from lidar_perception.detectors.checkpoint import read_header
-    from lidar_perception.detectors.pointnet.config import ABLATIONS
-    from lidar_perception.scoring.tables import narrow_table, number
-    table = narrow_table("Ablation, simulated or KITTI frames validated on", "network", "paper mAP",
-                         "AP from above", "accuracy", "of objects")
-    for name, paper in zip(ABLATIONS, PAPER_ABLATION):
-        metrics = read_header(out / name / "best.safetensors").metrics
-        table.add_row(name, f"{paper:.2f}", *(number(metrics.get(key), digits=1) for key in
-                                              ("score", "accuracy", "object_accuracy")))
-    table.caption = ("AP from above: mean of Car, Pedestrian and Cyclist at the overlaps 0.5 / "
-                     "0.25 / 0.25, moderate, R40; best weights of each run.")
-    console.print(table)
 
 
 def tell(progress: Any, steps: int, batches: Any, out: Path) -> None:

@@ -58,16 +58,6 @@ class Data:
     most_cuts: int
 
 
-class TooShort(InputError):
-    """A budget, hours, in which nothing is learned; enough: one in which something is."""
-
-    def __init__(self, hours: float, enough: float):
-        super().__init__(f"a budget of {hours:g} h is too short for {LEAST_STEPS} steps on this "
-                         f"machine: give --budget {enough:.2g} or more, or fewer --data-scans "
-                         "and --data-val-scans")
-        self.enough = enough
-
-
 def plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(),
          epochs: float = 0.0) -> Plan:
     """The plan that fits into so many hours. given: what is fixed, where it is not 0 (part False:
@@ -82,7 +72,9 @@ def plan(hours: float, cores: int, speed: Speed, data: Data, given: Plan = Plan(
     enough = hours
     while _fitted(enough, cores, speed, data, given, epochs).steps < LEAST_STEPS:
         enough = 1.2 * enough
-    raise TooShort(hours, 1.05 * enough)
+    raise InputError(f"a budget of {hours:g} h is too short for {LEAST_STEPS} steps on this "
+                     f"machine: give --budget {1.05 * enough:.2g} or more, or fewer --data-scans "
+                     "and --data-val-scans")
 
 
 def _fitted(hours: float, cores: int, speed: Speed, data: Data, given: Plan,

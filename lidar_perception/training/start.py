@@ -52,8 +52,8 @@ PACKAGE = Path("package")  # in --init: the weights that come with the package
 ROOM = 0.5        # GB that stay free on the disk
 
 
-class Planning(Protocol):
-    """What a plan is made by; params are those of a training, planned or not."""
+class Network(Protocol):
+    """What a network brings to a start. params are those of a training, planned or not."""
 
     @property
     def name(self) -> str:
@@ -75,10 +75,6 @@ class Planning(Protocol):
         """Seconds to cut a scene, of a step on the part and on the whole of the range, without the
         preparation's share of other cores, and to validate a frame; with the first scenes that can
         be used. InputError where none can."""
-
-
-class Network(Planning, Protocol):
-    """What a network brings to a start."""
 
     def own_weights(self, params: Any) -> Path:
         """Those that come with the package. InputError if there are none."""
@@ -107,12 +103,12 @@ class Ended(NamedTuple):
     batches: Batches
 
 
-def begins_with(network: Network, asked: Asked, params: Any) -> Path | None:
+def _begins_with(network: Network, asked: Asked, params: Any) -> Path | None:
     """The file of --init, if there is one."""
     return network.own_weights(params) if asked.init == PACKAGE else asked.init
 
 
-def check(asked: Asked, init: Path | None) -> None:
+def _check(asked: Asked, init: Path | None) -> None:
     """InputError, before anything is made, for what cannot be."""
     if asked.budget is not None and not 0 < asked.budget < math.inf:
         raise InputError(f"--budget {asked.budget:g} must be a number of hours above 0")
@@ -136,17 +132,17 @@ def start(network: Network, asked: Asked, params: Any, commit: str = "") -> Ende
     InputError for what cannot be used, before much is computed.
     """
     begun = time.monotonic()
-    init = begins_with(network, asked, params)
-    check(asked, init)
+    init = _begins_with(network, asked, params)
+    _check(asked, init)
     if not params.data.cache:
         params = with_values(params, {"data.cache": str(asked.out / SCANS)})
     decided = bool(params.steps or params.epochs)
     hours = asked.budget if decided else asked.budget or BUDGET
     sensor = sensor_named(params.sensor, params.mount_height)
-    settings = settings_of(asked, params, sensor, init)
+    settings = _settings_of(asked, params, sensor, init)
     with joined(chosen_device(asked.device)) as device, alone(asked.out):
         wait()  # until all have looked at what rank 0 is going to write
-        given, params = params, planned(network, asked, params, settings, sensor, device)
+        given, params = params, _make_plan(network, asked, params, settings, sensor, device)
         sources, held_out = _scenes_of(asked, params, sensor)
         cut = network.cut(params, sources, held_out, Path(params.data.cache))
         if rank() == 0:
@@ -178,7 +174,7 @@ def _said_when_stopped() -> Iterator[None]:
         raise
 
 
-def planned(network: Planning, asked: Asked, params: Any, settings: dict[str, Any],
+def _make_plan(network: Network, asked: Asked, params: Any, settings: dict[str, Any],
             sensor: Sensor, device: torch.device) -> Any:
     """params with the plan of the first start, which may be this one. InputError where that had
     other settings."""
@@ -190,7 +186,7 @@ def planned(network: Planning, asked: Asked, params: Any, settings: dict[str, An
     return _settled(network, asked, params, settings)
 
 
-def _settle(network: Planning, asked: Asked, params: Any, settings: dict[str, Any], sensor: Sensor,
+def _settle(network: Network, asked: Asked, params: Any, settings: dict[str, Any], sensor: Sensor,
             device: torch.device) -> None:
     """Plan, say so and write it, unless that was done by an earlier start."""
     path = asked.out / RUN
@@ -214,7 +210,7 @@ def _settle(network: Planning, asked: Asked, params: Any, settings: dict[str, An
                                  "speed": asdict(speed), "data": asdict(data)}, indent=1))
 
 
-def _measured(network: Planning, asked: Asked, params: Any, sensor: Sensor,
+def _measured(network: Network, asked: Asked, params: Any, sensor: Sensor,
               device: torch.device) -> tuple[Speed, Sequence[Any], Sequence[Any]]:
     """What the machine does now, and the sources of scenes to train with and to validate on."""
     few = _few(params)
@@ -259,7 +255,7 @@ def _planned(asked: Asked) -> tuple[Plan, Speed, Data]:
     return Plan(**known["plan"]), Speed(**known["speed"]), Data(**known["data"])
 
 
-def _settled(network: Planning, asked: Asked, params: Any, settings: dict[str, Any]) -> Any:
+def _settled(network: Network, asked: Asked, params: Any, settings: dict[str, Any]) -> Any:
     path = asked.out / RUN
     text = read_text(path, 10**6)
     try:
@@ -277,18 +273,15 @@ def _settled(network: Planning, asked: Asked, params: Any, settings: dict[str, A
     return with_values(params, values)
 
 
-def settings_of(asked: Asked, params: Any, sensor: Sensor, init: Path | None,
-                compared: int = 0) -> dict[str, Any]:
+def _settings_of(asked: Asked, params: Any, sensor: Sensor, init: Path | None) -> dict[str, Any]:
     """What a resumed run must have in common, of files what is in them: a split may name other
-    frames now, and weights be others. compared: networks that share the plan. InputError for scenes
-    that are not there."""
+    frames now, and weights be others. InputError for scenes that are not there."""
     sources, held_out = _scenes_of(asked, _few(params), sensor)
     weights = sha256(init.read_bytes()).hexdigest()[:12] if init else ""
     return {**params.decisive(), "data": list(asked.data), "val": list(asked.val),
             "split": str(asked.split or ""), "val_split": str(asked.val_split or ""),
             "frame_names": _names(sources), "val_frame_names": _names(held_out),
-            "init": str(asked.init or ""), "init_weights": weights, "sensor": asdict(sensor),
-            "compared": compared}
+            "init": str(asked.init or ""), "init_weights": weights, "sensor": asdict(sensor)}
 
 
 def _names(sources: Sequence[Any]) -> list[str]:
@@ -344,7 +337,7 @@ def _require_room(cache: Path, most_gb: float, chosen: Plan, speed: Speed) -> No
                          "give fewer --data-scans, a smaller --data-cache-gb or another --out")
 
 
-def _say(network: Planning, params: Any, sensor: Sensor, chosen: Plan, speed: Speed,
+def _say(network: Network, params: Any, sensor: Sensor, chosen: Plan, speed: Speed,
          data: Data, height: float | None) -> None:
     at = "" if height is None else f" at {height:g} m"
     scenes = " and ".join(text for count, text in (

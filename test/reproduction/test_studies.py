@@ -6,23 +6,20 @@ import importlib
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 from samples import crowd_folder
 
 from lidar_perception.candidates.configurations import PAPER
 from lidar_perception.candidates.silhouette import covered, cpa_scales, silhouettes
-from lidar_perception.cli.simulate import simulate
 from lidar_perception.data.open import open_recording
 from lidar_perception.param_fields import with_values
 from lidar_perception.reproduction import stm_cpa
-from lidar_perception.reproduction.studies import STUDIES, adaptive, confidence, far
+from lidar_perception.reproduction.studies import STUDIES, adaptive, confidence
 from lidar_perception.reproduction.studies.bank import FRONT, SIDE, template_bank
 from lidar_perception.reproduction.studies.configurations import WITHOUT
 from lidar_perception.reproduction.studies.density import thinned
 from lidar_perception.reproduction.variants import Found, best_f1, score
-from lidar_perception.types import InputError
 
 COUNT = 4
 
@@ -46,10 +43,10 @@ def study(name):
 def records(frames):
     """name -> records of the frames with pedestrians, of the studies that one scan will do for."""
     return {name: [study(name).measure(frames, i) for i in range(COUNT - 1)]
-            for name in STUDIES if name != "far"}
+            for name in STUDIES}
 
 
-@pytest.mark.parametrize("name", [n for n in STUDIES if n not in ("far", "confidence")])
+@pytest.mark.parametrize("name", [n for n in STUDIES if n != "confidence"])
 def test_counts_of_every_variant_add_up(name, records, frames):
     for record, frame in zip(records[name], frames):
         people = int((frame.truth().class_ids == 3).sum())
@@ -81,43 +78,6 @@ def test_reports_are_made_of_records_and_of_none(name, records):
         for section in made:
             for table in section.tables:
                 assert all(len(row) == len(table.header) for row in table.rows), table.name
-
-
-def test_far_needs_scans_before(frames):
-    with pytest.raises(InputError, match="object layout"):
-        far.measure(frames, 0)
-
-
-def test_far_on_a_drive(streets, tmp_path):
-    pytest.importorskip("kiss_icp", reason="needs kiss-icp, the extra [odometry]")
-    made = CliRunner().invoke(simulate, ["--format", "kitti-tracking", "--frames", "5", "--seed",
-                                         "33", "--street", "zone", "--people", "3", "--jobs", "1",
-                                         "--sensor", "generic:32,-25,3,0.4,10",
-                                         "--out", str(tmp_path / "drive")])
-    assert made.exit_code == 0, made.output
-    frames = open_recording(tmp_path / "drive").frames
-    with pytest.raises(InputError, match="fewer than 4 scans"):
-        far.measure(frames, 3)
-    record = far.measure(frames, 4)
-    assert set(record["variants"]) == set(far.NAMES)
-    near = [np.add(v["tp"], v["fn"]).tolist() for v in record["variants"].values()]
-    assert all(n == near[0] for n in near)
-    moving, all_moving, standing, all_standing = record["motion"]
-    assert 0 <= moving <= all_moving and 0 <= standing <= all_standing
-
-
-def test_confidence_over_scans_is_the_mean_of_the_log_odds():
-    shift = np.tile(np.eye(4), (3, 1, 1))
-    shift[:, 0, 3] = [0.0, 2.0, 4.0]  # the sensor drives 2 m from scan to scan
-    now = Found(boxes_at([(10, 0), (20, 5)]), np.array([0.5, 0.8]), 0.3)
-    earlier = [Found(boxes_at([(14.2, 0)]), np.array([0.9]), 0.3),
-               Found(boxes_at([(11.9, 0.3), (40, 0)]), np.array([0.1, 0.9]), 0.3)]
-    joined = far.persistent(now, earlier, shift)
-    assert joined.scores == pytest.approx([0.5, 0.8])  # 0.9 and 0.1 cancel; nothing near the other
-    assert far.persistent(now, [Found(np.zeros((0, 7)), np.zeros(0), 0.3)] * 2,
-                          shift).scores == pytest.approx([0.5, 0.8])
-    once = far.persistent(now, [earlier[0], earlier[0]], shift)
-    assert once.scores[0] > 0.5
 
 
 # --- parts ---------------------------------------------------------------------------------

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 
 import pytest
 from click.testing import CliRunner
 
-from lidar_perception.cli import train as train_module
 from lidar_perception.cli.main import cli
 from lidar_perception.detectors.checkpoint import read_header
 from lidar_perception.detectors.open import open_detector
-from lidar_perception.detectors.pointnet.config import ABLATIONS, NETWORKS
+from lidar_perception.detectors.pointnet.config import NETWORKS
 from lidar_perception.detectors.pointnet.network import load_pointnet
 from lidar_perception.detectors.pointnet.weights_file import judge_file
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.sensor import sensor_named
 from lidar_perception.training.params import PointNetTraining
-from lidar_perception.training.pointnet.start import PointNetStart
-from lidar_perception.training.start import BUDGET
 from lidar_perception.types import InputError
 
 # Others run these lines.
@@ -77,44 +73,6 @@ def test_a_judge_is_trained_on_what_a_pointpillars_proposes(cache, tmp_path):
         result = train(cache, tmp_path / "bad", **{"--proposer": file})
         assert isinstance(result.exception, InputError) and words in str(result.exception)
         assert not (tmp_path / "bad").exists()
-
-
-def test_rows_that_are_compared_have_the_same_steps_and_scenes_and_share_the_budget(
-        cache, tmp_path, monkeypatch):
-    def measured(network, *_):  # a fast row, and slow ones
-        return (0.1, 1.0, 1.0, 0.1) if network.config.name == "base" else (0.2, 4.0, 4.0, 0.5)
-
-    rows = []
-    monkeypatch.setattr(PointNetStart, "measured", measured)
-    monkeypatch.setattr(train_module, "run", lambda *each: rows.append(each))
-    monkeypatch.setattr(train_module, "print_ablation", lambda out: None)
-    of_budget = {"--steps": 0, "--validate-steps": 0, "--data-scans": 0, "--data-val-scans": 0}
-    for more in (), ("--resume",):
-        assert train(cache, tmp_path, "--ablation", *more, **of_budget).exit_code == 0
-    (_, asked, first), *_ = rows
-    assert 0 < first.steps * 4.0 < 3600 * BUDGET / len(ABLATIONS)
-    assert first.data.scans > 0 and first.data.val_scans > 0 and first.validate_steps > 0
-    assert asked.budget * len(ABLATIONS) == BUDGET
-    assert [(name, asked.budget, replace(first, network=name), tmp_path / name)
-            for name in ABLATIONS] * 2 == [
-        (network.config.name, row.budget, params, row.out) for network, row, params in rows]
-    refused = train(cache, tmp_path / "other", "--ablation", "--network", "improved")
-    assert "leave out --network" in str(refused.exception)
-
-
-def test_every_row_of_the_ablation_is_trained_and_shown(cache, tmp_path, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "120")
-    papers = train_module.PAPER_ABLATION
-    assert len(papers) == len(ABLATIONS)
-    for name in list(ABLATIONS)[1:-1]:  # those are made and run in test_pointnet.py
-        monkeypatch.delitem(ABLATIONS, name)
-    monkeypatch.setattr(train_module, "PAPER_ABLATION", (papers[0], papers[-1]))
-    result = train(cache, tmp_path / "all", "--ablation", **{"--steps": 1, "--validate-steps": 1})
-    assert result.exit_code == 0, result.output
-    for name in ABLATIONS:
-        assert read_header(tmp_path / "all" / name / "best.safetensors").config.name == name
-        assert name in result.output
-    assert "75.52" in result.output and "88.96" in result.output
 
 
 def test_every_network_can_be_asked_for():

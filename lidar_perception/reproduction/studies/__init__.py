@@ -3,6 +3,6 @@
 # name -> where its Experiment is; imported only on demand
 STUDIES = {
     name: f"lidar_perception.reproduction.studies.{name}:STUDY"
-    for name in ("configurations", "seeds", "morphology", "adaptive", "confidence", "far",
-                 "geometry", "density")
+    for name in ("configurations", "seeds", "morphology", "adaptive", "confidence", "geometry",
+                 "density")
 }
