@@ -50,6 +50,39 @@ def bag_folder(root):
     return root
 
 
+def odometry_folder(root):
+    """Two sequences with times, poses and calibration, as downloaded from KITTI."""
+    for sequence, count in (("00", 2), ("11", 1)):
+        folder = root / "dataset/sequences" / sequence
+        for i in range(count):
+            write(folder / f"velodyne/{i:06}.bin", scene(i).tobytes())
+        write(folder / "calib.txt", calibration_text(CALIBRATION))
+        write(folder / "times.txt", "".join(f"{0.1036 * i:e}\n" for i in range(count)))
+        write(root / f"dataset/poses/{sequence}.txt",
+              "".join(pose_line(drive(i), CALIBRATION) for i in range(count)))
+    return root
+
+
+def kitti360_folder(root):
+    """Scans 0, 1 and 3 of a drive."""
+    name = "2013_05_28_drive_0000_sync"
+    scans = root / f"data_3d_raw/{name}/velodyne_points"
+    for i in (0, 1, 3):
+        write(scans / f"data/{i:010}.bin", scene(i).tobytes())
+    write(scans / "timestamps.txt",
+          "".join(f"2013-05-28 08:46:02.{i}04700000\n" for i in range(4)))
+    return root
+
+
+def openpcdet_folder(root):
+    for i in range(3):
+        (root / "points").mkdir(parents=True, exist_ok=True)
+        np.save(root / f"points/{i:06}.npy", scene(i))
+        write(root / f"labels/{i:06}.txt", "12.0 0.0 -0.98 3.9 1.6 1.5 0.1 Vehicle\n")
+    write(root / "ImageSets/train.txt", "000000\n000002\n")
+    return root
+
+
 def cloud_folder(root):
     for i in (1, 2, 10):  # in this order, as people count
         write(root / f"scan{i}.bin", scene(i).astype(np.float32).tobytes())
@@ -68,6 +101,11 @@ MADE = {  # name: (make, inner folders or files that say the same, what is said 
                  {BOXES, POSES}),
     "semantickitti": (semantic_folder, ("", "sequences"), "SemanticKITTI, 3 frames",
                       {POINT_LABELS, POSES}),
+    "odometry": (odometry_folder, ("", "dataset", "dataset/sequences"),
+                 "KITTI odometry, 3 frames", {CAMERA, POSES}),
+    "kitti360": (kitti360_folder, ("", "data_3d_raw", "data_3d_raw/2013_05_28_drive_0000_sync"),
+                 "KITTI-360, 3 frames", set()),
+    "openpcdet": (openpcdet_folder, ("",), "OpenPCDet custom data, 3 frames", {BOXES}),
     "bag": (bag_folder, ("", "bag.mcap"), "rosbag2 bag, clouds on /points, 3 frames",
             {BOXES, CAMERA}),
     "files": (cloud_folder, ("",), ".bin clouds, no times in their names, 3 frames", set()),

@@ -21,7 +21,7 @@ from msg_utils.point_cloud2 import from_array, xyz
 from msg_utils.stamps import header_message
 
 KITTI = "x y z intensity"
-MAX_COLUMNS = 5  # of a .npy file whose fourth column is surely the intensity
+MAX_COLUMNS = 16  # of a .npy file; more are a cloud on its side
 MAX_RING = 256
 SAMPLE = 2000  # points on which the columns of a .bin file are told
 NEGATIVE = 0.1  # of them; where more have a negative intensity the columns are others
@@ -105,12 +105,12 @@ def _with_usual_names(points: np.ndarray) -> np.ndarray:
                                  "itemsize": points.dtype.itemsize}))
 
 
-def read_npy(file: Path, max_columns: int = MAX_COLUMNS) -> np.ndarray:
+def read_npy(file: Path) -> np.ndarray:
     """Read a .npy file of an array (N, 3) [x y z], or (N, 4) and more [x y z intensity ...], or of
     a structured one.
 
     Returns: (N,) structured array; of more than four columns the first four.
-    Raises: InputError for another shape or type, and for more than max_columns.
+    Raises: InputError for another shape or type.
     """
     try:
         array = np.array(np.load(regular(file), mmap_mode="r", allow_pickle=False))
@@ -119,7 +119,7 @@ def read_npy(file: Path, max_columns: int = MAX_COLUMNS) -> np.ndarray:
                          "numpy.save") from None
     if array.dtype.names:
         return array.reshape(-1)
-    if array.ndim != 2 or not 3 <= array.shape[1] <= max_columns or array.dtype.kind != "f":
+    if array.ndim != 2 or not 3 <= array.shape[1] <= MAX_COLUMNS or array.dtype.kind != "f":
         raise InputError(f"{file} has an array {array.shape} of {array.dtype}; expected (N, 3) "
                          "x y z or (N, 4) x y z intensity as float32")
     kind = np.float64 if array.dtype.itemsize == 8 else np.float32

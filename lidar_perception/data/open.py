@@ -9,11 +9,11 @@ from itertools import islice
 from pathlib import Path
 from types import ModuleType
 
-from lidar_perception.data import bag_frames, cloud_folder, semantickitti
+from lidar_perception.data import bag_frames, cloud_folder, openpcdet, semantickitti
 from lidar_perception.data.cloud_files import SUFFIXES
 from lidar_perception.data.frame import Recording
 from lidar_perception.data.kitti import folder as kitti
-from lidar_perception.data.kitti import raw
+from lidar_perception.data.kitti import kitti360, odometry, raw
 from lidar_perception.data.mounting import height_of
 from lidar_perception.data.nuscenes import folder as nuscenes
 from lidar_perception.runs.files import read_text
@@ -23,9 +23,12 @@ from lidar_perception.types import InputError
 # opens it; and how such a folder looks. A new format is one line here.
 LAYOUTS = {
     bag_frames: "",
-    semantickitti: "KITTI odometry or SemanticKITTI (sequences/00/)",
+    semantickitti: "",
+    odometry: "KITTI odometry or SemanticKITTI (sequences/00/)",
     kitti: "KITTI (velodyne/ or training/velodyne/)",
+    kitti360: "KITTI-360 (data_3d_raw/)",
     raw: "KITTI raw drives (velodyne_points/data/)",
+    openpcdet: "OpenPCDet's custom data (points/*.npy and labels/)",
     nuscenes: "nuScenes (v1.0-*/ and samples/)",
     cloud_folder: "",
 }

@@ -33,6 +33,16 @@ def read_calibration(path: Path, image: Path | None = None) -> Calibration:
     return Calibration(intrinsics, _pose(path, rectify, velodyne), *size)
 
 
+def read_odometry_calibration(path: Path, image: Path | None = None) -> Calibration:
+    """Read calib.txt of a sequence of the odometry benchmark, whose Tr is the pose of the LiDAR in
+    the rectified camera frame. Image and errors as in read_calibration."""
+    values = matrices(path)
+    intrinsics = matrix(values, path, "P2", (3, 4))
+    size = _png_size(image) or _size_by_focal_length(intrinsics)
+    return Calibration(intrinsics, _pose(path, np.eye(3), matrix(values, path, "Tr", (3, 4))),
+                       *size)
+
+
 def read_raw_calibration(day: Path) -> Calibration:
     """RAW_CALIB of a raw recording day."""
     cameras, lidar = (day / name for name in RAW_CALIB)

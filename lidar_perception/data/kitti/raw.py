@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -41,34 +42,47 @@ def drives_of(path: Path) -> list[Path]:
 
 def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
     """Open the drives, in order of time; only the file lists and the time stamps are read."""
-    frames: list[Frame] = []
-    labelled = calibrated = False
-    timed = True
-    drives = {drive: scans_of(drive) for drive in drives_of(path.absolute())}
-    scale = cloud_scale([file for files in drives.values() for file in files])
-    for drive, files in drives.items():
-        labels = drive / TRACKLETS
-        truth = truth_by_number(labels, read_tracklets)
-        calibration_files = [drive.parent / name for name in RAW_CALIB]
-        has_camera = any(file.exists() for file in calibration_files)
-        calibration = (functools.cache(partial(read_raw_calibration, drive.parent))
-                       if has_camera else nothing)
-        own = _numbers(drive, files)
-        stamps = read_stamps(drive, own, required=has_camera)  # as a drive of KITTI has both
-        start = frames[-1].stamp_ns + GAP_NS if frames else START_NS
-        for i, (file, number) in enumerate(zip(files, own)):
-            stamp = stamps[i] if stamps else start + (number - own[0]) * PERIOD_NS
-            frames.append(Frame(
-                f"{drive.name}/{file.stem}", stamp, partial(load_scan, file, stamp, scale),
-                partial(truth, number), calibration=calibration, sequence=drive.name, index=number,
-                points=file, image=drive / f"image_02/data/{file.stem}.png",
-                files=(file, labels, *calibration_files), native=drive, intensity_max=scale))
-        labelled = labelled or labels.exists()
-        calibrated, timed = calibrated or has_camera, timed and bool(stamps)
+    drives = drives_of(path.absolute())
+    with_camera = {drive: any((drive.parent / name).exists() for name in RAW_CALIB)
+                   for drive in drives}
+    frames, timed = frames_of(drives, need_stamps=with_camera)  # a drive of KITTI has both
     if not frames:
         raise InputError(f"{path} has no KITTI scans: expected DATE/DRIVE_sync/{DATA}/*.bin")
-    return Recording(path, "KITTI raw drives", sorted(frames, key=lambda frame: frame.stamp_ns),
-                     frozenset([CAMERA] * calibrated + [BOXES] * labelled), timed=timed)
+    labels = {drive: truth_by_number(drive / TRACKLETS, read_tracklets) for drive in drives}
+    calibrations = {drive: functools.cache(partial(read_raw_calibration, drive.parent))
+                    if with_camera[drive] else nothing for drive in drives}
+    frames = [replace(frame, truth=partial(labels[frame.native], frame.index),
+                      calibration=calibrations[frame.native],
+                      files=(*frame.files, frame.native / TRACKLETS,
+                             *(frame.native.parent / name for name in RAW_CALIB)))
+              for frame in frames]
+    labelled = any((drive / TRACKLETS).exists() for drive in drives)
+    return Recording(path, "KITTI raw drives", frames, frozenset(
+        [CAMERA] * any(with_camera.values()) + [BOXES] * labelled), timed=timed)
+
+
+def frames_of(drives: Sequence[Path], need_stamps: dict[Path, bool] | None = None
+              ) -> tuple[list[Frame], bool]:
+    """Return the frames of drives with scans in DATA, in order of time, without labels and camera;
+    native is the folder of the drive. And whether all their times are recorded; otherwise 10 Hz is
+    assumed, which is an InputError for a drive that needs its stamps."""
+    frames: list[Frame] = []
+    timed = True
+    files = {drive: scans_of(drive) for drive in drives}
+    scale = cloud_scale([file for some in files.values() for file in some])
+    for drive, scans in files.items():
+        numbers = _numbers(drive, scans)
+        stamps = _stamps(drive, numbers, bool(need_stamps and need_stamps[drive]))
+        timed = timed and bool(stamps)
+        start = frames[-1].stamp_ns + GAP_NS if frames else START_NS
+        for i, (file, number) in enumerate(zip(scans, numbers)):
+            stamp = stamps[i] if stamps else start + (number - numbers[0]) * PERIOD_NS
+            frames.append(Frame(
+                f"{drive.name}/{file.stem}", stamp, partial(load_scan, file, stamp, scale),
+                sequence=drive.name, index=number, points=file,
+                image=drive / f"image_02/data/{file.stem}.png", files=(file,), native=drive,
+                intensity_max=scale))
+    return sorted(frames, key=lambda frame: frame.stamp_ns), timed
 
 
 def scans_of(drive: Path) -> list[Path]:
@@ -102,9 +116,9 @@ def _numbers(drive: Path, files: Sequence[Path]) -> list[int]:
     return [numbers[file.stem] for file in files]
 
 
-def read_stamps(drive: Path, numbers: Sequence[int], required: bool = False) -> list[int]:
-    """Return nanoseconds for the scans with these numbers, from timestamps.txt of a drive; empty
-    without this file, which is an InputError where it is required.
+def _stamps(drive: Path, numbers: Sequence[int], required: bool) -> list[int]:
+    """Nanoseconds of the scans with these numbers, from timestamps.txt of a drive; empty without
+    this file, which is an InputError where it is required.
 
     Lines are "2011-09-26 13:02:25.594360375", read as UTC. Scan i has line i, which is blank where
     a scan is missing, or without blank lines the i-th scan has the i-th line.

@@ -170,7 +170,7 @@ def _content(labels: DriveLabels, frames: Sequence[Frame], positions: Sequence[i
         """The object of this frame."""
         if uid not in seen:
             before = objects.get(uid, {})
-            same = class_name(str(before.get("type", ""))) == kind  # whatever its case is
+            same = class_name(str(before.get("type", ""))) == kind  # in any spelling
             objects[uid] = {"name": f"{kind} {uid}", **before,
                             "type": before["type"] if same else kind}
         seen.setdefault(uid, []).append(index)

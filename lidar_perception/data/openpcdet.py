@@ -1,0 +1,76 @@
+"""The layout that OpenPCDet's tutorial for custom data sets defines: points/NAME.npy with
+labels/NAME.txt, and ImageSets/*.txt that name frames."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from lidar_perception.classes import class_name
+from lidar_perception.data.cloud_files import cloud_scale, load_points
+from lidar_perception.data.frame import BOXES, Frame, Recording
+from lidar_perception.data.kitti.folder import PERIOD_NS, START_NS
+from lidar_perception.runs.files import read_text
+from lidar_perception.types import CLASSES, LARGEST, GroundTruth, InputError
+from lidar_perception.wire.messages import any_class_ids
+from lidar_perception.wire.topics import LIDAR_FRAME
+
+LINE = "x y z dx dy dz heading class"
+
+
+def recognises(path: Path) -> bool:
+    """Return True for a folder with points/*.npy beside labels/ or ImageSets/."""
+    return bool(_scans(path)) and any((path / name).is_dir() for name in ("labels", "ImageSets"))
+
+
+def _scans(path: Path) -> list[Path]:
+    return sorted(file for file in path.glob("points/*") if file.suffix.lower() == ".npy")
+
+
+def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recording:
+    """Open the clouds, which may be from anywhere, in order of their names; only the file lists are
+    read. A split file is one of ImageSets/."""
+    files = _scans(path)
+    scale = cloud_scale(files)
+    frames = []
+    for i, file in enumerate(files):
+        label, stamp = path / f"labels/{file.stem}.txt", START_NS + i * PERIOD_NS
+        frames.append(Frame(
+            file.stem, stamp, partial(load_points, file, stamp, LIDAR_FRAME, scale=scale),
+            truth=partial(_truth, label), index=i, points=file, files=(file, label),
+            intensity_max=scale))
+    known = {frame.name for frame in frames}
+    lost = {label.stem: label for label in sorted(path.glob("labels/*.txt"))
+            if label.stem not in known}
+    return Recording(path, "OpenPCDet custom data", frames,
+                     frozenset({BOXES} if any(path.glob("labels/*.txt")) else set()),
+                     tuple((name, f"{label} has no points/{name}.npy; copy it there")
+                           for name, label in lost.items()) if scans else (),
+                     mounted=False, drives=False)
+
+
+def _truth(path: Path) -> GroundTruth | None:
+    """The objects of a label file; None without one. A class that is not known by any of its names
+    (Vehicle, person) is Misc, with its name as class_name."""
+    if not path.exists():
+        return None
+    boxes, names = [], []
+    for i, line in enumerate(read_text(path, what="the labels").splitlines(), 1):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            box = np.array(words[:7], float)
+            if len(words) < 8 or not ((np.abs(box) <= LARGEST).all() and (box[3:6] > 0).all()):
+                raise ValueError
+        except ValueError:
+            raise InputError(f"{path}:{i} is not '{LINE}' with sizes above 0: {line[:200]!r}; "
+                             "correct or remove it") from None
+        boxes.append(box)
+        names.append(class_name(" ".join(words[7:])))
+    ids = any_class_ids(names)
+    misc = CLASSES.index("Misc")
+    return GroundTruth.of(boxes, ids, [{"class_name": name} if i == misc else {}
+                                       for name, i in zip(names, ids)])
