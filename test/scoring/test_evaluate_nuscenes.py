@@ -188,7 +188,7 @@ def test_files_that_are_no_results_are_named(root, tmp_path, monkeypatch, capsys
 @pytest.mark.parametrize("arguments, words", [
     (["--data", "a"], "give either --results JSON or --weights FILE"),
     (["--data", "a", "--results", "b", "--weights", "c"], "give either"),
-    (["--results", "b"], "Missing option '--data'"),
+    (["--results", "b"], "DATA is missing"),
     (["--data", "a", "--results", "b", "--write-results", "c"], "such a file already"),
 ])
 def test_flags_that_do_not_go_together(arguments, words, monkeypatch, capsys):

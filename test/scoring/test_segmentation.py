@@ -370,7 +370,7 @@ def test_methods_and_frames_can_be_chosen(tmp_path):
 def test_calls_that_cannot_be_answered_say_why(tmp_path):
     root = semantic_folder(tmp_path / "semantic", ["00/000000"])
     kitti = object_folder(tmp_path / "kitti")
-    for arguments, text in (([], "Missing option '--data'"),
+    for arguments, text in (([], "DATA is missing"),
                             (["--data", root, "--methods", "magic"], "is no method"),
                             (["--data", kitti, "--png", "a.png"], "--png draws"),
                             (["--data", kitti, "--methods", "threshold"], "labelled points only")):
