@@ -1,4 +1,4 @@
-"""simulate: labelled scans without a data set, and how they compare with real ones."""
+"""simulate: labelled scans without a data set."""
 
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ import click
 
 from lidar_perception import __version__
 from lidar_perception.cli.command import Choice, Command
-from lidar_perception.cli.data import a_path, opened, out_file, out_folder, write_json
-from lidar_perception.data.frame import BOXES
+from lidar_perception.cli.data import out_folder
 from lidar_perception.data.to_bag import write_bag
 from lidar_perception.labels.names import ALIASES
 from lidar_perception.runs.folder import is_finished, unfinished
@@ -21,13 +20,13 @@ from lidar_perception.runs.terminal import console, track
 from lidar_perception.simulation.dataset import FOLDERS, LAYOUTS, Plan, write_frames
 from lidar_perception.simulation.drive import longest_drive
 from lidar_perception.simulation.scene import MOST_PEOPLE, SCENES, Scenes
-from lidar_perception.simulation.sensor import GENERIC, NAMES, Sensor, sensor_named
+from lidar_perception.simulation.sensor import GENERIC, NAMES, sensor_named
 from lidar_perception.simulation.to_bag import simulated_scans
 from lidar_perception.types import InputError
 
 
 @click.command(cls=Command)
-@out_folder("Bag or folder to make.")
+@out_folder("Bag or folder to make.", required=True)
 @click.option("--format", "--to", "layout", type=Choice(["mcap", *LAYOUTS], ALIASES),
               default="mcap", show_default=True, help="A rosbag2 bag, or the folders of one of "
               "these data sets.")
@@ -37,7 +36,7 @@ from lidar_perception.types import InputError
 @click.option("--mount-height", type=click.FloatRange(0, 10), default=0.0, metavar="M",
               help="Height of the sensor above the ground. Default: what its file or preset says.")
 @click.option("--frames", type=click.IntRange(1), default=40, show_default=True,
-              help="Number of scans; with --compare, one scan of each of that many streets.")
+              help="Number of scans.")
 @click.option("--seed", type=click.IntRange(0), default=1, show_default=True,
               help="Seed of the first street; the same seed gives the same bytes.")
 @click.option("--scene", default="street", show_default=True, metavar="NAME",
@@ -55,16 +54,10 @@ from lidar_perception.types import InputError
 @click.option("--resume", is_flag=True, help="Resume an unfinished data set; needs identical "
               "settings.")
 @click.option("--force", is_flag=True, help="Replace an earlier simulated data set in --out.")
-@a_path("--compare", "Compare simulated scans with the labelled ones of this data set or bag; "
-        "nothing is written to --out.", "PATH")
-@out_file("--json", "With --compare: write every curve to this file.")
-@out_file("--png", "With --compare: draw every curve.")
-def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed: int,
+def simulate(out: Path, layout: str, sensor_name: str, frames: int, seed: int,
              scene: str, kind: str | None, people: float, mount_height: float,
-             streets_of: int | None, jobs: int | None, resume: bool, force: bool,
-             compare: Path | None, json: Path | None, png: Path | None) -> None:
-    """Write labelled scans of simulated streets, campuses or interiors as a bag or data set, or
-    measure how realistic those of streets are.
+             streets_of: int | None, jobs: int | None, resume: bool, force: bool) -> None:
+    """Write labelled scans of simulated streets, campuses or interiors as a bag or data set.
 
     A file INCOMPLETE marks an unfinished data set; --resume resumes it.
 
@@ -73,23 +66,10 @@ def simulate(out: Path | None, layout: str, sensor_name: str, frames: int, seed:
       lidar-perception simulate --frames 100 --seed 4 --out drive
       lidar-perception simulate --format kitti --frames 1000 --out training_data
       lidar-perception simulate --scene campus --sensor vlp-16 --mount-height 0.6 --out robot
-      lidar-perception simulate --compare /data/kitti/object --png realism.png
     """
-    if (out is None) == (compare is None):
-        raise click.UsageError("give either --out FOLDER or --compare PATH")
     scenes = Scenes(kind, people, scene)
-    if compare is not None:
-        if scene != "street":
-            raise click.UsageError("--compare compares streets, as all real data here does")
-        if resume or force or jobs or streets_of:
-            raise click.UsageError("--resume, --force, --jobs and --streets-of go with --out")
-        _compare(compare, frames, seed, sensor_named(sensor_name, mount_height), scenes, json, png)
-        return
-    if json or png:
-        raise click.UsageError("--json and --png go with --compare")
     if resume and force:
         raise click.UsageError("--resume resumes, --force starts over: give one of them")
-    assert out is not None  # as there is no --compare
     sensor = sensor_named(sensor_name, mount_height)
     plan = Plan(layout, sensor, seed, frames,
                 streets_of or (1 if layout == "kitti" else longest_drive(sensor)), scenes)
@@ -135,26 +115,3 @@ def _data_set(out: Path, plan: Plan, sensor_name: str, mount_height: float, jobs
     console.print(f"{out} is complete: there is nothing to do" if complete else
                   f"{out}: {plan.frames} scans" + (f", {plan.frames - len(missing)} of them from "
                                                    "before" if resume else ""))
-
-
-def _compare(real: Path, frames: int, seed: int, sensor: Sensor, scenes: Scenes,
-             json_file: Path | None, png: Path | None) -> None:
-    from lidar_perception.candidates.configurations import PAPER
-    from lidar_perception.candidates.warm_up import warm_up
-    from lidar_perception.simulation.realism.compare import evenly, measured_scans, side_by_side
-    from lidar_perception.simulation.realism.report import draw_realism, print_realism
-
-    recording = opened(real)
-    recording.require(BOXES, "simulate --compare")
-    chosen = evenly(recording)
-    warm_up()
-    measured = measured_scans(track(chosen, "measuring real scans", len(chosen)), PAPER)
-    made = simulated_scans(seed, frames, sensor, streets_of=1, scenes=scenes)
-    simulated = measured_scans(track(made, "measuring simulated scans", frames), PAPER)
-    content = {"data": str(real), "seed": seed, **side_by_side(measured, simulated)}
-    print_realism(content, console)
-    write_json(json_file, content)
-    if png:
-        draw_realism(png, content)
-        console.print(f"picture: {png}")
-

@@ -53,7 +53,7 @@ ROOM = 0.5        # GB that stay free on the disk
 
 
 class Network(Protocol):
-    """What a network brings to a start. params are those of a training, planned or not."""
+    """The parts of a training that depend on the network; params may be planned or not."""
 
     @property
     def name(self) -> str:

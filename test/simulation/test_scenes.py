@@ -186,11 +186,6 @@ def test_what_is_no_scene_is_named(scenes, said):
         next(simulated_scans(0, 1, TINY, 1, scenes))
 
 
-def test_only_streets_are_compared(tmp_path):
-    result = CliRunner().invoke(simulate, ["--compare", str(tmp_path), "--scene", "indoor"])
-    assert result.exit_code == 2 and "--compare compares streets" in result.output
-
-
 def test_beams_that_wander_do_so_where_there_is_one_scan_of_each_scene():
     sensor, seen = replace(EXACT, wander=np.radians(2.0)), []
     for seed in range(3):

@@ -7,8 +7,8 @@ import pytest
 from numba import njit
 from raycast_samples import FULL, OVER_ROAD, SENSOR, crowd
 
+from experiments.realism.roughness import roughness
 from lidar_perception.simulation.raycast import cast
-from lidar_perception.simulation.realism.roughness import roughness
 from lidar_perception.simulation.sensor import HDL64E, rays
 from lidar_perception.simulation.terrain import Ground, cast_ground, compiled, surface_height, tufts
 

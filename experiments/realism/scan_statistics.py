@@ -12,6 +12,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
+from experiments.realism.roughness import roughness
 from lidar_perception.camera import Camera
 from lidar_perception.candidates.boxes import height_matches
 from lidar_perception.candidates.params import PipelineParams
@@ -22,7 +23,6 @@ from lidar_perception.geometry import box_corners, horizontal_range, points_in_b
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.ground.segment import segment_ground
 from lidar_perception.scoring.centres.matching import RANGE_NAMES
-from lidar_perception.simulation.realism.roughness import roughness
 from lidar_perception.types import GroundTruth, LidarFrame
 
 CLASSES = tuple(DETECTED)

@@ -7,10 +7,10 @@ from pathlib import Path
 
 from rich.console import Console
 
+from experiments.realism.compare import MIN_SAMPLES, factor_off
+from experiments.realism.scan_statistics import CURVES
 from lidar_perception.scoring.pictures import save_picture
 from lidar_perception.scoring.tables import narrow_table, number, print_skipped
-from lidar_perception.simulation.realism.compare import MIN_SAMPLES, factor_off
-from lidar_perception.simulation.realism.scan_statistics import CURVES
 
 WORST = 25
 REAL, SIMULATED, WRONG = "#0072b2", "#d55e00", "#b00000"

@@ -19,14 +19,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import binom
 
-from lidar_perception.candidates.params import PipelineParams
-from lidar_perception.candidates.refine import STAGES
-from lidar_perception.data.frame import Frame, Recording
-from lidar_perception.ground.params import mounted
-from lidar_perception.param_fields import with_values
-from lidar_perception.scoring.centres.matching import RANGE_NAMES
-from lidar_perception.scoring.centres.report import CandidateReport, of_frame
-from lidar_perception.simulation.realism.scan_statistics import (
+from experiments.realism.scan_statistics import (
     CLASSES,
     CURVES,
     SCORES,
@@ -35,6 +28,13 @@ from lidar_perception.simulation.realism.scan_statistics import (
     object_rows,
     scan_rows,
 )
+from lidar_perception.candidates.params import PipelineParams
+from lidar_perception.candidates.refine import STAGES
+from lidar_perception.data.frame import Frame, Recording
+from lidar_perception.ground.params import mounted
+from lidar_perception.param_fields import with_values
+from lidar_perception.scoring.centres.matching import RANGE_NAMES
+from lidar_perception.scoring.centres.report import CandidateReport, of_frame
 from lidar_perception.types import InputError
 
 MAX_SCANS = 500  # of a folder that are compared; of a larger one, evenly spread

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidar_perception.simulation.realism.roughness import MIN_CELLS, roughness, scatter_of_cells
+from experiments.realism.roughness import MIN_CELLS, roughness, scatter_of_cells
 
 LIMITS = np.array([0.0, 5.0, 15.0, np.inf])
 
