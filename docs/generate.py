@@ -199,7 +199,8 @@ PAGES: dict[str, dict[str, Any]] = {
         what="Replays a rosbag2 bag (MCAP or SQLite3), or one of ROS 1. Messages go from the file "
              "to DDS as they are. Ends with exit code 0 when the bag is played.",
         inputs=[],
-        outputs=[("the topics of the bag", "as recorded", "With the recorded QoS."),
+        outputs=[("the topics of the bag", "as recorded", "With the recorded QoS. Livox "
+                  "CustomMsg and CompressedPointCloud2 as PointCloud2."),
                  ("/clock", "rosgraph_msgs/Clock", "The bag's time, with `clock_hz`.")],
         services=[("~/pause, ~/resume", "std_srvs/Trigger", ""),
                   ("~/step", "std_srvs/Trigger", "While paused: one more cloud and what comes "

@@ -24,13 +24,13 @@ from launch import LaunchDescription
 from lidar_perception.data.bag import Bag
 from lidar_perception.nodes.graph import (
     chosen_clouds,
-    cloud_topics,
     evaluation,
     relative,
     result_topics,
     wait_for,
 )
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
+from lidar_perception.wire.clouds import CLOUD_TYPES
 from lidar_perception.wire.topics import POINTS, TF_STATIC
 
 HERE = Path(__file__).resolve().parent
@@ -49,7 +49,7 @@ def replay(context):
     use_large_shared_memory()  # of the player, so that the nodes need not take it for a driver
     with Bag(value["bag"]) as bag:
         clouds = chosen_clouds(value["bag"], bag.topics, value["points"])
-        played = [t for t in bag.topics if t == clouds or t not in cloud_topics(bag.topics)]
+        played = [t for t, kind in bag.topics.items() if t == clouds or kind not in CLOUD_TYPES]
     sim_time = {"use_sim_time": value["use_sim_time"] == "true"}
     log_level = ["--log-level", value["log_level"]]
     remap, scoring = evaluation(value["scores"], single)

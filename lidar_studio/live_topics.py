@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from lidar_perception.data.bag_frames import CLOUD
 from lidar_perception.data.to_bag import MARKERS
 from lidar_perception.types import InputError
+from lidar_perception.wire.clouds import POINT_CLOUD
 from lidar_perception.wire.topics import FOUND, POINTS, TRUTH
 from lidar_perception.wire.topics import TRACKS as TRACKED
 from lidar_studio.live import BOXES, LABELS, TRACKS
@@ -48,7 +48,7 @@ def clouds_topic(types: Mapping[str, str], namespace: str = "", wanted: str = ""
     """The topic of the clouds, of topic -> type of all that is published: the wanted one; else the
     one with most columns, else the only one. InputError, in a line for a person, where there is
     none, or it is not clear which."""
-    clouds = sorted(t for t, kind in types.items() if kind == CLOUD)
+    clouds = sorted(t for t, kind in types.items() if kind == POINT_CLOUD)
     where = f" in the namespace {namespace}" if namespace else ""
     if wanted:
         full = resolved(wanted, namespace)

@@ -23,7 +23,7 @@ from lidar_perception.data.open_storage import damaged, find_files, open_file
 from lidar_perception.data.qos import LATCHED_QOS, SENSOR_QOS, full_profile, read_profiles
 from lidar_perception.data.record_file import RecordFile
 from lidar_perception.data.ros1_bag import Ros1File
-from lidar_perception.data.storage import END, START, StorageFile, in_time_order
+from lidar_perception.data.storage import END, START, StorageFile, Topic, in_time_order
 from lidar_perception.runs.files import check_free, refuse_others, require_name
 from lidar_perception.runs.resuming import locked
 from lidar_perception.types import InputError, InputWarning
@@ -166,7 +166,7 @@ class Bag:
     Attributes:
         topics: name -> type, of the topics that can be read.
         counts: name -> number of messages of each of them.
-        unreadable: name -> type and encoding, of topics that nothing here reads.
+        unreadable: name -> Topic, of topics whose messages nothing here reads.
         start_ns, end_ns: time of the first message, and after the last one; 0 without messages.
 
     Raises:
@@ -183,7 +183,7 @@ class Bag:
                           for file in find_files(self.path, metadata)]
             self.topics: dict[str, str] = {}
             self.counts: dict[str, int] = {}
-            self.unreadable: dict[str, str] = {}
+            self.unreadable: dict[str, Topic] = {}
             recorded, problems = self._take_topics()
             times = [file.times for _, file in self.files if file.times is not None]
             self.start_ns = min((first for first, _ in times), default=0)
@@ -214,7 +214,7 @@ class Bag:
                 if topic.encoding == "cdr":
                     kinds.setdefault(topic.name, Counter())[topic.type] += topic.messages
                 else:
-                    self.unreadable[topic.name] = f"{topic.type} as {topic.encoding}"
+                    self.unreadable[topic.name] = topic
         for name, found in kinds.items():
             self.unreadable.pop(name, None)
             (self.topics[name], self.counts[name]), *others = found.most_common()
@@ -240,8 +240,10 @@ class Bag:
     @property
     def content(self) -> str:
         """Its topics, each with its type, for people."""
+        others = {name: f"{topic.type} as {topic.encoding}"
+                  for name, topic in self.unreadable.items()}
         return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(
-            {**self.unreadable, **self.topics}.items())) or "nothing"
+            {**others, **self.topics}.items())) or "nothing"
 
     def qos(self, topic: str) -> list[Qos]:
         """Return the profiles that the topic was recorded with, as rosbags has them; maybe none.
@@ -252,9 +254,9 @@ class Bag:
 
     def require(self, topic: str) -> None:
         """InputError that lists what there is, if the bag has no such topic."""
-        if topic in self.unreadable:
-            raise InputError(f"{self.path} has {self.unreadable[topic]} on {topic}, which is not "
-                             "read; record it with ROS 2")
+        if other := self.unreadable.get(topic):
+            raise InputError(f"{self.path} has {other.type} as {other.encoding} on {topic}, which "
+                             "is not read; record it with ROS 2")
         if topic not in self.topics:
             raise InputError(f"{self.path} has no topic {topic}; it has {self.content}")
 

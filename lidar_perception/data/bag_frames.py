@@ -6,7 +6,7 @@ import struct
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from functools import cached_property, partial
 from itertools import islice
 from operator import itemgetter
@@ -32,13 +32,18 @@ from lidar_perception.data.frame import (
 from lidar_perception.data.open_storage import storage_files
 from lidar_perception.data.recorded_scale import MAX_READ, scale_of
 from lidar_perception.types import SENSOR_HEIGHT, GroundTruth, InputError, LidarFrame
-from lidar_perception.wire.codec import decode
+from lidar_perception.wire.clouds import (
+    CLOUD_TYPES,
+    check_readable,
+    cloud_topics,
+    decode_cloud,
+    packets_problem,
+)
 from lidar_perception.wire.messages import calibration_of, column, raw_intensity, to_frame, to_truth
 from lidar_perception.wire.topics import CAMERA_INFO, EXTRINSICS, INSTANCE, POINTS, SEMANTIC, TRUTH
 from msg_utils.markers import from_marker_array
 from msg_utils.stamps import SECOND
 
-CLOUD = "sensor_msgs/msg/PointCloud2"
 # What is known by these topics
 BESIDE = {BOXES: {TRUTH}, CAMERA: {CAMERA_INFO, EXTRINSICS}}
 
@@ -53,20 +58,22 @@ def recognises(path: Path) -> bool:
 def cloud_topic(bag: Bag, points: str = "") -> str:
     """The topic of a bag to take the clouds from: points, where one is named, else /points, else
     the only one with clouds. InputError where there is none, or several."""
-    clouds = sorted(topic for topic, kind in bag.topics.items()
-                    if kind == CLOUD and bag.counts[topic])
+    every = cloud_topics(bag.topics)
+    clouds = [topic for topic in every if bag.counts[topic]]
     if not points and POINTS not in clouds and len(clouds) > 1:
         raise InputError(f"{bag.path} has clouds on {', '.join(clouds)}; name the topic of one, as "
                          f"in {bag.path}:{clouds[0]}")
-    if not points and CLOUD not in bag.topics.values():
-        raise InputError(f"{bag.path} has no {CLOUD.replace('/msg', '')}; it has {bag.content}. "
-                         "Raw packets and Livox' CustomMsg become clouds in the driver of the "
-                         "sensor: play the bag to it and record what it publishes")
+    if not points and not every:
+        others = {name: topic.type for name, topic in bag.unreadable.items()} | bag.topics
+        raise InputError(f"{bag.path} has no sensor_msgs/PointCloud2 and no other clouds: "
+                         + (packets_problem(others) or f"it has {bag.content}. Record the cloud "
+                            "topic of the sensor's driver"))
     chosen = points or (clouds[0] if clouds and POINTS not in clouds else POINTS)
     bag.require(chosen)
-    if bag.topics[chosen] != CLOUD:
-        raise InputError(f"{bag.path} has {bag.topics[chosen]} on {chosen}, no clouds; name "
-                         f"another topic, as in {bag.path}:/points")
+    if bag.topics[chosen] not in CLOUD_TYPES:
+        raise InputError(f"{bag.path} has {bag.topics[chosen]} on {chosen}, no clouds; "
+                         + (packets_problem({chosen: bag.topics[chosen]})
+                            or f"name another topic, as in {bag.path}:/points"))
     return chosen
 
 
@@ -78,6 +85,7 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
     topics = {topic for topic, count in bag.counts.items() if count}
     frames = BagFrames(opened, points, bag.topics[points], bag.counts[points])
     labelled = False
+    frames.check_readable()
     with suppress(InputError):  # a damaged cloud is named when it is read
         labelled = frames.first is not None and frames.labelled(frames.first[1]) is not None
     has = frozenset(what for what, needed in BESIDE.items() if needed <= topics) | {
@@ -101,6 +109,12 @@ class BagFrames(Sequence):
         """The frames of a sensor at that height."""
         return BagFrames(self.opened, self.points, self.kind, self.clouds, sensor_height)
 
+    def check_readable(self) -> None:
+        """Raise InputError if the clouds are compressed in a way that is not read."""
+        if self.first is not None:
+            with self._named(self.first[0]):
+                check_readable(self.first[1], self.kind)
+
     def __len__(self) -> int:
         return self.clouds
 
@@ -117,9 +131,9 @@ class BagFrames(Sequence):
         return np.array([row[2] for row in self._index], np.int64)
 
     def message(self, i: int) -> Any:
-        """Cloud i as it was recorded, with all its columns."""
+        """Cloud i as a PointCloud2 with all the columns that were recorded."""
         time, before, *_ = self._index[i]
-        return decode(self._read(time, before), self.kind)
+        return decode_cloud(self._read(time, before), self.kind)
 
     def __getitem__(self, i):
         if isinstance(i, slice):
@@ -199,7 +213,8 @@ class BagFrames(Sequence):
     def full_scale(self) -> float:
         """The intensity of a full reflection, by the first clouds, as only they can be read without
         a look through the bag; the same for all frames."""
-        return scale_of(self._first_clouds(), lambda data: raw_intensity(decode(data, self.kind)))
+        return scale_of(self._first_clouds(),
+                        lambda data: raw_intensity(decode_cloud(data, self.kind)))
 
     def _first_clouds(self) -> Iterator[bytes]:
         with suppress(InputError):  # damage is named when it is read
@@ -218,12 +233,18 @@ class BagFrames(Sequence):
                      point_truth=partial(self._point_truth, time, data),
                      calibration=partial(self._calibration, time),
                      pose=lambda: self.poses(stamp), index=i, sensor_height=self.sensor_height,
-                     files=self.files, native=lambda: decode(data(), self.kind),
+                     files=self.files, native=lambda: decode_cloud(data(), self.kind),
                      intensity_max=lambda: self.full_scale)
 
     def _load(self, time: int, data: Callable[[], bytes]) -> LidarFrame:
+        with self._named(time):
+            return to_frame(decode_cloud(data(), self.kind), self.full_scale)[0]
+
+    @contextmanager
+    def _named(self, time: int) -> Iterator[None]:
+        """Say in an InputError which cloud it is about."""
         try:
-            return to_frame(decode(data(), self.kind), self.full_scale)[0]
+            yield
         except InputError as error:
             raise InputError(f"{self.path}, topic {self.points} at {time} ns: {error}") from None
 
@@ -231,7 +252,7 @@ class BagFrames(Sequence):
         """A serialised cloud, decoded, if it has labels of its points; None otherwise, and if it is
         broken."""
         with suppress(InputError):
-            msg = decode(data, self.kind)
+            msg = decode_cloud(data, self.kind)
             if {SEMANTIC, INSTANCE} <= {f.name for f in msg.fields}:
                 return msg
         return None
@@ -239,11 +260,9 @@ class BagFrames(Sequence):
     def _point_truth(self, time: int, data: Callable[[], bytes]) -> PointTruth | None:
         if (msg := self.labelled(data())) is None:
             return None
-        try:
+        with self._named(time):
             indices = to_frame(msg)[1]
             classes, instances = (column(msg, name, indices) for name in (SEMANTIC, INSTANCE))
-        except InputError as error:
-            raise InputError(f"{self.path}, topic {self.points} at {time} ns: {error}") from None
         assert classes is not None and instances is not None  # labelled() has seen both
         return PointTruth(classes.astype(np.uint16), instances.astype(np.uint16))
 

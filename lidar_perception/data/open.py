@@ -32,6 +32,10 @@ LAYOUTS = {
     nuscenes: "nuScenes (v1.0-*/ and samples/)",
     cloud_folder: "",
 }
+PACKETS = ("sensor packets", "play it to the driver of the sensor and record its cloud topic in a "
+           "bag")
+LIVOX_VIEWER = ("Livox Viewer", "make a bag of it with livox_ros_driver's lvx_to_rosbag.launch, or "
+                "export PCD files in Livox Viewer")
 # Suffixes of other formats, and what makes one of the above of them.
 CONVERTERS = {
     ".las": ("LAS", "convert it with PDAL: pdal translate IN.las OUT.pcd"),
@@ -42,8 +46,9 @@ CONVERTERS = {
                  "mmdetection3d"),
     ".feather": ("Argoverse 2", "read the sweeps with av2 (av2.utils.io.read_lidar_sweep) and save "
                  "x y z intensity with numpy.save"),
-    ".pcap": ("sensor packets", "play it to the driver of the sensor and record its cloud topic in "
-              "a bag"),
+    ".pcap": PACKETS, ".pcapng": PACKETS,
+    ".lvx": LIVOX_VIEWER, ".lvx2": LIVOX_VIEWER,
+    ".osf": ("Ouster OSF", "convert it with ouster-cli: ouster-cli source IN.osf save OUT.pcd"),
 }
 MAX_FILES = 10_000  # of a folder that are looked at for these
 

@@ -36,7 +36,8 @@ def storage_files(folder: Path) -> list[Path]:
     there is no folder."""
     if not folder.is_dir():
         return []
-    return sorted(file for file in folder.iterdir() if _suffix(file) in FORMATS and not file.is_dir())
+    return sorted(file for file in folder.iterdir()
+                  if _suffix(file) in FORMATS and not file.is_dir())
 
 
 def find_files(path: Path, metadata: Metadata) -> list[Path]:

@@ -65,7 +65,7 @@ def _of_bag(path: Path, topic: str) -> RawClouds:
     topic = bag_frames.cloud_topic(bag, topic)
     if not bag.counts[topic]:
         raise InputError(f"{path} has no cloud on {topic}; record it again")
-    frames = bag_frames.BagFrames(opened, topic, bag_frames.CLOUD, bag.counts[topic])
+    frames = bag_frames.BagFrames(opened, topic, bag.topics[topic], bag.counts[topic])
     return RawClouds(path, f"{bag.layout}, clouds on {topic}", len(frames), frames.stamps(),
                      frames.message, frames.poses, topic)
 

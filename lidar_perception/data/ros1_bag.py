@@ -11,7 +11,9 @@ from rosbags.highlevel import AnyReader
 
 from lidar_perception.data.qos import LATCHED_QOS
 from lidar_perception.data.storage import Stream, Topic
+from lidar_perception.wire.clouds import LIVOX
 from lidar_perception.wire.codec import typestore
+from lidar_perception.wire.livox import livox_ros1_to_cdr
 
 MAGIC = b"#ROSBAG V"
 SUFFIX = ".bag"
@@ -37,6 +39,9 @@ class Ros1File:
         self.converted = {topic.id: self._conversion(self.recorded[topic.id].msgtype, topic.type,
                                                      made)
                           for topic in self.topics if topic.encoding == "cdr"}
+        for topic in self.topics:
+            if topic.type in LIVOX:  # rosbags converts point by point
+                self.converted[topic.id] = livox_ros1_to_cdr
         self.times = ((self.reader.start_time, self.reader.end_time - 1)
                       if self.reader.message_count else None)
 

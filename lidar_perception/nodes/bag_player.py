@@ -1,4 +1,4 @@
-"""Replays a bag: CDR bytes from the file to DDS, never decoded."""
+"""Replays a bag: CDR bytes from the file to DDS; only clouds in other messages are decoded."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from lidar_perception.data.bag import Bag
-from lidar_perception.nodes.graph import cloud_topics
 from lidar_perception.nodes.pacing import Pace
 from lidar_perception.nodes.runtime import OK, RELIABLE, WARN, LidarNode
 from lidar_perception.nodes.transforms import STATIC_QOS
 from lidar_perception.params import PlayerParams
 from lidar_perception.types import InputError, InputWarning
+from lidar_perception.wire.clouds import POINT_CLOUD, cloud_topics, decode_cloud
+from lidar_perception.wire.codec import encode
 from lidar_perception.wire.transforms import TF_MESSAGE
 from msg_utils.messages import ros_message
 from msg_utils.stamps import SECOND, time_message
@@ -47,6 +48,11 @@ class BagPlayer(LidarNode):
             self.bag = Bag(self.params.bag)
         for warning in wrong:
             self.get_logger().warning(str(warning.message))
+        # Topics with clouds that are played as PointCloud2
+        self.converted = {t for t in cloud_topics(self.bag.topics)
+                          if self.bag.topics[t] != POINT_CLOUD}
+        self.kinds = {t: POINT_CLOUD if t in self.converted else kind
+                      for t, kind in self.bag.topics.items()}
         self.names = self._chosen_topics()
         self.publishers_by_topic = {t: p for t in self.names if (p := self._publisher(t))}
         if not self.publishers_by_topic:
@@ -62,9 +68,10 @@ class BagPlayer(LidarNode):
         self.stop_ns = (self.start_ns + int(self.params.duration * SECOND)
                         if self.params.duration else None)
         self.paused = self.params.start_paused
+        self.warned: set[str] = set()  # topics with messages that are left out
         self.steps = 0
         self.step_topic = max(self.publishers_by_topic, key=lambda t: (
-            "PointCloud2" in self.bag.topics[t], self.bag.counts[t]))
+            self.kinds[t] == POINT_CLOUD, self.bag.counts[t]))
         self.now_ns, self.anchor = self.start_ns, monotonic()
         self.pace = Pace(self, self.params.follow, self.params.ahead, self.params.follow_timeout)
         self.clock = self.params.clock_hz and self.create_publisher(Clock, "/clock", RELIABLE)
@@ -91,9 +98,9 @@ class BagPlayer(LidarNode):
                     for topic, name in names.items()}
         kinds: dict[str, str] = {}
         for topic, name in expanded.items():
-            if kinds.setdefault(name, self.bag.topics[topic]) != self.bag.topics[topic]:
+            if kinds.setdefault(name, self.kinds[topic]) != self.kinds[topic]:
                 raise InputError(f"{name} would have the types {kinds[name]} and "
-                                 f"{self.bag.topics[topic]}; remap {topic} to another name")
+                                 f"{self.kinds[topic]}; remap {topic} to another name")
         return expanded
 
     def _expanded(self, name: str, what: str) -> str:
@@ -116,7 +123,7 @@ class BagPlayer(LidarNode):
         return wanted
 
     def _publisher(self, topic: str) -> Any:
-        kind = self.bag.topics[topic]
+        kind = self.kinds[topic]
         try:
             return self.output(self.names[topic], kind, _qos(
                 self.bag.qos(topic), self._held(topic), lossless=bool(self.params.follow)))
@@ -200,11 +207,27 @@ class BagPlayer(LidarNode):
                                                self.stop_ns):
             if not self._wait_until(stamp, topic):
                 return
+            if (played := self._as_played(topic, data)) is None:
+                continue
             if topic == self.step_topic:
-                self._follow(data)
-            self.publishers_by_topic[topic].publish(data)
+                self._follow(played)
+            self.publishers_by_topic[topic].publish(played)
             self.counts["frames"] += topic == self.step_topic
             self.last_stamp_ns = stamp
+
+    def _as_played(self, topic: str, data: bytes) -> bytes | None:
+        """Return the CDR of a message as it is played; None, with a warning for the first one of a
+        topic, for a cloud that cannot be converted."""
+        if topic not in self.converted:
+            return data
+        try:
+            return encode(decode_cloud(data, self.bag.topics[topic]))
+        except InputError as error:
+            if topic not in self.warned:
+                self.get_logger().warning(f"messages on {topic} are left out: {error}")
+            self.warned.add(topic)
+            self.counts["left_out"] = self.counts.get("left_out", 0) + 1
+            return None
 
     def _follow(self, cloud: bytes) -> None:
         """Wait until the graph keeps up; the bag's time stands still meanwhile."""
@@ -230,7 +253,8 @@ class BagPlayer(LidarNode):
                 before.setdefault(topic, deque(maxlen=self._held(topic))).append(data)
         for topic, messages in before.items():
             for data in messages:
-                self.publishers_by_topic[topic].publish(data)
+                if (played := self._as_played(topic, data)) is not None:
+                    self.publishers_by_topic[topic].publish(played)
 
     def _wait_until(self, stamp: int, topic: str) -> bool:
         """Serve until it is time for stamp; False when the node shall end."""

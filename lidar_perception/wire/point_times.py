@@ -15,6 +15,7 @@ from msg_utils.stamps import SECOND, to_ns
 # As Ouster, Velodyne, Hesai and RoboSense, Autoware and Livox call it; the first that is there.
 NAMES = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
 UNITS_NS = (10**9, 10**6, 10**3, 1)
+LIVOX_COLUMN, LIVOX_UNIT_NS = ("offset_time", True), 1  # whole numbers: the unit is documented
 SWEEP = 2e-3, 1.0   # seconds that a turn takes: by these the unit is told from the others
 SINCE_1970_NS = 1e18  # later than 2001
 MAX_OFFSET = 1.0    # seconds between a point and the stamp of its cloud
@@ -56,7 +57,8 @@ def point_times(msg: Any, indices: np.ndarray) -> PointTimes:
     counts[indices] = True
     turn = column[counts & finite]
     low, span = known.min(), turn.max() - turn.min()
-    unit = _unit_ns(float(span), whole, float(low))
+    unit = LIVOX_UNIT_NS if (name, whole) == LIVOX_COLUMN else _unit_ns(float(span), whole,
+                                                                        float(low))
     stamp = to_ns(msg.header.stamp)
     since_stamp = abs(float(low)) * unit <= abs(float(low) * unit - stamp)
     at_stamp = 0 if since_stamp else stamp // unit if whole else stamp / unit

@@ -192,7 +192,8 @@ def test_times_in_names_may_lack_leading_zeros(tmp_path, names, expected):
     ("a.e57", r"format E57 .*pdal"), ("segment-1/x.tfrecord", r"format Waymo .*KITTI"),
     ("training/lidar/x.parquet", r"format Waymo .*KITTI"),
     ("val/log/sensors/lidar/1.feather", r"format Argoverse 2 .*av2"),
-    ("drive.pcap", r"sensor packets .*driver")])
+    ("drive.pcap", r"sensor packets .*driver"), ("drive.pcapng", "sensor packets"),
+    ("drive.lvx2", "Livox Viewer.*lvx_to_rosbag"), ("drive.osf", "ouster-cli source")])
 def test_other_formats_are_refused_by_name_with_a_converter(tmp_path, file, words):
     path = write(tmp_path / file, b"LASF")
     for place in (path, tmp_path):

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from bag_samples import as_ros1
+from cloud_samples import compressed_message, livox_message, livox_points
 
 pytest.importorskip("rclpy", reason="needs ROS 2, or the extra [ros]")
 
@@ -19,8 +20,10 @@ from std_srvs.srv import Trigger
 
 from lidar_perception.data.bag import LATCHED_QOS, SENSOR_QOS, Bag, BagWriter
 from lidar_perception.nodes.runtime import LATCHED, RELIABLE, SENSOR_DATA, WAITING
+from lidar_perception.wire.clouds import COMPRESSED, LIVOX
 from lidar_perception.wire.codec import bag_message, decode, encode
 from lidar_perception.wire.topics import CAMERA_INFO, POINTS, TRUTH
+from msg_utils.point_cloud2 import to_array
 from msg_utils.stamps import to_ns
 
 CLOUD, TEXT, INFO = ("sensor_msgs/msg/PointCloud2", "std_msgs/msg/String",
@@ -108,6 +111,33 @@ def test_of_static_transforms_all_hold_and_of_other_latched_topics_the_last(
     assert [decode(d, INFO).width for d in player.sent["info"]] == [19]
     depths = {p.topic_name: p.qos_profile.depth for p in player._outputs}
     assert depths == {"/tf_static": 100, "/info": 10, "/text": 10}  # also for who comes late
+
+
+def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path):
+    """A cloud that cannot be converted is left out; the others, and other topics, are played."""
+    from lidar_perception.nodes.bag_player import BagPlayer
+    points = livox_points()
+    plain = np.zeros(3, [(axis, "<f4") for axis in "xyz"])
+    with BagWriter(tmp_path / "bag") as bag:
+        for topic, kind, messages in (
+                ("/livox", LIVOX[1], [livox_message(points)] * 2),
+                ("/zlib", COMPRESSED, [compressed_message(plain, "zlib")]),
+                ("/draco", COMPRESSED, [compressed_message(plain, "draco")] * 2),
+                ("/text", TEXT, [bag_message(TEXT, data="text")])):
+            bag.add_topic(topic, kind)
+            for message in messages:
+                bag.write(topic, START, message)
+    player = start(BagPlayer, bag=str(tmp_path / "bag"))
+    assert {p.topic_name: p.msg_type.__name__ for p in player.publishers_by_topic.values()} == {
+        "/livox": "PointCloud2", "/zlib": "PointCloud2", "/draco": "PointCloud2", "/text": "String"}
+    player.serve = lambda timeout_sec: None
+    player._play_once()
+    sent = {topic: [decode(d, TEXT if topic == "text" else CLOUD) for d in data]
+            for topic, data in player.sent.items()}
+    assert [np.array_equal(to_array(cloud)["x"], points["x"]) for cloud in sent["livox"]] == [True,
+                                                                                              True]
+    assert [len(to_array(cloud)) for cloud in sent["zlib"]] == [3]
+    assert (sent["draco"], texts(sent["text"]), player.counts["left_out"]) == ([], ["text"], 2)
 
 
 def test_a_topic_of_several_publishers_is_offered_as_the_best_of_them_did():
