@@ -29,10 +29,19 @@ from lidar_perception.nodes.graph import (
     result_topics,
     wait_for,
 )
+from lidar_perception.nodes.launching import (
+    ARGUMENTS,
+    given_arguments,
+    parameter_files,
+    refuse_unknown,
+    with_arguments,
+)
 from lidar_perception.nodes.shared_memory import use_large_shared_memory
 from lidar_perception.wire.clouds import CLOUD_TYPES
 from lidar_perception.wire.topics import POINTS, TF_STATIC
 
+VALUES = ("bag", "rate", "loop", "scores", "points", "config", "single", "real_time",
+          "use_sim_time", "log_level")
 HERE = Path(__file__).resolve().parent
 CONFIG = HERE.parent / "config" / "replay.param.yaml"
 GLOBAL = {TF_STATIC, "/tf", "/clock", "/diagnostics"}
@@ -41,11 +50,12 @@ SECONDS_FOR_THE_LAST_FRAME = 1.0
 GRAPH = {"detectors": "candidates", "namespace": "", "name_prefix": ""}
 
 
-def replay(context):
+def replay(context, given):
+    refuse_unknown(given, context, {*VALUES, "rviz", *ARGUMENTS} - GRAPH.keys())
     value = {k: context.perform_substitution(LaunchConfiguration(k))
-             for k in ("bag", "rate", "loop", "scores", "points", "config", "single",
-                       "real_time", "use_sim_time", "log_level")}
+             for k in VALUES}
     single = value["single"] == "true"
+    files = [str(CONFIG), *parameter_files(value["config"])]
     use_large_shared_memory()  # of the player, so that the nodes need not take it for a driver
     with Bag(value["bag"]) as bag:
         clouds = chosen_clouds(value["bag"], bag.topics, value["points"])
@@ -60,33 +70,35 @@ def replay(context):
     waits = [*wait_for(single), f"{final}:={1 if real_time else 2}"]  # evaluator, player
     player = Node(
         package="lidar_perception", executable="bag_player", name="bag_player", output="screen",
-        parameters=[value["config"], {"bag": value["bag"], "rate": float(value["rate"]),
-                                      "loop": value["loop"] == "true",
-                                      "topics": played,
-                                      **follow,
-                                      "wait_for": waits}],
+        parameters=with_arguments(files, "bag_player", {
+            "bag": value["bag"], "rate": float(value["rate"]), "loop": value["loop"] == "true",
+            "topics": played, **follow, "wait_for": waits}),
         # Relative, so that they go into a namespace if this file is included in one.
         remappings=[(t, relative(POINTS if t == clouds else t)) for t in played
                     if t not in GLOBAL],
         ros_arguments=log_level)
     evaluator = Node(
         package="lidar_perception", executable="evaluator", name="evaluator", output="screen",
-        parameters=[value["config"], scoring, sim_time], remappings=list(remap.items()),
-        ros_arguments=log_level)
+        parameters=with_arguments(files, "evaluator", {**scoring, **sim_time}),
+        remappings=list(remap.items()), ros_arguments=log_level)
     end = TimerAction(period=SECONDS_FOR_THE_LAST_FRAME,
                       actions=[EmitEvent(event=Shutdown(reason="the bag is played"))])
-    given = context.launch_configurations
-    return [*(LogInfo(msg=f"{name}:={given[name]} is no argument of replay.launch.py")
-              for name, fixed in GRAPH.items() if given.get(name, fixed) != fixed),
+    found = context.launch_configurations
+    return [*(LogInfo(msg=f"{name}:={found[name]} is no argument of replay.launch.py")
+              for name, fixed in GRAPH.items() if found.get(name, fixed) != fixed),
             player, evaluator,
             RegisterEventHandler(OnProcessExit(target_action=player, on_exit=[end]))]
 
 
 def generate_launch_description():
+    given = given_arguments()
     pipeline = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(HERE / "perception.launch.py")),
-        launch_arguments={"points": relative(POINTS), **GRAPH, **{k: LaunchConfiguration(k)
-            for k in ("config", "single", "rviz", "use_sim_time", "log_level")}}.items())
+        launch_arguments={
+            "points": relative(POINTS), **GRAPH,
+            "config": [f"{CONFIG},", LaunchConfiguration("config")],
+            **{k: LaunchConfiguration(k) for k in ("single", "rviz", "use_sim_time", "log_level")},
+        }.items())
     return LaunchDescription([
         DeclareLaunchArgument("bag", description="Folder of the bag."),
         DeclareLaunchArgument("points", default_value="", description="The bag's topic of clouds; "
@@ -95,7 +107,8 @@ def generate_launch_description():
         DeclareLaunchArgument("loop", default_value="false", choices=["true", "false"],
                               description="Start again at the end."),
         DeclareLaunchArgument("scores", default_value="", description="JSON file for the scores."),
-        DeclareLaunchArgument("config", default_value=str(CONFIG), description="Parameter file."),
+        DeclareLaunchArgument("config", default_value="", description="Parameter files, with "
+                              "commas, on top of config/replay.param.yaml."),
         DeclareLaunchArgument("single", default_value="false", choices=["true", "false"],
                               description="All stages in one process."),
         DeclareLaunchArgument("rviz", default_value="false", choices=["true", "false"],
@@ -106,6 +119,7 @@ def generate_launch_description():
         DeclareLaunchArgument("use_sim_time", default_value="true", choices=["true", "false"],
                               description="Take the time from /clock."),
         DeclareLaunchArgument("log_level", default_value="info", description="debug, info, ..."),
-        OpaqueFunction(function=replay),  # first, as the other sets `points` to its own
+        # First, because the pipeline sets `points` and `config` to its own.
+        OpaqueFunction(function=lambda context: replay(context, given)),
         pipeline,
     ])

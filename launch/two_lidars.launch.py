@@ -6,11 +6,12 @@
 
 from pathlib import Path
 
-from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, OpaqueFunction
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
 from launch import LaunchDescription
+from lidar_perception.nodes.launching import ARGUMENTS, given_arguments, refuse_unknown
 
 GRAPH = Path(__file__).resolve().parent / "detectors.launch.py"
 SIDES = ("left", "right")
@@ -21,7 +22,9 @@ SHARED = {"detectors": "candidates", "single": "false", "tracking": "false",
 
 
 def generate_launch_description():
+    given, known = given_arguments(), {*SIDES, *SHARED, *ARGUMENTS} - {"namespace", "points"}
     return LaunchDescription([
+        OpaqueFunction(function=lambda context: refuse_unknown(given, context, known)),
         *(DeclareLaunchArgument(side, default_value="points", description="Topic of the cloud, in "
                                 f"the namespace {side} unless it starts with /.")
           for side in SIDES),

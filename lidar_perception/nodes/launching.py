@@ -1,16 +1,24 @@
-"""What the launch files share: their arguments, and one process for each node."""
+"""Arguments shared by all launch files, and one process for each node.
+
+The parameters of a node come from the package's own file, then from the files that the user gives,
+then from the other arguments; the later ones win.
+"""
 
 from __future__ import annotations
 
+import sys
+import tempfile
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 import yaml
-from launch.actions import DeclareLaunchArgument, LogInfo, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription, LogInfo, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchDescription
+from lidar_perception.nodes import NODES
 from lidar_perception.nodes.graph import (
     ALONE,
     BEHIND,
@@ -26,14 +34,17 @@ from lidar_perception.nodes.graph import (
     relative,
     trackers_of,
 )
+from lidar_perception.nodes.known import node_parameters
+from lidar_perception.nodes.param_files import EVERY_NODE, is_for, read_sections, unknown_nodes
 from lidar_perception.param_fields import flatten
 from lidar_perception.params import ClusteringNodeParams, GroundNodeParams
-from lidar_perception.types import InputError
+from lidar_perception.types import InputError, unknown_name
 from lidar_perception.wire.topics import ODOMETRY, POINTS
 
 CONFIGS = {"candidates": "perception", "pointpillars": "pointpillars", "pointnet": "pointnet",
            "fused": "fused"}
 
+OF_LAUNCH = ("launch-prefix", "launch-prefix-filter")  # arguments that launch itself takes
 RESPAWN_DELAY = 2.0  # seconds, so that a node that cannot start does not fill the log
 
 SWITCHES: dict[str, Any] = dict(default_value="false", choices=["true", "false"])
@@ -56,10 +67,11 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
     "range": dict(default_value="", choices=["", "auto", "ahead", "around"],
                   description="Parameter range of fused and pointpillars: what they see; empty: "
                   "that of the parameter file."),
-    "config": dict(default_value="", description="Parameter file of all nodes; empty: "
-                   "config/*.param.yaml of each detector."),
-    "experts": dict(default_value="", description="Of ground and clusters: a parameter file, or "
-                    "the detector whose file it is; empty: config, or that of the first."),
+    "config": dict(default_value="", description="Parameter files of all nodes, with commas, on "
+                   "top of config/*.param.yaml of each detector."),
+    "experts": dict(default_value="", description="Of ground and clusters: the detector whose "
+                    "config/*.param.yaml they take, empty: the first; or a parameter file on top "
+                    "of all others."),
     "weights": dict(default_value="", description="Checkpoint of the network, with several "
                     "networks NAME=FILE,NAME=FILE; empty: that of the parameter file, or the one "
                     "that comes with the package."),
@@ -88,12 +100,17 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
 def graph_launch(config_folder: Path, detectors: str) -> LaunchDescription:
     """Ground and clusters, once, and the detectors behind them: a list with commas, the default of
     the argument `detectors`. ARGUMENTS are the others."""
+    given = given_arguments()
 
     def nodes(context: Any) -> list[Any]:
+        refuse_unknown(given, context, ["detectors", *ARGUMENTS])
         value = {k: context.perform_substitution(LaunchConfiguration(k))
                  for k in ("detectors", *ARGUMENTS)}
         processes = started(value, config_folder)
-        return [*(LogInfo(msg=line) for line in conflicts(value, config_folder)), *processes]
+        lines = [f"warning: {line}" for file in parameter_files(value["config"], value["experts"])
+                 for line in unknown_nodes(file, _graph(value))]
+        return [*(LogInfo(msg=line) for line in [*lines, *conflicts(value, config_folder)]),
+                *processes]
 
     return LaunchDescription([
         DeclareLaunchArgument("detectors", default_value=detectors,
@@ -103,30 +120,89 @@ def graph_launch(config_folder: Path, detectors: str) -> LaunchDescription:
     ])
 
 
+def given_arguments() -> list[Any]:
+    """Return the names of the arguments that are given to the launch file that calls this, on the
+    command line or by the file that includes it; text, or substitutions of launch.
+
+    Only the IncludeLaunchDescription that loads the file knows them. In the context they are among
+    the launch configurations of all other files.
+    """
+    frame: Any = sys._getframe()
+    while frame is not None:
+        action = frame.f_locals.get("self")
+        if isinstance(action, IncludeLaunchDescription):
+            return [name for name, _ in action.launch_arguments]
+        frame = frame.f_back
+    return []
+
+
+def refuse_unknown(given: list[Any], context: Any, known: Collection[str]) -> None:
+    """Raise InputError for the first name that is not an argument; it names the closest one."""
+    for parts in given:
+        name = "".join(part if isinstance(part, str) else context.perform_substitution(part)
+                       for part in (parts if isinstance(parts, list | tuple) else [parts]))
+        if name in known or name in OF_LAUNCH:
+            continue
+        if nodes := [node for node in NODES if name in node_parameters(node)]:
+            raise InputError(f"'{name}' is not a launch argument but a parameter of "
+                             f"{', '.join(nodes)}; set it in a parameter file, config:=FILE")
+        raise unknown_name("launch argument", name, sorted(known))
+
+
+def parameter_files(config: str, experts: str = "") -> list[str]:
+    """Return the parameter files among the values of `config` and `experts`. InputError for one
+    that does not exist."""
+    files = [config] if Path(config).is_file() else [f for f in config.split(",") if f]
+    if missing := [file for file in files if not Path(file).is_file()]:
+        raise InputError(f"config: there is no parameter file {missing[0]}")
+    if experts and experts not in CONFIGS:
+        if not Path(experts).is_file():
+            raise InputError(f"experts: there is no parameter file {experts}, nor a detector of "
+                             f"that name ({', '.join(CONFIGS)})")
+        files.append(experts)
+    return files
+
+
 def started(value: dict[str, str], config_folder: Path) -> list[Node]:
     """The nodes that the values of the arguments ask for."""
-    if value["config"] and not Path(value["config"]).is_file():
-        raise InputError(f"config: there is no parameter file {value['config']}")
-    detectors, single = _detectors(value), value["single"] == "true"
-    prefix, tracking = value["name_prefix"], value["tracking"] == "true"
-    # Whether a node wants odometry, its parameter file may say; it changes nothing for the others.
-    graph = prefixed(graph_of(detectors, single, tracking and not single), prefix)
-    files = {node: value["config"] or _own_file(name, config_folder) for name in detectors
+    graph, detectors, single = _graph(value), _detectors(value), value["single"] == "true"
+    prefix, users = value["name_prefix"], parameter_files(value["config"])
+    files = {node: [_own_file(name, config_folder), *users] for name in detectors
              for node in (ALONE if single else BEHIND)[name]}
-    files |= dict.fromkeys(EXPERTS, _expert_file(value, config_folder))
-    files |= dict.fromkeys(trackers_of(detectors), value["config"] or str(
-        config_folder / f"{TRACKER}.param.yaml"))
+    files |= {node: _expert_files(value, config_folder) for node in EXPERTS}
+    files |= {node: [str(config_folder / f"{TRACKER}.param.yaml"), *users]
+              for node in trackers_of(detectors)}
     topics = {relative(POINTS): value["points"], relative(ODOMETRY): value["odometry"]}
     viewer = [_viewer(value, config_folder)] if value["rviz"] == "true" else []
     return viewer + [Node(
         package="lidar_perception", executable=executable_of(node.removeprefix(prefix)), name=node,
         namespace=value["namespace"] or None, output="screen",
-        parameters=list(filter(None, [files[node.removeprefix(prefix)],
-                                      _given(value, node.removeprefix(prefix), detectors)])),
+        parameters=with_arguments(files[node.removeprefix(prefix)], node,
+                                  _given(value, node.removeprefix(prefix), detectors)),
         remappings=[(a, topics.get(b, b)) for a, b in {**remap, **ODOMETRY_IN}.items()],
         ros_arguments=["--log-level", value["log_level"]],
         respawn=value["respawn"] == "true", respawn_delay=RESPAWN_DELAY,
     ) for node, remap in graph.items()]
+
+
+def _graph(value: dict[str, str]) -> dict[str, dict[str, str]]:
+    # Whether a node wants odometry, its parameter file may say; it changes nothing for the others.
+    detectors, single = _detectors(value), value["single"] == "true"
+    tracking = value["tracking"] == "true" and not single
+    return prefixed(graph_of(detectors, single, tracking), value["name_prefix"])
+
+
+def with_arguments(files: list[str], node: str, given: dict[str, Any]) -> list[Any]:
+    """Return the parameters of a node for launch: its files, and above them what arguments set."""
+    # launch writes `given` under /**, where rcl prefers the sections that name the node.
+    named = [section for file in files for section in read_sections(file)
+             if section != EVERY_NODE and is_for(section, node)]
+    if not given or not named:
+        return [*files, *filter(None, [given])]
+    with tempfile.NamedTemporaryFile("w", prefix="launch_params_", suffix=".yaml",
+                                     delete=False) as file:
+        yaml.safe_dump({section: {"ros__parameters": given} for section in named}, file)
+    return [*files, given, file.name]
 
 
 def conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
@@ -136,10 +212,10 @@ def conflicts(value: dict[str, str], config_folder: Path) -> list[str]:
     if value["single"] == "true":
         return ["experts has no effect, as with single:=true each detector finds ground and "
                 "clusters itself"] if given else []
-    if given not in ("", *CONFIGS) or (value["config"] and not given):
+    if given not in ("", *CONFIGS):
         return []
-    chosen = given or detectors[0]
-    numbers = {name: _expert_numbers(_own_file(name, config_folder))
+    chosen, users = given or detectors[0], parameter_files(value["config"])
+    numbers = {name: _expert_numbers([_own_file(name, config_folder), *users])
                for name in (chosen, *detectors)}
     lines = []
     for name in detectors:
@@ -156,28 +232,19 @@ def _own_file(detector: str, config_folder: Path) -> str:
     return str(config_folder / f"{CONFIGS[detector]}.param.yaml")
 
 
-def _expert_file(value: dict[str, str], config_folder: Path) -> str:
-    """The parameter file of ground and clusters."""
-    given = value["experts"]
-    if given in CONFIGS:
-        return _own_file(given, config_folder)
-    if given and not Path(given).is_file():
-        raise InputError(f"experts: there is no parameter file {given}, nor a detector of that "
-                         f"name ({', '.join(CONFIGS)})")
-    return given or value["config"] or _own_file(_detectors(value)[0], config_folder)
+def _expert_files(value: dict[str, str], config_folder: Path) -> list[str]:
+    """Return the parameter files of ground and clusters."""
+    chosen = value["experts"] if value["experts"] in CONFIGS else _detectors(value)[0]
+    return [_own_file(chosen, config_folder), *parameter_files(value["config"], value["experts"])]
 
 
-def _expert_numbers(file: str) -> dict[str, Any]:
-    """The numbers of ground and clusters by a parameter file of ours."""
-    def dotted(section: dict, prefix: str = "") -> dict[str, Any]:
-        return {k: v for key, inner in section.items() for k, v in (
-            dotted(inner, f"{prefix}{key}.") if isinstance(inner, dict)
-            else {prefix + key: inner}).items()}
-
+def _expert_numbers(files: list[str]) -> dict[str, Any]:
+    """Return the parameters of ground and clusters with these files."""
     known = {key: list(v) if isinstance(v, tuple) else v
              for group in (GroundNodeParams(), ClusteringNodeParams())
              for key, v in flatten(group).items() if key.startswith(("ground.", "clustering."))}
-    given = dotted(yaml.safe_load(Path(file).read_text())["/**"]["ros__parameters"])
+    given = {key: number for file in files for section, values in read_sections(file).items()
+             if any(is_for(section, node) for node in EXPERTS) for key, number in values.items()}
     return known | {k: v for k, v in given.items() if k in known}
 
 

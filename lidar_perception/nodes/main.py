@@ -14,6 +14,7 @@ import signal
 import sys
 import tempfile
 from contextlib import contextmanager, suppress
+from itertools import pairwise
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING
@@ -76,6 +77,17 @@ def run(name: str, arguments: list[str]) -> int:
     return _spin(getattr(module, NODES[name][0]), arguments, perf_counter() - begin, stop)
 
 
+def _misspelt_sections(arguments: list[str], node: str) -> list[str]:
+    """Return a line for each section of the parameter files that may be meant for this node."""
+    from lidar_perception.nodes.param_files import unknown_nodes
+    from lidar_perception.types import InputError
+    lines = []
+    for path in [b for a, b in pairwise(arguments) if a == "--params-file"]:
+        with suppress(InputError):  # too large, say; rcl has read it all the same
+            lines += unknown_nodes(path, [node], only_like=True)
+    return lines
+
+
 def _leave(node: LidarNode) -> None:
     """End the process beside work that goes on, such as a compilation."""
     import rclpy
@@ -110,7 +122,8 @@ def _spin(node_class: type, arguments: list[str], seconds: float, stop: Stop) ->
             stop.leave = lambda: _leave(node)
         if stop.asked:
             node.stop.set_result(None)
-        for line in misspelt(n for n in node._parameter_overrides if not node.has_parameter(n)):
+        for line in [*misspelt(n for n in node._parameter_overrides if not node.has_parameter(n)),
+                     *_misspelt_sections(arguments, node.get_name())]:
             node.get_logger().warning(line)  # before anything that takes long
         if not node.stop.done():
             node.start()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import re
 import sys
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -12,6 +13,7 @@ import pytest
 
 from lidar_perception.nodes.graph import graph_of
 from lidar_perception.nodes.known import node_parameters
+from lidar_perception.nodes.param_files import read_sections
 from lidar_perception.types import InputError
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -105,7 +107,8 @@ def test_a_launch_file_starts_its_graph_or_one_process_a_detector(name, launched
     for node in nodes(autostart="false").values():
         assert node.parameters[1] == {"autostart": False}  # what is not given, the file may say
     mine = str(ROOT / "config" / "best.param.yaml")
-    assert nodes(config=mine)["clustering"].parameters[0] == mine
+    for node in nodes(config=mine, tracking="true").values():  # on top of the package's own
+        assert node.parameters[0] != node.parameters[1] == mine
     frames = {"base_frame": "base", "target_frame": "odom"}
     for node in nodes(deskew="odometry", odometry="/odometry", **frames).values():
         assert frames.items() < node.parameters[1].items()
@@ -125,7 +128,7 @@ def test_ground_and_clusters_have_one_file_and_what_others_would_take_is_said(la
             ("pointnet,pointpillars", "", "pointnet", ["ground.method patchwork"]),
             ("pointpillars,pointnet", "", "pointpillars", ["clustering.euclidean.gamma 0.0"]),
             ("pointpillars,pointnet", "pointnet", "pointnet", ["ground.method patchwork"]),
-            ("pointpillars,pointnet", str(mine), "mine", []),
+            ("pointpillars,pointnet", str(mine), "pointpillars", []),
             ("candidates,pointnet,pointpillars", "", "perception",
              ["ground.method cloth", "clustering.dbscan.eps [0.5, 0.7, 1.0]"]),
             ("pointnet", "", "pointnet", [])):
@@ -135,14 +138,76 @@ def test_ground_and_clusters_have_one_file_and_what_others_would_take_is_said(la
         assert files["ground_segmentation"] == files["clustering"] == stem
         assert all(files[f"{name}_detector"] == name for name in detectors.split(",")
                    if name != "candidates")
+        assert all((str(mine) in started[name].parameters) == (experts == str(mine))
+                   for name in ("ground_segmentation", "clustering"))
         assert len(nodes.said) == len(words)
         assert all(word in line for word, line in zip(words, nodes.said, strict=True))
-    everything = str(ROOT / "config" / "fused.param.yaml")
-    started = nodes(detectors="pointnet,pointpillars", config=everything, experts="pointpillars")
-    assert started["pointnet_detector"].parameters[0] == everything
+    mine.write_text("/**: {ros__parameters: {ground: {method: patchwork}}}")
+    started = nodes(detectors="pointnet,pointpillars", config=str(mine), experts="pointpillars")
+    assert started["pointnet_detector"].parameters[1] == str(mine)
     assert started["clustering"].parameters[0].endswith("pointpillars.param.yaml")
+    assert "ground.method" not in nodes.said[0]  # it is the same for both now
     nodes(single="true", experts="pointnet")
     assert "has no effect" in nodes.said[0]
+
+
+def test_users_file_is_above_the_packages_and_arguments_above_both(launched, tmp_path):
+    """rcl prefers a section that names a node over /**, also an earlier one; ours are all /**."""
+    for file in (ROOT / "config").glob("*.param.yaml"):
+        assert list(read_sections(file)) == ["/**"]
+    _, nodes = launched("fused")
+    mine = tmp_path / "mine.yaml"
+    mine.write_text("/**/fused_detector: {ros__parameters: {fused: {range: ahead}}}\n"
+                    "left: {clustering: {ros__parameters: {clustering.density: 1.0}}}\n")
+    started = nodes(config=f"{ROOT}/config/best.param.yaml,{mine}", range="around")
+    *files, given, above = started["fused_detector"].parameters
+    assert [Path(file).name for file in files] == [
+        "fused.param.yaml", "best.param.yaml", "mine.yaml"]
+    assert read_sections(above) == {"/**/fused_detector": given} == {
+        "/**/fused_detector": {"fused.range": "around"}}
+    assert started["clustering"].parameters[1:] == files[1:]
+    assert nodes.said == []
+
+
+@pytest.mark.parametrize("section, words", [
+    ("fused_detectr", "is called 'fused_detectr'.*; did you mean 'fused_detector'"),
+    ("/left/ground_segmentaton", "'ground_segmentaton'.* 'ground_segmentation'"),
+    ("controller_server", "is called 'controller_server', so its parameters change nothing$"),
+    ("/**", ""), ("/*", ""), ("/left/**", ""), ("/**/clustering", ""), ("left/fused_detector", ""),
+    ("front_fused_detector", ""), ("perception", "")])  # ours, in another graph
+def test_section_that_no_node_takes_is_a_warning(section, words, launched, tmp_path):
+    mine = tmp_path / "mine.yaml"
+    mine.write_text(f"{section}:\n  ros__parameters: {{input.queue: 2}}\n")
+    _, nodes = launched("fused")
+    assert len(nodes(config=str(mine))) == 3
+    assert [bool(re.search(words, line)) for line in nodes.said] == [True] * bool(words)
+
+
+@pytest.mark.parametrize("name, given, words", [
+    ("fused", "pionts", "no launch argument 'pionts'; did you mean 'points'?"),
+    ("fused", "fused.scores.car", "a parameter of fused_detector; set it in a parameter file"),
+    ("detectors", "zzz", "no launch argument 'zzz'; valid names: ahead, autostart"),
+    ("replay", "real_tme", "did you mean 'real_time'"),
+    ("replay", "namespace", "no launch argument 'namespace'"),
+    ("two_lidars", "lft", "did you mean 'left'"),
+    ("fused", "points", ""), ("fused", "launch-prefix", ""), ("two_lidars", "config", "")])
+def test_argument_that_a_launch_file_does_not_have_is_refused(name, given, words, description):
+    """ros2 launch, too, gives its arguments by an IncludeLaunchDescription."""
+    class Including(Recorded):
+        def execute(self):
+            return description(name)
+
+    sys.modules["launch.actions"].IncludeLaunchDescription = Including
+    actions = Including(launch_arguments=[(given, "1")]).execute()
+    first = next(a.function for a in actions if hasattr(a, "function"))
+    said = ""
+    try:
+        first(SimpleNamespace())  # with nothing that the work after the check needs
+    except InputError as error:
+        said = str(error)
+    except AttributeError:
+        pass
+    assert words in said and bool(words) == bool(said)
 
 
 def test_a_second_sensor_has_names_of_its_own(launched):
@@ -221,6 +286,7 @@ def test_a_replay_plays_to_the_nodes_that_its_player_and_evaluator_know(descript
     actions = description("replay")
     pipeline = dict(next(a.launch_arguments for a in actions if hasattr(a, "launch_arguments")))
     assert pipeline["detectors"] == "candidates"
+    assert pipeline["config"][0].endswith("replay.param.yaml,")
     assert pipeline["namespace"] == pipeline["name_prefix"] == ""
     arguments = {a.args[0]: getattr(a, "default_value", "") for a in actions if a.args[1:] == ()
                  and hasattr(a, "description")} | {"bag": str(drive_bag)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+from time import sleep
 
 import numpy as np
 import pytest
@@ -117,12 +118,13 @@ def test_a_problem_whose_numbers_change_with_every_cloud_is_logged_once(start, m
 
 ARGUMENTS = {"-p foo": "-p foo", "--params-file /nope.yaml": "/nope.yaml",
              "-r __node:=1bad": "1bad", "--nonsense": "--nonsense", "-p stm.threshold:=7.0":
-             "stm.threshold", "-p bag:=7": "bag", f"-p bag:={300 * 'a'}": "a: File name too long"}
+             "stm.threshold", "-p bag:=7": "bag", f"-p bag:={300 * 'a'}": "File name too long"}
 
 
 def test_arguments_that_ros_does_not_take_are_one_line_and_exit_code_2(domain):
     program = '''
 import sys
+from time import sleep
 from types import SimpleNamespace
 from lidar_perception.nodes import bag_player, main, perception
 stop = SimpleNamespace(closing=lambda: None, closed=lambda code: None)
@@ -227,3 +229,17 @@ def test_clouds_wait_for_the_partner_with_their_stamp():
     for i in range(20):
         paired.add_cloud(100 + i, i)
     assert len(delivered) == 15 and all(p is None for _, p in delivered)
+
+
+def test_section_of_a_parameter_file_that_is_misspelt_is_said_by_its_node(processes, tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("trackr: {ros__parameters: {autostart: false}}\n"
+                    "controller_server: {ros__parameters: {autostart: false}}\n"
+                    "pointnet_detectr: {ros__parameters: {autostart: false}}\n")
+    processes.run_node("tracker", ["tracker", "--ros-args", "--params-file", str(file)])
+    process = processes.running["tracker"]
+    while "ready" not in (log := processes.log("tracker")):
+        assert process.poll() is None
+        sleep(0.05)
+    warned, = [line for line in log.splitlines() if "[WARN]" in line and "mine.yaml" in line]
+    assert "no node here is called 'trackr'" in warned and "did you mean 'tracker'" in warned

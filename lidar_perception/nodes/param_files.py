@@ -1,0 +1,85 @@
+"""ROS parameter files: which nodes their sections are for."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator
+from itertools import count, islice
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from lidar_perception.nodes import NODES
+from lidar_perception.runs.files import read_text, short
+from lidar_perception.types import InputError, closest_name
+
+MAX_BYTES = 10**6
+MAX_KEYS = 10_000  # that are visited: anchors can put a group into itself
+MAX_LINES = 20     # about names, of one file
+EVERY_NODE = "/**"
+
+
+def read_sections(path: str | Path) -> dict[str, dict[str, Any]]:
+    """Read a parameter file.
+
+    Returns:
+        {name of a node, or pattern such as "/**/tracker": {dotted parameter: value}}
+
+    Raises:
+        InputError: the file cannot be read, or is not YAML of this form.
+    """
+    try:
+        content = yaml.safe_load(read_text(path, MAX_BYTES)) or {}
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"cannot read the parameter file {path}: {short(error)}") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{path} is not a parameter file; see config/ for the form")
+    visited = count()
+    found: dict[str, dict[str, Any]] = {}
+    for node, group in _leaves(path, content, visited, "/", stop="ros__parameters"):
+        values = group if isinstance(group, dict) else {}
+        found[node] = {**found.get(node, {}), **dict(_leaves(path, values, visited, "."))}
+    return found
+
+
+def _leaves(path: str | Path, group: dict, visited: Iterator[int], separator: str,
+            prefix: str = "", stop: str | None = None) -> Iterator[tuple[str, Any]]:
+    """Yield the joined name and the value of each leaf, or of each key `stop`."""
+    for key, value in group.items():
+        if next(visited) >= MAX_KEYS:
+            raise InputError(f"{path} has more than {MAX_KEYS} entries")
+        if key == stop:
+            yield prefix.removesuffix(separator), value
+        elif isinstance(value, dict):
+            yield from _leaves(path, value, visited, separator, f"{prefix}{key}{separator}", stop)
+        elif stop is None:
+            yield f"{prefix}{key}", value
+
+
+def is_for(section: str, node: str) -> bool:
+    """Return True if a section is for a node of this name, in some namespace."""
+    return section.rpartition("/")[2] in ("*", "**", node)
+
+
+def unknown_nodes(path: str | Path, nodes: Collection[str], only_like: bool = False) -> list[str]:
+    """Return a line for each section of a parameter file that no node takes.
+
+    It may be for a node of another package. Nodes of ours are known that are not among `nodes`,
+    also with a prefix, since several graphs may share a file.
+
+    Args:
+        nodes: names of the nodes that are started with it.
+        only_like: leave out the names that are not most like one of `nodes`.
+    """
+    lines = []
+    for section in read_sections(path):
+        name = section.rpartition("/")[2]
+        if any(is_for(section, node) for node in nodes) or name.endswith(tuple(NODES)):
+            continue
+        guess = closest_name(name, [*nodes, *NODES])
+        if guess in nodes or not only_like:
+            lines.append(f"{path}: no node here is called {name[:80]!r}, so its parameters change "
+                         "nothing" + (f"; did you mean {guess!r}?" if guess else ""))
+    return [*islice(lines, MAX_LINES)]

@@ -1,0 +1,30 @@
+"""Arguments that a launch file does not have are refused by launch itself, before any node starts.
+
+Runs where ROS 2's launch is installed; test_launch_files.py has stand-ins for it.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+pytest.importorskip("launch_ros", reason="needs launch_ros, which comes with ROS 2")
+
+from launch.actions import SetLaunchConfiguration
+
+from launch import LaunchDescription, LaunchService
+from lidar_perception.testing.launching import launch_file
+
+NOTHING_STARTS = {"detectors": "dream"}
+
+
+@pytest.mark.parametrize("name, given, words", [
+    ("fused", {"pionts": "/cloud"}, "no launch argument 'pionts'; did you mean 'points'?"),
+    ("two_lidars", {"fused.scores.car": "0.7"}, "a parameter of fused_detector"),
+    ("fused", {"launch-prefix": ""}, "'dream' is none of")])
+def test_argument_that_a_launch_file_does_not_have_is_refused(name, given, words, capfd):
+    """Launch configurations of the file that includes ours are not its arguments."""
+    service = LaunchService(noninteractive=True)
+    service.include_launch_description(LaunchDescription([
+        SetLaunchConfiguration("map", "office"), launch_file(name, **NOTHING_STARTS, **given)]))
+    assert service.run() == 1
+    assert words in "".join(capfd.readouterr())
