@@ -67,11 +67,12 @@ def frame(seed: int = 0) -> LidarFrame:
     return LidarFrame(np.ascontiguousarray(points[:, :3]), points[:, 3].copy())
 
 
-def eager(params: DetectorParams = DetectorParams(), score: float = 0.25) -> DetectorParams:
+def eager(params: DetectorParams = DetectorParams(), score: float = 0.25,
+          engine: str = "auto") -> DetectorParams:
     """Parameters with which random weights find something."""
     names = ("car", "pedestrian", "cyclist", "other")
     return with_values(params, {**{f"pointpillars.scores.{n}": score for n in names},
-                                "pointpillars.nms.iou": 0.2})
+                                "pointpillars.nms.iou": 0.2, "pointpillars.engine": engine})
 
 
 def random_detector(version: str = "v0", params: DetectorParams | None = None,

@@ -71,6 +71,14 @@ def layers_format() -> Any:
                  choices=("off", "auto", "bf16"), fixed=True)
 
 
+def network_engine() -> Any:
+    """Return the parameter of detectors with PointPillars that chooses what runs its layers."""
+    return param("auto", "What runs PointPillars' layers on the CPU. sparse: kernels that compute "
+                 "only the cells near points, for versions without ground (v1, v2, v4), x86-64 "
+                 "with AVX2 and amp off. torch: all cells. auto: sparse where it can. Detections "
+                 "are the same.", choices=("auto", "torch", "sparse"), fixed=True)
+
+
 def share_on_points() -> Any:
     """The parameter of detectors that put cars where their points are."""
     return param(0.75, "How far cars are moved so that their points begin at the faces that are "

@@ -175,4 +175,4 @@ def test_tensors_of_other_types_are_refused(tmp_path):
     write(path, {name: value.double() if value.is_floating_point() else value
                  for name, value in state.items()}, Header(config).text())
     expected = PointPillarsDetector(TorchNetwork(lively(config)), Header(config), CPU, eager())
-    assert same(load_detector(path, "cpu", eager())(frame()), expected(frame()))
+    assert same(load_detector(path, "cpu", eager(engine="torch"))(frame()), expected(frame()))

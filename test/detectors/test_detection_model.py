@@ -154,7 +154,7 @@ def test_a_network_in_16_bits_says_about_the_same_in_float32():
     said = {}
     with torch.inference_mode():
         for amp in ("off", "bf16"):
-            logits, boxes_at = TorchNetwork(lively(config), amp=amp)(pillars, None)
+            logits, boxes_at, _ = TorchNetwork(lively(config), amp=amp)(pillars, None)
             said[amp] = torch.cat([logits, *boxes_at(torch.arange(len(logits)))], dim=1)
     assert said["bf16"].dtype == torch.float32 and not torch.equal(said["bf16"], said["off"])
     assert (said["bf16"] - said["off"]).abs().max() < 0.05 * said["off"].abs().max()

@@ -59,7 +59,7 @@ def test_a_checkpoint_gives_back_what_was_saved(saved, tmp_path):
     for name, value in load_network(tmp_path / "half")[1].state_dict().items():
         torch.testing.assert_close(value, network.state_dict()[name], atol=1e-7,
                                    rtol=0 if value.ndim < 2 else 2**-10)
-    found = load_detector(path, "cpu", eager())(frame())
+    found = load_detector(path, "cpu", eager(engine="torch"))(frame())
     expected = PointPillarsDetector(TorchNetwork(network), header, CPU, eager())(frame())
     assert len(found.detections) and same(found, expected)
 
@@ -146,12 +146,12 @@ def test_weights_that_do_not_come_with_the_package_are_asked_for(tmp_path, monke
     monkeypatch.setattr(weights_module, "WEIGHTS", tmp_path)
     with pytest.raises(InputError, match="no weights for v4 compact"):
         load_detector("", "cpu")
-    wanted = with_values(eager(), {"pointpillars.version": "v1"})
+    wanted = with_values(eager(engine="torch"), {"pointpillars.version": "v1"})
     config = tiny("v1")
     save_checkpoint(tmp_path / "pointpillars_v1_compact.safetensors", lively(config),
                     Header(config))
     assert same(load_detector("", "cpu", wanted)(frame()), random_detector("v1")(frame()))
-    named = with_values(eager(), {"pointpillars.weights": str(
+    named = with_values(eager(engine="torch"), {"pointpillars.weights": str(
         tmp_path / "pointpillars_v1_compact.safetensors")})
     assert same(load_detector("", "cpu", named)(frame()), random_detector("v1")(frame()))
     with pytest.raises(InputError, match="no checkpoint /nowhere"):
@@ -181,11 +181,13 @@ def test_export_writes_from_a_checkpoint_and_bad_files_are_refused(saved, tmp_pa
     done = CliRunner().invoke(cli, ["export", "onnx", str(path), "--out", str(out)])
     assert done.exit_code == 0 and "v4 compact" in " ".join(done.output.split())
     assert same(load_detector(out, "cpu", eager())(frame()),
-                load_detector(path, "cpu", eager())(frame()), 1e-4)
+                load_detector(path, "cpu", eager(engine="torch"))(frame()), 1e-4)
     with pytest.raises(InputError, match="not on 'cuda'"):
         load_detector(out, "cuda")
     with pytest.raises(InputError, match="set amp: off"):
         load_detector(out, "cpu", with_values(eager(), {"pointpillars.amp": "bf16"}))
+    with pytest.raises(InputError, match="set engine: auto"):
+        load_detector(out, "cpu", eager(engine="sparse"))
     (tmp_path / "bad.onnx").write_bytes(out.read_bytes()[:-50])
     for name, words in ("bad.onnx", "cannot read"), ("none.onnx", "no exported network"):
         with pytest.raises(InputError, match=words):

@@ -204,7 +204,7 @@ def load_fused_detector(path: str | Path = "", device: str = "auto",
     fusion = fusion_of(path, settings)
     proposer = load_detector(fusion.proposer, device, DetectorParams(
         pointpillars=PointPillarsParams(range=settings.range, amp=settings.amp, warm_up=False,
-                                        threads=settings.threads,
+                                        threads=settings.threads, engine=settings.engine,
                                         cpu_fallback=settings.cpu_fallback)))
     classifier = load_pointnet_detector(fusion.classifier, device, PointNetDetectorParams(
         pointnet=PointNetParams(warm_up=False, cpu_fallback=settings.cpu_fallback)))

@@ -10,6 +10,7 @@ from lidar_perception.detectors.params import (
     NetworkParams,
     NmsParams,
     layers_format,
+    network_engine,
     seen_range,
     share_on_points,
 )
@@ -34,6 +35,7 @@ class FusedParams(NetworkParams):
                             "the package.", fixed=True)
     range: str = seen_range()
     amp: str = layers_format()
+    engine: str = network_engine()
     proposals: float = param(0.02, "Least score of PointPillars for a box to be looked at.",
                              low=0.001, high=1.0)
     max_proposals: int = param(200, "Boxes of PointPillars that are looked at, those with its "

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
@@ -31,6 +30,7 @@ from lidar_perception.detectors.pointpillars.network import (
 )
 from lidar_perception.detectors.pointpillars.params import STEPS, DetectorParams
 from lidar_perception.detectors.pointpillars.pillars import Pillars, make_pillars
+from lidar_perception.detectors.pointpillars.sparse import SparseNetwork, unsupported
 from lidar_perception.detectors.pointpillars.weights_file import weights_file
 from lidar_perception.detectors.view import (
     as_found,
@@ -57,10 +57,17 @@ class Network(Protocol):
 
 class TorchNetwork:
     """A network on a device, its norms folded into its layers, which work in the format of
-    number_format(amp)."""
+    number_format(amp).
 
-    def __init__(self, network: PointPillars, device: torch.device = CPU, amp: str = "off"):
-        self.network, self.amp = fused(network).to(device), amp
+    engine: what runs it on the CPU: torch; sparse, see sparse.py; or auto, sparse where it can.
+    InputError for sparse where it cannot.
+    """
+
+    def __init__(self, network: PointPillars, device: torch.device = CPU, amp: str = "off",
+                 engine: str = "torch"):
+        network = fused(network)
+        self.sparse = _sparse(network, amp, engine)
+        self.network, self.amp = network.to(device), amp
 
     def to(self, device: torch.device) -> None:
         """Move to another device."""
@@ -68,11 +75,29 @@ class TorchNetwork:
 
     def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
         device = pillars.points.device
+        if self.sparse and device == CPU:
+            return self.sparse(pillars, maps)
         numbers = number_format(self.amp, device)
         with torch.autocast(device.type, numbers, enabled=numbers is not None):
             features = self.network.features(pillars, maps).float()
         head = self.network.head
-        return head.logits(features)[0], lambda anchors: head.boxes_at(features, anchors)
+        return Prediction(head.logits(features)[0],
+                          lambda anchors: head.boxes_at(features, anchors))
+
+
+def _sparse(network: PointPillars, amp: str, engine: str) -> SparseNetwork | None:
+    """The network in the sparse engine; None where torch runs it."""
+    if engine == "torch":
+        return None
+    reason = unsupported(network)
+    if not reason and number_format(amp, CPU):
+        reason = "it works in float32, and amp asks for 16 bits"
+    if not reason:
+        return SparseNetwork(network)
+    if engine == "sparse":
+        raise InputError(f"the sparse engine cannot run this network: {reason}; choose the engine "
+                         "auto or torch")
+    return None
 
 
 class Boxes(NamedTuple):
@@ -159,24 +184,25 @@ class PointPillarsDetector(NetworkDetector):
 
     def _detections(self, predictions: dict[bool, Prediction]) -> tuple:
         """Detections, and what nothing_passed gives, of all looks together."""
-        found = [self._passed(turned, *prediction) for turned, prediction in predictions.items()]
-        boxes, logits, labels = map(np.concatenate, zip(*found))
+        found = [self._passed(turned, said) for turned, said in predictions.items()]
+        boxes, best_logits, labels = map(np.concatenate, zip(*found))
         best: dict[str, float] = {}
         broken: str | None = None
-        if any(len(scores) > 1 and (scores == scores[0]).all()
-               for scores, _ in predictions.values()):
-            boxes, logits, labels = boxes[:0], logits[:0], labels[:0]
+        scored = [said.logits for said in predictions.values() if len(said.logits)]
+        if any(len(logits) > 1 and (logits == logits[0]).all() for logits in scored):
+            boxes, best_logits, labels = boxes[:0], best_logits[:0], labels[:0]
             broken = ("the network gives every place the same scores; the weights are broken, "
                       "take others")
-        elif len(boxes) == 0:
-            highest = torch.stack([scores.amax(dim=0) for scores, _ in predictions.values()])
-            best, broken = self.nothing_passed(torch.sigmoid(highest.amax(dim=0)).tolist())
-        scores = torch.sigmoid(torch.from_numpy(logits)).numpy()
+        elif len(boxes) == 0 and scored:
+            highest = torch.cat(scored).amax(dim=0)
+            best, broken = self.nothing_passed(torch.sigmoid(highest).tolist())
+        scores = torch.sigmoid(torch.from_numpy(best_logits)).numpy()
         detections = best_of_each(boxes, scores, labels, self.config.classes, self.settings.nms)
         return calibrated(detections, self.header.calibration), best, broken
 
-    def _passed(self, turned: bool, logits: Tensor, boxes_at: Callable) -> Boxes:
+    def _passed(self, turned: bool, prediction: Prediction) -> Boxes:
         """The boxes of one look whose score suffices, turned back."""
+        logits = prediction.logits
         limits = logits.new_tensor([*map(_logit, self.raw_min_scores())])
         chosen = torch.nonzero((logits >= limits).any(dim=1))[:, 0]
         best, labels = logits[chosen].max(dim=1)
@@ -184,9 +210,11 @@ class PointPillarsDetector(NetworkDetector):
         if len(valid) > self.settings.nms.candidates:
             valid = valid[best[valid].topk(self.settings.nms.candidates).indices]
         chosen, best, labels = chosen[valid], best[valid], labels[valid]
-        codes, directions = boxes_at(chosen)
+        codes, directions = prediction.boxes_at(chosen)
         if self.anchors.device != codes.device:  # the network was moved, maybe by another detector
             self.anchors = make_anchors(self.look, codes.device)
+        if prediction.anchors is not None:
+            chosen = prediction.anchors[chosen]
         boxes = decode(codes.float(), directions.argmax(dim=1), self.anchors[chosen],
                        self.config.direction_offset).cpu().numpy()
         found = Boxes(boxes, best.cpu().numpy(), labels.cpu().numpy())
@@ -263,7 +291,8 @@ def load_detector(path: str | Path = "", device: str = "auto",
                   params: DetectorParams = DetectorParams()) -> PointPillarsDetector:
     """A detector from a checkpoint (.safetensors) or an exported network (.onnx); with an empty
     path the one that params name, or else the one that comes with the package. InputError where it
-    is missing, or not of the version and size that params ask for, or device is not there."""
+    is missing, or not of the version and size that params ask for, or device is not there, or the
+    engine cannot run it."""
     path = Path(path) if str(path) not in ("", ".") else weights_file(params.pointpillars)
     if params.pointpillars.threads:
         torch.set_num_threads(params.pointpillars.threads)
@@ -278,10 +307,16 @@ def load_detector(path: str | Path = "", device: str = "auto",
         if params.pointpillars.amp == "bf16":
             raise InputError(f"{path} works in the numbers it was exported with; set amp: off, or "
                              "use the checkpoint it was exported from")
+        if params.pointpillars.engine != "auto":
+            raise InputError(f"{path} runs in ONNX Runtime; set engine: auto, or use the "
+                             "checkpoint it was exported from")
     else:
         where = chosen_device(device)
         header, loaded = load_network(path)
-        network = TorchNetwork(loaded, CPU, params.pointpillars.amp)
+        if where != CPU and params.pointpillars.engine == "sparse":
+            raise InputError(f"the sparse engine runs on the CPU, not on {where}; set device: cpu, "
+                             "or engine: auto")
+        network = TorchNetwork(loaded, CPU, params.pointpillars.amp, params.pointpillars.engine)
     for name in "version", "size":
         wanted, found = getattr(params.pointpillars, name), getattr(header.config, name)
         if wanted not in ("auto", found):

@@ -28,10 +28,20 @@ EPS, MOMENTUM = 1e-3, 0.01  # of batch norms
 CODE, BINS = 7, 2      # numbers that describe a box, and halves of the circle of headings
 PRIOR = 0.01           # score of every anchor before training
 
-# What a detector asks of a network, torch's or an exported one: logits (A, K) of one cloud, and
-# codes (M, 7) and directions (M, 2) at anchors (M,).
-Prediction = tuple[Tensor, Callable[[Tensor], tuple[Tensor, Tensor]]]
 Conv = nn.Conv2d | nn.ConvTranspose2d
+
+
+class Prediction(NamedTuple):
+    """The output of a network for one cloud.
+
+    logits: (M, K) of the anchors that were evaluated.
+    boxes_at: Returns codes (N, 7) and directions (N, 2) at rows (N,) of logits.
+    anchors: (M,) int64, the anchors of these rows; None where they are all anchors in order.
+    """
+
+    logits: Tensor
+    boxes_at: Callable[[Tensor], tuple[Tensor, Tensor]]
+    anchors: Tensor | None = None
 
 
 class Outputs(NamedTuple):
@@ -166,9 +176,12 @@ class Head(nn.Module):
 
     def boxes_at(self, features: Tensor, anchors: Tensor) -> tuple[Tensor, Tensor]:
         """codes (M, 7) and directions (M, 2) of anchors (M,) of the only cloud."""
-        cells, numbers = anchors // self.per_cell, anchors % self.per_cell
-        rows = features[0].flatten(1)[:, cells].T  # (M, C)
+        rows = features[0].flatten(1)[:, anchors // self.per_cell].T  # (M, C)
+        return self.boxes_of(rows, anchors % self.per_cell)
 
+    def boxes_of(self, rows: Tensor, numbers: Tensor) -> tuple[Tensor, Tensor]:
+        """Return codes (M, 7) and directions (M, 2) of anchors number (M,) of their cells, from
+        the features (M, C) of these cells."""
         def one(conv: nn.Conv2d, width: int) -> Tensor:
             weight = conv.weight.view(self.per_cell, width, -1)[numbers]  # (M, width, C)
             bias = _bias(conv).view(self.per_cell, width)[numbers]

@@ -140,4 +140,4 @@ class OnnxNetwork:
         if [x.shape for x in (logits, codes, directions)] != self.shapes:
             raise InputError(f"the outputs of {self.source} have other shapes than a network of "
                              "its header; export it again")
-        return logits[0], lambda anchors: (codes[0, anchors], directions[0, anchors])
+        return Prediction(logits[0], lambda anchors: (codes[0, anchors], directions[0, anchors]))

@@ -5,7 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from lidar_perception.clustering.params import FULL_DENSITY, ClusteringParams, DbscanParams
-from lidar_perception.detectors.params import NetworkParams, layers_format, seen_range
+from lidar_perception.detectors.params import (
+    NetworkParams,
+    layers_format,
+    network_engine,
+    seen_range,
+)
 from lidar_perception.ground.params import GroundParams
 from lidar_perception.param_fields import param
 from lidar_perception.robot.params import CropParams
@@ -28,6 +33,7 @@ class PointPillarsParams(NetworkParams):
                       choices=("auto", "full", "compact"), fixed=True)
     range: str = seen_range()
     amp: str = layers_format()
+    engine: str = network_engine()
 
 
 # The experts of paper B: Patchwork++ and DBSCAN, of which it gives no numbers. Ours, chosen on

@@ -1,0 +1,267 @@
+"""A network without ground on a CPU, computed only where it differs from an empty street.
+
+Without ground about 2 % of the pillars hold points. Where the receptive field of a layer has
+neither a pillar with points nor a cell of the cluster map, its value is that of an empty cloud: one
+row of numbers, and near the border of the grid a few more. These are computed once. For each cloud
+the layers compute the other cells, and of these only the ones that the head reads: it is evaluated
+up to REACH cells from a point, as farther away nothing is detected. The result is that of torch
+within rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from lidar_perception.detectors.pointpillars import sparse_kernels as kernels
+from lidar_perception.detectors.pointpillars.network import FpnNeck, PointPillars, Prediction
+from lidar_perception.detectors.pointpillars.pillars import Pillars
+from lidar_perception.detectors.pointpillars.sparse_layers import (
+    Grid,
+    Layer,
+    dilated,
+    make_layers,
+    padded,
+    padded_bias,
+    shrunk,
+)
+
+REACH = 6                 # cells of the head around each point in which it is evaluated
+MIN_PER_PART = 1_000_000  # multiplications that are worth handing to another thread
+PARTS_PER_THREAD = 4      # so that a thread that is held up leaves its work to the others
+
+
+class Map(NamedTuple):
+    """Values of H x W cells: numbers (H + 2, W + 2) int32 of rows (R, C) float32. Row 0 is zero;
+    the border of numbers, which is the padding of a convolution, points at it."""
+
+    numbers: np.ndarray
+    rows: np.ndarray
+
+    def at(self, cells: np.ndarray) -> np.ndarray:
+        """Return the values (M, C) of cells (M,), numbered row by row."""
+        width = self.numbers.shape[1] - 2
+        return self.rows[self.numbers[1 + cells // width, 1 + cells % width]]
+
+
+def unsupported(network: PointPillars) -> str | None:
+    """Return why SparseNetwork cannot run a network on this machine, None where it can."""
+    config = network.pillar_net.config
+    if not kernels.LANES:
+        return "this processor has no AVX2"
+    if not config.remove_ground:
+        return f"{config.version} also reads the ground, which occupies most cells"
+    if not isinstance(network.neck, FpnNeck) or config.fusion != "add":
+        return "its neck does not add its maps"
+    if config.zero_row:
+        return "its pillars have rows of zeros"
+    return None
+
+
+class SparseNetwork:
+    """A fused network on the CPU, for which unsupported() returns None. Several threads may call
+    it at once."""
+
+    def __init__(self, network: PointPillars):
+        self.head, self.has_map = network.head, network.map_net is not None
+        self.layers = make_layers(network)
+        linear, config = network.pillar_net.linear, network.pillar_net.config
+        points, offsets = config.point_columns, config.offset_columns
+        scales = torch.ones(points + offsets)
+        scales[:2], scales[4 + offsets:] = config.xy_scale, config.id_scale
+        order = [*range(4), *range(4 + offsets, points + offsets), *range(4, 4 + offsets)]
+        scaled = (linear.weight.detach() * scales)[:, order].T.numpy()  # points, then offsets
+        self.pillar_weights = np.zeros((len(scaled), padded(linear.out_features)), np.float32)
+        self.pillar_weights[:, :linear.out_features] = scaled
+        self.pillar_bias = padded_bias(linear.bias, self.pillar_weights.shape[1])
+        self._empty: dict[Grid, list[Map]] = {}
+
+    def __call__(self, pillars: Pillars, maps: Tensor | None) -> Prediction:
+        """Predict at the anchors of all cells up to REACH from a point."""
+        cells, features, logits = self.evaluate(pillars, maps, REACH)
+        head = self.head
+        anchors = torch.from_numpy(cells)[:, None] * head.per_cell + torch.arange(head.per_cell)
+
+        def boxes_at(chosen: Tensor) -> tuple[Tensor, Tensor]:
+            rows = features.at(cells[(chosen // head.per_cell).numpy()])
+            return head.boxes_of(torch.from_numpy(rows[:, :head.codes.in_channels]),
+                                 chosen % head.per_cell)
+
+        return Prediction(torch.from_numpy(logits).view(-1, head.classes), boxes_at,
+                          anchors.flatten())
+
+    def evaluate(self, pillars: Pillars, maps: Tensor | None, reach: int | None
+                 ) -> tuple[np.ndarray, Map, np.ndarray]:
+        """Compute the network up to `reach` cells of the head from a point; None: everywhere.
+
+        Args:
+            pillars: Of one cloud, which may be empty.
+            maps: As in PointPillars.features.
+
+        Returns:
+            Cells (M,) int64 of the head's grid, row by row; the map that the head reads; and
+            logits (M, anchors per cell * K) float32.
+        """
+        inputs = [self._pillar_map(pillars)]
+        if self.has_map:
+            assert maps is not None
+            inputs.append(_cluster_map(maps[0].numpy()))
+        empty = self._empty_maps(pillars.grid)
+        chosen = self._chosen([of.numbers[1:-1, 1:-1] > 0 for of in inputs], reach)
+        *_, features, scores = self._run(inputs, chosen, empty)
+        logits = scores.rows[len(empty[-1].rows):, :self.head.scores.out_channels]
+        return np.flatnonzero(chosen[-1]), features, np.ascontiguousarray(logits)
+
+    def _pillar_map(self, pillars: Pillars) -> Map:
+        points, offsets, cells = (x.numpy() for x in pillars[:3])
+        occupied = np.zeros(pillars.grid, bool)
+        occupied.ravel()[cells] = True
+        numbers, index = kernels.number_cells(occupied, _blank(pillars.grid), 1)
+        rows = np.zeros((1 + len(numbers), self.pillar_weights.shape[1]), np.float32)
+        kernels.pillar_rows(points, offsets, cells, index, self.pillar_weights, self.pillar_bias,
+                            rows)
+        return Map(index, rows)
+
+    def _chosen(self, occupied: list[np.ndarray], reach: int | None) -> list[np.ndarray]:
+        """Return the cells (H, W) bool that each layer has to compute."""
+        reached = list(occupied)
+        for layer in self.layers:
+            reached.append(layer.reached(reached))
+        needed = [np.zeros_like(mask) for mask in reached]
+        if reach is None:
+            needed[-1][:] = True
+        else:
+            scale = len(occupied[0]) // len(needed[-1])
+            needed[-1] = dilated(shrunk(occupied[0], scale), reach)
+        reached[-1] = needed[-1]
+        for i in range(len(self.layers) - 1, -1, -1):
+            own = len(occupied) + i
+            self.layers[i].require(needed[own], needed[:own])
+        return [a & b for a, b in zip(reached, needed)][len(occupied):]
+
+    def _run(self, inputs: list[Map], chosen: Sequence[np.ndarray],
+             empty: Sequence[Map]) -> list[Map]:
+        """Return the maps of all layers: new rows in the cells chosen, elsewhere those of an empty
+        cloud."""
+        maps = list(inputs)
+        for layer, mask, background in zip(self.layers, chosen, empty):
+            maps.append(_computed(layer, maps, mask, background))
+        return maps[len(inputs):]
+
+    def _empty_maps(self, grid: Grid) -> list[Map]:
+        """Return the maps of all layers for an empty cloud.
+
+        Values depend on the distance to the border alone, so the layers are run on a grid that is
+        just large enough to have every distance that matters.
+        """
+        if grid not in self._empty:
+            count = 2 if self.has_map else 1
+            margins, grids = [0] * count, [grid] * count
+            for layer in self.layers:
+                margins.append(layer.margin(margins))
+                grids.append(layer.grid(grids))
+            coarsest = grid[0] // min(height for height, _ in grids)
+            size = max((2 * margin + 1) * (grid[0] // height)
+                       for margin, (height, _) in zip(margins, grids))
+            size = -(-size // coarsest) * coarsest
+            small = min(size, grid[0]), min(size, grid[1])
+            small_grids = [small] * count
+            for layer in self.layers:
+                small_grids.append(layer.grid(small_grids))
+            inputs = [Map(_blank(small), np.zeros((1, width), np.float32))
+                      for width in (len(self.pillar_bias), padded(3))[:count]]
+            maps = self._run(inputs, [np.ones(g, bool) for g in small_grids[count:]],
+                             [Map(_blank(g), np.zeros((1, len(layer.bias)), np.float32))
+                              for g, layer in zip(small_grids[count:], self.layers)])
+            self._empty[grid] = [_background(*each) for each in zip(
+                maps, margins[count:], grids[count:])]
+        return self._empty[grid]
+
+
+def _blank(grid: Grid) -> np.ndarray:
+    """An index that points at row 0 everywhere."""
+    return np.zeros((grid[0] + 2, grid[1] + 2), np.int32)
+
+
+def _cluster_map(maps: np.ndarray) -> Map:
+    """The Map of maps (3, H, W) uint8."""
+    occupied = (maps[0] | maps[1] | maps[2]) > 0
+    cells, index = kernels.number_cells(occupied, _blank(occupied.shape), 1)
+    rows = np.zeros((1 + len(cells), padded(3)), np.float32)
+    rows[1:, :3] = maps.reshape(3, -1)[:, cells].T
+    return Map(index, rows)
+
+
+def _computed(layer: Layer, maps: list[Map], chosen: np.ndarray, background: Map) -> Map:
+    """The map of a layer, computed in the cells chosen (H, W) bool."""
+    first = len(background.rows)
+    cells, index = kernels.number_cells(chosen, background.numbers, first)
+    rows = np.empty((first + len(cells), len(layer.bias)), np.float32)
+    rows[:first] = background.rows
+    sums, width = rows[first:], chosen.shape[1]
+    sums[:] = layer.bias
+
+    def compute(begin: int, end: int) -> None:
+        if layer.coarse is not None:
+            kernels.upsample(*maps[layer.coarse], cells, width, layer.scale, sums, begin, end)
+        for i, term in enumerate(layer.terms, start=1):
+            floor = layer.floor if i == len(layer.terms) else -np.inf
+            kernels.convolve(*maps[term.source], cells, width, term.stride, term.weights, sums,
+                             np.float32(floor), begin, end)
+
+    _in_parts(compute, len(cells), sum(term.weights.size for term in layer.terms))
+    return Map(index, rows)
+
+
+def _background(of: Map, margin: int, grid: Grid) -> Map:
+    """The map of an empty cloud on a grid, from the one on a smaller grid."""
+    kept, places = zip(*(_along(size, small - 2, margin)
+                         for size, small in zip(grid, of.numbers.shape)))
+    rows = of.rows[of.numbers[1:-1, 1:-1][np.ix_(*kept)]].reshape(-1, of.rows.shape[1])
+    index = _blank(grid)
+    index[1:-1, 1:-1] = 1 + places[0][:, None] * len(kept[1]) + places[1]
+    return Map(index, np.concatenate([np.zeros_like(rows[:1]), rows]))
+
+
+def _along(size: int, small: int, margin: int) -> tuple[np.ndarray, np.ndarray]:
+    """Along one axis: which of `small` cells differ, and which of these each of `size` cells
+    equals."""
+    if small <= 2 * margin:
+        return np.arange(size), np.arange(size)
+    kept = np.r_[:margin + 1, small - margin:small]
+    cell = np.arange(size)
+    return kept, np.where(cell < size - margin, np.minimum(cell, margin), cell - size + len(kept))
+
+
+def _in_parts(compute: Callable[[int, int], None], count: int, cost: int) -> None:
+    """Call compute(begin, end) for parts of 0 .. count on as many threads as torch uses; cost:
+    multiplications of each of `count`."""
+    threads = torch.get_num_threads()
+    parts = min(count * cost // MIN_PER_PART, threads * PARTS_PER_THREAD)
+    if threads == 1 or parts < 2:
+        compute(0, count)
+        return
+    ends = [count * i // parts for i in range(parts + 1)]
+    waiting = iter(list(pairwise(ends)))
+
+    def work() -> None:
+        for begin, end in waiting:
+            compute(begin, end)
+
+    helpers = [_pool(threads - 1).submit(work) for _ in range(threads - 1)]
+    work()
+    for helper in helpers:
+        if not helper.cancel():  # it has begun
+            helper.result()
+
+
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads, "sparse_network")

@@ -1,0 +1,293 @@
+"""The sparse engine of PointPillars computes what torch computes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from detection_samples import lively, random_detector, same, tiny
+
+from lidar_perception.data.open import open_recording
+from lidar_perception.detectors.checkpoint import Header
+from lidar_perception.detectors.devices import CPU
+from lidar_perception.detectors.open import open_detector
+from lidar_perception.detectors.pointpillars import sparse, sparse_kernels
+from lidar_perception.detectors.pointpillars.config import network_config
+from lidar_perception.detectors.pointpillars.detector import PointPillarsDetector, TorchNetwork
+from lidar_perception.detectors.pointpillars.expert import NetworkInput
+from lidar_perception.detectors.pointpillars.network import fused
+from lidar_perception.detectors.pointpillars.pillars import make_pillars
+from lidar_perception.detectors.pointpillars.sparse_layers import dilated, shrunk
+from lidar_perception.param_fields import with_values
+from lidar_perception.simulation.drive import scan_at
+from lidar_perception.simulation.sensor import HDL64E
+from lidar_perception.types import InputError
+
+pytestmark = [pytest.mark.usefixtures("one_thread"), pytest.mark.skipif(
+    not sparse_kernels.LANES, reason="Numba compiles for a processor without AVX2")]
+
+TOLERANCE = 1e-4  # of features and logits, whose sizes are about 1 to 30
+WIDE = dict(low=(-12.8, -14.08, -3.0), high=(12.8, 14.08, 1.0))  # 176 x 160 pillars
+
+
+def strong(config, seed=0):
+    """A fused network in which a point still matters after the last layer."""
+    network = lively(config, seed)
+    for module in network.modules():
+        if isinstance(module, torch.nn.Conv2d) and module.kernel_size == (3, 3):
+            module.weight.mul_(2.0)
+    return fused(network)
+
+
+def inputs(config, points, drawn, seed=0, share=1.0):
+    """Pillars of uniformly random points in a share of each axis, from the lowest corner, and a map
+    with the share `drawn` of its cells drawn there."""
+    rng = np.random.default_rng(seed)
+    cloud = rng.uniform([*config.low, 0], [*config.high, 1], (points, 4))
+    cloud[:, :2] = config.low[:2] + share * (cloud[:, :2] - config.low[:2])
+    if config.cluster_ids:
+        cloud = np.column_stack([cloud, rng.integers(0, 60, points)])
+    maps = torch.from_numpy((rng.random((1, 3, *config.grid)) < drawn).astype(np.uint8))
+    for axis in 2, 3:
+        maps.swapaxes(2, axis)[:, :, int(share * maps.shape[axis]):] = 0
+    return (make_pillars([torch.from_numpy(cloud.astype(np.float32))], config),
+            maps if config.pseudo_map else None)
+
+
+def by_torch(network, pillars, maps):
+    """Features and logits (H * W, C) of all cells."""
+    features = network.features(pillars, maps)
+    return [x[0].flatten(1).T.numpy() for x in (features, network.head.scores(features))]
+
+
+def assert_equal(config, points, drawn, reach=None, seed=0, share=1.0):
+    network = strong(config, seed)
+    pillars, maps = inputs(config, points, drawn, seed, share)
+    with torch.inference_mode():
+        expected = by_torch(network, pillars, maps)
+        cells, features, logits = sparse.SparseNetwork(network).evaluate(pillars, maps, reach)
+    assert len(cells) == len(expected[0]) or reach is not None
+    values = features.at(cells)[:, :expected[0].shape[1]]
+    for found, wanted in (values, expected[0]), (logits, expected[1]):
+        np.testing.assert_allclose(found, wanted[cells], rtol=0, atol=TOLERANCE)
+    return expected[0]
+
+
+@pytest.mark.parametrize("version", ["v1", "v2", "v4"])
+@pytest.mark.parametrize(("points", "drawn"), [(0, 0.0), (1, 0.0), (5, 0.01), (20_000, 1.0)])
+def test_small_network_equals_torch(version, points, drawn):
+    assert_equal(tiny(version), points, drawn, seed=points)
+
+
+@pytest.mark.parametrize(("version", "size", "changes"), [
+    ("v1", "compact", WIDE), ("v2", "compact", WIDE), ("v4", "compact", WIDE),
+    ("v4", "compact", dict(low=(0.0, -14.08, -3.0), high=(25.6, 14.08, 1.0), cell=0.08)),
+    ("v4", "full", dict(low=(0.0, -5.12, -3.0), high=(10.24, 5.12, 1.0))),
+    ("v1", "full", dict(low=(-5.12, -5.12, -3.0), high=(5.12, 5.12, 1.0))),
+    ("v4", "compact", dict(WIDE, block_strides=(1, 2, 4))),
+    ("v4", "compact", dict(low=(0.0, -7.68, -3.0), high=(15.36, 7.68, 1.0),
+                           block_strides=(2, 3, 2), classes=("Car",))),
+    ("v4", "compact", dict(WIDE, block_strides=(2, 2), block_channels=(24, 40),
+                           block_layers=(0, 2), map_channels=(6,), pillar_channels=10)),
+])
+def test_shipped_sizes_equal_torch_also_at_the_border(version, size, changes):
+    config = network_config(version, size, **changes)
+    few = assert_equal(config, 12, 0.001, share=0.1)
+    none = assert_equal(config, 0, 0.0)
+    changed = np.abs(few - none).max(axis=1)
+    assert changed.max() > 0.05 and (size == "full" or changed.min() < 1e-6)
+
+
+def test_head_is_evaluated_near_points_only():
+    config = network_config("v4", "compact", **WIDE)
+    assert_equal(config, 10, 0.0, reach=sparse.REACH)
+    pillars, maps = inputs(config, 10, 0.0)
+    network = sparse.SparseNetwork(strong(config))
+    prediction = network(pillars, maps)
+    occupied = np.zeros(config.grid, bool)
+    occupied.ravel()[pillars.cells] = True
+    rows, columns = np.nonzero(shrunk(occupied, 2))
+    height, width = config.head_grid
+    away = np.maximum(np.abs(np.arange(height)[:, None, None] - rows),
+                      np.abs(np.arange(width)[:, None] - columns)).min(axis=2)
+    cells = np.flatnonzero(away <= 6)
+    per_cell = network.head.per_cell
+    np.testing.assert_array_equal(
+        prediction.anchors, (cells[:, None] * per_cell + np.arange(per_cell)).ravel())
+    assert prediction.logits.shape == (len(cells) * per_cell, 3)
+
+
+def test_boxes_equal_torch_at_any_anchors():
+    config = tiny("v4")
+    network, (pillars, maps) = strong(config), inputs(config, 30, 0.02)
+    with torch.inference_mode():
+        expected = TorchNetwork(lively(config))  # fused once more: the same weights
+        expected.network = network
+        wanted = expected(pillars, maps)
+        found = sparse.SparseNetwork(network)(pillars, maps)
+        chosen = torch.tensor([0, 5, 17, len(found.anchors) - 1])
+        for ours, theirs in zip(found.boxes_at(chosen), wanted.boxes_at(found.anchors[chosen])):
+            torch.testing.assert_close(ours, theirs, rtol=0, atol=TOLERANCE)
+
+
+def test_threads_and_earlier_clouds_change_nothing(monkeypatch):
+    monkeypatch.setattr(sparse, "MIN_PER_PART", 1000)
+    config = network_config("v4", "compact", **WIDE)
+    network = sparse.SparseNetwork(strong(config))
+    first, second = inputs(config, 50, 0.001), inputs(config, 3000, 0.05, seed=1)
+    alone = network(*first)
+    torch.set_num_threads(3)
+    kept = network(*second)
+    again = network(*first)
+    assert torch.equal(alone.logits, again.logits) and torch.equal(alone.anchors, again.anchors)
+    chosen = torch.arange(9)
+    assert all(map(torch.equal, alone.boxes_at(chosen), again.boxes_at(chosen)))
+    torch.set_num_threads(1)
+    assert torch.equal(kept.logits, network(*second).logits)
+
+
+def test_an_error_in_one_part_is_raised(monkeypatch):
+    def fail(begin, end):
+        if begin:
+            raise ZeroDivisionError
+
+    torch.set_num_threads(2)
+    with pytest.raises(ZeroDivisionError):
+        sparse._in_parts(fail, 100, sparse.MIN_PER_PART)
+
+
+@pytest.mark.parametrize("layer", ["pillar_net.linear.weight", "blocks.1.0.0.weight",
+                                   "neck.laterals.2.weight"])
+def test_weights_that_are_no_numbers_are_reported(layer):
+    config = tiny("v4")
+    network = lively(config)
+    network.get_parameter(layer).fill_(torch.nan)
+    detector = PointPillarsDetector(TorchNetwork(network, engine="sparse"), Header(config), CPU)
+    rng = np.random.default_rng(0)
+    cloud = rng.uniform([2, -3, -1, 0], [6, 3, 0, 1], (200, 4)).astype(np.float32)
+    found = detector(cloud, ground=np.zeros(200, bool), cluster_ids=np.zeros(200, int))
+    assert len(found.detections) == 0 and found.problem
+
+
+def test_networks_that_torch_must_run(monkeypatch):
+    for config, words in [(tiny("v0"), "ground"), (tiny("v3"), "ground"),
+                          (tiny("v1", fusion="concat"), "neck"),
+                          (tiny("v1", neck="deconv"), "neck"),
+                          (tiny("v1", max_points=4, zero_row=True), "rows of zeros")]:
+        network = lively(config)
+        assert words in sparse.unsupported(fused(network))
+        assert TorchNetwork(network, engine="auto").sparse is None
+        with pytest.raises(InputError, match=f"{words}.*; choose the engine auto or torch"):
+            TorchNetwork(network, engine="sparse")
+    network = lively(tiny("v4"))
+    assert TorchNetwork(network).sparse is None and TorchNetwork(network, engine="auto").sparse
+    with pytest.raises(InputError, match="16 bits"):
+        TorchNetwork(network, amp="bf16", engine="sparse")
+    monkeypatch.setattr(sparse_kernels, "LANES", 0)
+    assert "AVX2" in sparse.unsupported(fused(network))
+    assert TorchNetwork(network, engine="auto").sparse is None
+
+
+@pytest.mark.parametrize("weights", ["fused", "pointpillars"])
+def test_engine_is_a_parameter(weights):
+    quick = {f"{weights}.warm_up": False}
+    for engine, expected in ("auto", True), ("sparse", True), ("torch", False):
+        detector = open_detector(weights, "cpu", settings={**quick, f"{weights}.engine": engine})
+        proposer = detector.proposer if weights == "fused" else detector
+        assert (proposer.network.sparse is not None) == expected
+    with pytest.raises(InputError, match="engine"):
+        open_detector("pointpillars", "cpu", settings={
+            "pointpillars.warm_up": False, "pointpillars.engine": "sparse",
+            "pointpillars.version": "v0"})
+
+
+@pytest.fixture(scope="module")
+def both_engines():
+    return [open_detector("fused", "cpu", settings={"fused.engine": engine, "fused.warm_up": False})
+            for engine in ("torch", "sparse")]
+
+
+def assert_same_detections(detectors, frames):
+    total = 0
+    for frame in frames:
+        by_torch, by_sparse = (detector(frame).detections for detector in detectors)
+        assert np.array_equal(by_torch.class_ids, by_sparse.class_ids)
+        np.testing.assert_allclose(by_torch.boxes, by_sparse.boxes, rtol=0, atol=1e-4)
+        np.testing.assert_allclose(by_torch.scores, by_sparse.scores, rtol=0, atol=1e-5)
+        total += len(by_torch)
+    return total
+
+
+@pytest.mark.parametrize("range", ["ahead", "around"])
+def test_detections_of_a_simulated_street_equal_torch(range, both_engines, streets):
+    detectors = [detector.with_range(range) for detector in both_engines]
+    assert assert_same_detections(detectors, [scan_at(12, 0, HDL64E).frame]) > 5
+
+
+def test_detections_of_kitti_frames_equal_torch(data, both_engines):
+    frames = [frame.load() for frame in open_recording(data / "kitti_object").frames[:3]]
+    assert assert_same_detections(both_engines, frames) > 3
+
+
+@pytest.mark.parametrize("version", ["v1", "v2", "v4"])
+def test_detector_of_random_weights_equals_torch(version):
+    detector = random_detector(version)
+    detector.params = with_values(detector.params, {"pointpillars.nms.candidates": 5000})
+    other = PointPillarsDetector(TorchNetwork(lively(detector.config), engine="sparse"),
+                                 detector.header, CPU, detector.params)
+    rng = np.random.default_rng(3)
+    cloud = rng.uniform([0, -5, -1.5, 0], [10, 5, 0.5, 1], (4000, 4)).astype(np.float32)
+    columns = dict(ground=np.zeros(4000, bool), cluster_ids=rng.integers(0, 9, 4000))
+    found = detector(cloud, **columns)
+    assert len(found.detections) > 3
+    assert same(other(cloud, **columns), found, atol=TOLERANCE)
+
+
+def test_a_cloud_without_a_pillar_detects_nothing():
+    detector = random_detector("v4")
+    detector.network = TorchNetwork(lively(detector.config), engine="sparse")
+    broken = NetworkInput(np.full((10, 4), np.nan, np.float32),
+                          np.zeros((3, *detector.config.grid), np.uint8))
+    *_, detections, best, problem = detector._predict({False: broken})
+    assert len(detections) == 0 and best == {} and problem is None
+
+
+KERNEL = """
+import numpy as np
+from lidar_perception.detectors.pointpillars import sparse_kernels as kernels
+assert kernels.LANES == 8
+rng = np.random.default_rng(0)
+rows = rng.normal(size=(50, 12)).astype(np.float32)
+rows[0] = 0
+index = np.zeros((8, 9), np.int32)
+index[1:-1, 1:-1] = rng.integers(0, 50, (6, 7))
+weights = rng.normal(size=(2, 9, 12, kernels.BLOCK)).astype(np.float32)
+cells = np.flatnonzero(rng.random(42) < 0.7).astype(np.int32)
+sums = np.ones((len(cells), 2 * kernels.BLOCK), np.float32)
+kernels.convolve(index, rows, cells, 7, 1, weights, sums, np.float32(-2.0), 0, len(cells))
+for cell, found in zip(cells, sums):
+    y, x = divmod(cell, 7)
+    read = rows[index[y:y + 3, x:x + 3].ravel()]
+    wanted = 1 + np.einsum("tc,btco->bo", read.astype(float), weights).ravel()
+    np.testing.assert_allclose(found, np.maximum(wanted, -2), atol=1e-4)
+"""
+
+
+def test_kernel_of_avx2_on_a_wider_processor():
+    if sparse_kernels.LANES != 16:
+        pytest.skip("the other tests have run it")
+    features = "+sse,+sse2,+sse3,+ssse3,+sse4.1,+sse4.2,+popcnt,+avx,+avx2,+fma,+bmi,+bmi2,+lzcnt"
+    environment = {**os.environ, "NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": features}
+    subprocess.run([sys.executable, "-c", KERNEL], env=environment, check=True)
+
+
+def test_dilation_grows_along_both_axes():
+    mask = np.zeros((9, 7), bool)
+    mask[0, 6] = mask[5, 2] = True
+    wanted = np.zeros_like(mask)
+    wanted[:3, 4:] = wanted[3:8, :5] = True
+    np.testing.assert_array_equal(dilated(mask, 2), wanted)
