@@ -46,13 +46,15 @@ from lidar_perception.scoring.centres.matching import match_centres
 from lidar_perception.scoring.centres.tables import print_candidate_report
 from lidar_perception.scoring.recorded import Answered, answered
 from lidar_perception.tracking.ego import NO_SOURCE
-from lidar_perception.types import CLASSES, PEDESTRIAN, InputError
+from lidar_perception.types import CLASSES, PEDESTRIAN, InputError, class_ids
 from lidar_perception.wire.messages import column, to_detections, to_frame, to_truth
 from lidar_perception.wire.topics import POINTS
 from lidar_perception.wire.track_markers import drawn_trails
+from msg_utils.markers import from_marker_array
 from msg_utils.stamps import to_ns
 
 RECORD = "demo.json"                      # in a folder that demo has made, what it replayed
+BEHIND_M = 2.0                            # metres; found there, and the picture is all around
 REPLACED = ("drive", "result", "logs")    # by the next demo
 
 
@@ -127,7 +129,8 @@ def demo(data: Path | None, detector: str, out: Path, frames: int, drive_seed: i
     _print_pace(content, rate, clouds)
     content["tracks"] = _print_tracks(tracks, calibration, content["poses"])
     write_text(out / "scores.json", json.dumps(content, indent=1))
-    picture = _draw_best(out, cloud_topic(single, detector), _drawn(found, detector))
+    picture = _draw_best(out, cloud_topic(single, detector), _drawn(found, detector),
+                         next(iter(played)).sensor_height)
     console.print(f"results in {out}: result (bag), scores.json, logs"
                   + (", birdseye.png" if picture else ""))
     console.print(f"look at it: lidar-perception view {out / 'result'}")
@@ -224,32 +227,34 @@ def _print_tracks(frames: Sequence[Answered], calibration: Any, poses: str) -> d
     return {"found": result.count, "scores": result.scores}
 
 
-def _drawn(frames: Sequence[Answered], detector: str) -> dict[int, tuple[np.ndarray, np.ndarray]]:
-    """Stamp -> true and found boxes, of the classes that the detector can find."""
+def _drawn(frames: Sequence[Answered], detector: str) -> dict[int, tuple[np.ndarray, Any]]:
+    """Stamp -> boxes of labels and the found objects, of classes that the detector can find."""
     wanted = {CLASSES[PEDESTRIAN]} if detector == CANDIDATES else {*DETECTED}
-
-    def of(objects: Any) -> np.ndarray:
-        return objects.boxes[[label in wanted for label in objects.labels]]
-
-    return {f.stamp_ns: (of(f.truth), of(f.found)) for f in frames}
+    return {f.stamp_ns: (f.truth.boxes[[label in wanted for label in f.truth.labels]], f.found)
+            for f in frames}
 
 
-def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, np.ndarray]]) -> bool:
-    """Draw the recorded frame with most hits, and the ways of tracks; False if none has a label."""
+def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, Any]],
+               height: float) -> bool:
+    """Draw the recorded frame with most hits, with its tracks, where there are any; False if no
+    frame has a label."""
     from lidar_perception.nodes.replay import TRACKS
-    from lidar_perception.scoring.pictures import draw_frame
-    hits = {stamp: (len(match_centres(found, truth)[0]), len(truth))
+    from lidar_perception.rendering.colors import by_cluster
+    from lidar_perception.rendering.files import write_png
+    from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
+    hits = {stamp: (len(match_centres(found.boxes, truth)[0]), len(truth))
             for stamp, (truth, found) in frames.items() if len(truth)}
     if not hits:
         return False
     best = max(hits, key=lambda s: (hits[s], s))  # the last of them: its trails are longest
+    truth, found = frames[best]
     trails: dict[int, np.ndarray] = {}
     drawing = None
     with Bag(out / "result") as bag:
         for topic, _, msg in bag.messages({cloud, TRACKS} & set(bag.topics)):
             if topic == TRACKS:
                 if msg.markers and to_ns(msg.markers[0].header.stamp) == best:
-                    trails = drawn_trails(msg)
+                    found, trails = from_marker_array(msg), drawn_trails(msg)
             elif to_ns(msg.header.stamp) == best:
                 drawing = msg
     if drawing is None:
@@ -257,8 +262,13 @@ def _draw_best(out: Path, cloud: str, frames: dict[int, tuple[np.ndarray, np.nda
     frame, indices = to_frame(drawing)
     ground, ids = column(drawing, "ground", indices), column(drawing, "cluster_id", indices)
     none = np.zeros(len(frame), int)
-    draw_frame(out / "birdseye.png", frame.xyz, none > 0 if ground is None else ground > 0,
-               none if ids is None else renumbered(ids)[0], *frames[best], trails=trails,
-               title=f"{hits[best][0]} of {hits[best][1]} labelled objects found, stamp "
-               f"{best / 1e9:.1f} s")
+    colors = None if ground is None else by_cluster(
+        ground > 0, none if ids is None else renumbered(ids)[0])
+    boxes = Boxes(found.boxes, np.array(class_ids(found.labels), int),
+                  [str(i) if trails else "" for i in found.ids],
+                  [trails.get(int(i), found.boxes[k:k + 1, :3]) for k, i in enumerate(found.ids)])
+    stage = Stage.of(frame, height, not (found.boxes[:, 0] < -BEHIND_M).any())
+    write_png(out / "birdseye.png", draw_frame(
+        stage, frame, boxes, truth, f"{hits[best][0]} of {hits[best][1]} labelled objects found",
+        f"{best / 1e9:.1f} s", colors))
     return True

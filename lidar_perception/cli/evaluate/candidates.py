@@ -66,16 +66,22 @@ def _draw(png: Path, recording: Any, report: Any, params: PipelineParams) -> Non
     """The frame with most pedestrians of those that have candidates."""
     from lidar_perception.candidates.pipeline import find_candidates
     from lidar_perception.candidates.seeds import load_seed
+    from lidar_perception.rendering.colors import by_cluster
+    from lidar_perception.rendering.files import write_png
+    from lidar_perception.rendering.picture import Boxes, Stage, draw_frame
     from lidar_perception.scoring.centres.report import pedestrians_of, seed_source
-    from lidar_perception.scoring.pictures import draw_frame
+    from lidar_perception.types import LidarFrame
     best = report.with_most()
     if best is None:
         return
     template = None if params.seed.source == "ground_truth" else load_seed(params.seed.file)
     frame = next(frame for frame in recording if frame.name == best)
     truth = pedestrians_of(frame, params.view.enabled)
-    segmented, found = find_candidates(frame.load(), seed_source(truth, template, params),
-                                       frame.camera(), params)
-    draw_frame(png, segmented.xyz, segmented.ground, segmented.cluster_ids, truth,
-               found.final.boxes, title=f"frame {frame.name}")
+    scan = frame.load()
+    segmented, found = find_candidates(scan, seed_source(truth, template, params), frame.camera(),
+                                       params)
+    stage = Stage.of(scan, params.ground.sensor_pose.height, params.view.enabled)
+    write_png(png, draw_frame(
+        stage, LidarFrame(segmented.xyz), Boxes(found.final.boxes, found.final.class_ids), truth,
+        f"frame {frame.name}", colors=by_cluster(segmented.ground, segmented.cluster_ids)))
     console.print(f"picture: {png}")
