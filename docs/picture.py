@@ -1,147 +1,78 @@
-"""The pictures of the README and of look.md, on a simulated scan: python docs/picture.py"""
+"""The pictures of the README, look.md and detect.md, on simulated scans: python docs/picture.py"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from itertools import pairwise
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.collections import LineCollection, PolyCollection
+from PIL import Image
 
 from lidar_perception.candidates.params import PipelineParams
 from lidar_perception.candidates.pipeline import find_candidates
 from lidar_perception.candidates.seed_sources import fixed_seed
 from lidar_perception.candidates.seeds import load_seed
+from lidar_perception.cli.main import cli
 from lidar_perception.clustering.cluster import cluster
 from lidar_perception.detectors.open import open_detector
 from lidar_perception.detectors.pointpillars.params import DetectorParams
-from lidar_perception.geometry import box_corners, points_in_box
 from lidar_perception.ground.segment import segment_ground
+from lidar_perception.rendering.canvas import Canvas
+from lidar_perception.rendering.colors import BACKGROUND, by_cluster
+from lidar_perception.rendering.files import write_png
+from lidar_perception.rendering.picture import Boxes, Stage, draw_view, highlighted
+from lidar_perception.rendering.views import Perspective
 from lidar_perception.simulation.drive import scan_at
 from lidar_perception.simulation.scene import Scenes
 from lidar_perception.simulation.sensor import HDL64E
-from lidar_perception.types import CLASSES
-from msg_utils.markers import COLORS
-
-
-@dataclass(frozen=True)
-class View:
-    """A pinhole camera, in the frame of the points: metres, pixels, degrees from edge to edge."""
-
-    eye: tuple[float, float, float]
-    target: tuple[float, float, float]
-    fov: float
-    width: int
-    height: int
-    near: float = 0.3
-
-    @property
-    def focal(self) -> float:
-        """Pixels."""
-        return self.width / 2 / np.tan(np.radians(self.fov) / 2)
-
-    def project(self, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels (..., 2), column and row, and metres ahead of the eye (...) of points (..., 3)."""
-        ahead = np.subtract(self.target, self.eye)
-        ahead /= np.linalg.norm(ahead)
-        right = np.cross(ahead, [0.0, 0.0, 1.0])
-        right /= np.linalg.norm(right)
-        seen = (xyz - np.array(self.eye)) @ np.stack([right, np.cross(ahead, right), ahead]).T
-        depth = np.maximum(seen[..., 2], self.near)[..., None]
-        centre = [self.width / 2, self.height / 2]
-        return seen[..., :2] / depth * self.focal + centre, seen[..., 2]
-
+from lidar_perception.types import Detections
 
 FOLDER = Path(__file__).parent / "images"
 SEED, STREETS = 9, Scenes("zone", people=3.0)
-README = View(eye=(-9.0, -4.5, 5.2), target=(14.0, 1.6, -0.9), fov=58.0, width=1600, height=720)
-LOOK = View(eye=(-12.0, -6.0, 8.0), target=(12.0, 1.0, -1.2), fov=60.0, width=1600, height=800)
-POINT = 0.024  # a point's radius in metres
-
-EDGES = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4], [0, 4], [1, 5], [2, 6],
-         [3, 7]]
-FACES = [[0, 3, 7, 4], [1, 2, 6, 5], [0, 1, 5, 4], [2, 3, 7, 6], [4, 5, 6, 7]]  # the front first
-SKY, FLOOR = (0.035, 0.05, 0.085), (0.075, 0.095, 0.14)
-GROUND, REST = (0.36, 0.47, 0.62), (0.55, 0.60, 0.68)  # as config/lidar_perception.rviz has them
-# Neighbouring clusters differ; muted, so that boxes stand out.
-CLUSTERS = np.array([
-    [0.56, 0.47, 0.86], [0.33, 0.65, 0.62], [0.82, 0.56, 0.66], [0.50, 0.68, 0.38],
-    [0.38, 0.56, 0.85], [0.80, 0.65, 0.42], [0.68, 0.42, 0.68], [0.42, 0.70, 0.80],
-    [0.76, 0.50, 0.44], [0.58, 0.62, 0.46]])
-CLASS_COLORS = {"Car": (0.20, 0.80, 1.00), "Pedestrian": (1.00, 0.42, 0.32),
-                "Cyclist": (1.00, 0.82, 0.22)}
+FINER = 2  # drawn so many times larger, then made smaller: smooth points
+README = Perspective((-9.0, -4.5, 5.2), (14.0, 1.6, -0.9), 58.0, 1600 * FINER, 720 * FINER)
+LOOK = Perspective((-12.0, -6.0, 8.0), (12.0, 1.0, -1.2), 60.0, 1600 * FINER, 800 * FINER)
+DRIVE_FRAMES, DRIVE_SEED = 20, 4
 
 
-def draw(path: Path, view: View, xyz: np.ndarray, colors: np.ndarray, boxes: np.ndarray,
-         box_colors: np.ndarray, legend: dict[str, tuple] | None = None) -> None:
-    """Draw from far to near: the points behind a box, its faces, what is before it; edges last.
-    colors (N, 3) and box_colors (B, 3) are RGB in 0..1; legend is name -> colour."""
-    pixels, depth = view.project(xyz.astype(float))
-    order = np.argsort(-depth)
-    order = order[depth[order] > view.near]
+def draw(path: Path, view: Perspective, xyz: np.ndarray, colors: np.ndarray,
+         found: Detections) -> None:
+    """Draw a cloud with boxes, without texts."""
+    boxes = Boxes(found.boxes, found.class_ids)
+    canvas = Canvas(view.width, view.height, BACKGROUND)
+    draw_view(canvas, view, Stage(50.0, True, -1.73), xyz, highlighted(colors, xyz, boxes), boxes)
+    write_png(path, np.asarray(Image.fromarray(canvas.pixels).reduce(FINER)))
 
-    figure = plt.figure(figsize=(view.width / 100, view.height / 100), dpi=100)
-    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, view.width), ylim=(view.height, 0))
-    axes.axis("off")
-    axes.imshow(np.linspace(SKY, FLOOR, view.height)[:, None],
-                extent=(0, view.width, view.height, 0), aspect="auto")
 
-    def draw_points(rows: np.ndarray, layer: int) -> None:
-        radius = np.clip(POINT * view.focal / depth[rows], 0.6, 2.2)
-        axes.scatter(*pixels[rows].T, s=(2 * radius * 0.72) ** 2, linewidths=0, zorder=layer,
-                     c=np.column_stack([colors[rows], np.exp(-depth[rows] / 110)]))
-
-    ends, ahead = view.project(box_corners(boxes.astype(float)))
-    far_first = np.argsort(-ahead.mean(axis=1))
-    limits = [np.inf, *ahead.mean(axis=1)[far_first], view.near]
-    for layer, (far, near) in enumerate(pairwise(limits)):
-        draw_points(order[(depth[order] <= far) & (depth[order] > near)], 2 * layer)
-        if layer < len(boxes):
-            k = far_first[layer]
-            axes.add_collection(PolyCollection(
-                [ends[k][face] for face in FACES], zorder=2 * layer + 1,
-                facecolors=[(*box_colors[k], 0.07 if i else 0.38) for i in range(len(FACES))]))
-            axes.add_collection(LineCollection(ends[k][EDGES], colors=[box_colors[k]],
-                                               linewidths=1.1, zorder=2 * len(limits)))
-    for i, (name, color) in enumerate((legend or {}).items()):
-        figure.text(0.985, 0.955 - i * 0.05, name, ha="right", va="center", fontsize=15,
-                    color=color)
-    figure.savefig(path)
-    plt.close(figure)
+def draw_detect(path: Path) -> None:
+    """Draw the last frame of a simulated drive by `detect --track --png`."""
+    with tempfile.TemporaryDirectory() as folder:
+        drive, out = f"{folder}/drive", Path(folder) / "out"
+        for words in (["simulate", "--out", drive, "--frames", str(DRIVE_FRAMES), "--seed",
+                       str(DRIVE_SEED)],
+                      ["detect", drive, "--out", str(out), "--track", "--png"]):
+            with suppress(SystemExit):
+                cli(words, standalone_mode=False)
+        path.write_bytes(sorted((out / "png").rglob("*.png"))[-1].read_bytes())
 
 
 def make(folder: Path = FOLDER) -> None:
-    """Simulate the scan, run the package on it, write the pictures."""
+    """Simulate scans, run the package on them, write the pictures."""
     frame = scan_at(SEED, 0, HDL64E, STREETS).frame
     params = DetectorParams()
     found = open_detector("pointpillars")(frame).detections
     ground = segment_ground(frame, params.ground)
     cluster_ids = np.zeros(len(frame), np.int32)
     cluster_ids[~ground] = cluster(frame.xyz[~ground], params.clustering)
-    colors = np.where(ground[:, None], GROUND, REST)
-    clustered = (cluster_ids > 0) & ~ground
-    colors[clustered] = CLUSTERS[cluster_ids[clustered] * 7 % len(CLUSTERS)]
-    box_colors = np.array([CLASS_COLORS[CLASSES[i]] for i in found.class_ids])
-    for box, color in zip(found.boxes, box_colors):
-        colors[points_in_box(frame.xyz, box, 0.1) & ~ground] = 0.45 + 0.55 * color
-    draw(folder / "scene.png", README, frame.xyz, colors, found.boxes, box_colors, CLASS_COLORS)
+    draw(folder / "scene.png", README, frame.xyz, by_cluster(ground, cluster_ids), found)
 
-    # The displays that are on in the layouts: clusters by id, the ground, and detections in the
-    # colours of their markers.
-    template = load_seed(PipelineParams().seed.file)
-    segmented, candidates = find_candidates(frame, fixed_seed(template))
-    colors = plt.get_cmap("turbo")(segmented.cluster_ids / segmented.cluster_ids.max())[:, :3]
-    colors[segmented.ground] = GROUND
-    shown = [found, candidates.final]
-    draw(folder / "look.png", LOOK, segmented.xyz, colors,
-         np.concatenate([each.boxes for each in shown]),
-         np.array([COLORS[CLASSES[i]] for each in shown for i in each.class_ids]))
+    # The displays that are on in the layouts: clusters, the ground, detections and candidates.
+    segmented, candidates = find_candidates(frame, fixed_seed(load_seed(
+        PipelineParams().seed.file)))
+    draw(folder / "look.png", LOOK, segmented.xyz, by_cluster(
+        segmented.ground, segmented.cluster_ids), found.followed_by(candidates.final))
+    draw_detect(folder / "detect.png")
 
 
 if __name__ == "__main__":

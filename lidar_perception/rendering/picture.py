@@ -25,6 +25,7 @@ from lidar_perception.types import CLASSES, LidarFrame
 EDGES = np.array([[0, 1], [1, 2], [2, 3], [3, 0], [4, 5], [5, 6], [6, 7], [7, 4],
                   [0, 4], [1, 5], [2, 6], [3, 7]])  # of box_corners
 FRONT, FLOOR = [0, 3, 7, 4], [0, 1, 2, 3]  # corners of the face that looks ahead, and below
+OTHER_FACES = [[1, 2, 6, 5], [0, 1, 5, 4], [2, 3, 7, 6], [4, 5, 6, 7]]
 RING_POINTS = 180
 MIN_RANGE, MAX_RANGE_AHEAD, MAX_RANGE_AROUND = 6.0, 55.0, 45.0  # metres that a picture shows
 FOV = 60.0         # degrees, from left to right
@@ -108,16 +109,12 @@ def draw_frame(stage: Stage, scan: LidarFrame, found: Boxes, labels: np.ndarray 
     title and time: written at the top; colors (N, 3) uint8: of the points, instead of the
     stage's."""
     scale = colors is None
-    colors = stage.colors(scan) if colors is None else colors.copy()
-    rows, first = points_in_boxes(scan.xyz, found.boxes, 0.1)
-    for k, class_id in enumerate(found.class_ids):
-        inside = rows[first[k]:first[k + 1]]
-        colors[inside] = INSIDE * np.array(class_color(class_id)) + (1 - INSIDE) * 240
+    colors = highlighted(stage.colors(scan) if colors is None else colors, scan.xyz, found)
     whole = Canvas(stage.width, stage.height, BACKGROUND)
     column, texts = 0, _heading(stage, title, time)
     for view in stage.views:
         canvas = Canvas(view.width, view.height, BACKGROUND)
-        written = _draw(canvas, view, stage, scan.xyz, colors, found, labels)
+        written = draw_view(canvas, view, stage, scan.xyz, colors, found, labels)
         whole.paste(canvas, column, 0)
         texts += [text.moved(column) for text in written]
         column += view.width
@@ -127,9 +124,19 @@ def draw_frame(stage: Stage, scan: LidarFrame, found: Boxes, labels: np.ndarray 
     return whole.pixels
 
 
-def _draw(canvas: Canvas, view: View, stage: Stage, xyz: np.ndarray, colors: np.ndarray,
-          found: Boxes, labels: np.ndarray) -> list[Text]:
-    """Draw one view of a frame, and return its texts."""
+def highlighted(colors: np.ndarray, xyz: np.ndarray, found: Boxes) -> np.ndarray:
+    """Return the colours (N, 3) of points (N, 3), light ones of their class for those in boxes."""
+    colors = colors.copy()
+    rows, first = points_in_boxes(xyz, found.boxes, 0.1)
+    for k, class_id in enumerate(found.class_ids):
+        inside = rows[first[k]:first[k + 1]]
+        colors[inside] = INSIDE * np.array(class_color(class_id)) + (1 - INSIDE) * 240
+    return colors
+
+
+def draw_view(canvas: Canvas, view: View, stage: Stage, xyz: np.ndarray, colors: np.ndarray,
+              found: Boxes, labels: np.ndarray = NONE) -> list[Text]:
+    """Draw one view of a frame with points (N, 3) in colors (N, 3), and return its texts."""
     texts = _rings(canvas, view, stage)
     pixels, depth = view.project(xyz)
     ahead = np.flatnonzero(depth > NEAR)
@@ -139,10 +146,12 @@ def _draw(canvas: Canvas, view: View, stage: Stage, xyz: np.ndarray, colors: np.
     boxes = found.boxes.astype(float)
     _trails(canvas, view, found, tints)
     _edges(canvas, view, labels.astype(float), np.tile(LABEL, (len(labels), 1)), 1.2, dashed=True)
-    face = FLOOR if isinstance(view, BirdsEye) else FRONT
-    ends, far = view.project(box_corners(boxes)[:, face])
-    for corners, tint in zip(ends[(far > NEAR).all(axis=1)], tints[(far > NEAR).all(axis=1)]):
-        canvas.polygon(corners, tint, 0.25)
+    faces = [(FLOOR, 0.25)] if isinstance(view, BirdsEye) else [
+        *((face, 0.05) for face in OTHER_FACES), (FRONT, 0.3)]
+    ends, far = view.project(box_corners(boxes))
+    for k in np.flatnonzero((far > NEAR).all(axis=1)):
+        for face, alpha in faces:
+            canvas.polygon(ends[k, face], tints[k], alpha)
     _edges(canvas, view, boxes, tints, 1.7)
     _arrows(canvas, view, found, tints)
     return texts + _names(view, found)
@@ -167,7 +176,7 @@ def _sensor(canvas: Canvas, view: View, stage: Stage) -> None:
     size = 0.013 * stage.reach
     corners = np.array([[1.6, 0, 0], [-1, 1, 0], [-0.4, 0, 0], [-1, -1, 0]]) * size
     ends, depth = view.project(corners + [0, 0, stage.ground])
-    if (depth > NEAR).all():
+    if (depth > NEAR).all() and all(_inside(view, end) for end in ends):
         canvas.polygon(ends[[0, 1, 2]], TEXT, 0.9)
         canvas.polygon(ends[[0, 2, 3]], TEXT, 0.7)
 
