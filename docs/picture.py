@@ -30,7 +30,7 @@ from lidar_perception.types import Detections
 
 FOLDER = Path(__file__).parent / "images"
 SEED, STREETS = 9, Scenes("zone", people=3.0)
-FINER = 2  # drawn so many times larger, then made smaller: smooth points
+FINER = 2  # pictures are drawn at twice their size and reduced, so that points are smooth
 README = Perspective((-9.0, -4.5, 5.2), (14.0, 1.6, -0.9), 58.0, 1600 * FINER, 720 * FINER)
 LOOK = Perspective((-12.0, -6.0, 8.0), (12.0, 1.0, -1.2), 60.0, 1600 * FINER, 800 * FINER)
 DRIVE_FRAMES, DRIVE_SEED = 20, 4
