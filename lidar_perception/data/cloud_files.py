@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from lidar_perception.data.pcd import read_pcd
 from lidar_perception.data.ply import read_ply
 from lidar_perception.data.recorded_scale import recorded_scale
 from lidar_perception.data.records import read_records
-from lidar_perception.runs.files import regular
+from lidar_perception.runs.files import regular, short
 from lidar_perception.types import MAX_RANGE, InputError, LidarFrame
 from lidar_perception.wire.codec import bag_message
 from lidar_perception.wire.messages import raw_intensity, to_frame
@@ -114,9 +115,10 @@ def read_npy(file: Path) -> np.ndarray:
     """
     try:
         array = np.array(np.load(regular(file), mmap_mode="r", allow_pickle=False))
-    except (OSError, ValueError, EOFError, TypeError) as error:
-        raise InputError(f"{file} is no .npy file that can be read ({error}); save it again with "
-                         "numpy.save") from None
+    except (OSError, ValueError, EOFError, TypeError, LookupError, OverflowError, MemoryError,
+            SyntaxError, TokenError, RecursionError) as error:  # the header is read as Python
+        raise InputError(f"{file} is no .npy file that can be read ({short(error)}); save it again "
+                         "with numpy.save") from None
     if array.dtype.names:
         return array.reshape(-1)
     if array.ndim != 2 or not 3 <= array.shape[1] <= MAX_COLUMNS or array.dtype.kind != "f":

@@ -142,7 +142,10 @@ def test_npy_files_are_clouds(tmp_path, array, intensity):
 @pytest.mark.parametrize("make", [
     lambda p: np.save(p, CLOUD.T), lambda p: np.save(p, CLOUD.astype(np.int32)),
     lambda p: np.save(p, np.array([{}]), allow_pickle=True), lambda p: write(p, b"\x93NUMPY"),
-    lambda p: np.save(p, np.zeros((5, 2), np.float32)), lambda p: write(p, b"")])
+    lambda p: np.save(p, np.zeros((5, 2), np.float32)), lambda p: write(p, b""),
+    lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(60,(60,"))),
+    lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(9**99,"))),
+    lambda p: (np.save(p, CLOUD), write(p, p.read_bytes().replace(b"(60, 4)", b"(60, 5)")))])
 def test_a_broken_npy_file_is_named(tmp_path, make):
     make(tmp_path / "one.npy")
     with pytest.raises(InputError, match=r"one\.npy .*(save it again|expected \(N, 3\))") as error:

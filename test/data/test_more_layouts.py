@@ -112,6 +112,7 @@ def test_kitti360_has_poses_of_the_lidar_and_a_camera(tmp_path, poses):
         np.testing.assert_allclose(frame.pose(), world(frame.index), atol=1e-6)
         np.testing.assert_allclose(frame.calibration().lidar_to_camera, LIDAR_TO_CAMERA, atol=1e-9)
         assert (frame.calibration().width, frame.calibration().height) == (1408, 376)
+        assert type(frame.calibration().width) is int  # as JSON takes it
     write(root / f"data_poses/{NAME}/{poses}", "0 1 2 3\n")
     with pytest.raises(InputError, match=rf"{poses} has a line that is not 1\d finite numbers"):
         open_recording(root).frames[0].pose()
@@ -158,3 +159,14 @@ def test_a_broken_line_of_openpcdet_is_named(tmp_path, line):
     with pytest.raises(InputError, match=r"000000\.txt:2 is not 'x y z dx dy dz heading class'"):
         open_recording(root).frames[0].truth()
     assert BOXES in open_recording(root).has
+
+
+@pytest.mark.parametrize("file, content, words", [
+    ("dataset/poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 nan\n", "cannot read pose 0"),
+    ("dataset/sequences/00/calib.txt", "P2: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 1 0 0 0 1 0 0 0 1 0 0 0\n",
+     "is no rotation")])
+def test_poses_that_are_none_are_named(tmp_path, file, content, words):
+    write(odometry_folder(tmp_path) / file, content)
+    with pytest.raises(InputError, match=words) as error:
+        open_recording(tmp_path).frames[0].pose()
+    assert str(tmp_path / file) in str(error.value)

@@ -48,6 +48,7 @@ def test_what_lies_there_is_recognised_said_and_read(tmp_path, monkeypatch, kind
             assert len(frame.load()) and np.array_equal(frame.load().xyz, same.load().xyz)
             assert frame.load().stamp_ns == frame.stamp_ns
             assert (frame.camera() is not None) == (CAMERA in has)
+            assert type(frame.calibration().width) is int if CAMERA in has else True
             assert (frame.pose() is not None) == (POSES in has)
             assert (frame.point_truth() is not None) == (POINT_LABELS in has)
             assert bool(frame.files) == (BOXES in has)

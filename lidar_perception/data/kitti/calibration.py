@@ -39,7 +39,7 @@ def read_odometry_calibration(path: Path, image: Path | None = None) -> Calibrat
     values = matrices(path)
     intrinsics = matrix(values, path, "P2", (3, 4))
     size = _png_size(image) or _size_by_focal_length(intrinsics)
-    return Calibration(intrinsics, _pose(path, np.eye(3), matrix(values, path, "Tr", (3, 4))),
+    return Calibration(intrinsics, rigid(homogeneous(matrix(values, path, "Tr", (3, 4))), path),
                        *size)
 
 
@@ -48,7 +48,7 @@ def read_raw_calibration(day: Path) -> Calibration:
     cameras, lidar = (day / name for name in RAW_CALIB)
     values, pose = matrices(cameras), matrices(lidar)
     velodyne = np.column_stack([matrix(pose, lidar, "R", (3, 3)), matrix(pose, lidar, "T", (3,))])
-    width, height = matrix(values, cameras, "S_rect_02", (2,)).astype(int)
+    width, height = matrix(values, cameras, "S_rect_02", (2,)).astype(int).tolist()
     rectify = matrix(values, cameras, "R_rect_00", (3, 3))
     return Calibration(matrix(values, cameras, "P_rect_02", (3, 4)),
                             _pose(day, rectify, velodyne), width, height)
@@ -79,12 +79,16 @@ def matrix(values: dict, path: Path, name: str, shape: tuple[int, ...],
 
 def _pose(path: Path, rectify: np.ndarray, velodyne: np.ndarray) -> np.ndarray:
     """(4, 4) LiDAR into the rectified camera frame."""
-    pose = homogeneous(rectify) @ homogeneous(velodyne)
+    return rigid(homogeneous(rectify) @ homogeneous(velodyne), path)
+
+
+def rigid(pose: np.ndarray, path: Path) -> np.ndarray:
+    """Return a pose (4, 4) that a file gives. InputError, naming the file, if it is no rotation and
+    translation."""
     turn = pose[:3, :3]
     if not (np.isfinite(pose).all() and np.allclose(turn @ turn.T, np.eye(3), atol=MAX_SKEW)
             and np.linalg.det(turn) > 0):
-        raise InputError(f"the pose of the LiDAR in {path} is no rotation; download KITTI's "
-                         "calibration again")
+        raise InputError(f"the pose of the LiDAR in {path} is no rotation; download it again")
     return pose
 
 

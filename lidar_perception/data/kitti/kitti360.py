@@ -16,7 +16,7 @@ import numpy as np
 from lidar_perception.camera import Calibration
 from lidar_perception.data.frame import CAMERA, POSES, Recording, nothing
 from lidar_perception.data.kitti import raw
-from lidar_perception.data.kitti.calibration import homogeneous, matrices, matrix
+from lidar_perception.data.kitti.calibration import homogeneous, matrices, matrix, rigid
 from lidar_perception.runs.files import read_text
 from lidar_perception.types import InputError
 
@@ -61,7 +61,7 @@ def _calibration(root: Path) -> Calibration:
     """The calibration of the rectified left camera."""
     path = root / CALIBRATION / "perspective.txt"
     values = matrices(path)
-    width, height = matrix(values, path, "S_rect_00", (2,)).astype(int)
+    width, height = matrix(values, path, "S_rect_00", (2,)).astype(int).tolist()
     return Calibration(matrix(values, path, "P_rect_00", (3, 4)),
                        _rectify(root) @ np.linalg.inv(_camera_to_lidar(root)), width, height)
 
@@ -69,13 +69,13 @@ def _calibration(root: Path) -> Calibration:
 def _rectify(root: Path) -> np.ndarray:
     """(4, 4) from the left camera to the rectified one."""
     path = root / CALIBRATION / "perspective.txt"
-    return homogeneous(matrix(matrices(path), path, "R_rect_00", (3, 3)))
+    return rigid(homogeneous(matrix(matrices(path), path, "R_rect_00", (3, 3))), path)
 
 
 def _camera_to_lidar(root: Path) -> np.ndarray:
     """(4, 4) from the left camera to the LiDAR."""
     path = root / CALIBRATION / "calib_cam_to_velo.txt"
-    return homogeneous(_rows(path, 12)[0].reshape(3, 4))
+    return rigid(homogeneous(_rows(path, 12)[0].reshape(3, 4)), path)
 
 
 def _pose_file(root: Path, drive: str) -> Path | None:

@@ -15,6 +15,7 @@ from lidar_perception.data.kitti.calibration import (
     matrices,
     matrix,
     read_odometry_calibration,
+    rigid,
 )
 from lidar_perception.data.kitti.folder import (
     GAP_NS,
@@ -127,7 +128,7 @@ def _poses(sequence: Path) -> tuple[np.ndarray, Path, list[str]] | None:
         return None
     calibration = sequence / CALIBRATION
     to_camera = homogeneous(matrix(matrices(calibration), calibration, "Tr", (3, 4)))
-    return to_camera, poses, read_text(poses, what="the poses").splitlines()
+    return rigid(to_camera, calibration), poses, read_text(poses, what="the poses").splitlines()
 
 
 def _pose(poses: Callable[[], tuple[np.ndarray, Path, list[str]] | None],
@@ -139,6 +140,8 @@ def _pose(poses: Callable[[], tuple[np.ndarray, Path, list[str]] | None],
     to_camera, path, lines = read
     try:
         moved = np.array(lines[i].split(), float).reshape(3, 4)
+        if not np.isfinite(moved).all():
+            raise ValueError("a number is not finite")
     except (ValueError, IndexError) as error:
         raise InputError(f"cannot read pose {i} of {path} ({error}); download it again") from None
     return np.linalg.inv(to_camera) @ homogeneous(moved) @ to_camera
