@@ -64,8 +64,7 @@ def test_times_that_are_missing_or_wrong_are_named(tmp_path, text, words):
 # KITTI-360
 
 NAME = "2013_05_28_drive_0000_sync"
-CAM_TO_POSE = np.array([[0.04, -0.11, 0.99, 1.57], [0.99, 0.01, -0.04, 0.04],
-                        [-0.01, 0.99, 0.11, 0.9]])
+CAM_TO_POSE = np.column_stack([RECTIFY @ [[0, 0, 1], [1, 0, 0], [0, 1, 0]], [1.57, 0.04, 0.9]])
 
 
 def world(i):
@@ -162,7 +161,8 @@ def test_a_broken_line_of_openpcdet_is_named(tmp_path, line):
 
 
 @pytest.mark.parametrize("file, content, words", [
-    ("dataset/poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 nan\n", "cannot read pose 0"),
+    ("dataset/poses/00.txt", "1 0 0 0 0 1 0 0 0 0 1 nan\n", "is no rotation"),
+    ("dataset/poses/00.txt", "1 9 0 0 0 1 0 0 0 0 1 0\n", "is no rotation"),
     ("dataset/sequences/00/calib.txt", "P2: 1 0 0 0 0 1 0 0 0 0 1 0\nTr: 1 0 0 0 1 0 0 0 1 0 0 0\n",
      "is no rotation")])
 def test_poses_that_are_none_are_named(tmp_path, file, content, words):

@@ -32,7 +32,8 @@ COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
     "tracking": (2, [("convert", "tracking", "--out", "made", "--force")]),
     "semantickitti": (3, [("evaluate", "segmentation", "--data", "semantickitti")]),
     "nuscenes": (3, [("convert", "nuscenes", "--out", "made", "--force")]),
-    "pcd": (1, [("convert", "pcd", "--out", "made", "--force")]),
+    **{name: (1, [("convert", name, "--out", "made", "--force")]) for name in (
+        "pcd", "ply", "npy", "openpcdet", "odometry", "raw")},
     **{format: (1, [("convert", place, "--data", "bag/drive", "--to", "kitti_tracking",
                      "--out", "made", "--force")]) for format, place in LABELS.items()},
     "results": (2, [("evaluate", "detection", *KITTI, "--results", "results")]),
@@ -45,7 +46,7 @@ COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
     "fused": (1, [("evaluate", "detection", *KITTI, "--limit", "1", "--weights", "{}")]),
     "pth": (1, [("import-weights", "{}", "--out", "made.safetensors")]),
 }
-TEXT = (".txt", ".json", ".yaml", ".pcd")
+TEXT = (".txt", ".json", ".yaml", ".pcd", ".xml")
 INSTEAD: dict[str, Callable[[Path], object]] = {
     "nothing": lambda path: None, "an empty file": Path.touch, "a folder": Path.mkdir,
     "a pipe": os.mkfifo, "a link to itself": lambda path: path.symlink_to(path.name),

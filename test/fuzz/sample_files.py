@@ -65,6 +65,7 @@ def write_samples(root: Path) -> None:
         "VERSION 0.7", "FIELDS x y z intensity", "SIZE 4 4 4 4", "TYPE F F F F", "COUNT 1 1 1 1",
         "WIDTH 20", "HEIGHT 1", "POINTS 20", "DATA ascii",
         *(" ".join(map(str, point)) for point in scan(0)[:20].tolist())]))
+    _write_foreign(root)
     (root / "ros1").mkdir()
     as_ros1(root / "bag/drive", root / "ros1/drive.bag", "lz4")
     nuscenes_folder.save(root / "nuscenes", nuscenes_folder.made_tables(
@@ -87,6 +88,32 @@ def write_samples(root: Path) -> None:
             package / f"detectors/{name.partition('_')[0]}/weights/{name}.safetensors"
         ).read_bytes())
     write_bytes(root / "pth/weights.pth", _pth())
+
+
+def _write_foreign(root: Path) -> None:
+    """Write clouds and labels in the layouts of other tools."""
+    cloud = scan(0)[:200]
+    for folder in ("npy", "openpcdet/points", "ply"):
+        (root / folder).mkdir(parents=True)
+    np.save(root / "npy/0.npy", cloud)
+    np.save(root / "openpcdet/points/0.npy", cloud)
+    write_text(root / "openpcdet/labels/0.txt", "14 5 -0.9 4.2 1.7 1.5 0.3 Vehicle")
+    write_bytes(root / "ply/0.ply", (
+        f"ply\nformat binary_big_endian 1.0\nelement vertex {len(cloud)}\nproperty float x\n"
+        "property float y\nproperty float z\nproperty float intensity\nend_header\n"
+    ).encode() + cloud.astype(">f4").tobytes())
+    sequence = root / "odometry/dataset/sequences/00"
+    kitti.write_velodyne(sequence / "velodyne/000000.bin", cloud)
+    write_text(sequence / "calib.txt", calibration_text(FORWARD_CAMERA))
+    write_text(sequence / "times.txt", "0.0")
+    write_text(root / "odometry/dataset/poses/00.txt", pose_line(np.eye(4), FORWARD_CAMERA))
+    kitti.write_velodyne(root / "raw/velodyne_points/data/0000000000.bin", cloud)
+    write_text(root / "raw/velodyne_points/timestamps.txt", "2011-09-26 13:02:25.594360375")
+    write_text(root / "raw/frame_list.txt", "0 0000000000")
+    write_text(root / "raw/tracklet_labels.xml", (
+        "<boost_serialization><tracklets><item><objectType>car</objectType><h>1.5</h><w>1.7</w>"
+        "<l>4.2</l><first_frame>0</first_frame><poses><item><tx>14</tx><ty>5</ty><tz>-1.7</tz>"
+        "<rz>0.3</rz></item></poses></item></tracklets></boost_serialization>"))
 
 
 def _yaml(values: dict[str, Any]) -> str:

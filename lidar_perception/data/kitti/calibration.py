@@ -88,7 +88,7 @@ def rigid(pose: np.ndarray, path: Path) -> np.ndarray:
     turn = pose[:3, :3]
     if not (np.isfinite(pose).all() and np.allclose(turn @ turn.T, np.eye(3), atol=MAX_SKEW)
             and np.linalg.det(turn) > 0):
-        raise InputError(f"the pose of the LiDAR in {path} is no rotation; download it again")
+        raise InputError(f"a pose in {path} is no rotation; download it again")
     return pose
 
 

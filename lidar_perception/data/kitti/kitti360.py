@@ -90,11 +90,11 @@ def _poses(root: Path, drive: str) -> dict[int, np.ndarray]:
         return {}
     to_camera = np.linalg.inv(_camera_to_lidar(root))
     if path.name == POSE_FILES[0]:  # of the rectified camera
-        return {int(row[0]): row[1:].reshape(4, 4) @ _rectify(root) @ to_camera
+        return {int(row[0]): rigid(row[1:].reshape(4, 4), path) @ _rectify(root) @ to_camera
                 for row in _rows(path, 17)}
     mount = root / CALIBRATION / "calib_cam_to_pose.txt"
-    to_vehicle = homogeneous(matrix(matrices(mount), mount, "image_00", (3, 4)))
-    return {int(row[0]): homogeneous(row[1:].reshape(3, 4)) @ to_vehicle @ to_camera
+    to_vehicle = rigid(homogeneous(matrix(matrices(mount), mount, "image_00", (3, 4))), mount)
+    return {int(row[0]): rigid(homogeneous(row[1:].reshape(3, 4)), path) @ to_vehicle @ to_camera
             for row in _rows(path, 13)}
 
 

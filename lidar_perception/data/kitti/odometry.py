@@ -140,8 +140,6 @@ def _pose(poses: Callable[[], tuple[np.ndarray, Path, list[str]] | None],
     to_camera, path, lines = read
     try:
         moved = np.array(lines[i].split(), float).reshape(3, 4)
-        if not np.isfinite(moved).all():
-            raise ValueError("a number is not finite")
     except (ValueError, IndexError) as error:
         raise InputError(f"cannot read pose {i} of {path} ({error}); download it again") from None
-    return np.linalg.inv(to_camera) @ homogeneous(moved) @ to_camera
+    return np.linalg.inv(to_camera) @ rigid(homogeneous(moved), path) @ to_camera
