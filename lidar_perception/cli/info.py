@@ -48,7 +48,10 @@ def _bag(path: Path) -> dict[str, Any]:
                             "qos": next((f"{qos.reliability.name.lower()}, "
                                          f"{qos.durability.name.lower()}"
                                          for qos in bag.qos(topic)), None)}
-                           for topic, kind in sorted(bag.topics.items())]}
+                           for topic, kind in sorted(bag.topics.items())],
+                "unreadable": [{"topic": name, "type": topic.type, "encoding": topic.encoding,
+                                "messages": topic.messages}
+                               for name, topic in sorted(bag.unreadable.items())]}
 
 
 def _print_bag(content: dict[str, Any]) -> None:
@@ -58,6 +61,9 @@ def _print_bag(content: dict[str, Any]) -> None:
                          overflow="fold")
     for row in content["topics"]:
         table.add_row(row["topic"], row["type"], str(row["messages"]), row["qos"])
+    for row in content["unreadable"]:
+        table.add_row(row["topic"], f"{row['type']} as {row['encoding']}, not read",
+                      str(row["messages"]), "")
     console.print(table)
 
 

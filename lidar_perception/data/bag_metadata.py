@@ -28,7 +28,8 @@ class Metadata:
 
     files: names of the storage files. topics: name -> (type, number of messages). qos: offered
     profiles of topics, as text or parsed. start_ns, duration_ns: None if it does not say them.
-    problems: one sentence per error in it.
+    compression: format of compressed files or messages, "" without. problems: one sentence per
+    error in it.
     """
 
     files: list[str] = field(default_factory=list)
@@ -36,6 +37,7 @@ class Metadata:
     qos: dict[str, Any] = field(default_factory=dict)
     start_ns: int | None = None
     duration_ns: int | None = None
+    compression: str = ""
     problems: list[str] = field(default_factory=list)
 
 
@@ -49,6 +51,8 @@ def read_metadata(folder: Path) -> Metadata:
         content = yaml.load(read_text(path, MAX_BYTES), _Loader)
         info = content["rosbag2_bagfile_information"]
         metadata.files = [PurePath(name).name for name in info["relative_file_paths"]]
+        if str(info.get("compression_mode") or "none").lower() != "none":
+            metadata.compression = str(info.get("compression_format") or "")
         metadata.start_ns = _number(info, "starting_time", "nanoseconds_since_epoch")
         metadata.duration_ns = _number(info, "duration", "nanoseconds")
         for topic in info["topics_with_message_count"] or ():

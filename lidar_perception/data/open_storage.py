@@ -48,6 +48,9 @@ def find_files(path: Path, metadata: Metadata) -> list[Path]:
         raise InputError(f"there is no bag {path}")
     if not path.is_dir():
         return [regular(path)]
+    if metadata.compression not in ("", "zstd"):
+        raise InputError(f"{path} is compressed by {metadata.compression}, which is not read; "
+                         "decompress it with 'ros2 bag convert'")
     for file in path.iterdir():
         regular(file)
     found = storage_files(path)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ import click
 import pytest
 from cli_samples import error_line, exit_of
 from click.testing import CliRunner
+from mcap.writer import Writer
 from samples import LABELS, WALKER, lowered_crowd, object_folder, walker_label, write
 
 from lidar_perception.candidates.configurations import PAPER
@@ -198,6 +200,30 @@ def test_info_as_json_has_what_the_table_has(bag, kitti):
     folder = json.loads(run("info", kitti, "--json"))
     assert (folder["frames"], folder["layout"]) == (2, "KITTI object data")
     assert folder["first_cloud"]["labels"] == ["Pedestrian"]
+
+
+def test_what_is_wrong_in_a_bag_is_said_in_one_line_and_the_command_goes_on(bag, tmp_path):
+    shutil.copytree(bag, tmp_path / "bag")
+    text = (bag / "metadata.yaml").read_text().replace("message_count: 2", "message_count: 9")
+    (tmp_path / "bag/metadata.yaml").write_text(text)
+    for command in (["info", tmp_path / "bag"],
+                    ["convert", tmp_path / "bag", "--out", tmp_path / "out"]):
+        result = CliRunner().invoke(cli, [*map(str, command)], catch_exceptions=False)
+        assert result.exit_code == 0
+        warned, = [line for line in result.stderr.splitlines() if "warning" in line]
+        assert warned.startswith(f"warning: {tmp_path}/bag/metadata.yaml is wrong: it says 9")
+
+
+def test_info_lists_topics_that_are_not_read(tmp_path):
+    with open(tmp_path / "a.mcap", "wb") as stream:
+        writer = Writer(stream)
+        writer.start(profile="ros2")
+        for name, encoding in (("Log", "protobuf"), ("Text", "cdr")):
+            writer.register_channel(f"/{name}", encoding, writer.register_schema(name, "", b""))
+        writer.finish()
+    assert "Log as protobuf, not read" in run("info", tmp_path / "a.mcap")
+    content = json.loads(run("info", tmp_path / "a.mcap", "--json"))
+    assert [row["topic"] for row in content["unreadable"]] == ["/Log"]
 
 
 def test_info_describes_a_recording_that_is_no_bag(kitti):

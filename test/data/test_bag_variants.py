@@ -300,6 +300,13 @@ def test_a_wrong_metadata_is_said_once_and_the_files_are_read(written, rows, tmp
         assert [*bag.raw()] == rows
 
 
+def test_a_bag_that_another_plugin_compressed_is_named(written, tmp_path):
+    path = changed(written, tmp_path / "bag", lambda info: info.update(
+        compression_mode="FILE", compression_format="lz4"))
+    with pytest.raises(InputError, match=r"compressed by lz4, which is not read; .*ros2 bag"):
+        Bag(path)
+
+
 @pytest.mark.parametrize("text", ["text", "a: [\n", "", "\xff\x00"])
 def test_a_metadata_that_is_none_is_said(written, rows, tmp_path, text):
     shutil.copytree(written, tmp_path / "bag")

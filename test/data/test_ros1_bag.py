@@ -79,3 +79,14 @@ def test_a_damaged_one_is_named_in_one_line(drive_bag, tmp_path):
         with pytest.raises(InputError, match="truncated or damaged") as error:
             [frame.load() for frame in open_recording(path)]
         assert "\n" not in str(error.value) and path.name in str(error.value)
+
+
+def test_a_bag_of_sensor_packets_names_the_driver_that_makes_clouds_of_them(tmp_path):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    kind = "velodyne_msgs/msg/VelodyneScan"
+    store.register(get_types_from_msg("uint8[] packets", kind))
+    with Writer(tmp_path / "packets.bag") as bag:
+        connection = bag.add_connection("/velodyne_packets", kind, typestore=store)
+        bag.write(connection, 5, bytes(4))
+    with pytest.raises(InputError, match=r"VelodyneScan on /velodyne_packets .*velodyne_"):
+        open_recording(tmp_path / "packets.bag")

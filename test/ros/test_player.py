@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import yaml
 from bag_samples import as_ros1
 from cloud_samples import compressed_message, livox_message, livox_points
 
@@ -138,6 +139,21 @@ def test_livox_and_compressed_clouds_are_played_as_point_clouds(start, tmp_path)
                                                                                               True]
     assert [len(to_array(cloud)) for cloud in sent["zlib"]] == [3]
     assert (sent["draco"], texts(sent["text"]), player.counts["left_out"]) == ([], ["text"], 2)
+
+
+def test_a_wrong_metadata_is_a_warning_and_the_bag_is_played(start, text_bag, tmp_path, capfd):
+    from lidar_perception.nodes.bag_player import BagPlayer
+    shutil.copytree(text_bag, tmp_path / "bag")
+    metadata = yaml.safe_load((text_bag / "metadata.yaml").read_text())
+    metadata["rosbag2_bagfile_information"].update(
+        starting_time={"nanoseconds_since_epoch": START + 10 * STEP}, duration={"nanoseconds": 5},
+        storage_identifier="")
+    (tmp_path / "bag/metadata.yaml").write_text(yaml.safe_dump(metadata))
+    player = start(BagPlayer, bag=str(tmp_path / "bag"), rate=100.0)
+    player.serve = lambda timeout_sec: None
+    player._play_once()
+    assert len(player.sent["text"]) == 20
+    assert capfd.readouterr().err.count("metadata.yaml is wrong: it says a start of") == 1
 
 
 def test_a_topic_of_several_publishers_is_offered_as_the_best_of_them_did():
