@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import click
@@ -18,8 +18,8 @@ class Choice(click.ParamType):
 
     name = "choice"
 
-    def __init__(self, choices: Iterable[str], aliases: Mapping[str, str] = {}):
-        self.choices, self.aliases = tuple(choices), aliases
+    def __init__(self, choices: Collection[str], aliases: Mapping[str, str] = {}):
+        self.choices, self.aliases = choices, aliases
 
     def convert(self, value: Any, param: Any, ctx: Any) -> str:
         known = {_plain(alias): name for alias, name in self.aliases.items()}

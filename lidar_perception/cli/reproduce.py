@@ -90,7 +90,10 @@ def reproduce(words: tuple[str, ...], study: str | None, data: Path | None,
 def _experiment_and_data(words: tuple[str, ...], data: Path | None) -> tuple[str, Path]:
     """The arguments, of which the experiment may be left out. UsageError where DATA is missing, or
     something is given twice."""
-    named = words[0] if words and (words[0] in EXPERIMENTS or len(words) > 1) else None
+    first = words[0] if words else ""
+    is_experiment = first in EXPERIMENTS or len(words) > 1 or (
+        first and data is not None and not Path(first).exists())
+    named = first if is_experiment else None
     rest = words[named is not None:]
     experiment = Choice(EXPERIMENTS).convert(named or next(iter(EXPERIMENTS)), None, None)
     if len(rest) + (data is not None) > 1:

@@ -71,7 +71,7 @@ def test_a_study_runs_by_its_name(few, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("arguments, words", [
-    (["--study", "luck"], "'luck' is no study"), (["other"], "'other'"), (["--jobs", "0"], "0 is"),
+    (["--study", "luck"], "'luck' is unknown"), (["other"], "'other'"), (["--jobs", "0"], "0 is"),
     (["--limit", "0"], "0 is"), (["--jobs", "2", "--dask", "a:1"], "give one of them")])
 def test_what_cannot_be_asked_for_is_named(tmp_path, arguments, words):
     result = CliRunner().invoke(cli, ["reproduce", "--data", str(tmp_path), "--out",
