@@ -20,7 +20,7 @@ from lidar_perception.classes import TABLE
 from lidar_perception.data.frame import Frame, Recording
 from lidar_perception.param_fields import with_values
 from lidar_perception.tracking.ego import usable
-from lidar_perception.types import InputError, LidarFrame
+from lidar_perception.types import InputError, LidarFrame, did_you_mean
 from lidar_studio.interpolation import Motion
 from lidar_studio.journal import header
 
@@ -170,11 +170,25 @@ def one_drive(recording: Recording, sequence: str | None = None) -> Drive:
         raise InputError(f"{recording.path} has {len(names)} drives; name one with --sequence: "
                          f"{listed}")
     if sequence is not None and sequence not in names:
-        raise InputError(f"{recording.path} has no drive {sequence}; it has {listed}")
+        raise InputError(f"{recording.path} has no drive {sequence}; it has {listed}"
+                         + did_you_mean(sequence, names))
     chosen = names[0] if sequence is None else sequence
     frames = [frame for frame in every if frame.sequence == chosen]
     path = Path(recording.path).absolute()
     return Drive("_".join(filter(None, (path.name, chosen))), replace(recording, frames=frames))
+
+
+def require_clouds(drive: Drive) -> None:
+    """Raise the InputError of the first frame if neither its cloud nor the middle or last one can
+    be read."""
+    problems: list[InputError] = []
+    for i in sorted({0, len(drive.frames) // 2, len(drive.frames) - 1}):
+        try:
+            drive.frames[i].load()
+            return
+        except InputError as error:
+            problems.append(error)
+    raise problems[0]
 
 
 def classes() -> list[dict[str, Any]]:

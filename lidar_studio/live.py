@@ -273,7 +273,8 @@ class Live:
         found = {source_name(t): with_sources(o) for t, o in of_kind[BOXES].items()}
         truth = next((to_truth(o) for o in of_kind[LABELS].values()), None)
         matches = {} if truth is None else {
-            name: {**compared(truth, d, min_score), "false": None} for name, d in found.items()}
+            name: {**compared(truth, d, min_score), "false": None, "ignored": None}
+            for name, d in found.items()}
         return shown_layers(truth, found, matches)
 
 

@@ -99,11 +99,20 @@ def shown_layers(truth: GroundTruth | None, found: Mapping[str, Detections],
 
 def compared(truth: GroundTruth, found: Detections, min_score: float, camera: Camera | None = None,
              classes: frozenset[str] = frozenset(DETECTED)) -> dict[str, list[int]]:
-    """Row numbers of labels that are missed, and of detections of at least min_score that are
-    false, for each of the classes: a hit overlaps seen from above by the class's relaxed share, or
-    is a pedestrian with its centre within 1 m. What only looks like a class, a van like a car, is
-    neither; nor is a detection outside the camera's view, where there is one: labels end there."""
-    missed, false = [], []
+    """Compare the detections of at least min_score with the labels.
+
+    A hit overlaps by the class's relaxed share in BEV, or is a pedestrian with its centre within
+    1 m. All labels are hit, missed or ignored; all these detections are hits, false or ignored.
+
+    Args:
+        camera: detections outside its view are ignored, as labels end there.
+        classes: classes that can be detected; labels of others are ignored. So are objects that
+            only look like one of them, such as a van, and detections on them.
+
+    Returns:
+        Row numbers: `missed` and `ignored_labels` of labels, `false` and `ignored` of detections.
+    """
+    missed, false, hits = [], [], []
     true_names = np.array([SIMILAR[CLASSES[c]] for c in truth.class_ids], object)
     for name in classes & DETECTED.keys():
         alike = np.flatnonzero(true_names == name)
@@ -118,11 +127,16 @@ def compared(truth: GroundTruth, found: Detections, min_score: float, camera: Ca
         i, j = one_to_one(1.0 - share, hit) if hit.size else (np.zeros(0, int), np.zeros(0, int))
         own = truth.class_ids[alike] == CLASSES.index(name)
         missed += alike[own & ~np.isin(np.arange(len(alike)), j)].tolist()
+        hits += rows[i[own[j]]].tolist()
         wrong = np.delete(rows, i)
         if camera is not None and len(wrong):
             wrong = wrong[camera.in_view(found.boxes[wrong, :3])]
         false += wrong.tolist()
-    return {"missed": sorted(missed), "false": sorted(false)}
+    wanted = [CLASSES.index(name) for name in classes & DETECTED.keys()]
+    counted = np.flatnonzero(found.scores >= min_score)
+    return {"missed": sorted(missed), "false": sorted(false),
+            "ignored_labels": np.flatnonzero(~np.isin(truth.class_ids, wanted)).tolist(),
+            "ignored": np.setdiff1d(counted, [*hits, *false]).tolist()}
 
 
 def by_detector(detector: Detector) -> Source:

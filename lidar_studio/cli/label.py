@@ -63,7 +63,7 @@ def label(data: Path, sequence: str | None, out: Path | None, detector: Detector
       lidar-perception label drive --out labels --no-open --port 8080
       lidar-perception label drive --export kitti-tracking:labels
     """
-    from lidar_studio.drive import one_drive
+    from lidar_studio.drive import one_drive, require_clouds
     from lidar_studio.journal import NAME as JOURNAL
     from lidar_studio.session import ImportedAlready, session
 
@@ -75,6 +75,8 @@ def label(data: Path, sequence: str | None, out: Path | None, detector: Detector
         return
     with looking_through(data):
         drive = one_drive(recording, sequence)
+    if target is None:
+        require_clouds(drive)
     folder = out or Path("out/label") / drive.name
     if target is not None and not imports and not (folder / JOURNAL).is_file():
         raise InputError(f"there is no journal in {folder}; give its folder with --out")

@@ -122,7 +122,7 @@ def _served(path: Path, detectors: tuple[DetectorChoice, ...], results: tuple[Pa
     from lidar_perception.data.bag_frames import recognises
     from lidar_perception.data.open import with_topic
     from lidar_studio import results as shown
-    from lidar_studio.drive import one_drive
+    from lidar_studio.drive import one_drive, require_clouds
     from lidar_studio.served import Served
 
     path, named = with_topic(path)
@@ -131,6 +131,7 @@ def _served(path: Path, detectors: tuple[DetectorChoice, ...], results: tuple[Pa
                  else opened(path))
     with looking_through(path):
         drive = one_drive(recording, sequence)
+    require_clouds(drive)
     found = shown.Results()
     if a_bag:
         drive = shown.with_recorded_scans(drive)

@@ -39,7 +39,8 @@ function build() {
   showComing();
 }
 
-const rowOf = (title, value, colour, what) => element("div", { class: "count-row", title: what },
+const rowOf = (title, value, colour, what, part) => element("div",
+  { class: `count-row${part ? " part" : ""}`, title: what },
   element("span", {}, title), element("b", { style: colour ? `color:${colour}` : "" },
     value === null ? "–" : String(value)));
 
@@ -52,9 +53,14 @@ function showComing() {
 function count() {
   const area = document.getElementById("counts");
   if (!area) return;
-  const { source, labels, missed, found, false: wrong } = resultCounts();
-  area.replaceChildren(rowOf("labels", labels), rowOf(source ? `by ${source}` : "detections", found),
-    rowOf("missed", missed, missed ? MISSED : ""), rowOf("false", wrong, wrong ? FALSE : ""));
+  const { source, labels, hits, missed, ignoredLabels, found, false: wrong, ignored } = resultCounts();
+  const part = (title, value, colour, what = "") => rowOf(title, value, colour, what, true);
+  area.replaceChildren(rowOf("labels", labels, "", "Found, missed and ignored ones"),
+    part("found", hits, ""), part("missed", missed, missed ? MISSED : ""),
+    part("ignored", ignoredLabels, "", "Labels of classes that are not scored, such as vans"),
+    rowOf(source ? `by ${source}` : "detections", found, "", "Right, false and ignored ones"),
+    part("right", hits, ""), part("false", wrong, wrong ? FALSE : ""),
+    part("ignored", ignored, "", "On ignored labels, or outside the image, where labels end"));
 }
 
 export function openResults() {

@@ -28,23 +28,26 @@ function boxesIn({ labels, detections, matches }, frame) {
       chosen: it?.frame === frame && it.layer === layer && it.k === k });
   };
   const compared = [...store.sources].find(([, { shown }]) => shown)?.[0];
-  const missed = new Set(store.layers.errors ? matches[compared]?.missed : []);
+  const rowsOf = (rows) => new Set((store.layers.errors && rows) || []);
+  const missed = rowsOf(matches[compared]?.missed), passed = rowsOf(matches[compared]?.ignored_labels);
   if (store.layers.labels) {
     for (const [k, label] of labels.entries()) {
       const wrong = missed.has(k);
       add({ strong: wrong, wrong: wrong ? "missed" : null, colour: wrong ? MISSED
         : store.mode === "view" ? LABEL : colourOfClass(label[7]),
-        text: wrong ? `missed ${label[7]}` : null }, "labels", k, label);
+        text: wrong ? `missed ${label[7]}` : passed.has(k) ? `ignored ${label[7]}` : null },
+      "labels", k, label);
     }
   }
   for (const [source, { shown, colour }] of store.sources) {
     if (!shown) continue;
-    const wrong = new Set((store.layers.errors && matches[source]?.false) || []);
+    const wrong = rowsOf(matches[source]?.false), ignored = rowsOf(matches[source]?.ignored);
     for (const [k, row] of (detections[source] ?? []).entries()) {
       if (row[8] < store.minScore) continue;
       const bad = wrong.has(k);
       add({ strong: bad, wrong: bad ? "false" : null, colour: bad ? FALSE : colour,
-        text: `${bad ? "false " : ""}${row[7]} ${row[8].toFixed(2)}` }, source, k, row);
+        text: `${bad ? "false " : ignored.has(k) ? "ignored " : ""}${row[7]} ${row[8].toFixed(2)}` },
+      source, k, row);
     }
   }
   return found;
@@ -86,14 +89,18 @@ export async function nextWrong(by) {
   changed("focus");
 }
 
-/** How many of the frame shown: {labels, missed, found, false} of the first source shown. */
+/** Counts of the frame shown, of the first source shown. labels = hits + missed + ignoredLabels,
+ * found = hits + false + ignored; null where that is not known: without labels, of a running graph,
+ * and for a new score until the server has answered. */
 export function resultCounts() {
-  const { labels, detections, matches } = store.results;
+  const { labels, detections, matches, score } = store.results;
   const source = [...store.sources].find(([, { shown }]) => shown)?.[0];
-  const rows = detections[source] ?? [], match = matches[source];
-  return { source, labels: labels.length, missed: match?.missed.length ?? null,
-           found: rows.filter((row) => row[8] >= store.minScore).length,
-           false: match?.false ? match.false.filter((k) => rows[k][8] >= store.minScore).length : null };
+  const match = score === store.minScore ? matches[source] : undefined;
+  const missed = match?.missed.length ?? null, ignoredLabels = match?.ignored_labels.length ?? null;
+  return { source, labels: labels.length, missed, ignoredLabels,
+           hits: match ? labels.length - missed - ignoredLabels : null,
+           found: (detections[source] ?? []).filter((row) => row[8] >= store.minScore).length,
+           false: match?.false?.length ?? null, ignored: match?.ignored?.length ?? null };
 }
 
 /** The answer of the server for a frame, asked for once. */
@@ -115,7 +122,7 @@ export function forget(frame) {
 
 /** Show those of the frame shown; boxes of another frame are never seen with it. */
 export async function loadResults() {
-  const { frame } = store;
+  const { frame, minScore: score } = store;
   let found = NOTHING;
   if (!store.drive.frames[frame]) return;
   try {
@@ -130,7 +137,7 @@ export async function loadResults() {
       changed("sources");
     }
   }
-  store.results = { ...found, frame };
+  store.results = { ...found, frame, score };
   changed("results");
 }
 

@@ -190,7 +190,7 @@ def test_tracks_of_two_trackers_keep_apart_and_labels_say_what_is_missed(live):
     live.boxes(FOUND, boxes(1, x=50.0), None)
     assert len({t["id"] for t in live.tracks()}) == 2
     match = live.layers(0, 0.0)["matches"]["fused_detector"]
-    assert match == {"missed": [0], "false": None}
+    assert match == {"missed": [0], "false": None, "ignored_labels": [], "ignored": None}
     live.forget(TRACKED)  # another graph takes its place
     live.hear("/c/tracker/output/tracks", TRACKS)
     live.boxes("/c/tracker/output/tracks", boxes(1), None)

@@ -324,6 +324,10 @@ def test_view_selects_single_labels_and_keys_step_through_what_is_missed(browser
     with serving("view", drive_bag, "--results", results, "--no-open") as shown, \
             opened(browser, shown.url) as page:
         missed = page.evaluate("page.store.results.matches.nothing.missed")
+        counts = page.evaluate("[...document.querySelectorAll('#counts b')].map(b => "
+                               "Number(b.textContent))")
+        assert counts[0] == sum(counts[1:4]) > counts[2] == len(missed) > 0
+        assert counts[4] == sum(counts[5:]) == 0
         seen = []
         for k in [*missed, None]:
             page.keyboard.press("n")

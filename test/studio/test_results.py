@@ -9,11 +9,12 @@ from time import monotonic, sleep
 
 import numpy as np
 import pytest
+from cli_samples import exit_of
 from click.testing import CliRunner
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lidar_perception.classes import CAR, CLASSES, PEDESTRIAN
+from lidar_perception.classes import CAR, CLASSES, DETECTED, PEDESTRIAN
 from lidar_perception.cli.main import cli
 from lidar_perception.data.bag import BagWriter, KeptOpen
 from lidar_perception.data.bag_poses import BagPoses
@@ -45,32 +46,55 @@ def truth(boxes, class_ids):
     return GroundTruth.of(boxes, class_ids)
 
 
+def wrong(*arguments, **more):
+    """Rows that are missed, and false; every row must be counted once."""
+    truth, found, least, *_ = arguments
+    result = compared(*arguments, **more)
+    hits = len(truth) - len(result["missed"]) - len(result["ignored_labels"])
+    assert hits == (found.scores >= least).sum() - len(result["false"]) - len(result["ignored"])
+    return {"missed": result["missed"], "false": result["false"]}
+
+
 def test_labels_found_as_they_are_leave_nothing_missed_or_false():
     ids = [CAR, CAR, PEDESTRIAN]
     boxes = np.vstack([CARS, [[8.0, -3, -1, 0.6, 0.6, 1.7, 0]]])
     found = Detections.of(boxes, ids, [0.9, 0.4, 0.7])
     for order in ([0, 1, 2], [2, 0, 1]):
-        assert compared(truth(boxes[order], np.array(ids)[order]), found, 0.0) == {
+        assert wrong(truth(boxes[order], np.array(ids)[order]), found, 0.0) == {
             "missed": [], "false": []}
 
 
 def test_a_score_below_the_least_is_as_if_it_were_not_there():
     found = Detections.of(CARS, CAR, [0.9, 0.4])
-    assert compared(truth(CARS, [CAR, CAR]), found, 0.5) == {"missed": [1], "false": []}
-    assert compared(truth(CARS[:1], [CAR]), found, 0.0) == {"missed": [], "false": [1]}
+    assert wrong(truth(CARS, [CAR, CAR]), found, 0.5) == {"missed": [1], "false": []}
+    assert wrong(truth(CARS[:1], [CAR]), found, 0.0) == {"missed": [], "false": [1]}
 
 
 def test_two_boxes_on_one_car_are_one_too_many_and_classes_do_not_mix():
     found = Detections.of(np.vstack([CARS[:1], CARS[:1]]), CAR, [0.9, 0.8])
-    assert compared(truth(CARS[:1], [CAR]), found, 0.0)["false"] in ([0], [1])
+    assert wrong(truth(CARS[:1], [CAR]), found, 0.0)["false"] in ([0], [1])
     other = Detections.of(CARS[:1], PEDESTRIAN, 0.9)
-    assert compared(truth(CARS[:1], [CAR]), other, 0.0) == {"missed": [0], "false": [0]}
+    assert wrong(truth(CARS[:1], [CAR]), other, 0.0) == {"missed": [0], "false": [0]}
 
 
 def test_a_van_is_neither_missed_nor_makes_a_car_there_false():
-    assert compared(truth(CARS[:1], [VAN]), Detections.none(), 0.0) == {"missed": [], "false": []}
+    assert wrong(truth(CARS[:1], [VAN]), Detections.none(), 0.0) == {"missed": [], "false": []}
     found = Detections.of(CARS[:1], CAR, 0.9)
-    assert compared(truth(CARS[:1], [VAN]), found, 0.0) == {"missed": [], "false": []}
+    assert wrong(truth(CARS[:1], [VAN]), found, 0.0) == {"missed": [], "false": []}
+    result = compared(truth(CARS, [CAR, VAN]), Detections.of(CARS, CAR, 0.9), 0.0)
+    assert (result["ignored_labels"], result["ignored"]) == ([1], [1])
+
+
+@given(st.lists(st.tuples(st.integers(0, 8), st.integers(0, 3)), max_size=6),
+       st.lists(st.tuples(st.integers(0, 8), st.integers(0, 3), st.integers(0, 4)), max_size=6),
+       st.sampled_from([frozenset(DETECTED), frozenset(["Pedestrian"]), frozenset(["Car", "Van"])]))
+def test_every_label_and_detection_is_counted_once(labels, detections, classes):
+    def boxes(rows):
+        return np.array([[3.0 * place, 2, -1, 4, 1.6, 1.5, 0] for place, *_ in rows]).reshape(-1, 7)
+    kinds = CAR, VAN, PEDESTRIAN, CLASSES.index("Tram")
+    wrong(truth(boxes(labels), [kinds[k] for _, k in labels]),
+          Detections.of(boxes(detections), [kinds[k] for _, k, _ in detections],
+                        [score / 4 for *_, score in detections]), 0.5, classes=classes)
 
 
 def test_what_a_source_cannot_detect_it_does_not_miss(drive_bag):
@@ -179,3 +203,16 @@ def test_a_screenshot_is_a_picture_of_the_page_and_leaves_no_browser_behind(driv
 def test_a_frame_that_is_not_there_is_said(drive_bag):
     result = CliRunner().invoke(cli, ["view", str(drive_bag), "--frame", "99", "--no-open"])
     assert isinstance(result.exception, InputError) and "no frame 99" in str(result.exception)
+
+
+@pytest.mark.parametrize("verb", ["view", "label"])
+@pytest.mark.parametrize("content", [b"no cloud\n", b"", b"# .PCD v0.7\nDATA ascii\n"])
+def test_a_file_without_a_cloud_is_refused_before_a_page_is_served(verb, content, tmp_path,
+                                                                   monkeypatch, capsys):
+    file = tmp_path / "text.pcd"
+    file.write_bytes(content)
+    monkeypatch.chdir(tmp_path)
+    assert exit_of(monkeypatch, verb, file, "--no-open") == 2
+    said = capsys.readouterr()
+    assert str(file) in said.err.splitlines()[-1] and "http" not in said.out
+    assert not (tmp_path / "out").exists()
