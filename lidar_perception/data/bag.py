@@ -239,7 +239,7 @@ class Bag:
 
     @property
     def content(self) -> str:
-        """Its topics, each with its type, for people."""
+        """Text that lists the topics with their types."""
         others = {name: f"{topic.type} as {topic.encoding}"
                   for name, topic in self.unreadable.items()}
         return ", ".join(f"{topic} ({kind})" for topic, kind in sorted(
@@ -262,22 +262,14 @@ class Bag:
 
     def raw(self, topics: Iterable[str] | None = None, start_ns: int | None = None,
             stop_ns: int | None = None) -> Iterator[tuple[str, int, bytes]]:
-        """(topic, time, CDR bytes) in order of time; all topics by default. InputError where the
-        bag is damaged, at the end if other numbers of messages were read than it says."""
+        """Yield (topic, time, CDR bytes) in order of time; all topics by default. InputError where
+        the bag is damaged, at the end of a file that has other numbers of messages than it says."""
         wanted = self.topics.keys() & (self.topics if topics is None else {*topics})
         start, stop = START if start_ns is None else start_ns, END if stop_ns is None else stop_ns
-        found = dict.fromkeys(wanted, 0)
-        for name, time, data in in_time_order(
-                (file.times[0], partial(self._of_file, path, file, wanted, start, stop))
-                for path, file in self.files
-                if file.times and file.times[0] < stop and start <= file.times[1]):
-            found[name] += 1
-            yield name, time, data
-        if start <= self.start_ns and stop_ns is None:
-            for topic, count in found.items():
-                if count != self.counts[topic]:
-                    raise InputError(damaged(self.path, f"it says {self.counts[topic]} messages on "
-                                             f"{topic} and holds {count}"))
+        return in_time_order(
+            (file.times[0], partial(self._of_file, path, file, wanted, start, stop))
+            for path, file in self.files
+            if file.times and file.times[0] < stop and start <= file.times[1])
 
     def _of_file(self, path: Path, file: StorageFile, wanted: set[str], start: int, stop: int
                  ) -> Iterator[tuple[str, int, bytes]]:
@@ -285,14 +277,20 @@ class Bag:
                  and topic.encoding == "cdr" and topic.type == self.topics[topic.name]}
         if not names:
             return
+        found = Counter[int]()
         try:
             for topic, time, data in file.messages(names, start, stop):
+                found[topic] += 1
                 yield names[topic], time, unpack_message(data)
+            for said in file.topics if start <= self.start_ns and stop == END else ():
+                if said.id in names and said.messages != found[said.id]:
+                    raise ValueError(f"it says {said.messages} messages on {said.name} and holds "
+                                     f"{found[said.id]}")
         except Exception as error:  # zstd, struct, SQLite and rosbags raise their own
             raise InputError(damaged(path, error)) from None
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
-        """(topic, time, message) of rosbags' classes."""
+        """Yield (topic, time, message of rosbags' class) in order of time."""
         for topic, stamp, data in self.raw(topics):
             try:
                 yield topic, stamp, decode(data, self.topics[topic])

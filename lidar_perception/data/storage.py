@@ -1,4 +1,9 @@
-"""Interface of the storage files of bags: MCAP, SQLite and ROS 1."""
+"""Interface of the storage files of bags: MCAP, SQLite and ROS 1.
+
+rosbags' reader of ROS 2 bags is not used: it trusts metadata.yaml and finds messages by the text of
+their QoS (rosbags/rosbag2/reader.py), and refuses MCAP files that it does not expect
+(rosbags/rosbag2/storage_mcap.py).
+"""
 
 from __future__ import annotations
 

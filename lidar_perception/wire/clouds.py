@@ -72,7 +72,7 @@ def packets_problem(topics: Mapping[str, str]) -> str | None:
         if driver := DRIVERS.get(package):
             return (f"{kind} on {topic} has the raw packets of a sensor, which are not read: play "
                     f"the bag to {driver} and record the clouds that it publishes")
-        if name in ("PointCloud", "LaserScan"):
+        if package == "sensor_msgs" and name in ("PointCloud", "LaserScan"):
             return (f"{kind} on {topic} is not read: record its scans as PointCloud2, with "
                     f"{'laser_geometry' if name == 'LaserScan' else 'point_cloud_converter'}")
     return None
