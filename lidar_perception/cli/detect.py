@@ -166,8 +166,9 @@ def print_summary(summary: Summary, run: Run) -> None:
     print_time(content["ms"], console)
     for path in summary.paths:
         console.print(f"written: {path}")
-    for remark in run.remarks:
-        console.print(Text("note", "yellow") + f": {remark}")
+    for remark, *others in run.remarks.values():
+        more = f" ({len(others)} more such frames)" if others else ""
+        console.print(Text("note", "yellow") + f": {remark}{more}")
     for problem, count in content["problems"].items():
         console.print(Text("problem", "yellow") + f" in {count} frames: {problem}")
     print_skipped(content["skipped"], console)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import repeat
@@ -22,7 +23,7 @@ from lidar_perception.data.kitti.results import (
     write_results,
     write_tracking_results,
 )
-from lidar_perception.detecting.results import FrameResult, short_floats
+from lidar_perception.detecting.results import FrameResult, short_floats, with_optional_parts
 from lidar_perception.labels.drive_labels import DriveLabels, FrameLabels
 from lidar_perception.labels.exchange import export_labels
 from lidar_perception.runs.files import write_text
@@ -39,7 +40,7 @@ class Run:
 
     recording: its data; out: its folder; header: a JSON object, see run.header_of; count: the
     number of frames to write; skipped: a line for each of them that could not be read or written;
-    remarks: lines about the results as a whole.
+    remarks: lines about the results, grouped by their text without numbers.
     """
 
     recording: Recording
@@ -47,11 +48,11 @@ class Run:
     header: dict[str, Any]
     count: int
     skipped: list[str] = field(default_factory=list)
-    remarks: dict[str, None] = field(default_factory=dict)
+    remarks: dict[str, dict[str, None]] = field(default_factory=dict)
 
     def say(self, remark: str) -> None:
         """Add a remark, once."""
-        self.remarks[remark] = None
+        self.remarks.setdefault(mask_numbers(remark), {})[remark] = None
 
 
 class Format(Protocol):
@@ -185,13 +186,19 @@ class OpenLabel(WrittenAtEnd):
             [{"velocity": row["velocity"]} if row["velocity"] else {} for row in found])
 
     def finish(self) -> None:
-        frames = [self.run.recording.frames[i] for i in range(self.run.count)]
+        frames = [with_optional_parts(self.run.recording.frames[i], self.run.say)
+                  for i in range(self.run.count)]
         labels = [self.labels.get(frame.name) or FrameLabels.of(frame.name, frame.stamp_ns)
                   for frame in frames]
         export_labels(DriveLabels(labels), "openlabel", self.path, frames, force=True)
 
 
 FORMATS: Mapping[str, type] = {"kitti": Kitti, "json": Json, "csv": Csv, "openlabel": OpenLabel}
+
+
+def mask_numbers(line: str) -> str:
+    """Return a line with # for its numbers, so that it is the same for many frames."""
+    return re.sub(r"\d[\d.]*", "#", line)
 
 
 def rows(result: FrameResult) -> list[dict[str, Any]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -18,7 +17,7 @@ import numpy as np
 
 from lidar_perception import __version__
 from lidar_perception.data.frame import Recording
-from lidar_perception.detecting.formats import Format, Run
+from lidar_perception.detecting.formats import Format, Run, mask_numbers
 from lidar_perception.detecting.results import FrameResult, by_detector, by_record
 from lidar_perception.detectors.contract import Detector
 from lidar_perception.detectors.open import Configured, kind_and_file
@@ -32,7 +31,6 @@ from lidar_perception.types import CLASSES
 # What a run writes into its folder, besides the journal and a bag, which replaces itself.
 WRITTEN = ("kitti/**/*.txt", "detections.json", "detections.csv", "openlabel/*.json",
            "png/**/*.png")
-NUMBER = re.compile(r"\d[\d.]*")
 
 
 @dataclass
@@ -60,14 +58,14 @@ class Summary:
         self.tracks.update([] if result.tracks is None else result.tracks.ids.tolist())
         self.ms.append(result.ms)
         for problem in filter(None, (result.problem, result.tracking_problem)):
-            self.problems[self._first.setdefault(NUMBER.sub("#", problem), problem)] += 1
+            self.problems[self._first.setdefault(mask_numbers(problem), problem)] += 1
         for each in self.formats:
             each.add(result)
 
     @property
     def paths(self) -> list[Path]:
-        """Where the results are."""
-        return [each.path for each in self.formats]
+        """Where the results are; nothing is written without a result."""
+        return [each.path for each in self.formats if each.path.exists()]
 
     def compute(self) -> dict[str, Any]:
         """All of it, as JSON can hold it; ms is the median, None without frames."""

@@ -64,15 +64,16 @@ def check_film(path: Path, count: int) -> None:
 
 @contextmanager
 def film(path: Path, size: tuple[int, int]) -> Iterator[Film]:
-    """Write a film of pictures of a size (width, height); the file appears when it is complete.
-    InputError where it cannot be written."""
+    """Write a film of pictures of a size (width, height); the file appears when it is complete, and
+    not at all without a picture. InputError where it cannot be written."""
     partial = path.with_name(f".{path.stem}.incomplete{path.suffix}")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         writer: Any = _Encoded(partial, size) if path.suffix in ENCODED else _Animated(partial)
         yield writer
-        writer.close()
-        partial.replace(path)
+        if writer.ticks:
+            writer.close()
+            partial.replace(path)
     except OSError as error:
         raise InputError(f"cannot write {path}: {error.strerror or error}") from None
     finally:
@@ -108,7 +109,7 @@ class _Animated:
     """GIF or WebP, which Pillow writes at once."""
 
     def __init__(self, path: Path) -> None:
-        self.path = path
+        self.path, self.ticks = path, 0
         self.pictures: list[Image.Image] = []
         self.durations: list[int] = []  # milliseconds
 
@@ -118,10 +119,10 @@ class _Animated:
         if self.path.suffix == ".gif":
             image = image.quantize(128, dither=Image.Dither.NONE)
         self.pictures.append(image)
-        self.durations.append(max(20, round(seconds * 1000)))
+        self.durations.append(max(20, round(seconds * TICKS)))
+        self.ticks += self.durations[-1]
 
     def close(self) -> None:
-        if self.pictures:
-            first, *others = self.pictures
-            first.save(self.path, save_all=True, append_images=others, duration=self.durations,
-                       loop=0, quality=80)  # which GIF has not
+        first, *others = self.pictures
+        first.save(self.path, save_all=True, append_images=others, duration=self.durations, loop=0,
+                   quality=80)  # which GIF has not

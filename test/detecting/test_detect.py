@@ -308,11 +308,14 @@ def test_frames_that_cannot_be_read_are_named_and_the_others_are_written(kitti, 
 def test_labels_and_cameras_that_cannot_be_read_are_not_needed(kitti, tmp_path, monkeypatch,
                                                                 capsys):
     write(kitti / "training/label_2/000001.txt", "Car")
-    (kitti / "training/calib/000002.txt").unlink()
+    for i in 0, 2, 3:
+        (kitti / f"training/calib/{i:06}.txt").unlink()
     assert detect(monkeypatch, kitti, "--out", tmp_path / "out", "--format", ALL) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert "labels left out: " in said and "000001.txt" in said
-    assert "camera calibration left out: " in said and "nominal camera" in said
+    assert said.count("calibration left out: ") == 1 and "(2 more such frames)" in said
+    assert said.count("nominal camera") == 1
+    assert "calibration left out: " in said and "nominal camera" in said
     assert len(read_json(tmp_path / "out")["frames"]) == 4
 
 

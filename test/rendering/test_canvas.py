@@ -164,7 +164,10 @@ def read_film(path):
     return [list(column) for column in zip(*frames)]
 
 
-def test_a_film_that_fails_leaves_nothing(tmp_path):
+def test_a_film_that_fails_or_has_no_picture_leaves_nothing(tmp_path):
+    for suffix in (".gif", *[".mp4"] * (importlib.util.find_spec("av") is not None)):
+        with film(tmp_path / f"a{suffix}", (160, 90)):
+            pass
     with pytest.raises(ZeroDivisionError), film(tmp_path / "a.gif", (160, 90)) as made:
         made.add(pictures(1)[0], 1 / 0)
     assert not [*tmp_path.iterdir()]
