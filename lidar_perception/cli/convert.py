@@ -15,7 +15,7 @@ from rich.text import Text
 from lidar_perception.cli.command import Choice, Command
 from lidar_perception.cli.data import a_path, limit_option, opened, split_option
 from lidar_perception.labels.datasets import LAYOUTS
-from lidar_perception.labels.exchange import FORMATS
+from lidar_perception.labels.exchange import FORMATS, READERS
 from lidar_perception.labels.names import ALIASES
 from lidar_perception.runs.terminal import console, track
 from lidar_perception.types import InputError
@@ -33,8 +33,8 @@ DATASETS, LABELS = tuple(LAYOUTS), tuple(FORMATS)
               help="Bag, folder or file to make.")
 @a_path("--data", "Same as DATA. With both, DATA is the path of labels of this drive, which are "
         "converted.", "DRIVE")
-@click.option("--from", "given", type=Choice(LABELS, ALIASES), help="Format of the labels at DATA. "
-              "Default: recognised.")
+@click.option("--from", "given", type=Choice(READERS, ALIASES), help="Format of the labels at "
+              "DATA. Default: recognised.")
 @click.option("--detections", metavar="TOPIC", help="Take the boxes on this topic of the bag at "
               "DATA (MarkerArray or Detection3DArray), instead of its labels.")
 @click.option("--points", default="", metavar="TOPIC",

@@ -39,7 +39,7 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
         label, stamp = path / f"labels/{file.stem}.txt", START_NS + i * PERIOD_NS
         frames.append(Frame(
             file.stem, stamp, partial(load_points, file, stamp, LIDAR_FRAME, scale=scale),
-            truth=partial(_truth, label), index=i, points=file, files=(file, label),
+            truth=partial(read_labels, label), index=i, points=file, files=(file, label),
             intensity_max=scale))
     known = {frame.name for frame in frames}
     lost = {label.stem: label for label in sorted(path.glob("labels/*.txt"))
@@ -51,9 +51,9 @@ def open_recording(path: Path, *, points: str = "", scans: bool = True) -> Recor
                      mounted=False, drives=False)
 
 
-def _truth(path: Path) -> GroundTruth | None:
-    """The objects of a label file; None without one. A class that is not known by any of its names
-    (Vehicle, person) is Misc, with its name as class_name."""
+def read_labels(path: Path) -> GroundTruth | None:
+    """Return the objects of a label file; None without one. A class that is not known by any of its
+    names (Vehicle, person) is Misc, with its name as class_name."""
     if not path.exists():
         return None
     boxes, names = [], []

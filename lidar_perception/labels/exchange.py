@@ -12,14 +12,17 @@ import numpy as np
 
 from lidar_perception.data.bag_frames import recognises as is_bag
 from lidar_perception.data.frame import Frame
+from lidar_perception.data.kitti.raw import TRACKLETS
 from lidar_perception.labels.drive_labels import NO_TRACK, DriveLabels
 from lidar_perception.labels.formats import (
     bag,
     kitti_object,
+    kitti_raw,
     kitti_tracking,
     labelcloud,
     nuscenes,
     openlabel,
+    openpcdet,
     sustech,
 )
 from lidar_perception.labels.formats.files import MAX_BYTES, in_file, read_json
@@ -46,8 +49,11 @@ FORMATS: dict[str, tuple[Read, Write]] = {
     "mcap": (bag.read, bag.write),
     "mcap-labels": (bag.read, bag.write_labels),
 }
-
-
+# What can be read: these, and formats that are not written.
+READERS: dict[str, Read] = {name: read for name, (read, _) in FORMATS.items()} | {
+    "kitti-raw": kitti_raw.read,
+    "openpcdet": openpcdet.read,
+}
 WITH_NOTES = {"kitti", "kitti-tracking", "openlabel", "mcap", "mcap-labels"}
 
 
@@ -66,7 +72,8 @@ def import_labels(path: Path, format: str, frames: Sequence[Frame]) -> DriveLabe
     """The labels at a path, of each of the frames of a drive in their order. InputError in one line
     where they cannot be read, or are of frames that the drive has not."""
     with np.errstate(all="ignore"):  # what is too large for a float is no label, see FrameLabels.of
-        return _of(format)[0](path, frames[:])  # of a bag, frames that do not hold their clouds
+        read = READERS[format_name(format, READERS)]
+        return read(path, frames[:])  # of a bag, frames that do not hold their clouds
 
 
 def export_labels(labels: DriveLabels, format: str, out: Path, frames: Sequence[Frame],
@@ -78,7 +85,7 @@ def export_labels(labels: DriveLabels, format: str, out: Path, frames: Sequence[
         raise InputError(f"labels of {len(labels)} frames for a drive of {len(frames)}; give those "
                          "of the same frames")
     in_file("what the labels keep of the file that they were read from",
-            lambda: _of(format)[1](labels, out, frames[:], force))
+            lambda: FORMATS[format][1](labels, out, frames[:], force))
     notes = 0 if format in WITH_NOTES else sum(len(each.notes) for each in labels.frames)
     ids = format == "kitti" and any((f.track_ids != NO_TRACK).any() for f in labels.frames)
     return Written(out, labels.boxes, len(labels), (
@@ -92,9 +99,11 @@ def recognised(path: Path) -> str:
         and not file.name.startswith(("_", ".")))
     if not path.exists():
         raise InputError(f"there is no file or folder {path}; give one with labels: "
-                         f"{', '.join(FORMATS)}")
+                         f"{', '.join(READERS)}")
     if path.suffix in (".mcap", ".db3") or (path.is_dir() and is_bag(path)):
         return "mcap"
+    if path.suffix == ".xml" or any(path.glob(f"**/{TRACKLETS}")):
+        return "kitti-raw"
     for folder, format in ("label_02", "kitti-tracking"), ("label_2", "kitti"):
         if label_folder(path, folder) != path:
             return format
@@ -103,18 +112,22 @@ def recognised(path: Path) -> str:
         if found:
             return found
     raise InputError(f"{path} holds no labels that are recognised, or none at all; say with --from "
-                     f"which of {', '.join(FORMATS)} they are")
+                     f"which of {', '.join(READERS)} they are")
 
 
 def _by_text(file: Path) -> str:
-    """By the class's place in the first line."""
-    words = read_text(file, MAX_BYTES).split(maxsplit=3)
+    """By the number of numbers before the class in the first line."""
+    words = read_text(file, MAX_BYTES).lstrip().partition("\n")[0].split()
     if words and words[0].endswith(":"):
         return ""  # a calibration
-    with suppress(ValueError, IndexError):
-        float(words[0]), float(words[1])
-        return "kitti-tracking"
-    return "kitti" if len(words) > 3 else ""
+    before = 0
+    with suppress(ValueError):
+        for word in words:
+            float(word)
+            before += 1
+    if before == 0:
+        return "kitti" if len(words) > 3 else ""
+    return "kitti-tracking" if before == 2 else "openpcdet" if before == 7 else ""
 
 
 def _by_json(content: Any) -> str:
@@ -133,7 +146,3 @@ def _by_json(content: Any) -> str:
             for row in boxes:
                 return "nuscenes-tracking" if "tracking_name" in row else "nuscenes-detection"
     return ""
-
-
-def _of(format: str) -> tuple[Read, Write]:
-    return FORMATS[format_name(format, FORMATS)]

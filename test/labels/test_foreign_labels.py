@@ -292,3 +292,56 @@ def test_regions_of_openlabel_stay_regions(tmp_path):
     assert again["frames"]["5"]["objects"] == {"1": {"object_data": car},
                                                "-1": {"object_data": data}}
     assert [o["type"] for o in again["objects"].values()] == ["car", "dontcare"]
+
+
+POSE = "<item><tx>12</tx><ty>0</ty><tz>-1.7</tz><rz>0.1</rz></item>"
+TRACK = ("<item><objectType>{}</objectType><h>1.5</h><w>1.6</w><l>3.9</l><first_frame>{}"
+         "</first_frame><poses>{}</poses></item>")
+
+
+def tracklets(path, *tracks):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"<boost_serialization><tracklets>{''.join(tracks)}</tracklets>"
+                    "</boost_serialization>")
+    return path
+
+
+def test_tracklets_of_cvat_are_labels_of_a_drive(tmp_path):
+    frames = drive("one")  # numbers 5 to 7
+    path = tracklets(tmp_path / "in/tracklet_labels.xml", TRACK.format("car", 5, POSE * 2),
+                     TRACK.format("bus", 7, POSE))
+    for given in (path, path.parent):
+        assert recognised(given) == "kitti-raw"
+        labels = import_labels(given, "kitti_raw", frames)
+        assert [each.class_names for each in labels.frames] == [["Car"], ["Car"], ["bus"]]
+        assert [each.track_ids.tolist() for each in labels.frames] == [[0], [0], [1]]
+        np.testing.assert_allclose(labels.frames[0].boxes[0], [12, 0, -0.95, 3.9, 1.6, 1.5, 0.1])
+    (path.parent / "frame_list.txt").write_text("7 000005\n5 000006\n6 000007\n")
+    labels = import_labels(path, "kitti-raw", frames)
+    assert [each.class_names for each in labels.frames] == [["bus"], ["Car"], ["Car"]]
+    tracklets(path, TRACK.format("Car", 9, POSE))
+    with pytest.raises(InputError, match=r"has the frame 9 .* the drive has 5 to 7"):
+        import_labels(path, "kitti-raw", frames)
+    several = drive("several")
+    with pytest.raises(InputError, match="is one file, and the frames are of 2 drives"):
+        import_labels(path, "kitti-raw", several)
+    with pytest.raises(InputError, match="has no tracklet_labels"):
+        import_labels(path.parent, "kitti-raw", several)
+    tracklets(tmp_path / "in/0011/tracklet_labels.xml", TRACK.format("Van", 5, POSE))
+    labels = import_labels(path.parent, "kitti-raw", several)
+    assert [name for each in labels.frames for name in each.class_names] == ["Van"]
+
+
+def test_labels_of_openpcdet_are_labels_of_a_drive(tmp_path):
+    frames = drive("one")
+    folder = tmp_path / "labels"
+    folder.mkdir()
+    (folder / "000006.txt").write_bytes(
+        b"\xef\xbb\xbf12.0 0 -0.98 3.9 1.6 1.5 0.1 Vehicle\r\n1 2 0 1 1 2 0 e-scooter\r\n")
+    for given in (folder, tmp_path):
+        assert recognised(given) == "openpcdet"
+        labels = import_labels(given, "openpcdet", frames)
+        assert [each.class_names for each in labels.frames] == [[], ["Car", "e-scooter"], []]
+    assert labels.frames[1].boxes[0].tolist() == [12, 0, -0.98, 3.9, 1.6, 1.5, 0.1]
+    with pytest.raises(InputError, match="there is no format 'openpcdet'"):
+        export_labels(labels, "openpcdet", tmp_path / "out", frames)

@@ -104,16 +104,22 @@ def _numbers(drive: Path, files: Sequence[Path]) -> list[int]:
     path = drive / FRAME_LIST
     if not path.exists():
         return [number_of(file) for file in files]
-    rows = [line.split(maxsplit=1) for line in read_text(path, what="the list").splitlines()
-            if line.strip() and not line.startswith("#")]
-    try:
-        numbers = {Path(name.strip()).name: int(number) for number, name in rows}
-    except ValueError as error:
-        raise InputError(f"{path} has a line that is not NUMBER NAME ({error}); export the drive "
-                         "again") from None
+    numbers = read_frame_list(path)
     if unknown := [file.name for file in files if file.stem not in numbers]:
         raise InputError(f"{path} does not name {unknown[0]}; export the drive again")
     return [numbers[file.stem] for file in files]
+
+
+def read_frame_list(path: Path) -> dict[str, int]:
+    """Return the numbers of the scans by their names without folder and suffix, from the lines
+    "NUMBER NAME" of a file. InputError for another line."""
+    rows = [line.split(maxsplit=1) for line in read_text(path, what="the list").splitlines()
+            if line.strip() and not line.startswith("#")]
+    try:
+        return {Path(name.strip()).name: int(number) for number, name in rows}
+    except ValueError as error:
+        raise InputError(f"{path} has a line that is not NUMBER NAME ({error}); export the drive "
+                         "again") from None
 
 
 def _stamps(drive: Path, numbers: Sequence[int], required: bool) -> list[int]:
