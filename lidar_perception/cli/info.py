@@ -13,8 +13,9 @@ from lidar_perception.cli.command import Command
 from lidar_perception.cli.data import data_argument, lost_labels
 from lidar_perception.data import bag_frames
 from lidar_perception.data.bag import Bag
-from lidar_perception.data.open import layout_of, open_recording
+from lidar_perception.data.open import expected, layout_of, open_recording
 from lidar_perception.runs.terminal import console
+from lidar_perception.types import InputError
 
 
 @click.command(cls=Command)
@@ -30,7 +31,10 @@ def info(data: Path, as_json: bool) -> None:
       lidar-perception info /data/kitti/tracking
       lidar-perception info drive.bag --json
     """
-    if layout_of(data) in (None, bag_frames):
+    layout = layout_of(data)
+    if layout is None and data.is_dir():
+        raise InputError(f"{data} has no metadata.yaml and is no other recording: {expected()}")
+    if layout in (None, bag_frames):
         content, show = _bag(data), _print_bag
     else:
         content, show = _recording(data), _print_recording

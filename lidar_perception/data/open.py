@@ -69,10 +69,7 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
     if not path.exists():
         raise InputError(f"there is no {path}; give a bag or the folder of a data set")
     if (layout := layout_of(path)) is None:
-        *folders, last = filter(None, LAYOUTS.values())
-        raise InputError(f"{path} is no recording that can be read: expected a rosbag2 bag, or the "
-                         f"folder of {', '.join(folders)} or {last}, or {', '.join(SUFFIXES)} "
-                         "files")
+        raise InputError(f"{path} is no recording that can be read: {expected()}")
     recording = layout.open_recording(path, points=points, scans=scans)
     if len(recording) == 0:
         raise InputError(f"{path} ({recording.layout}) has no frame; record or download it again")
@@ -87,6 +84,13 @@ def open_recording(path: str | Path, *, split: str | Path | None = None, points:
         open_recording, path, split=split, points=points, scans=scans,
         sensor_height=sensor_height))
     return recording if split is None else _of_split(recording, Path(split))
+
+
+def expected() -> str:
+    """Return the list of what can be opened, for messages."""
+    *folders, last = filter(None, LAYOUTS.values())
+    return (f"expected a rosbag2 bag, or the folder of {', '.join(folders)} or {last}, or "
+            f"{', '.join(SUFFIXES)} files")
 
 
 def layout_of(path: Path) -> ModuleType | None:

@@ -116,7 +116,7 @@ def recognised(path: Path) -> str:
 
 
 def _by_text(file: Path) -> str:
-    """By the number of numbers before the class in the first line."""
+    """Tell the format by how many numbers precede the class in the first line."""
     words = read_text(file, MAX_BYTES).lstrip().partition("\n")[0].split()
     if words and words[0].endswith(":"):
         return ""  # a calibration

@@ -410,7 +410,8 @@ def test_a_frame_that_cannot_be_read_is_counted_as_skipped(kitti, tmp_path):
 BAD_INPUTS = {
     "missing bag": (["info", "{tmp}/none"], "there is no bag {tmp}/none"),
     "too long a name": (["info", f"{{tmp}}/{300 * 'a'}"], "a: File name too long"),
-    "no bag": (["info", "{tmp}"], "{tmp} has no metadata.yaml"),
+    "no bag": (["info", "{tmp}"], "{tmp} has no metadata.yaml and is no other recording: "
+               "expected a rosbag2 bag, or the folder of KITTI"),
     "missing data": (["convert", "{tmp}/none", "--out", "{tmp}/o"], "there is no {tmp}/none"),
     "no data": (["convert", "{tmp}", "--out", "{tmp}/o"], "{tmp} is no recording that can be read"),
     "existing out": (["convert", "{kitti}", "--out", "{bag}"], "exists already"),

@@ -1,7 +1,7 @@
 """Tracklets of KITTI's raw drives, as CVAT and Datumaro export them: one XML file a drive.
 
-See data.kitti.labels.read_tracklets for what is read. A frame_list.txt beside the file gives the
-number of each frame by its name.
+data.kitti.labels.read_tracklets reads the boxes. frame_list.txt in the same folder gives the number
+of each frame by its name.
 """
 
 from __future__ import annotations
