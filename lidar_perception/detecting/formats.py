@@ -33,6 +33,13 @@ BOX = ("x", "y", "z", "length", "width", "height", "yaw")
 COLUMNS = ("frame", "sequence", "index", "stamp_ns", "frame_id", "id", "class", "score", *BOX,
            "velocity_x", "velocity_y")
 
+UNITS = {
+    "box": "x y z of the centre, length, width, height in metres, yaw in radians counter-clockwise "
+           "from x, in the LiDAR frame of the cloud: x forward, y left, z up",
+    "velocity": "metres a second over ground along x and y of the LiDAR frame; relative to the "
+                "sensor where ego is none", "score": "0..1", "stamp_ns": "nanoseconds",
+    "ms": "milliseconds of the detector"}
+
 
 @dataclass
 class Run:
@@ -142,7 +149,8 @@ class Json(WrittenAtEnd):
             "problem": result.problem, "objects": rows(result)}, allow_nan=False))
 
     def finish(self) -> None:
-        head = json.dumps({**self.run.header, "skipped": self.run.skipped}, indent=1)
+        head = json.dumps({"format": "lidar_perception detections", "units": UNITS,
+                           **self.run.header, "skipped": self.run.skipped}, indent=1)
         write_text(self.path, f'{head[:-2]},\n "frames": [\n' + ",\n".join(self.lines) + "\n]}")
 
 

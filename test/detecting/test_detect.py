@@ -38,6 +38,8 @@ from lidar_perception.detectors.contract import Found
 from lidar_perception.detectors.open import LOAD
 from lidar_perception.labels.exchange import import_labels
 from lidar_perception.scoring.recorded import by_stamp
+from lidar_perception.scoring.run import fill
+from lidar_perception.scoring.tracking.report import TrackingReport, by_tracker, observe
 from lidar_perception.tracking.params import TrackingParams
 from lidar_perception.types import Detections
 from lidar_perception.wire.topics import POINTS, TRUTH
@@ -79,7 +81,7 @@ def test_any_recording_gives_a_result_of_every_frame(kind, tmp_path, monkeypatch
     content = read_json(out)
     assert [frame["name"] for frame in content["frames"]] == names and len(made) == len(names)
     assert content["detector"] == content["weights"] == NAME and content["skipped"] == []
-    assert content["parameters"]["least"] == 0.5
+    assert content["parameters"]["least"] == 0.5 and "metres" in content["units"]["box"]
     found = objects(content)
     for frame, said in zip(open_recording(data), content["frames"]):
         assert {k: said[k] for k in ("sequence", "index", "stamp_ns", "frame_id")} == {
@@ -219,6 +221,22 @@ def test_tracks_have_ids_and_velocities_that_never_mix(drives, tmp_path, monkeyp
         np.testing.assert_allclose(tracks.boxes[:, :3], np.array(
             objects(content)[frame.name])[:, 2:5], atol=2e-4)
         assert [e["track_id"] for e in tracks.extras] == each.track_ids.tolist()
+
+
+def test_written_tracks_score_as_the_tracker_itself(drives, tmp_path, monkeypatch):
+    assert detect(monkeypatch, drives, "--out", tmp_path, "--format", "kitti", "--track",
+                  "--ego", "none", "--force") == 0
+    recording, itself, read = open_recording(drives), TrackingReport(), TrackingReport()
+    fill(itself, recording, by_tracker(lambda: MadeDetector().with_min_score(0.05), ego="none"))
+    for frame in recording:
+        if (truth := frame.truth()) is not None:
+            found = read_tracking_results(tmp_path / f"kitti/{frame.sequence}.txt",
+                                          frame.calibration().lidar_to_camera)
+            read.update(observe(frame.sequence, frame.index, truth, found[frame.index],
+                                frame.calibration()))
+    scores = [report.compute()["classes"] for report in (read, itself)]
+    assert scores[0].keys() == scores[1].keys() and scores[0]["Pedestrian"]["boxes"] > 0
+    assert numbers_in(scores[0]) == pytest.approx(numbers_in(scores[1]), abs=1e-3)
 
 
 def test_drives_of_a_bag_are_tracked_apart(tmp_path, monkeypatch):

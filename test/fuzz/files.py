@@ -18,18 +18,22 @@ from fuzz.mutation import mutate_bytes, mutate_text
 
 SECONDS, MEGABYTES = 60.0, 3000.0
 KITTI = ("--data", "kitti")
+DETECT = ("--out", "made", "--weights", "pointnet", "--limit", "2", "--png", "--format",
+          "kitti,json,csv,mcap,openlabel")
 # Label format -> its folder or file; the labels are of the drive in bag/.
 LABELS = {"openlabel": "openlabel", "sustech": "sustech", "labelcloud": "labelcloud",
           "nuscenes_tracking": "nuscenes_tracking/labels.json"}
 # Format -> its weight, and the commands that read it; {} is the damaged file.
 COMMANDS: dict[str, tuple[float, list[tuple[str, ...]]]] = {
     "bag": (8, [("info", "bag/drive"), ("convert", "bag/drive", "--out", "made", "--force"),
-                ("setup", "--data", "bag/drive", "--out", "made")]),
+                ("setup", "--data", "bag/drive", "--out", "made"),
+                ("detect", "bag/drive", *DETECT)]),
     "ros1": (3, [("info", "ros1/drive.bag"),
                  ("convert", "ros1/drive.bag", "--out", "made", "--force")]),
     "kitti": (4, [("convert", "kitti", "--out", "made", "--force"),
                   ("evaluate", "candidates", *KITTI)]),
-    "tracking": (2, [("convert", "tracking", "--out", "made", "--force")]),
+    "tracking": (2, [("convert", "tracking", "--out", "made", "--force"),
+                     ("detect", "tracking", *DETECT, "--track", "--video", "made.gif")]),
     "semantickitti": (3, [("evaluate", "segmentation", "--data", "semantickitti")]),
     "nuscenes": (3, [("convert", "nuscenes", "--out", "made", "--force")]),
     **{name: (1, [("convert", name, "--out", "made", "--force")]) for name in (

@@ -26,7 +26,8 @@ from lidar_perception.types import InputError
 
 @click.command(cls=Command)
 @walk_options()
-@a_path("--results", "Result files of any detector, in KITTI's format: DIR/000000.txt ...", "DIR")
+@a_path("--results", "Result files of any detector, in KITTI's format: DIR/000000.txt ...; "
+        "or the folder that `detect --format kitti` wrote.", "DIR")
 @detector_options()
 @click.option("--min-score", type=click.FloatRange(0, 1), default=MIN_SCORE, show_default=True,
               help="Leave out boxes of --weights with a lower score. Average precision needs "
